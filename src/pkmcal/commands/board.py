@@ -1,4 +1,4 @@
-"""``pkmcal board``: a calibration board to print, true to scale."""
+"""``pkmcal board``: PDF page of a calibration board in true size."""
 
 from __future__ import annotations
 

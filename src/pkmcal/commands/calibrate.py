@@ -1,4 +1,4 @@
-"""``pkmcal calibrate``: from a session to a calibrated machine on disk."""
+"""``pkmcal calibrate``: calibration of a session's machine, written to files."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def calibrate(
         )
         progress("Writing the report", 0.97)
         outcome = outcome_of(value)
-        with output_lock(folder):  # another run may have written there meanwhile
+        with output_lock(folder):  # another process may have written there since the first check
             over = check_output(folder, force=force)
             archive_folder = None if force else keep_earlier(folder, outcome.texts)
             write_outcome(outcome, folder, CALIBRATION_FILES, over)

@@ -1,4 +1,4 @@
-"""``pkmcal camera``: a camera calibrated from photographs of a board."""
+"""``pkmcal camera``: calibration of a camera with images of a board."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OTHER_CAMERA_FILES = {
 
 
 class CameraFileForm(StrEnum):
-    """Other programs' camera files."""
+    """Formats of other programs' camera files."""
 
     OPENCV = "opencv"
     ROS = "ros"
@@ -82,7 +82,10 @@ def camera(
 
 
 def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
-    """A session's photographs of its board, all of one camera, and the board's file."""
+    """Image files of a session's board, all of one camera, and the board's file.
+
+    Raises InputError if no station observes a board, several cameras do, or there are no files.
+    """
     from pkmcal.errors import InputError
     from pkmcal.files import read_yaml, validated_document, wanted_file
     from pkmcal.session.schema import session_schema
@@ -124,7 +127,9 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
 
 
 def photographs(images: list[Path]) -> list[Path]:
-    """The photographs named, folders opened; in the order of their names."""
+    """Image files of the arguments in the order of their names, with folders replaced by their
+    content.
+    """
     from pkmcal.errors import InputError
     from pkmcal.files import IMAGE_FILE_ENDINGS
 
@@ -148,7 +153,7 @@ def photographs(images: list[Path]) -> list[Path]:
 
 
 def board_file_of(images: list[Path]) -> Path:
-    """board.yaml in the photographs' folder, or in the one above it."""
+    """board.yaml in the folder of the images, or in the folder above; InputError without it."""
     from pkmcal.errors import InputError
     from pkmcal.files import resolved
 

@@ -1,4 +1,4 @@
-"""``pkmcal export``: a machine for other programs."""
+"""``pkmcal export``: files of a machine for other programs."""
 
 from __future__ import annotations
 
@@ -59,8 +59,9 @@ def export(
 
 
 def _beside(calibration: str, to: str) -> Path:
-    """Beside a calibration's folder, or here for a machine that is only a file or a name. Links are
-    not followed: they may lead out of somebody else's folder.
+    """Folder beside a calibration's folder, or in the current one for a machine's file or name.
+
+    Links are not followed: they may lead out of the user's folder.
     """
     path = Path(calibration)
     folder = path.parent if path.is_file() and path.suffix == ".json" else path
@@ -70,7 +71,7 @@ def _beside(calibration: str, to: str) -> Path:
 
 
 def summary(made: Export, source: MachineSource, folder: Path) -> dict[str, Any]:
-    """What the command says, for programs."""
+    """Document that the command prints for programs."""
     return {
         "exit_code": 0,
         "format": made.exporter.name,
@@ -89,13 +90,15 @@ def summary(made: Export, source: MachineSource, folder: Path) -> dict[str, Any]
 
 
 def _trial(made: Export, folder: Path) -> str | None:
-    """A command that tries the files out, from here and as often as one likes."""
+    """Shell command that tries out the files from the current folder; None if the format has
+    none.
+    """
     trial = made.exporter.trial
     return f"(cd {shlex.quote(str(folder))} && {trial})" if trial else None
 
 
 def print_export(out: Console, made: Export, source: MachineSource, folder: Path) -> None:
-    """What the command says, for people."""
+    """Print the result for people."""
     state = "good" if source.calibrated and source.usable else "doubtful"
     console.print_points(out, [(console.MARK_SIGNS[state], f"{source.origin}: {source.headline}")])
     points = [
@@ -111,5 +114,5 @@ def print_export(out: Console, made: Export, source: MachineSource, folder: Path
     console.print_files(out, [(str(folder / name), made.exporter.title) for name in made.files])
     if trial := _trial(made, folder):
         out.print()
-        # in one line however narrow the terminal is: it is there to be copied
+        # not wrapped, so that it can be copied
         out.print(f"  {trial}", soft_wrap=True, markup=False, highlight=False)

@@ -1,4 +1,4 @@
-"""``pkmcal new``: a commented session to fill in."""
+"""``pkmcal new``: template of a session with comments."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FELT_FILE_DESCRIPTIONS = {
     "joints.csv": "the carriages when the bed was felt",
     "poses.csv": "the tool's height above the bed there",
 }
-"""Of a session that is whole."""
+"""Descriptions of the files of a complete session of a printer."""
 PHOTOGRAPHS_DESCRIPTION = "where the photographs go"
 
 
@@ -82,7 +82,9 @@ def _of_printer(
     others: Mapping[str, object],
     as_json: bool,
 ) -> int:
-    """A printer's session; others : what else was asked, which does not go with it."""
+    """Write a printer's session. others : options given in addition, which exclude
+    ``--printer``.
+    """
     from pkmcal.errors import InputError
     from pkmcal.printers.session import write_printer_session
 
@@ -110,7 +112,9 @@ def _summary_lines(
     done: bool = False,
     of_printer: bool = False,
 ) -> int:
-    """What was written; done : nothing is missing in it. of_printer : drawn by its firmware."""
+    """Print the files written. done : nothing is missing in the session. of_printer : its nominal
+    model is from a firmware's file.
+    """
     if as_json:
         console.print_json({"folder": str(folder), "files": names})
         return 0
@@ -134,12 +138,12 @@ def _summary_lines(
 
 
 def on_terminal() -> bool:
-    """Whether somebody is there to answer."""
+    """Whether a user can answer."""
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def _dialogue() -> tuple[str | None, ObservedChoice | None, int]:
-    """What somebody at a terminal wants: the machine, what is seen of it, from how many places."""
+    """Machine, observed parts and number of stations, by a dialogue."""
     from rich.prompt import IntPrompt, Prompt
 
     from pkmcal.mechanisms import catalogue, load_mechanism

@@ -1,4 +1,4 @@
-"""``pkmcal plan``: the next configurations worth measuring, and where to put the camera."""
+"""``pkmcal plan``: the next configurations to measure, and the poses of the camera."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def plan(
 
 
 def _tracker(text: str) -> tuple[float, float | None]:
-    """A tracker's noise, m and rad, of a text such as 2e-5 or 2e-5,1e-4."""
+    """Noise of a tracker, m and rad, from a text such as 2e-5 or 2e-5,1e-4."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:

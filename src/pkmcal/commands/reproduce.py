@@ -1,4 +1,4 @@
-"""``pkmcal reproduce``: the papers' figures computed again, beside what the papers print."""
+"""``pkmcal reproduce``: the papers' figures recomputed, beside the printed ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ REPRODUCTION_FOLDER = Path("reproduction")
 
 
 class Paper(StrEnum):
-    """A paper that can be reproduced."""
+    """Papers that can be reproduced."""
 
     A = "a"
     B = "b"

@@ -1,4 +1,6 @@
-"""``pkmcal servo``: control by the legs in the image, simulated with the calibrated machine."""
+"""``pkmcal servo``: simulated visual servoing by the legs in the image, with a calibrated
+machine.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from pkmcal.errors import InputError
 
 SERVO_FILES = {"servo.html": PAGE_DESCRIPTION, "servo.json": NUMBERS_DESCRIPTION}
 MOST_SAMPLES = 5000
-"""Samples of a run; more take minutes and hundreds of megabytes."""
+"""Maximum number of samples of a run; more take minutes and hundreds of megabytes."""
 
 
 def servo(
@@ -123,6 +125,6 @@ def servo(
     try:
         with console.progress(as_json) as progress:
             outcome = outcome_of(study_servoing(scene, plan, progress))
-    except InputError as error:  # what a camera does not see is told with its file
+    except InputError as error:  # located at the camera's file, which determines what is in view
         raise error if error.where or camera is None else error.located(str(camera)) from None
     return finish(outcome, folder, SERVO_FILES, as_json=as_json)

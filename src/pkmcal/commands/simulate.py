@@ -1,4 +1,4 @@
-"""``pkmcal simulate``: a session with known truth."""
+"""``pkmcal simulate``: a simulated session with known truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from pkmcal.cameras import Camera
 
 SMALLEST_PICTURE_SIDE, LARGEST_PICTURE_SIDE = 64, 8192
-"""Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
+"""Limits of an image's width and height in px: below, legs are too narrow to have edges; above,
+memory does not suffice.
+"""
 
 
 def simulate(
@@ -153,7 +155,7 @@ def simulate(
 
 
 def parsed_size(text: str) -> tuple[int, int]:
-    """(width, height) of a text such as 800x600."""
+    """(width, height) from a text such as 800x600."""
     match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text.strip())
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:

@@ -1,4 +1,4 @@
-"""``pkmcal study``: accuracy before anything is bought, by simulation."""
+"""``pkmcal study``: accuracy of calibrations by simulation, before anything is bought."""
 
 from __future__ import annotations
 

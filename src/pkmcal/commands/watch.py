@@ -1,4 +1,4 @@
-"""``pkmcal watch``: is a machine still as calibrated."""
+"""``pkmcal watch``: test of whether a machine has changed since its calibration."""
 
 from __future__ import annotations
 
