@@ -52,7 +52,7 @@ def _seed(value: int) -> int:
 
 
 Seed = Annotated[
-    int, typer.Option("--seed", metavar="N", callback=_seed, help="Of all random draws.")
+    int, typer.Option("--seed", metavar="N", callback=_seed, help="Seed for all random numbers.")
 ]
 
 SessionFolder = Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")]

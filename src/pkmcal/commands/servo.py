@@ -40,11 +40,13 @@ def servo(
         str | None, typer.Option(metavar="1,2,3", help="Legs that the camera sees; all.")
     ] = None,
     runs: Annotated[
-        int, console.number_option("servo", "runs", "N", "Ways to go, of every estimate.")
+        int, console.number_option("servo", "runs", "N", "Number of motions, for every estimate.")
     ] = 60,
     gain: Annotated[
         float,
-        console.number_option("servo", "gain", "G", "Part of the error corrected in a second."),
+        console.number_option(
+            "servo", "gain", "G", "Part of the error that is corrected in a second."
+        ),
     ] = 1.0,
     rate: Annotated[float, console.number_option("servo", "rate", "HZ", "Images a second.")] = 25.0,
     delay: Annotated[
@@ -75,10 +77,11 @@ def servo(
         ),
     ] = 3.0,
     start: Annotated[
-        str | None, typer.Option(metavar="POSE", help="x,y,z,rx,ry,rz of every run (m, rad).")
+        str | None,
+        typer.Option(metavar="POSE", help="Start of every run: x,y,z,rx,ry,rz (m, rad)."),
     ] = None,
     goal: Annotated[
-        str | None, typer.Option(metavar="POSE", help="The same of every run's goal.")
+        str | None, typer.Option(metavar="POSE", help="Goal of every run, in the same form.")
     ] = None,
     out: Annotated[Path | None, console.folder("servo unless given.")] = None,
     seed: console.Seed = 0,
