@@ -1,7 +1,7 @@
-"""What would make the photographs better, and what they promise, in words.
+"""Advice on better images, and the forecast of a capture, as findings and tables.
 
-Advice is given from what is measured: where legs are hidden, where edges that ought to be seen are
-lost and what is the matter with them, and from where the stations look.
+Advice follows from measurements: where legs are hidden, where expected edges are lost and why, and
+the directions from which the stations look.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.wording import brief, count, listed, named
 
 ADVICE_WORTH_FACTOR = 1.2
-"""Factor on a standard deviation from which its cause is worth advice: as much as half as many
-photographs again would gain."""
+"""Minimum gain of a standard deviation, as a factor, that is worth advice: that of half as many
+images in addition.
+"""
 INFORMATION_LOST_SHARE = 1 - 1 / ADVICE_WORTH_FACTOR**2
-"""Share of the information that is lost by then."""
+"""Share of the information that is lost with that factor."""
 POOR_LEG = 0.5
-"""Share of what legs tell on average below which one of them is named."""
+"""Information of a leg, relative to the mean of all legs, below which the leg is named."""
 EDGE_SHARES_LEGEND = (
     "Shares of what all edges tell about the machine, by leg and station.",
     "Variance: of the platform's position, what comes from the leg's edges: where",
@@ -44,7 +45,7 @@ ONE_LEGEND = (
 
 
 def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, ...]:
-    """Advice, the most useful first."""
+    """Advice for a session, the most useful first."""
     out = [
         *_second_place(forecast),
         *_from_one_side(inspection),
@@ -58,7 +59,7 @@ def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, 
 
 
 def _second_place(forecast: Forecast | None) -> list[Finding]:
-    """Whether another place would do more than more photographs from this one."""
+    """Advice to use a second station, if it gains more than further images at the only one."""
     if forecast is None or not forecast.second * ADVICE_WORTH_FACTOR < forecast.position:
         return []
     return [
@@ -72,10 +73,10 @@ def _second_place(forecast: Forecast | None) -> list[Finding]:
 
 
 def _from_one_side(inspection: Inspection) -> list[Finding]:
-    """Whether the stations look along nearly the same line.
+    """Advice if all stations look along nearly the same line.
 
-    What one camera sees badly, along its line of sight, another sees by the sine of the angle
-    between the two.
+    What one camera determines badly, along its line of sight, another determines by the sine of the
+    angle between the two lines.
     """
     cameras = [station.photographs.camera for station in inspection.stations]
     if len(cameras) < 2 or any(view_angle(camera) >= PANORAMIC_HALF_VIEW for camera in cameras):
@@ -95,7 +96,7 @@ def _from_one_side(inspection: Inspection) -> list[Finding]:
 
 
 def _hidden(inspection: Inspection) -> list[Finding]:
-    """Legs that no station sees well."""
+    """Advice on legs that are hidden from every station."""
     in_view = [station for station in inspection.stations if station.quality is not None]
     if not in_view or len(in_view) < len(inspection.stations):
         return []
@@ -121,7 +122,7 @@ def _hidden(inspection: Inspection) -> list[Finding]:
 
 
 def _slim(inspection: Inspection) -> list[Finding]:
-    """Tubes so narrow in a station's photographs that the profiles of both edges overlap."""
+    """Advice on tubes so narrow in a station's images that the profiles of both edges overlap."""
     tubes, least = tubes_of(inspection.session.machine), 2 * PROFILE_REACH_INSIDE
     out: list[Finding] = []
     for station in inspection.stations:
@@ -141,7 +142,7 @@ def _slim(inspection: Inspection) -> list[Finding]:
 
 
 def _lost(inspection: Inspection, station: StationInspection, edges: EdgesOf) -> list[Finding]:
-    """Why edges that ought to be seen are lost, where these are many."""
+    """Advice on the cause of lost edges, if many of the expected ones are lost."""
     expected, lost = int(edges.expected.sum()), edges.expected & ~edges.valid
     if station.quality is None or not expected or lost.sum() <= INFORMATION_LOST_SHARE * expected:
         return []
@@ -177,7 +178,9 @@ def _lost(inspection: Inspection, station: StationInspection, edges: EdgesOf) ->
 
 
 def _sheet(station: StationInspection) -> str:
-    """Before which the darker and the brighter legs stand out more, those that do least."""
+    """Brightness of a background with better contrast for the quartile of legs of least
+    contrast.
+    """
     if station.quality is None:
         return "white"
     level = station.quality.level[np.isfinite(station.quality.level)]
@@ -188,7 +191,7 @@ def _sheet(station: StationInspection) -> str:
 
 
 def forecast_figure(forecast: Forecast) -> Figure:
-    """The card."""
+    """Key figure of the forecast."""
     return Figure(
         f"What would {forecast.photographs} such photographs a station give?",
         ((brief(forecast.position * 1e3), "mm"), (brief(math.degrees(forecast.orientation)), "°")),
@@ -197,7 +200,7 @@ def forecast_figure(forecast: Forecast) -> Figure:
 
 
 def forecast_part(forecast: Forecast) -> Part:
-    """What a capture would give, and which legs tell it."""
+    """Section on the predicted accuracy of a capture, and the legs that determine it."""
     stations = tuple(dict.fromkeys(leg.station for leg in forecast.legs))
     numbers = tuple(dict.fromkeys(leg.leg for leg in forecast.legs))
     by = {(leg.station, leg.leg): leg for leg in forecast.legs}
@@ -251,7 +254,7 @@ def forecast_part(forecast: Forecast) -> Part:
 
 
 def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
-    """The forecast, and the legs that tell least, with what is the matter with them."""
+    """Sentences on the forecast, and on the legs with the least information and their causes."""
     photographs = sum(len(edges.photographs) for edges in forecast.edges)
     out = [
         f"{forecast.photographs} such photographs a station, over the joints' ranges, would"

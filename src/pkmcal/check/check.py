@@ -1,8 +1,8 @@
-"""Find what is wrong with a session before any work is spent on it.
+"""Checks of a session before it is calibrated.
 
-Everything that `load_session` refuses, then what only the photographs can tell: whether they
-decode, are exposed and sharp, and whether the machine and the boards are recognised in them; then
-what readings and measured poses tell before any calibration.
+All that `load_session` refuses, then what only images show: whether they can be decoded, are well
+exposed and sharp, and whether machine and boards are recognized in them; then what readings and
+measured poses show before a calibration.
 """
 
 from __future__ import annotations
@@ -61,27 +61,27 @@ from pkmcal.session.starter import untouched_files
 from pkmcal.wording import listed
 
 BROKEN_PHOTOGRAPHS_NAMED = 10
-"""Broken photographs of a station that are named one by one; the others are counted."""
+"""Number of broken images of a station that are reported individually; the others are counted."""
 OTHER_MODE = np.deg2rad(20.0)
-"""Turn to another assembly below which one could be taken for the other."""
+"""Rotation to another assembly mode below which one can be mistaken for the other, rad."""
 STROKE_END_SHARE = 0.15
-"""Part of a joint's range, at either end, in which a reading is an extreme one."""
+"""Part of a joint's range, at either end, whose readings count as extreme."""
 
 
 def check_session(
     folder: Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
 ) -> SessionCheck:
-    """Look through a session; what is wrong comes back as findings, nothing is raised.
+    """Check a session; faults are returned as findings, never raised.
 
     seed : of the random searches, as in `calibrate`.
     """
-    # As in `calibrate`: threads inside the linear algebra would only be in each other's way.
+    # as in `calibrate`: threads inside the linear algebra would hinder each other
     with threadpool_limits(1, "blas"):
         return _check(Path(folder), seed, progress or (lambda _text, _share: None))
 
 
 def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionCheck:
-    """:func:`check_session`, step by step."""
+    """Steps of :func:`check_session`."""
     progress("Reading the session", 0.0)
     findings = [*untouched_files(folder)]
     try:
@@ -99,7 +99,7 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
     findings += link_findings(session, motion.poses)
     findings += numbering_note(session)
     progress("What such photographs will give", 0.8)
-    by_hand = any(station.handheld for station in session.stations)  # no place to come back to
+    by_hand = any(station.handheld for station in session.stations)  # no station for further images
     expected = None
     if in_view.inspection and not by_hand:
         try:
@@ -125,7 +125,7 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
 
 
 def _workspace(session: Session) -> list[Finding]:
-    """Whether the drawing's machine comes to the workspace that the session names."""
+    """Finding if the nominal machine does not reach the session's workspace."""
     if session.workspace is None:
         return []
     try:
@@ -136,12 +136,15 @@ def _workspace(session: Session) -> list[Finding]:
 
 
 def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]:
-    """Each station's photographs of legs; those that cannot be decoded are findings."""
+    """Images of legs by station, None for a station without any, and findings on those that cannot
+    be decoded.
+    """
     out: list[Photographs | None] = []
     findings: list[Finding] = []
     room = CACHED_IMAGE_BYTES
     for number, station in enumerate(session.stations):
-        if "legs" not in station.observe:  # decoded one by one where the board is looked for
+        # images of the board are decoded one by one in the search for it
+        if "legs" not in station.observe:
             out.append(None)
             continue
         rows: list[int] = []
@@ -176,7 +179,7 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
 
 
 def _more_broken(session: Session, number: int, count: int) -> InputError:
-    """The error about all photographs of a station that cannot be decoded but those named."""
+    """Error on the broken images of a station that are not reported individually."""
     name = session.stations[number].name
     return InputError(
         "photographs cannot be decoded",
@@ -189,7 +192,11 @@ def _more_broken(session: Session, number: int, count: int) -> InputError:
 
 @dataclass(frozen=True)
 class _Motion:
-    """poses : T_base_platform (K, 4, 4), None where the drawing cannot take the readings."""
+    """Kinematics of the nominal machine at the readings.
+
+    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings. singularity :
+    least over the configurations. assemblies : number of assembly modes at the first readings.
+    """
 
     poses: Array | None
     singularity: float
@@ -198,12 +205,15 @@ class _Motion:
 
 
 def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
-    """Whether the drawing's machine closes at all readings, and how well it is held there."""
+    """Whether the nominal machine closes at all readings, with its singularity and assembly modes
+    there.
+    """
     try:
         poses = platform_poses(session, most=not legs_stations(session))
         fk = session.machine.forward_result(session.joints, poses)
         first = session.joints[0]
-        if session.machine.layout.overdetermined:  # with errors they close in no pose
+        # an overdetermined machine does not close at readings with errors
+        if session.machine.layout.overdetermined:
             first = session.machine.inverse(poses[0])
         modes = session.machine.assembly_modes(first, rng)
     except PkmcalError as error:
@@ -221,7 +231,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
 
 
 class _Observed(NamedTuple):
-    """inspection : None where the machine could not be looked for."""
+    """Results of the images. inspection : None if the machine could not be searched for."""
 
     stations: tuple[StationCheck, ...]
     findings: tuple[Finding, ...]
@@ -235,11 +245,13 @@ def _observed(
     seed: int,
     progress: CalibrationProgress,
 ) -> _Observed:
-    """What the photographs of every station show, and what is to be said of it."""
+    """Checks of the images of every station: boards, localization, and the start of a
+    calibration.
+    """
     whole = [p for p in photographs if p is not None]
 
     def unlooked() -> tuple[StationCheck, ...]:
-        """Stations in which the machine could not even be looked for."""
+        """Checks of stations in which the machine cannot be searched for."""
         n_legs, value = session.machine.n_legs, zip(session.stations, photographs, strict=True)
         return tuple(
             _summary(station, unrecognised_quality(p.images if p else [], n_legs), recognised=False)
@@ -252,7 +264,7 @@ def _observed(
         return _Observed(unlooked(), (of_error(error),))
     if poses is None or len(whole) < len(legs_stations(session)):
         return _Observed(unlooked(), ())
-    # Of photographs that are broken is told already.
+    # Broken images have been reported already.
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
     if not lost:
@@ -261,7 +273,7 @@ def _observed(
     if lost and any(station.T_camera_base is None for station in session.stations):
         return _Observed(unlooked(), boards.findings)
     turns = () if lost else pose_findings(session, boards.boards)
-    located = localize(  # by the random numbers of `calibrate`
+    located = localize(  # with the random numbers of `calibrate`
         session,
         whole,
         boards.boards,
@@ -284,18 +296,18 @@ def _observed(
     if isinstance(settled, Settled):
         findings += [*(one.finding for one in settled.turned), *settled.findings]
         findings += _verdict_of_poses(settled)
-    stations = [  # as it is known of one that observes no legs
+    stations = [  # default for stations that observe no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
     places = _search_results(session, whole, located)
-    # one on a tripod was recognised all the same, and its quality tells why it may be left out
+    # A rejected station on a tripod was recognized, and its quality may explain the rejection.
     gone = {one.station.name for one in rejected if one.station.handheld}
-    if isinstance(retained, PkmcalError):  # of photographs by hand none was placed then
+    if isinstance(retained, PkmcalError):  # no hand-held image was localized then
         gone = {station.name for station in session.stations if station.handheld}
     parts: list[StationInspection] = []
     for p in whole:
-        if p.station not in places:  # another station's fault came first
+        if p.station not in places:  # the search ended at the fault of another station
             summary = unrecognised_quality(p.images, session.machine.n_legs)
             stations[p.station] = _summary(session.stations[p.station], summary, recognised=False)
             continue
@@ -311,7 +323,7 @@ def _observed(
 def _settled(
     session: Session, case: Case, seed: int, progress: CalibrationProgress
 ) -> Settled | PkmcalError:
-    """Where `calibrate` begins, or why it would not."""
+    """Start of a calibration as `calibrate` computes it, or the error with which it would end."""
     clock = Clock(lambda text, share: progress(text, 0.4 + 0.4 * share))
     try:
         return settle(session, case, False, seed, clock)
@@ -320,8 +332,8 @@ def _settled(
 
 
 def _refused(error: PkmcalError) -> Finding:
-    """Why `calibrate` gives no result, as it says so: wrong where the session is at fault, doubtful
-    where these data tell too little.
+    """Finding of an error of `calibrate`: wrong if the session is at fault, doubtful if its data
+    are insufficient.
     """
     return of_error(error, Level.WRONG if error.exit_code > 1 else Level.DOUBTFUL)
 
@@ -329,11 +341,12 @@ def _refused(error: PkmcalError) -> Finding:
 def _search_results(
     session: Session, photographs: list[Photographs], located: Localization
 ) -> dict[int, LocalizedPose]:
-    """Where the search for each station ended, by its number; without those not searched."""
+    """Localized poses by station number, without stations that were not searched."""
     fixed = [p.station for p in photographs if not session.stations[p.station].handheld]
     results = located.recognition.localizations if located.recognition else ()
     places = dict(zip(fixed, results, strict=bool(results)))
-    for k, one in located.places.items():  # what chance is to others, another place is to one alone
+    # for a hand-held image, the probability of a rival pose takes the place of that of chance
+    for k, one in located.places.items():
         places[k] = LocalizedPose(
             one.T_camera_base[0],
             math.nan,
@@ -351,7 +364,7 @@ def _station(
     poses: Array,
     recognised: bool,
 ) -> tuple[StationCheck, StationInspection]:
-    """One station in which the machine was looked for."""
+    """Check and inspection of a station in which the machine was searched for."""
     station, machine = session.stations[photographs.station], session.machine
     value, by_hand = pose.T_camera_base, station.T_camera_base
     what = (
@@ -392,7 +405,7 @@ def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:
 
 @dataclass(frozen=True)
 class BoardsCheck:
-    """All stations' boards, by the station's number, and what is to be said of them."""
+    """Boards found in the images, their checks by station number, and findings."""
 
     boards: Boards = field(default_factory=Boards)
     checks: Mapping[int, BoardCheck] = field(default_factory=dict[int, BoardCheck])
@@ -400,9 +413,9 @@ class BoardsCheck:
 
 
 def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> BoardsCheck:
-    """Look for the board in every station that observes it, nothing raised.
+    """Search for the board in every station that observes it; errors become findings.
 
-    images : all decoded photographs by the station's number.
+    images : all decoded images by station number.
     """
     findings: list[Finding] = []
     try:
@@ -427,7 +440,9 @@ def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) 
 
 
 def _unseen(one: StationBoard) -> str:
-    """The outer row or column that is never seen though all others are."""
+    """Outer row or column of the board that no image shows while all others are visible; empty if
+    none.
+    """
     board = one.views.board
     if board.type == "aruco_grid":
         return ""
@@ -455,7 +470,7 @@ def _board_check(one: StationBoard) -> BoardCheck:
 
 
 def joint_checks(session: Session) -> tuple[JointCheck, ...]:
-    """All joints' readings."""
+    """Ranges of all joints' readings."""
     names: list[JointCheck] = []
     for k, name in enumerate(session.document["joints"]["columns"]):
         values, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
@@ -470,7 +485,7 @@ def joint_checks(session: Session) -> tuple[JointCheck, ...]:
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:
-    """How the platform turns, by the poses that were measured."""
+    """Findings on the platform's rotations in the measured poses."""
     if not session.trackers and (not boards.stations or boards.body == "base"):
         return []
     try:
@@ -481,14 +496,14 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
 
 
 def _verdict_of_poses(settled: Settled) -> list[Finding]:
-    """Whether the mechanism, its parameters adjusted, explains the poses that were measured."""
+    """Findings on whether the mechanism with adjusted parameters explains the measured poses."""
     if settled.case.session.heights_alone:
         return _verdict_of_heights(settled)
     return _unexplained_poses(settled)
 
 
 def _verdict_of_heights(settled: Settled) -> list[Finding]:
-    """The model violations and the uneven bed that `calibrate` will find."""
+    """Findings on the model violations and the uneven bed that `calibrate` will report."""
     turns = settled.turns
     value = model_violations(
         settled.case.session,
@@ -505,7 +520,7 @@ def _verdict_of_heights(settled: Settled) -> list[Finding]:
 
 
 def _unexplained_poses(settled: Settled) -> list[Finding]:
-    """A finding where measured poses scatter more than their noise."""
+    """Finding if measured poses scatter more than their noise."""
     scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
     if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
         return []

@@ -1,4 +1,4 @@
-"""What differs between two calibrations, two drawings, or one and the other: ``pkmcal diff``."""
+"""Difference between two calibrations, two nominal models, or one of each: ``pkmcal diff``."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from pkmcal.wording import amount, brief, count, listed, number
 
 DIFFERENCE_FORMAT = 1
 DIFFERENCE_ALPHA = 0.01
-"""Share of unchanged machines that are said to have changed all the same."""
+"""False-alarm rate: share of unchanged machines that are reported as changed."""
 SAME_NUMBER_DIFFERENCE = 1e-9
-"""m or rad; numbers that differ by less are the same."""
+"""Difference (m or rad) below which numbers are equal."""
 MOST_CHANGES_NAMED = 4
-"""Changes that the verdict names."""
+"""Maximum number of changes that the verdict names."""
 
 
 @dataclass(frozen=True)
 class ComparedMachine:
-    """One of the two. name : as it was given. saved : None of a drawing."""
+    """One of the two machines. name : as given. saved : None for a nominal model."""
 
     name: str
     machine: Machine
@@ -41,24 +41,25 @@ class ComparedMachine:
 
     @property
     def covariance(self) -> Array | None:
-        """(P, P) of its parameters; None of a drawing."""
+        """Covariance (P, P) of the parameters; None for a nominal model."""
         return None if self.saved is None else self.saved.covariance
 
     @property
     def kind(self) -> str:
-        """What it is, for people."""
+        """Kind of the machine's source, for people."""
         return "drawing" if self.saved is None else "calibration"
 
 
 @dataclass(frozen=True)
 class MachineDifference:
-    """Everything that differs.
+    """Difference between two machines.
 
-    change : b less a. chance : of a chi-square as large in a machine that did not change; 1 between
-    drawings. chances : (P,) of each parameter's change, their number allowed for; NaN of what has
-    no standard deviation. centres : base and platform, a's laid over b's. tool : what the change
-    does to the tool over the workspace, its ``after``, or why there is no map. shared :
-    configurations that both saw. assumed : sentences.
+    change : b minus a. chance : p-value of its chi-square for an unchanged machine; 1 between
+    nominal models. chances : (P,) p-values of each parameter's change, corrected for their number;
+    NaN without a standard deviation. centres : of base and platform, a's registered to b's. tool :
+    effect of the change on the tool over the workspace, as ``after`` of the map, or the reason why
+    there is no map. shared : number of configurations that both calibrations used. assumed :
+    assumptions, in sentences.
     """
 
     a: ComparedMachine
@@ -77,7 +78,7 @@ class MachineDifference:
 
     @property
     def ordered(self) -> list[int]:
-        """Parameters with a change to tell of, the one least like chance first."""
+        """Indices of the parameters that differ, the most significant first."""
         size = np.abs(self.change.change)
         some = np.flatnonzero(size > SAME_NUMBER_DIFFERENCE)
         if self.change.dof:
@@ -89,7 +90,7 @@ class MachineDifference:
 
     @property
     def significant(self) -> list[int]:
-        """Those that chance does not explain; between drawings, all that differ."""
+        """Indices of the significant parameters; between nominal models, of all that differ."""
         return [k for k in self.ordered if not self.chances[k] >= DIFFERENCE_ALPHA / 2]
 
     def document(self) -> dict[str, Any]:
@@ -146,9 +147,9 @@ def _tool(tool_map: ToolMap) -> dict[str, Any]:
 def difference(
     a: SavedCalibration | Machine | Path | str, b: SavedCalibration | Machine | Path | str
 ) -> MachineDifference:
-    """Compare two calibrations, mechanism files or built-in machines; nothing is written.
+    """Compare two calibrations, mechanism files or built-in machines, without writing files.
 
-    Raises InputError where they are not of one machine.
+    Raises InputError if they are not of the same machine.
     """
     one, other = _compared(a), _compared(b)
     _check_same_machine(one, other)
@@ -217,7 +218,7 @@ def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
 
 
 def _one_drawing(both: list[SavedCalibration]) -> bool:
-    """Whether two calibrations lean on the same values with the same tolerances."""
+    """Whether two calibrations have the same nominal values and prior sigmas."""
     one, other = both
     first, second = (saved.machine.parameters.tolerance for saved in both)
     same = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
@@ -225,9 +226,11 @@ def _one_drawing(both: list[SavedCalibration]) -> bool:
 
 
 def _shared(both: list[SavedCalibration]) -> tuple[int, float]:
-    """Configurations of the first that both calibrations saw, and what both saw as a share of what
-    the one that saw less did: photographs, however they are grouped, or, without any, readings that
-    agree to the last digit.
+    """Number of the first calibration's configurations that both used, and the share of common
+    data.
+
+    Data are images, however they are grouped into configurations, or, without any, readings that
+    agree to the last digit; the share is relative to the calibration with fewer data.
     """
     if len(both) < 2:
         return 0, 0.0
@@ -239,13 +242,13 @@ def _shared(both: list[SavedCalibration]) -> tuple[int, float]:
 
 
 def _marks(saved: SavedCalibration, k: int) -> set[object]:
-    """What a configuration is known by."""
+    """Identity of a configuration: its images, or its readings."""
     photographs = saved.document["configurations"][k].get("photographs", ())
     return set(photographs) or {tuple(saved.joints[k].tolist())}
 
 
 def _region(both: list[SavedCalibration]) -> Region | None:
-    """The workspace that the first of them was calibrated for; None for the whole reach."""
+    """Workspace of the first calibration that has one; None for all reachable poses."""
     for saved in both:
         region = (saved.document.get("tool") or {}).get("region")
         if region:
@@ -255,7 +258,7 @@ def _region(both: list[SavedCalibration]) -> Region | None:
 
 
 def _chances(machine_change: MachineChange) -> tuple[float, Array]:
-    """Of the whole, and (P,) of each parameter, their number allowed for."""
+    """p-values of the whole change and (P,) of each parameter, corrected for their number."""
     from scipy.special import chdtrc, ndtr
 
     sigma = machine_change.sigma
@@ -271,7 +274,7 @@ def _chances(machine_change: MachineChange) -> tuple[float, Array]:
 def _assumed(
     a: ComparedMachine, b: ComparedMachine, one_drawing: bool, shared: int, share: float
 ) -> tuple[str, ...]:
-    """What the standard deviations of the change take for granted."""
+    """Assumptions of the change's standard deviations, in sentences."""
     out = [
         "The change leads from A to B, told in A's frames, B laid over it where the two differ"
         " least: by least squares over all free numbers, each in its tolerance."
@@ -310,7 +313,7 @@ UNMODELLED_CHANGES_TEXT = (
 
 
 def _judged(d: MachineDifference) -> MachineDifference:
-    """With its verdict."""
+    """Difference with its verdict."""
     refused = [
         wrong("difference.refused", side.name, reasons=" ".join(side.saved.verdict.reasons))
         for side in (d.a, d.b)
@@ -347,7 +350,7 @@ def _judged(d: MachineDifference) -> MachineDifference:
 
 
 def _of_tool(d: MachineDifference) -> str:
-    """What it does to the tool, as the end of a sentence."""
+    """Effect on the tool, as the end of a sentence."""
     if isinstance(d.tool, str):
         return ""
     _, after = d.tool.evenly
@@ -363,7 +366,7 @@ def _of_tool(d: MachineDifference) -> str:
 
 
 def _named(d: MachineDifference, k: int) -> Finding:
-    """A parameter's change."""
+    """Finding of a parameter's change."""
     table = d.a.machine.parameters
     name = table.names[k]
     return wrong(
@@ -377,7 +380,7 @@ def _named(d: MachineDifference, k: int) -> Finding:
 
 
 def change_text(d: MachineDifference, k: int) -> str:
-    """``+0.54 mm (±0.07 mm)``, or the bare number of what has no unit."""
+    """``+0.54 mm (±0.07 mm)``, or the number alone without a unit."""
     unit = d.a.machine.parameters.units[k]
     value, sigma = float(d.change.change[k]), float(d.change.sigma[k])
     sign = "+" if value >= 0 else "−"

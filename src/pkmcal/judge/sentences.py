@@ -1,5 +1,6 @@
-"""What judgements say: is the calibrated machine better than its drawing, by how much, and how sure
-(validate); is it still so, has it changed and where, or do the data tell too little (watch).
+"""Verdicts in words: whether the calibrated machine is better than the nominal one, by how much and
+how surely (validate); whether it is unchanged, has changed and where, or the data are insufficient
+(watch).
 """
 
 from __future__ import annotations
@@ -40,21 +41,21 @@ from pkmcal.wording import (
 )
 
 MOSTLY_NOISE = 2**0.5
-"""Factor on the photographs' noise within which that is more than half of the mean square."""
+"""Factor on the noise of images within which noise is more than half of the mean square."""
 POOR_REGION_FACTOR = 2.0
-"""Factor by which a region's errors must exceed those of the configurations in use to be told."""
+"""Ratio of a region's errors to those of the used configurations from which it is reported."""
 NOISIER_PHOTOGRAPHS_FACTOR = 1.5
-"""Times the calibration's noise from which on the photographs are no longer the same kind."""
+"""Ratio to the calibration's noise from which images are no longer of the same kind."""
 STEEL_EXPANSION = 12e-6
-"""Expansion of steel, 1/K, for a picture of what a common scale means."""
+"""Thermal expansion of steel, 1/K, to illustrate a common scale."""
 UNEXPLAINED_CHANCE = 1e-3
-"""Chance below which what the findings leave is said to be more than noise."""
+"""p-value of the unexplained rest below which it is reported."""
 MOST_OTHERS = 4
-"""Causes named beside the best; more are a table's."""
+"""Maximum number of rival causes that are named."""
 
 
 def factor(value: float) -> str:
-    """A factor with the digits that it deserves."""
+    """A factor with its significant digits."""
     if not np.isfinite(value):
         return "–"
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
@@ -72,10 +73,10 @@ def validation_verdict(
     measurements: Measurements,
     repeated: Booleans | None = None,
 ) -> Verdict:
-    """The verdict on new data, or, without any, on the regions held out, pooled.
+    """Verdict on new data, or, without any, on all held-out regions together.
 
-    measurements : of all configurations. repeated : (K,) those that the session has at poses that
-    the calibration used; None for nowhere.
+    measurements : of all configurations. repeated : (K,) configurations at poses that the
+    calibration used; None for none.
     """
     units = machine.joint_units
     unit = units[0] if len(set(units)) == 1 else None
@@ -141,7 +142,7 @@ def _not_better(gain: Ratio) -> list[Finding]:
 
 
 def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
-    """Residuals that the deviations do not promise: the first group's that has such."""
+    """Finding on residuals larger than their standard deviations, of the first group with such."""
     for group in groups:
         if not group.promise.usual:
             return [_too_large(group, units)]
@@ -163,7 +164,9 @@ def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
 
 
 def _weak_words(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
-    """Where plain root mean squares contradict the verdict, which weighs what was seen better."""
+    """Finding if unweighted root mean squares contradict the verdict, which weights by
+    observability.
+    """
     by_drawing, by_calibrated = (group.figures(e) for e in (group.drawing, group.calibrated))
     worse = by_calibrated.joint_rms > by_drawing.joint_rms
     if not worse.any() and by_calibrated.position <= by_drawing.position:
@@ -192,7 +195,7 @@ def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
 def _noise(
     after: Array, floor: float, unit: str | None, measurements: Measurements, rows: Integers
 ) -> tuple[Finding, ...]:
-    """That what is left of configurations ``rows`` is noise, and what would lessen it."""
+    """Finding if the residuals of configurations ``rows`` are mostly noise, with the remedy."""
     if unit is None or finite_rms(after) > MOSTLY_NOISE * floor:
         return ()
     visible = np.zeros((len(measurements.joints), measurements.n_stations), dtype=bool)
@@ -213,7 +216,7 @@ def _noise(
 
 
 def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
-    """Regions in which a calibration of the rest is poor."""
+    """Findings on regions in which a calibration by the others is poor."""
     out: list[Finding] = []
     for item in holdouts:
         off, usual = finite_rms(item.left_out.after), finite_rms(item.used.after)
@@ -233,7 +236,7 @@ def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
 
 @dataclass(frozen=True)
 class Names:
-    """What cameras and stations are called, by their numbers."""
+    """Names of cameras and stations by their indices."""
 
     cameras: tuple[str, ...] = ()
     stations: tuple[str, ...] = ()
@@ -241,11 +244,11 @@ class Names:
 
 @dataclass(frozen=True)
 class ComparedSession:
-    """What a verdict says besides the tests.
+    """Facts of a session for a verdict, besides the tests.
 
-    configurations : K names. calibrated, observed : (K,) used by the calibration, and looked at.
-    noisier : times the calibration's factor on the stated noise of edges. stations_moved : cameras
-    that were said to have been left in place.
+    configurations : (K,) names. calibrated, observed : (K,) used by the calibration, and observed.
+    noisier : ratio to the calibration's factor on the stated noise of edges. stations_moved :
+    cameras that were assumed to be unmoved.
     """
 
     configurations: tuple[str, ...]
@@ -257,7 +260,7 @@ class ComparedSession:
 
 
 def watch_verdict(judged: ChangeTests, around: ComparedSession) -> Verdict:
-    """The verdict; usable means still as calibrated."""
+    """Verdict on a change; usable means unchanged."""
     warnings = _warnings(around)
     if judged.changed:
         return _changed(judged, around, warnings)
@@ -279,16 +282,16 @@ def watch_verdict(judged: ChangeTests, around: ComparedSession) -> Verdict:
 
 
 def is_blind(leg: LegTest) -> bool:
-    """Whether not even a change as large as the drawing's tolerance would have been found."""
+    """Whether even a change as large as the prior sigma would not have been detected."""
     if leg.zero is None:
         return leg.whole.dof == 0
     return not leg.detects_zero <= leg.tolerance
 
 
 def cause_words(suspect: Suspect, names: Names = Names(), short: bool = False) -> str:
-    """A cause with the change it would have made, as a part of a sentence.
+    """A cause with its estimated change, as a part of a sentence.
 
-    short : how far a joint moved, but not along what.
+    short : only the size of a joint's motion, without its direction.
     """
     cause, value, sigma = suspect.cause, suspect.change.value, suspect.change.sigma
     who = named(cause.legs) if cause.legs else ""
@@ -330,7 +333,7 @@ def _ratio(value: float, sigma: float) -> str:
 
 
 def _vector(suspect: Suspect, short: bool) -> str:
-    """How far a joint moved, if the data tell that, and along what."""
+    """Size and direction of a joint's motion, if the data determine it."""
     cause, change = suspect.cause, suspect.change
     size = float(np.linalg.norm(change.value[:3]))
     if len(change.value) != 3 or size == 0 or not np.isfinite(change.sigma).all():
@@ -346,7 +349,7 @@ def _vector(suspect: Suspect, short: bool) -> str:
 
 
 def _place(change: Change) -> str:
-    """How far a camera moved and turned, as far as that is told."""
+    """Motion and rotation of a camera, as far as the data determine them."""
     out: list[str] = []
     for part, unit, factor in ((slice(3, 6), "mm", 1e3), (slice(0, 3), "°", 180 / np.pi)):
         value, covariance = change.value[part], change.covariance[part, part]
@@ -384,7 +387,7 @@ def _changed(
 
 
 def _changes_headline(findings: Sequence[Explanation]) -> str:
-    """What changed, in short."""
+    """Summary of the changes."""
     causes = [f.suspect.cause for f in findings if f.suspect.cause.part not in ("scale", "camera")]
     if not causes:
         return "all its lengths have another scale"
@@ -395,7 +398,7 @@ def _changes_headline(findings: Sequence[Explanation]) -> str:
 
 
 def _reason(value: Explanation, place: int, names: Names) -> Finding:
-    """One finding: what, how much, as after what, and what it may be instead."""
+    """Finding of one cause: its change and its rivals."""
     cause, change = value.suspect.cause, value.suspect.change
     alternatives = [cause_words(other, names, short=True) for other in value.others[:MOST_OTHERS]]
     if more := len(value.others) - len(alternatives):
@@ -421,7 +424,7 @@ def _reason(value: Explanation, place: int, names: Names) -> Finding:
 
 
 def _unnamed(judged: ChangeTests) -> Finding:
-    """Something changed, and no single cause stands out."""
+    """Finding of a change without an identified cause."""
     legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
     if legs:
         return wrong("watch.leg_test_fails", _of(legs), legs=_of(legs))
@@ -440,7 +443,7 @@ def _next(findings: Sequence[Explanation]) -> Finding:
 
 
 def _would_have(judged: ChangeTests) -> str:
-    """What would have been found, in words."""
+    """Changes that would have been detected, in words."""
     zeros = [leg for leg in judged.legs if leg.zero is not None and leg.zero.dof]
     if not zeros:
         return "no test of a leg fails"
@@ -452,14 +455,14 @@ def _would_have(judged: ChangeTests) -> str:
 
 
 def least_size(legs: Sequence[LegTest]) -> tuple[str, str]:
-    """Smallest changes of the legs' zeros that would be found, such as ``0.3 to 0.5``, and unit."""
+    """Smallest detectable changes of the legs' zeros, such as ``0.3 to 0.5``, and their unit."""
     scale, name = DISPLAY_UNITS[legs[0].unit]
     sizes = [brief(f(leg.detects_zero for leg in legs) * scale) for f in (min, max)]
     return " to ".join(dict.fromkeys(sizes)), name
 
 
 def _blind(legs: Sequence[LegTest]) -> tuple[Finding, ...]:
-    """Why these data are too few, of legs about which they say too little."""
+    """Findings on legs for which these data are insufficient."""
     nothing = [leg for leg in legs if not np.isfinite(leg.detects_zero)]
     little = [leg for leg in legs if np.isfinite(leg.detects_zero)]
     out: list[Finding] = []
@@ -487,5 +490,5 @@ def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
 
 
 def _of(tests: Sequence[LegTest]) -> str:
-    """The legs that tests are of."""
+    """Names of the legs of tests."""
     return named(j for test in tests for j in test.legs)

@@ -1,7 +1,7 @@
-"""A calibration on data that it did not see: ``pkmcal validate``.
+"""Validation of a calibration on independent data: ``pkmcal validate``.
 
-The session's photographs are measured as for a calibration. Then the calibrated machine is held,
-the platform's poses are seen without their readings, and the readings become predictions.
+The session's images are measured as for a calibration. Then the calibrated machine is fixed, the
+platform's poses are estimated without their readings, and the readings are predicted.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ NOT_INDEPENDENT = (
 
 @dataclass(frozen=True)
 class Validation:
-    """Everything that a validation found.
+    """Results of a validation.
 
-    calibration : as read back. judged : on configurations that it did not see; None where there are
-    none, and only regions were held out. calibrated : (K,) configurations that it had seen.
-    repeated : (K,) those that are new measurements of poses that it used. regions : hold-outs
-    within the session. paths : the straight ones.
+    calibration : as loaded. judged : comparison on configurations that it did not use; None without
+    any, when only regions were held out. calibrated : (K,) configurations that it used. repeated :
+    (K,) new measurements at poses that it used. regions : holdouts within the session. paths :
+    straight paths.
     """
 
     calibration: SavedCalibration
@@ -91,12 +91,12 @@ def validate_calibration(
     seed: int = 0,
     progress: CalibrationProgress | None = None,
 ) -> Validation:
-    """Errors of a calibration on a session that it did not see; nothing is written.
+    """Errors of a calibration on a session that it did not use, without writing files.
 
-    calibration : its folder, or as read back. session : a loaded session, or its folder.
-    regions : besides, hold out so many regions of the session's workspace, one after the other, and
-    calibrate on the rest; the session may then be the calibration's own. seed : of the search.
-    Raises InputError where the two do not belong together.
+    calibration : its folder, or as loaded. session : a loaded session, or its folder. regions :
+    number of regions of the session's workspace that are held out in addition, one after the other,
+    from a calibration on the rest; the session may then be that of the calibration. seed : of the
+    localization. Raises InputError if the two do not belong together.
     """
     from threadpoolctl import threadpool_limits
 
@@ -125,7 +125,8 @@ def validate_calibration(
         if new.size:
             try:
                 by_drawing = predict(drawing, data, estimate.state)
-            except PkmcalError as error:  # so far off that its poses are not found
+            # the nominal machine is too far off for its poses to be found
+            except PkmcalError as error:
                 by_drawing = None
                 why = str(error).rstrip(".")
                 failed = (note("validation.nominal_fails", why=why),)
@@ -150,18 +151,18 @@ def validate_calibration(
 
 
 def drawing_of(saved: SavedCalibration) -> Machine:
-    """The machine as drawn: its values, and where the drawing holds an estimate.
+    """Nominal machine of a calibration.
 
-    A calibration read back has its own values for a drawing; regions would be held out of an
-    estimate that is held to what they told.
+    The machine of a loaded calibration has the calibrated values as its nominal ones; holdouts of
+    regions must not use them as priors, because they depend on the held-out data.
     """
     table = replace(saved.machine.parameters, drawing=saved.drawing.copy())
     return replace(saved.machine, parameters=table, values=saved.drawing.copy())
 
 
 def _photographed(session: Session) -> Booleans:
-    """(K,) configurations with a photograph; all where a tracker may have seen them, or where
-    readings alone were taken.
+    """Mask (K,) of configurations with an image; all if there is a tracker, or for readings without
+    stations.
     """
     out = np.full(len(session.configurations), bool(session.trackers or not session.stations))
     for station in session.stations:

@@ -1,8 +1,8 @@
-"""Is a machine still as its calibration says: ``pkmcal watch``.
+"""Test of whether a machine has changed since its calibration: ``pkmcal watch``.
 
-New photographs, boards or poses with their readings are measured as for a calibration. Then the
-calibrated machine is held, the platform's poses and the stations are found, and what is left over
-is tested for a change of each leg. Nothing is calibrated anew.
+New images, boards or poses with their readings are measured as for a calibration. Then the
+calibrated machine is fixed, the poses of platform and stations are estimated, and the residuals are
+tested for a change of each leg. The machine is not calibrated anew.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pkmcal.wording import listed
 
 WATCH_FORMAT = 1
 WATCH_ALPHA = 0.01
-"""Share of machines that did not change that are flagged all the same."""
+"""False-alarm rate: share of unchanged machines that are flagged."""
 NOTHING_NEW = (
     "there is nothing new in this session: the calibration was made from it",
     "photographs, or poses, that were taken after the calibration",
@@ -47,14 +47,13 @@ NOTHING_NEW = (
 
 @dataclass(frozen=True)
 class Watch:
-    """Everything that a look at a calibrated machine found.
+    """Results of the tests of a calibrated machine.
 
-    calibration : as read back. judged : the tests. residuals : (K,) root mean squares of each
-    configuration's residuals with the machine held, in standard deviations. calibrated : (K,)
-    configurations that the calibration had used, left out. observed : (K,) those that were looked
-    at. noise_scale, pose_scale : factors on the stated noise that were used. same_place : stations
-    that were taken to stand where the calibration had them. stations_moved : those that were said
-    to, and do not.
+    calibration : as loaded. judged : the tests. residuals : (K,) root mean squares of each
+    configuration's residuals with the fixed machine, in standard deviations. calibrated : (K,)
+    configurations used by the calibration, which are excluded. observed : (K,) those that are
+    tested. noise_scale, pose_scale : factors on the stated noise. same_place : stations with the
+    poses of the calibration. stations_moved : stations that should have them, and do not.
     """
 
     calibration: SavedCalibration
@@ -109,13 +108,13 @@ def watch_machine(
     same_place: Sequence[str] = (),
     progress: CalibrationProgress | None = None,
 ) -> Watch:
-    """Test a calibrated machine on new data; nothing is written.
+    """Test a calibrated machine on new data, without writing files.
 
-    calibration : its folder, or as read back. session : a loaded session, or its folder; a few
-    configurations are enough. alpha : share of unchanged machines that may be flagged. seed : of
-    the search for the stations. same_place : names of stations whose camera was not touched since
-    the calibration; one that evidently was is found anew, and told. Raises InputError where the two
-    do not belong together.
+    calibration : its folder, or as loaded. session : a loaded session, or its folder; a few
+    configurations are enough. alpha : false-alarm rate. seed : of the localization. same_place :
+    names of stations whose camera was not touched since the calibration; a station that has
+    evidently moved is localized anew and reported. Raises InputError if the two do not belong
+    together.
     """
     from threadpoolctl import threadpool_limits
 
@@ -168,8 +167,8 @@ def watch_machine(
 
 
 def _readings(saved: SavedCalibration, session: Session) -> float:
-    """The factor on the readings' stated noise that the calibration found, where the session states
-    the same.
+    """Factor on the stated noise of readings found by the calibration, if the session states the
+    same noise; else 1.
     """
     joints = (saved.document.get("session") or {}).get("joints") or {}
     statistics = saved.document.get("statistics") or {}
@@ -178,13 +177,13 @@ def _readings(saved: SavedCalibration, session: Session) -> float:
 
 
 def names_of(session: Session) -> Names:
-    """Names of a session's cameras and stations, in the order of their numbers."""
+    """Names of a session's cameras and stations, in the order of their indices."""
     cameras = dict.fromkeys(station.camera_file for station in session.stations)
     return Names(tuple(cameras), session.station_names)
 
 
 def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> Session:
-    """The session with the kept stations' poses as the calibration has them.
+    """Session with the calibration's poses of the kept stations.
 
     Raises `InputError` for a station that the session, or the calibration, does not have.
     """
@@ -209,10 +208,11 @@ def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]
 def tests_with_fixed_stations(
     held: Held, prior: CalibrationPrior, alpha: float
 ) -> tuple[ChangeTests, CalibrationPrior, tuple[StationTest, ...]]:
-    """All tests, the stations that were kept for them, and those that evidently were moved.
+    """All tests, the prior with the stations that were kept for them, and the stations that have
+    moved.
 
-    Where moved cameras explain the data better than any change of the machine, these are found anew
-    and the tests made once more; so no more unchanged machines are flagged than alpha.
+    If moved cameras explain the data better than any change of the machine, they are freed and the
+    tests repeated; so the false-alarm rate remains alpha.
     """
     shifted: list[StationTest] = []
     while True:
@@ -230,7 +230,7 @@ def _hold_new(
     irls_weight: Trust,
     keep: Booleans,
 ) -> Held:
-    """The calibrated machine held on the configurations to keep, (K,)."""
+    """Fit of the new configurations, mask (K,) ``keep``, with the calibrated machine fixed."""
     data = remeasured.estimate.stated_edge_noise(remeasured.measurements)
     cameras = [station.camera for station in session.stations]
     wide = magnified(data, remeasured.observation, cameras) if cameras else None
@@ -251,7 +251,7 @@ def _hold_new(
 
 
 def _check_usable(saved: SavedCalibration) -> None:
-    """Raise `InputError` for a calibration that says of itself not to be used."""
+    """Raise `InputError` for a calibration with the verdict not to use it."""
     if saved.verdict.usable:
         return
     raise InputError(
