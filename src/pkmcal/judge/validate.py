@@ -125,8 +125,8 @@ def validate_calibration(
         if new.size:
             try:
                 by_drawing = predict(drawing, data, estimate.state)
-            # the nominal machine is too far off for its poses to be found
             except PkmcalError as error:
+                # the nominal machine is too far off for its poses to be found
                 by_drawing = None
                 why = str(error).rstrip(".")
                 failed = (note("validation.nominal_fails", why=why),)
