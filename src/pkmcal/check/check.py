@@ -295,7 +295,8 @@ def _observed(
     ]
     if isinstance(settled, Settled):
         findings += [*(one.finding for one in settled.turned), *settled.findings]
-        findings += _verdict_of_poses(settled)
+        heights = settled.case.session.heights_alone
+        findings += _verdict_of_heights(settled) if heights else _unexplained_poses(settled)
     stations = [  # default for stations that observe no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
@@ -493,13 +494,6 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
         return turning(session, measurements.poses, measurements.on_platform)
     except PkmcalError as error:
         return [_refused(error)]
-
-
-def _verdict_of_poses(settled: Settled) -> list[Finding]:
-    """Findings on whether the mechanism with adjusted parameters explains the measured poses."""
-    if settled.case.session.heights_alone:
-        return _verdict_of_heights(settled)
-    return _unexplained_poses(settled)
 
 
 def _verdict_of_heights(settled: Settled) -> list[Finding]:

@@ -155,7 +155,7 @@ def difference(
     _check_same_machine(one, other)
     both = [side.saved for side in (one, other) if side.saved is not None]
     shared, share = _shared(both)
-    one_drawing = len(both) == 2 and _one_drawing(both)
+    one_drawing = len(both) == 2 and _same_nominal_model(*both)
     value = machine_change(
         one.machine,
         other.machine,
@@ -217,10 +217,9 @@ def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
     )
 
 
-def _one_drawing(both: list[SavedCalibration]) -> bool:
+def _same_nominal_model(one: SavedCalibration, other: SavedCalibration) -> bool:
     """Whether two calibrations have the same nominal values and prior sigmas."""
-    one, other = both
-    first, second = (saved.machine.parameters.tolerance for saved in both)
+    first, second = (saved.machine.parameters.tolerance for saved in (one, other))
     same = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
     return same and np.allclose(first, second)
 

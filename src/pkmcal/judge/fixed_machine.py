@@ -171,7 +171,9 @@ def hold(
     assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
     if irls_weight is None:
-        if not _is_enough(assembled.problem, begin):
+        linear, unknowns = assembled.problem.linearize(begin), assembled.problem.unknowns.count
+        unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
+        if int(linear.usable.sum()) + len(linear.shared_by) < unknowns:
             raise too_little(machine, measurements)
         result = solve_batch(assembled.problem, begin, scale_readings=False)
         problem, solution = result.info.problem, result.solution
@@ -191,13 +193,6 @@ def hold(
     problem = opened.trusting(irls_weight.weights)
     state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
     return Held(still, assembled.observed, problem, state, ("machine", "intrinsics"))
-
-
-def _is_enough(problem: Problem, state: BatchState) -> bool:
-    """Whether there are at least as many rows as unknowns."""
-    linear = problem.linearize(state)
-    rows = int(linear.usable.sum()) + len(linear.shared_by)
-    return rows >= problem.unknowns.count + linear.by_own.shape[1] * linear.by_own.shape[-1]
 
 
 def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:

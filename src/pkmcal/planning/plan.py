@@ -175,14 +175,17 @@ def plan_measurements(
         )
         subject = replace(subject, rig=rig, prior=reference_values)
     progress(0.3)
-    joined = _together(rig) if together is None else together
+    if together is None:  # one camera is carried; several, or a tracker, measure at once
+        tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
+        several = tracked or len(np.unique(rig.camera_of_station)) > 1
+        together = len(rig.names) > 1 and several
     stations = range(len(rig.names))
-    groups = (tuple(stations),) if joined else tuple((s,) for s in stations)
+    groups = (tuple(stations),) if together else tuple((s,) for s in stations)
     made = _Making(rig, subject.prior, groups, count, index, work)
     pool = made.pool(Candidates.of_all(groups, *drawn))
     item = made.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
     progress(0.9)
-    return _ordered(subject, made, item, pool, region, joined, tried, rng)
+    return _ordered(subject, made, item, pool, region, together, tried, rng)
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
@@ -214,14 +217,6 @@ def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: i
             found=str(best_of),
             expected=f"1 to {len(rig.names)}",
         )
-
-
-def _together(rig: Rig) -> bool:
-    """Whether all stations measure at once: a single camera is carried from station to station,
-    several cameras or a tracker measure together.
-    """
-    tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
-    return len(rig.names) > 1 and (tracked or len(np.unique(rig.camera_of_station)) > 1)
 
 
 class _Pool(NamedTuple):
@@ -463,19 +458,22 @@ def _with_places(
             where="--places",
             expected="a camera that sees the legs, or a board that faces some place",
         )
+    # Information of each station on the machine, beyond the prior's.
     start = np.linalg.inv(first.covariance(first.information))
-    covariances, alone = np.zeros((len(infos), *start.shape)), np.zeros(len(infos))
+    information, alone = np.zeros((len(infos), *start.shape)), np.zeros(len(infos))
     for s, info in enumerate(infos):
-        after = np.linalg.inv(start)
+        covariance = np.linalg.inv(start)
         if info is not None:
-            after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
-            covariances[s] = np.linalg.inv(after) - start
-        alone[s] = first.tool(after)[0]
-    roots = np.stack([_padded_root(covariances[s]) for s in range(len(covariances))])
-    same = np.zeros(len(roots), dtype=int)
-    # distinct numbers, so that no station counts as a repetition of another
-    number = np.arange(len(roots), dtype=float)[:, None]
-    whole = CandidateRows(roots, same, number, start, np.eye(len(start)), first.work)
+            covariance = info.covariance(info.of(np.arange(len(few)), count / len(few)))
+            information[s] = np.linalg.inv(covariance) - start
+        alone[s] = first.tool(covariance)[0]
+    # Rows R with R^T R = information, whose smallest eigenvalues may be rounding.
+    eigenvalues, vectors = np.linalg.eigh(information)
+    rows = np.sqrt(np.maximum(eigenvalues, 0.0))[..., None] * vectors.mT
+    # The best set of stations; distinct numbers, so that none counts as a repetition of another.
+    same = np.zeros(len(rows), dtype=int)
+    number = np.arange(len(rows), dtype=float)[:, None]
+    whole = CandidateRows(rows, same, number, start, np.eye(len(start)), first.work)
     rule = PLAN_INDICES[index](whole)
     wanted = free_places or best_of or 1
     best = np.sort(exchanged(whole, greedy(whole, wanted, rule).chosen, rule))
@@ -500,12 +498,6 @@ def _view_information(
         return information_of(rig, Candidates.of_all(((0,),), *part), work, prior)
     except InputError:
         return None
-
-
-def _padded_root(information: Array) -> Array:
-    """R (p, p) with R^T R = information, whose smallest eigenvalues may be rounding."""
-    values, vectors = np.linalg.eigh(information)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
 def _around(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:

@@ -223,7 +223,11 @@ class SimulatedCalibrations:
         values = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         sigma = np.where(sigma > ROUNDING_SIGMA, sigma, np.nan)
-        sigma[_along_axes(machine)] = np.nan
+        # An axis is a unit vector: its largest component follows from the other two, and changes
+        # only to second order when the axis turns.
+        axes = machine.parameters.axes
+        largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
+        sigma[axes[np.arange(len(axes)), largest]] = np.nan
         off = tool_error_and_sigma(machine, theta, covariance, true, joints, every=every)
         return np.stack([theta - values, sigma]), np.stack(off)
 
@@ -286,17 +290,6 @@ def tool_error_and_sigma(
     out[0, good], out[1, good] = off, np.sqrt(np.maximum(variance, 0.0))
     out[:, out[1] < ROUNDING_SIGMA] = np.nan  # the machine cannot move in this direction
     return out[0], out[1]
-
-
-def _along_axes(machine: Machine) -> Integers:
-    """Indices of each axis's largest component.
-
-    That component follows from the other two: an axis is a unit vector, and a rotation of it
-    changes its largest component only to second order.
-    """
-    axes = machine.parameters.axes
-    largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
-    return axes[np.arange(len(axes)), largest]
 
 
 def _sizes(tool: Array) -> tuple[Array, Array]:

@@ -375,9 +375,9 @@ def scaled(machine: Machine, factor: float) -> Machine:
     lengths = np.array(machine.parameters.units) == "m"
     values[lengths] *= factor
     document = machine.with_values(values).to_document()
-    for leg, unit in zip(document["legs"], _units(machine), strict=True):
+    for leg, motor in zip(document["legs"], machine.layout.actuated.tolist(), strict=True):
         _scale(leg["length"], "range", factor)
-        if unit == "m":
+        if motor >= 0 and machine.joint_units[motor] == "m":
             _scale(leg["base"], "range", factor)
         for tube in leg.get("tubes", ()):
             tube["from"] *= factor
@@ -385,12 +385,6 @@ def scaled(machine: Machine, factor: float) -> Machine:
     if document.get("home"):
         _scale(document["home"], "position", factor)
     return _rebuilt(document)
-
-
-def _units(machine: Machine) -> list[str]:
-    """Unit of each leg's reading; empty for a leg without one."""
-    motors = machine.layout.actuated
-    return [machine.joint_units[k] if k >= 0 else "" for k in motors.tolist()]
 
 
 def _scale(node: dict[str, Any], key: str, factor: float) -> None:

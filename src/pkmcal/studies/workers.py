@@ -175,13 +175,9 @@ class _Worker:
         self.process.kill()
         for stream in (self.process.stdin, self.process.stdout):
             if stream is not None:
-                _closed(stream)
+                with suppress(OSError):  # nobody reads what was still to be written
+                    stream.close()
         self.process.wait()
-
-
-def _closed(stream: IO[bytes]) -> None:
-    with suppress(OSError):  # nobody reads what was still to be written
-        stream.close()
 
 
 def _answer(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
