@@ -85,7 +85,7 @@ def calibrate(
         These data do not allow a result.
 
     """
-    value = run(
+    calibration = run(
         session,
         method=method,
         seed=seed,
@@ -94,8 +94,10 @@ def calibrate(
         progress=progress,
     )
     # release the images, which a long-lived result need not keep in memory
-    retained = replace(value, photographs={})
-    return CalibrationResult(**{one.name: getattr(retained, one.name) for one in fields(retained)})
+    without_images = replace(calibration, photographs={})
+    return CalibrationResult(
+        **{one.name: getattr(without_images, one.name) for one in fields(without_images)}
+    )
 
 
 def load_result(source: Path | str) -> SavedCalibration:

@@ -115,11 +115,11 @@ def plan(
             )
             session = subject if isinstance(subject, Session) else None
             session = session or load_session(folder or "", measured=False)
-            source = as_it_stands(
+            rig_subject = as_it_stands(
                 session, after, from_drawing=from_drawing, same_place=same_place,
                 anywhere=places is not None, edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
-            return run(source, region=session.workspace, **planned)
+            return run(rig_subject, region=session.workspace, **planned)
         _check_options(
             "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
         )
@@ -132,7 +132,7 @@ def plan(
         name = machine.name if isinstance(subject, Machine) else str(subject)
         try:
             one = board or places or view_angle(eye) > PANORAMIC_HALF_VIEW
-            source = of_machine(
+            rig_subject = of_machine(
                 machine,
                 [eye] * (1 if one else PLACES_AROUND_A_MACHINE),
                 machine.joint_names,
@@ -146,7 +146,7 @@ def plan(
         except InputError as error:
             raise error.located(name) from None
         try:
-            return run(source, **planned)
+            return run(rig_subject, **planned)
         except InputError as error:
             raise error.located(str(camera) if isinstance(camera, Path | str) else name) from None
 

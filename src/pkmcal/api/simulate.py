@@ -70,9 +70,9 @@ def simulate(
             )
     check_number("simulate", "seed", seed)
     _check_settings(settings)
-    drawing = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
+    nominal = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
     eye = camera if isinstance(camera, Camera) else load_camera(camera) if camera else demo_camera()
-    machine = to_simulate(drawing, drawing.name)
+    machine = to_simulate(nominal, nominal.name)
     simulate_session(folder, machine, eye, Settings(**settings), seed=seed, progress=progress)
     return load_session(folder)
 

@@ -47,18 +47,18 @@ ONE_LEGEND = (
 def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, ...]:
     """Advice for a session, the most useful first."""
     out = [
-        *_second_place(forecast),
+        *_second_station(forecast),
         *_from_one_side(inspection),
-        *_hidden(inspection),
-        *_slim(inspection),
+        *_hidden_legs(inspection),
+        *_slim_tubes(inspection),
     ]
     if forecast is not None:
         for station, edges in zip(inspection.stations, forecast.edges, strict=True):
-            out += _lost(inspection, station, edges)
+            out += _lost_edges(inspection, station, edges)
     return tuple(out)
 
 
-def _second_place(forecast: Forecast | None) -> list[Finding]:
+def _second_station(forecast: Forecast | None) -> list[Finding]:
     """Advice to use a second station, if it gains more than further images at the only one."""
     if forecast is None or not forecast.second * ADVICE_WORTH_FACTOR < forecast.position:
         return []
@@ -95,16 +95,16 @@ def _from_one_side(inspection: Inspection) -> list[Finding]:
     return [note("images.one_side", degrees=angle)]
 
 
-def _hidden(inspection: Inspection) -> list[Finding]:
+def _hidden_legs(inspection: Inspection) -> list[Finding]:
     """Advice on legs that are hidden from every station."""
-    in_view = [station for station in inspection.stations if station.quality is not None]
-    if not in_view or len(in_view) < len(inspection.stations):
+    recognised = [station for station in inspection.stations if station.quality is not None]
+    if not recognised or len(recognised) < len(inspection.stations):
         return []
-    hidden = np.stack([s.quality.hidden.mean(axis=0) for s in in_view if s.quality is not None])
+    hidden = np.stack([s.quality.hidden.mean(axis=0) for s in recognised if s.quality is not None])
     best = np.argmin(np.nan_to_num(hidden, nan=np.inf), axis=0)
     least = hidden[best, np.arange(hidden.shape[1])]
     out: list[Finding] = []
-    for s, station in enumerate(in_view):
+    for s, station in enumerate(recognised):
         bad = np.flatnonzero((least > INFORMATION_LOST_SHARE) & (best == s))
         if not bad.size:
             continue
@@ -115,13 +115,13 @@ def _hidden(inspection: Inspection) -> list[Finding]:
                 legs=named(bad),
                 number=bad.size,
                 share=float(least[bad].mean()),
-                station=station.name if len(in_view) > 1 else None,
+                station=station.name if len(recognised) > 1 else None,
             )
         )
     return out
 
 
-def _slim(inspection: Inspection) -> list[Finding]:
+def _slim_tubes(inspection: Inspection) -> list[Finding]:
     """Advice on tubes so narrow in a station's images that the profiles of both edges overlap."""
     tubes, least = tubes_of(inspection.session.machine), 2 * PROFILE_REACH_INSIDE
     out: list[Finding] = []
@@ -141,7 +141,9 @@ def _slim(inspection: Inspection) -> list[Finding]:
     return out
 
 
-def _lost(inspection: Inspection, station: StationInspection, edges: EdgesOf) -> list[Finding]:
+def _lost_edges(
+    inspection: Inspection, station: StationInspection, edges: EdgesOf
+) -> list[Finding]:
     """Advice on the cause of lost edges, if many of the expected ones are lost."""
     expected, lost = int(edges.expected.sum()), edges.expected & ~edges.valid
     if station.quality is None or not expected or lost.sum() <= INFORMATION_LOST_SHARE * expected:
@@ -227,9 +229,9 @@ def forecast_part(forecast: Forecast) -> Part:
             Row(
                 str(j),
                 (
-                    *(_part(by[s, j].tells) for s in stations),
-                    _part(total[j]),
-                    _part(sum(by[s, j].variance for s in stations)),
+                    *(_percent(by[s, j].tells) for s in stations),
+                    _percent(total[j]),
+                    _percent(sum(by[s, j].variance for s in stations)),
                 ),
                 mark=Level.NOTE if j in poor else "good",
             )
@@ -238,7 +240,7 @@ def forecast_part(forecast: Forecast) -> Part:
         together = [sum(by[s, j].tells for j in numbers) for s in stations]
         variance = sum(leg.variance for leg in forecast.legs)
         all_ = Row(
-            "all", tuple(_part(x) for x in (*together, sum(together), variance)), mark="good"
+            "all", tuple(_percent(x) for x in (*together, sum(together), variance)), mark="good"
         )
         head = ("Leg", *stations, "Together", "Variance")
         shares = Table(
@@ -284,8 +286,14 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
 
 def _cells(leg: LegForecast) -> tuple[str, ...]:
     sigma = f"{leg.sigma:.2f} px" if math.isfinite(leg.sigma) else "–"
-    return _part(leg.seen), _part(leg.found), sigma, _part(leg.tells), _part(leg.variance)
+    return (
+        _percent(leg.seen),
+        _percent(leg.found),
+        sigma,
+        _percent(leg.tells),
+        _percent(leg.variance),
+    )
 
 
-def _part(share: float) -> str:
+def _percent(share: float) -> str:
     return f"{share:.0%}" if math.isfinite(share) else "–"

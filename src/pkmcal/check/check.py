@@ -90,20 +90,20 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
     progress("Reading photographs", 0.1)
-    photographs, broken = _decoded(session)
+    photographs, broken = _decode_images(session)
     progress("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
-    in_view = _observed(session, photographs, motion.poses, seed, progress)
-    stations, joints = in_view.stations, joint_checks(session)
-    findings += [*broken, *motion.findings, *in_view.findings, *joint_findings(session, joints)]
+    observed = _check_images(session, photographs, motion.poses, seed, progress)
+    stations, joints = observed.stations, joint_checks(session)
+    findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
     findings += numbering_note(session)
     progress("What such photographs will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no station for further images
     expected = None
-    if in_view.inspection and not by_hand:
+    if observed.inspection and not by_hand:
         try:
-            expected = forecast(in_view.inspection)
+            expected = forecast(observed.inspection)
         except (PkmcalError, np.linalg.LinAlgError) as error:
             findings.append(note("images.no_forecast", why=str(error).rstrip(".")))
     for station in stations:
@@ -119,8 +119,8 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
         singularity=motion.singularity,
         assemblies=motion.assemblies,
         forecast=expected,
-        advice=advice(in_view.inspection, expected) if in_view.inspection else (),
-        look=in_view.inspection,
+        advice=advice(observed.inspection, expected) if observed.inspection else (),
+        look=observed.inspection,
     )
 
 
@@ -135,7 +135,7 @@ def _workspace(session: Session) -> list[Finding]:
     return []
 
 
-def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]:
+def _decode_images(session: Session) -> tuple[list[Photographs | None], list[Finding]]:
     """Images of legs by station, None for a station without any, and findings on those that cannot
     be decoded.
     """
@@ -165,7 +165,7 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
             rows.append(photo.configuration)
             files.append((photo.path, label))
         if broken > BROKEN_PHOTOGRAPHS_NAMED:
-            more = _more_broken(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED)
+            more = _more_broken_error(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED)
             findings.append(of_error(more, station=station.name))
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
@@ -178,7 +178,7 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
     return out, findings
 
 
-def _more_broken(session: Session, number: int, count: int) -> InputError:
+def _more_broken_error(session: Session, number: int, count: int) -> InputError:
     """Error on the broken images of a station that are not reported individually."""
     name = session.stations[number].name
     return InputError(
@@ -191,7 +191,7 @@ def _more_broken(session: Session, number: int, count: int) -> InputError:
 
 
 @dataclass(frozen=True)
-class _Motion:
+class _Kinematics:
     """Kinematics of the nominal machine at the readings.
 
     poses : T_base_platform (K, 4, 4), None if the closure fails at some readings. singularity :
@@ -204,7 +204,7 @@ class _Motion:
     findings: tuple[Finding, ...]
 
 
-def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
+def _kinematics(session: Session, rng: np.random.Generator) -> _Kinematics:
     """Whether the nominal machine closes at all readings, with its singularity and assembly modes
     there.
     """
@@ -217,7 +217,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
             first = session.machine.inverse(poses[0])
         modes = session.machine.assembly_modes(first, rng)
     except PkmcalError as error:
-        return _Motion(None, math.nan, 0, (of_error(error),))
+        return _Kinematics(None, math.nan, 0, (of_error(error),))
     findings: list[Finding] = []
     weak = [session.configurations[k] for k in np.flatnonzero(fk.singularity < NEAR_SINGULAR)]
     if weak:
@@ -227,10 +227,10 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
         turn = float(np.rad2deg(turns[turns > 1e-3].min()))
         first_name = session.configurations[0]
         findings.append(doubtful("configurations.other_assembly", first_name, turn=turn))
-    return _Motion(poses, float(fk.singularity.min()), len(modes), tuple(findings))
+    return _Kinematics(poses, float(fk.singularity.min()), len(modes), tuple(findings))
 
 
-class _Observed(NamedTuple):
+class _ImageChecks(NamedTuple):
     """Results of the images. inspection : None if the machine could not be searched for."""
 
     stations: tuple[StationCheck, ...]
@@ -238,13 +238,13 @@ class _Observed(NamedTuple):
     inspection: Inspection | None = None
 
 
-def _observed(
+def _check_images(
     session: Session,
     photographs: list[Photographs | None],
     poses: Array | None,
     seed: int,
     progress: CalibrationProgress,
-) -> _Observed:
+) -> _ImageChecks:
     """Checks of the images of every station: boards, localization, and the start of a
     calibration.
     """
@@ -252,18 +252,20 @@ def _observed(
 
     def unlooked() -> tuple[StationCheck, ...]:
         """Checks of stations in which the machine cannot be searched for."""
-        n_legs, value = session.machine.n_legs, zip(session.stations, photographs, strict=True)
+        n_legs, observed = session.machine.n_legs, zip(session.stations, photographs, strict=True)
         return tuple(
-            _summary(station, unrecognised_quality(p.images if p else [], n_legs), recognised=False)
-            for station, p in value
+            _station_check(
+                station, unrecognised_quality(p.images if p else [], n_legs), recognised=False
+            )
+            for station, p in observed
         )
 
     try:
         check_observable(session)
     except InputError as error:
-        return _Observed(unlooked(), (of_error(error),))
+        return _ImageChecks(unlooked(), (of_error(error),))
     if poses is None or len(whole) < len(legs_stations(session)):
-        return _Observed(unlooked(), ())
+        return _ImageChecks(unlooked(), ())
     # Broken images have been reported already.
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
@@ -271,8 +273,8 @@ def _observed(
         boards = look_for_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
-        return _Observed(unlooked(), boards.findings)
-    turns = () if lost else pose_findings(session, boards.boards)
+        return _ImageChecks(unlooked(), boards.findings)
+    turn_findings = () if lost else pose_findings(session, boards.boards)
     located = localize(  # with the random numbers of `calibrate`
         session,
         whole,
@@ -283,45 +285,47 @@ def _observed(
     settled: Settled | PkmcalError | None = None
     if isinstance(located.result, PkmcalError):
         settled = located.result
-    elif not lost and not any(finding.level is Level.WRONG for finding in turns):
-        settled = _settled(session, located.result, seed, progress)
-    retained = located.result if not isinstance(settled, Settled) else settled.case
-    rejected = () if isinstance(retained, PkmcalError) else retained.session.rejected
+    elif not lost and not any(finding.level is Level.WRONG for finding in turn_findings):
+        settled = _calibration_start(session, located.result, seed, progress)
+    case = located.result if not isinstance(settled, Settled) else settled.case
+    rejected = () if isinstance(case, PkmcalError) else case.session.rejected
     findings = [
-        *([_refused(settled)] if isinstance(settled, PkmcalError) else []),
+        *([_refusal(settled)] if isinstance(settled, PkmcalError) else []),
         *boards.findings,
-        *turns,
+        *turn_findings,
         *(one.finding for one in rejected),
     ]
     if isinstance(settled, Settled):
         findings += [*(one.finding for one in settled.turned), *settled.findings]
         heights = settled.case.session.heights_alone
-        findings += _verdict_of_heights(settled) if heights else _unexplained_poses(settled)
+        findings += _height_findings(settled) if heights else _pose_scale_findings(settled)
     stations = [  # default for stations that observe no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
     places = _search_results(session, whole, located)
     # A rejected station on a tripod was recognized, and its quality may explain the rejection.
-    gone = {one.station.name for one in rejected if one.station.handheld}
-    if isinstance(retained, PkmcalError):  # no hand-held image was localized then
-        gone = {station.name for station in session.stations if station.handheld}
+    rejected_names = {one.station.name for one in rejected if one.station.handheld}
+    if isinstance(case, PkmcalError):  # no hand-held image was localized then
+        rejected_names = {station.name for station in session.stations if station.handheld}
     parts: list[StationInspection] = []
     for p in whole:
         if p.station not in places:  # the search ended at the fault of another station
             summary = unrecognised_quality(p.images, session.machine.n_legs)
-            stations[p.station] = _summary(session.stations[p.station], summary, recognised=False)
+            stations[p.station] = _station_check(
+                session.stations[p.station], summary, recognised=False
+            )
             continue
-        place = places[p.station]
-        recognised = place.good and stations[p.station].name not in gone
-        stations[p.station], station_edges = _station(session, p, place, poses, recognised)
+        pose = places[p.station]
+        recognised = pose.good and stations[p.station].name not in rejected_names
+        stations[p.station], station_edges = _check_station(session, p, pose, poses, recognised)
         parts.append(station_edges)
     stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
     station_edges = Inspection(session, poses, tuple(parts)) if parts else None
-    return _Observed(stations, tuple(findings), station_edges)
+    return _ImageChecks(stations, tuple(findings), station_edges)
 
 
-def _settled(
+def _calibration_start(
     session: Session, case: Case, seed: int, progress: CalibrationProgress
 ) -> Settled | PkmcalError:
     """Start of a calibration as `calibrate` computes it, or the error with which it would end."""
@@ -332,7 +336,7 @@ def _settled(
         return error
 
 
-def _refused(error: PkmcalError) -> Finding:
+def _refusal(error: PkmcalError) -> Finding:
     """Finding of an error of `calibrate`: wrong if the session is at fault, doubtful if its data
     are insufficient.
     """
@@ -344,8 +348,8 @@ def _search_results(
 ) -> dict[int, LocalizedPose]:
     """Localized poses by station number, without stations that were not searched."""
     fixed = [p.station for p in photographs if not session.stations[p.station].handheld]
-    results = located.recognition.localizations if located.recognition else ()
-    places = dict(zip(fixed, results, strict=bool(results)))
+    localizations = located.recognition.localizations if located.recognition else ()
+    places = dict(zip(fixed, localizations, strict=bool(localizations)))
     # for a hand-held image, the probability of a rival pose takes the place of that of chance
     for k, one in located.places.items():
         places[k] = LocalizedPose(
@@ -358,7 +362,7 @@ def _search_results(
     return places
 
 
-def _station(
+def _check_station(
     session: Session,
     photographs: Photographs,
     pose: LocalizedPose,
@@ -367,27 +371,27 @@ def _station(
 ) -> tuple[StationCheck, StationInspection]:
     """Check and inspection of a station in which the machine was searched for."""
     station, machine = session.stations[photographs.station], session.machine
-    value, by_hand = pose.T_camera_base, station.T_camera_base
-    what = (
-        quality(photographs, machine, value, poses[photographs.configuration])
+    T_camera_base, by_hand = pose.T_camera_base, station.T_camera_base
+    leg_quality = (
+        quality(photographs, machine, T_camera_base, poses[photographs.configuration])
         if recognised
         else unrecognised_quality(photographs.images, machine.n_legs)
     )
     summary = replace(
-        _summary(station, what, recognised=recognised),
+        _station_check(station, leg_quality, recognised=recognised),
         mismatch=pose.score,
         by_chance=pose.by_chance,
     )
     if recognised and by_hand is not None:
-        change = pose_difference(inverse(value), inverse(by_hand))
-        shifted, turned = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
-        summary = replace(summary, moved=shifted, turned=turned)
+        change = pose_difference(inverse(T_camera_base), inverse(by_hand))
+        distance, angle = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
+        summary = replace(summary, moved=distance, turned=angle)
     return summary, StationInspection(
-        station.name, photographs, by_hand, value, what if recognised else None
+        station.name, photographs, by_hand, T_camera_base, leg_quality if recognised else None
     )
 
 
-def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:
+def _station_check(station: Station, what: Quality, recognised: bool) -> StationCheck:
     some = len(what.saturated) > 0
     blur = what.blur[np.isfinite(what.blur)]
     return StationCheck(
@@ -425,22 +429,22 @@ def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) 
         return BoardsCheck(findings=(of_error(error),))
     if board is None:
         return BoardsCheck()
-    results: dict[int, StationBoard] = {}
+    station_boards: dict[int, StationBoard] = {}
     for number, station in enumerate(session.stations):
         if "board" not in station.observe:
             continue
         try:
-            results[number] = station_board(session, board, number, images[number])
+            station_boards[number] = station_board(session, board, number, images[number])
         except InputError as error:
             findings.append(of_error(error, station=station.name))
-    checks = {number: _board_check(one) for number, one in results.items()}
+    checks = {number: _board_check(one) for number, one in station_boards.items()}
     for number, check in checks.items():
         findings += board_findings(session, number, check)
-    boards = Boards(results, session.board_body, board.tolerance)
+    boards = Boards(station_boards, session.board_body, board.tolerance)
     return BoardsCheck(boards, checks, tuple(findings))
 
 
-def _unseen(one: StationBoard) -> str:
+def _unseen_border(one: StationBoard) -> str:
     """Outer row or column of the board that no image shows while all others are visible; empty if
     none.
     """
@@ -463,7 +467,7 @@ def _board_check(one: StationBoard) -> BoardCheck:
         rms=float(np.median(views.rms)),
         scatter=stood.scatter if stood else math.nan,
         distance=float(np.median(np.linalg.norm(views.poses.T_camera_board[:, :3, 3], axis=-1))),
-        unseen=_unseen(one),
+        unseen=_unseen_border(one),
     )
 
 
@@ -472,17 +476,17 @@ def _board_check(one: StationBoard) -> BoardCheck:
 
 def joint_checks(session: Session) -> tuple[JointCheck, ...]:
     """Ranges of all joints' readings."""
-    names: list[JointCheck] = []
+    checks: list[JointCheck] = []
     for k, name in enumerate(session.document["joints"]["columns"]):
-        values, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
+        readings, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
         stroke = high - low
         ends = (
-            int(np.sum(values < low + STROKE_END_SHARE * stroke)),
-            int(np.sum(values > high - STROKE_END_SHARE * stroke)),
+            int(np.sum(readings < low + STROKE_END_SHARE * stroke)),
+            int(np.sum(readings > high - STROKE_END_SHARE * stroke)),
         )
-        used = float(np.ptp(values) / stroke)
-        names.append(JointCheck(name, float(values.min()), float(values.max()), used, ends))
-    return tuple(names)
+        used = float(np.ptp(readings) / stroke)
+        checks.append(JointCheck(name, float(readings.min()), float(readings.max()), used, ends))
+    return tuple(checks)
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:
@@ -493,27 +497,27 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
         measurements = measurements_of(session, boards)
         return turning(session, measurements.poses, measurements.on_platform)
     except PkmcalError as error:
-        return [_refused(error)]
+        return [_refusal(error)]
 
 
-def _verdict_of_heights(settled: Settled) -> list[Finding]:
+def _height_findings(settled: Settled) -> list[Finding]:
     """Findings on the model violations and the uneven bed that `calibrate` will report."""
-    turns = settled.turns
-    value = model_violations(
+    fit = settled.turns
+    tested = model_violations(
         settled.case.session,
-        turns.observation,
-        turns.measurements,
-        turns.estimate,
-        linearize_at_solution(turns.measurements, turns.estimate),
+        fit.observation,
+        fit.measurements,
+        fit.estimate,
+        linearize_at_solution(fit.measurements, fit.estimate),
     )
     return [
-        *(replace(one.finding, level=Level.DOUBTFUL) for one in value.violations),
-        *discrepancy_findings(value.errors),
-        *([] if explains_heights(value.errors) else _unexplained_poses(settled)),
+        *(replace(one.finding, level=Level.DOUBTFUL) for one in tested.violations),
+        *discrepancy_findings(tested.errors),
+        *([] if explains_heights(tested.errors) else _pose_scale_findings(settled)),
     ]
 
 
-def _unexplained_poses(settled: Settled) -> list[Finding]:
+def _pose_scale_findings(settled: Settled) -> list[Finding]:
     """Finding if measured poses scatter more than their noise."""
     scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
     if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:

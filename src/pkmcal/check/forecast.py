@@ -96,12 +96,12 @@ def forecast(
         np.stack([station.T_camera_base for station in stations]),
         inspection.poses,
     )
-    capture = _planned(inspection, first, photographs)
+    capture = _planned_capture(inspection, first, photographs)
     information = _capture_information(capture)
     second = np.nan
     one = stations[0].photographs
     if len(stations) == 1 and view_angle(one.camera) < PANORAMIC_HALF_VIEW:
-        second = _capture_information(_two_places(capture)).position
+        second = _capture_information(_with_second_station(capture)).position
     return Forecast(
         photographs=photographs,
         position=information.position,
@@ -134,7 +134,7 @@ class _CaptureInformation(NamedTuple):
     drawing: float
 
 
-def _planned(inspection: Inspection, first: FirstEdges, photographs: int) -> _Capture:
+def _planned_capture(inspection: Inspection, first: FirstEdges, photographs: int) -> _Capture:
     """Capture with configurations over the joints' ranges, with the present share of extreme
     ones.
     """
@@ -151,7 +151,7 @@ def _planned(inspection: Inspection, first: FirstEdges, photographs: int) -> _Ca
     number = np.arange(photographs)
     pairs = [all_pairs([s], number + (0 if shared else photographs * s)) for s in range(len(rows))]
     T_camera_base = first.estimate.state.T_camera_base
-    in_view = zip(stations, T_camera_base, first.pools, strict=True)
+    cameras = zip(stations, T_camera_base, first.pools, strict=True)
     rig = Rig(
         machine,
         tuple(station.name for station in stations),
@@ -160,14 +160,14 @@ def _planned(inspection: Inspection, first: FirstEdges, photographs: int) -> _Ca
         inspection.session.joint_noise,
         tuple(
             LegsFrom(k, s.photographs.camera, T, pools, s.photographs.binning)
-            for k, (s, T, pools) in enumerate(in_view)
+            for k, (s, T, pools) in enumerate(cameras)
         ),
         shading=first.estimate.statistics.shading,
     )
     return _Capture(rig, poses[:wanted], readings[:wanted], np.concatenate(pairs))
 
 
-def _two_places(capture: _Capture) -> _Capture:
+def _with_second_station(capture: _Capture) -> _Capture:
     """Capture of a single station, with every other image taken a quarter turn around the
     machine.
     """
@@ -215,7 +215,7 @@ def _capture_information(capture: _Capture) -> _CaptureInformation:
     part = np.sum((rows @ place.T) ** 2, axis=-1)  # (K, r)
     prior = float(np.sum((info.linear.shared_by @ place.T) ** 2))
     tolerance = machine.parameters.tolerances_free()
-    values = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
+    row_information = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
     at = assembled.places.edges
 
     def by_leg(of_rows: Array) -> Array:
@@ -224,7 +224,7 @@ def _capture_information(capture: _Capture) -> _CaptureInformation:
         np.add.at(out, (edges.station, edges.leg), own)
         return out
 
-    share, shares = by_leg(part), by_leg(values)
+    share, shares = by_leg(part), by_leg(row_information)
     readings = float(part[:, problem.closure_rows].sum())
     whole = float(share.sum()) + readings + prior
     return _CaptureInformation(
@@ -246,13 +246,13 @@ def _by_leg(
         for j in np.unique(tubes.leg):
             mine = tubes.leg == j
             expected = int(edges.expected[:, mine].sum())
-            value = int(edges.valid[:, mine].sum())
+            inliers = int(edges.valid[:, mine].sum())
             out.append(
                 LegForecast(
                     station=station.name,
                     leg=int(j) + 1,
                     seen=float("nan") if hidden is None else float(1 - hidden[j]),
-                    found=value / expected if expected else float("nan"),
+                    found=inliers / expected if expected else float("nan"),
                     sigma=float(first.sigma[s, j]),
                     tells=float(information.share[s, j]),
                     variance=float(information.variance[s, j]),

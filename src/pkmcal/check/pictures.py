@@ -174,6 +174,6 @@ def leg_colours() -> tuple[tuple[int, int, int], ...]:
     """
     style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
     (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)", style, flags=re.MULTILINE)
-    results = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
-    numbers = [int(results[str(k + 1)], 16) for k in range(N_COLOURS)]
+    colours = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
+    numbers = [int(colours[str(k + 1)], 16) for k in range(N_COLOURS)]
     return tuple((n & 255, n >> 8 & 255, n >> 16) for n in numbers)

@@ -78,32 +78,32 @@ def link_findings(session: Session, poses: Array | None) -> list[Finding]:
 
 def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
     """Findings on the images of a station. n_legs : of the machine."""
-    results: list[Finding] = []
+    findings: list[Finding] = []
     at = {"subject": station.name, "station": station.name}
     where = "legs" if station.recognised else "pictures"
     if station.saturated > OVEREXPOSED_PIXEL_SHARE:
-        results.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
+        findings.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
     if station.black > TOO_DARK:
-        results.append(doubtful("images.black", **at, share=station.black, where=where))
+        findings.append(doubtful("images.black", **at, share=station.black, where=where))
     if station.blur > BLUR_STILL_MEASURED:
-        results.append(doubtful("images.blurred", **at, blur=station.blur))
+        findings.append(doubtful("images.blurred", **at, blur=station.blur))
     if station.recognised and station.legs < FEW_LEGS * n_legs:
-        results.append(doubtful("images.few_legs", **at, number=station.legs, of=n_legs))
-    return results
+        findings.append(doubtful("images.few_legs", **at, number=station.legs, of=n_legs))
+    return findings
 
 
 def board_findings(session: Session, number: int, check: BoardCheck) -> list[Finding]:
     """Findings on the board in a station's images. number : of the station, from 0."""
     station = session.stations[number]
     at = {"subject": station.name, "station": station.name}
-    results: list[Finding] = []
+    findings: list[Finding] = []
     if check.rms > POOR_CORNERS:
-        results.append(doubtful("board.corners_off", **at, rms=check.rms))
+        findings.append(doubtful("board.corners_off", **at, rms=check.rms))
     if check.unseen:
-        results.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
+        findings.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
     if session.board_body == "base" and check.found == 1 and len(station.photographs) > 1:
-        results.append(note("board.seen_once", **at))
-    return results
+        findings.append(note("board.seen_once", **at))
+    return findings
 
 
 def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Finding]:
@@ -119,10 +119,10 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
     count = len(session.configurations)
     if count < FEW_CONFIGURATIONS:
         findings.append(note("configurations.too_few", number=count))
-    return findings + _poses_of_many_names(session)
+    return findings + _repeated_pose_findings(session)
 
 
-def _poses_of_many_names(session: Session) -> list[Finding]:
+def _repeated_pose_findings(session: Session) -> list[Finding]:
     """Note on configurations with the same pose by their readings, and how to declare repeats."""
     owner = same_pose(session.joints, session.joint_noise)
     first, names = np.unique(owner, return_counts=True)
@@ -207,12 +207,12 @@ def _stations_table(check: SessionCheck) -> Table:
             levels.add(Level.WRONG)
         worst = [level for level in Level if level in levels]
         mark: Mark = worst[0] if worst else "good"
-        shifted = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
+        motion = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
         finite = station.recognised and math.isfinite(station.legs)
         cells = (
             str(station.photographs),
             _number(station.by_chance, "{:.0e}"),
-            shifted if math.isfinite(station.moved) else "–",
+            motion if math.isfinite(station.moved) else "–",
             f"{station.legs:.1f}/{check.n_legs}" if finite else "–",
             _number(station.saturated, "{:.0%}"),
             _number(station.black, "{:.0%}"),

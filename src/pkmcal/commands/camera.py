@@ -93,8 +93,8 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
 
     session = read_yaml(folder / "session.yaml")
     schema = validated_document(session, session_schema())
-    in_view = [schema.cameras[name] for name in schema.observers("board")]
-    if not in_view or schema.board is None:
+    observers = [schema.cameras[name] for name in schema.observers("board")]
+    if not observers or schema.board is None:
         raise InputError(
             "no station of this session observes a board",
             where=session.where("stations"),
@@ -109,7 +109,7 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
             found=schema.board.file,
             expected=wanted_file(board),
         )
-    cameras = sorted({station.camera for station in in_view})
+    cameras = sorted({station.camera for station in observers})
     if len(cameras) > 1:
         raise InputError(
             "the session's boards are seen by several cameras",
@@ -118,7 +118,7 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
             expected="one camera at a time",
             next_step="Name one camera's photographs: pkmcal camera IMAGES... --board FILE",
         )
-    patterns = [glob.escape(station.images) for station in in_view]
+    patterns = [glob.escape(station.images) for station in observers]
     wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]
     paths = sorted({folder / name for text in wild for name in glob.glob(text, root_dir=folder)})
     if not paths:

@@ -71,12 +71,14 @@ class _Commands(typer.core.TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         return (
-            _made(cmd_name) if cmd_name in COMMANDS_IN_ORDER else super().get_command(ctx, cmd_name)
+            _typer_command(cmd_name)
+            if cmd_name in COMMANDS_IN_ORDER
+            else super().get_command(ctx, cmd_name)
         )
 
 
 @cache
-def _made(name: str) -> Any:
+def _typer_command(name: str) -> Any:
     """A command as typer's object; building those of all commands would take 20 ms."""
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     alone.command(name)(getattr(import_module(f"pkmcal.commands.{name}"), name))
@@ -133,17 +135,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             code = INTERRUPTED_EXIT
         except Exception as error:  # noqa: BLE001 - the last resort: a defect, or a user's mistake
-            return _failed(error, words)
+            return _report_error(error, words)
         if code == INTERRUPTED_EXIT:  # typer turns Ctrl-C into this code
-            return _failed(KeyboardInterrupt(), words)
+            return _report_error(KeyboardInterrupt(), words)
         return code if isinstance(code, int) else 0
 
 
-def _failed(error: BaseException, words: list[str]) -> int:
+def _report_error(error: BaseException, words: list[str]) -> int:
     """Report an error as text, or as JSON with ``--json``; return the exit code."""
     if os.environ.get(DEBUG_VARIABLE):
         sys.stderr.write(legible("".join(traceback.format_exception(error)), keep="\n"))
-    message, code = _in_words(error, words)
+    message, code = _as_pkmcal_error(error, words)
     if "--json" in words and not isinstance(error, LostOutput):
         try:
             typer.echo(json.dumps({**message.as_dict(), "exit_code": code}, ensure_ascii=False))
@@ -156,13 +158,13 @@ def _failed(error: BaseException, words: list[str]) -> int:
     return code
 
 
-def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]:
+def _as_pkmcal_error(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]:
     """Any error as a PkmcalError, with its exit code."""
     if isinstance(error, PkmcalError):
         return error, error.exit_code
     if isinstance(error, _UsageError):
         command = words[0] + " " if words and words[0] in COMMANDS_IN_ORDER else ""
-        message = InputError(_usage(error), next_step=f"See pkmcal {command}--help")
+        message = InputError(_usage_message(error), next_step=f"See pkmcal {command}--help")
         return message, message.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED_EXIT
@@ -189,12 +191,16 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
     return defect, INTERNAL_ERROR_EXIT
 
 
-_SUGGESTED = re.compile(r"(Did you mean|\(Possible options:).*")
-_MACHINERY = ((r"Value error, ", ""), (r"Input should be", "it should be"), (r", unable to .*", ""))
+_SUGGESTION = re.compile(r"(Did you mean|\(Possible options:).*")
+_TYPER_PHRASES = (
+    (r"Value error, ", ""),
+    (r"Input should be", "it should be"),
+    (r", unable to .*", ""),
+)
 """Replacements in the messages of typer's own checks, which name internals."""
 
 
-def _usage(error: Exception) -> str:
+def _usage_message(error: Exception) -> str:
     """Message of an error about the command line, with the closest known word.
 
     typer's own suggestions are removed, because they include words of little similarity.
@@ -202,8 +208,8 @@ def _usage(error: Exception) -> str:
     from pkmcal.files import closest
 
     message = " ".join(getattr(error, "format_message", error.__str__)().split())
-    message = _SUGGESTED.sub("", message).rstrip("?. ")
-    for inside, instead in _MACHINERY:
+    message = _SUGGESTION.sub("", message).rstrip("?. ")
+    for inside, instead in _TYPER_PHRASES:
         message = re.sub(inside, instead, message)
     guess: str | None = None
     if option := re.match(r"No such option:? '?-*([^\s']+)", message):

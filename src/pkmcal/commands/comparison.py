@@ -55,11 +55,11 @@ class AgainstTruth:
 
 def compare_with_truth(calibration: Calibration, session_folder: Path) -> AgainstTruth:
     """Compare a calibration with ``truth.json`` in the session's folder."""
-    drawing = calibration.session.machine
-    truth = load_truth(session_folder, drawing)
+    nominal = calibration.session.machine
+    truth = load_truth(session_folder, nominal)
     off = _in_sigmas(calibration, truth)
     return AgainstTruth(
-        drawing=_errors(drawing, truth),
+        drawing=_errors(nominal, truth),
         calibrated=_errors(calibration.machine, truth),
         count=off.size,
         within=int(np.sum(off < WITHIN_TRUTH_SIGMAS)),
@@ -67,12 +67,12 @@ def compare_with_truth(calibration: Calibration, session_folder: Path) -> Agains
 
 
 def _errors(machine: Machine, truth: Truth) -> Errors:
-    value = machine_errors(machine, truth.machine, truth.joints)
+    errors = machine_errors(machine, truth.machine, truth.joints)
     return Errors(
-        centre=float(value.centre.mean()),
-        offset=rms(value.offset) if value.offset.size else 0.0,
-        position=float(np.nanmean(value.position)),
-        orientation=float(np.nanmean(value.orientation)),
+        centre=float(errors.centre.mean()),
+        offset=rms(errors.offset) if errors.offset.size else 0.0,
+        position=float(np.nanmean(errors.position)),
+        orientation=float(np.nanmean(errors.orientation)),
     )
 
 
@@ -85,11 +85,11 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
         T_base_platform=truth.T_base_platform,
         edge_shift=np.zeros_like(estimate.state.edge_shift),
     )
-    drawing = calibration.session.machine
-    covariance, table = in_gauge(drawing, true, default_gauge(drawing)), drawing.parameters
+    nominal = calibration.session.machine
+    true_in_gauge, table = in_gauge(nominal, true, default_gauge(nominal)), nominal.parameters
     # An axis has two free turns; along itself it changes only to second order.
-    error = table.to_free(estimate.machine.values) - table.to_free(covariance.theta)
+    error = table.to_free(estimate.machine.values) - table.to_free(true_in_gauge.theta)
     to_free = np.linalg.pinv(table.free_matrix())
     sigma = np.sqrt(np.maximum(np.diag(to_free @ estimate.covariance @ to_free.T), 0.0))
-    above_limit = sigma > 1e-9  # values that define the gauge have no standard deviation
-    return np.abs(error)[above_limit] / sigma[above_limit]
+    free = sigma > 1e-9  # values that define the gauge have no standard deviation
+    return np.abs(error)[free] / sigma[free]

@@ -161,23 +161,21 @@ def print_table(console: Console, table: Table) -> None:
 
     columns = table.columns[: table.first]
     marked = any(row.mark for row in table.rows)
-    display = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    grid = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
     if marked:
-        display.add_column()
+        grid.add_column()
     short = max((len(row.name) for row in table.rows), default=0) <= WIDEST_NAME
     for place, heading in enumerate(columns):
         left = place == 0 or place in table.words
-        display.add_column(
-            heading, justify="left" if left else "right", no_wrap=not place and short
-        )
+        grid.add_column(heading, justify="left" if left else "right", no_wrap=not place and short)
     for row in table.rows:
         mark = [MARK_SIGNS[row.mark] if row.mark else ""] if marked else []
         cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])
-        display.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
+        grid.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
     console.print()
     if table.title:
         console.print(legible(table.title), style="bold", markup=False)
-    console.print(display)
+    console.print(grid)
     for line in table.legend:
         console.print(f"   {line}", style="dim", markup=False)
 
@@ -201,8 +199,8 @@ def progress(quiet: bool = False) -> Generator[TextProgress]:
         return
     console = err()
     if not console.is_terminal:
-        with _lines() as values:
-            yield values
+        with _progress_lines() as report:
+            yield report
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -218,7 +216,7 @@ def progress(quiet: bool = False) -> Generator[TextProgress]:
 
 
 @contextmanager
-def _lines() -> Generator[TextProgress]:
+def _progress_lines() -> Generator[TextProgress]:
     """Context with a progress callback that prints lines at intervals; short commands print
     none.
     """

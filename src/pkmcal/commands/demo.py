@@ -72,10 +72,10 @@ def demo(
         write_outcome(outcome, result, CALIBRATION_FILES)
     # The truth is read only now, when everything is written.
     comparison = compare_with_truth(calibration, session)
-    photographs = sum(len(station.photographs) for station in calibration.session.stations)
+    n_images = sum(len(station.photographs) for station in calibration.session.stations)
     outcome = replace(
         outcome,
-        subject=f"A {calibration.machine.name}, not built quite as drawn, in {photographs}"
+        subject=f"A {calibration.machine.name}, not built quite as drawn, in {n_images}"
         f" simulated photographs: {session}",
         summary={
             **(outcome.summary or {}),

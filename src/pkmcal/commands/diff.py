@@ -44,8 +44,8 @@ def diff(
         check_own_folder(out, DIFFERENCE_FILES, "a difference")
     with console.progress(as_json) as progress, threadpool_limits(1, "blas"):
         progress("Comparing", 0.1)
-        value = difference(a, b)
-    saved = value.b.saved or value.a.saved
+        compared = difference(a, b)
+    saved = compared.b.saved or compared.a.saved
     folder = out or Path("diff")
     if out is None:
         if saved is not None:
@@ -54,7 +54,7 @@ def diff(
             beside = beside.parent.parent / "diff"
             folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
         check_own_folder(default_output(folder), DIFFERENCE_FILES, "a difference")
-    outcome = outcome_of(value)
+    outcome = outcome_of(compared)
     texts = {DIFFERENCE_DOCUMENT: json_text(outcome.document)}
     with output_lock(folder):  # another process may have written there since
         archive_folder = (

@@ -48,7 +48,7 @@ def export(
 
     exporter_of(to)
     source = load_source(calibration, session)
-    folder = out or default_output(_beside(calibration, to))
+    folder = out or default_output(_default_folder(calibration, to))
     made = run(source, to, force=force)
     write_export(made, folder)
     if as_json:
@@ -58,7 +58,7 @@ def export(
     return 0
 
 
-def _beside(calibration: str, to: str) -> Path:
+def _default_folder(calibration: str, to: str) -> Path:
     """Folder beside a calibration's folder, or in the current one for a machine's file or name.
 
     Links are not followed: they may lead out of the user's folder.

@@ -62,7 +62,7 @@ def new(
 
     if printer is not None or probed is not None:
         others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
-        return _of_printer(folder, printer, probed, board, places or 1, others, as_json)
+        return _new_printer_session(folder, printer, probed, board, places or 1, others, as_json)
     what: ObservedChoice | None = (
         "both" if board and legs else "board" if board else "legs" if legs else None
     )
@@ -70,10 +70,10 @@ def new(
     if plain and not as_json and on_terminal():
         machine, what, places = _dialogue()
     names = write_session(folder, machine, what, places or 1)
-    return _summary_lines(folder, names, as_json)
+    return _print_session(folder, names, as_json)
 
 
-def _of_printer(
+def _new_printer_session(
     folder: Path,
     printer: Path | None,
     probed: Path | None,
@@ -102,10 +102,10 @@ def _of_printer(
             expected="neither --machine nor --legs, and --probed or --board",
         )
     names = write_printer_session(folder, printer, probed, "board" if board else None, places)
-    return _summary_lines(folder, names, as_json, done=not board, of_printer=True)
+    return _print_session(folder, names, as_json, done=not board, of_printer=True)
 
 
-def _summary_lines(
+def _print_session(
     folder: Path,
     names: Sequence[str],
     as_json: bool,
@@ -120,11 +120,13 @@ def _summary_lines(
         return 0
     out = console.out()
     out.print("A session:\n" if done else "A session to fill in:\n", style="bold")
-    drawn = {"mechanism.yaml": FELT_FILE_DESCRIPTIONS["mechanism.yaml"]} if of_printer else {}
-    what = {**SESSION_FILE_DESCRIPTIONS, **(FELT_FILE_DESCRIPTIONS if done else drawn)}
-    reference_values = [name for name in what if name in names]
-    others = sorted(set(names) - set(reference_values))
-    rows = [(name, what[name]) for name in reference_values] + [
+    printer_files = (
+        {"mechanism.yaml": FELT_FILE_DESCRIPTIONS["mechanism.yaml"]} if of_printer else {}
+    )
+    what = {**SESSION_FILE_DESCRIPTIONS, **(FELT_FILE_DESCRIPTIONS if done else printer_files)}
+    described = [name for name in what if name in names]
+    others = sorted(set(names) - set(described))
+    rows = [(name, what[name]) for name in described] + [
         (name, PHOTOGRAPHS_DESCRIPTION) for name in others
     ]
     console.print_files(out, [(str(folder / name), what) for name, what in rows])
@@ -154,15 +156,15 @@ def _dialogue() -> tuple[str | None, ObservedChoice | None, int]:
         "Which one is most like yours",
         choices=names, show_choices=False, default="gough-stewart",
     )  # fmt: skip
-    drawn = load_mechanism(machine)
+    nominal = load_mechanism(machine)
     what: ObservedChoice | None = None
-    if any(leg.tubes for leg in drawn.document.legs):
+    if any(leg.tubes for leg in nominal.document.legs):
         answer = Prompt.ask(
             "What does the camera see of it",
             choices=["legs", "board", "both"], default="legs",
         )  # fmt: skip
         what = "both" if answer == "both" else "board" if answer == "board" else "legs"
-    elif drawn.redundancy > 0:
+    elif nominal.redundancy > 0:
         console.out().print("Its readings alone tell its geometry: no camera is needed.")
         return machine, None, 1
     else:

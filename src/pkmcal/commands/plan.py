@@ -127,7 +127,7 @@ def plan(
     sized = None if session is not None or camera else camera_of_size(parsed_size(size))
     with console.progress(as_json) as progress:
         progress("Looking at what there is", 0.0)
-        value = run(
+        planned = run(
             subject,
             count=configurations,
             index=index,
@@ -146,7 +146,7 @@ def plan(
             seed=seed,
             progress=lambda share: progress("Choosing configurations", 0.1 + 0.85 * share),
         )
-    return finish(outcome_of(value), folder, files, over=over, as_json=as_json)
+    return finish(outcome_of(planned), folder, files, over=over, as_json=as_json)
 
 
 def _tracker(text: str) -> tuple[float, float | None]:

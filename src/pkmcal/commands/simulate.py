@@ -98,8 +98,8 @@ def simulate(
 
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     planned = rehearsal_of(plan) if plan else None
-    drawing = planned.machine if planned else load_mechanism(mechanism, label=None)
-    machine = to_simulate(drawing, str(plan or mechanism))
+    nominal = planned.machine if planned else load_mechanism(mechanism, label=None)
+    machine = to_simulate(nominal, str(plan or mechanism))
     place = "platform" if on_platform else "base"
     settings = Settings(
         stations=stations,
@@ -141,7 +141,7 @@ def simulate(
             " truth is in its truth.json, which no calibration reads.",
         )
     ]
-    if machine is not drawing:
+    if machine is not nominal:
         points.append(
             (
                 console.MARK_SIGNS["note"],

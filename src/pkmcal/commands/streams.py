@@ -36,14 +36,14 @@ def withstanding() -> Generator[None]:
     them closed, Python has None there, and the next file to be opened would get its descriptor.
     """
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = _withstanding(sys.stdout, 1), _withstanding(sys.stderr, 2)
+    sys.stdout, sys.stderr = _robust_stream(sys.stdout, 1), _robust_stream(sys.stderr, 2)
     try:
         yield
     finally:
         sys.stdout, sys.stderr = before
 
 
-def _withstanding(stream: TextIO | None, number: int) -> TextIO:
+def _robust_stream(stream: TextIO | None, number: int) -> TextIO:
     raises = number == 1
     if stream is None:
         while (taken := os.open(os.devnull, os.O_RDONLY)) < number:

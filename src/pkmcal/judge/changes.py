@@ -149,17 +149,17 @@ def common_level(evidence: Evidence, causes: Sequence[Cause]) -> CommonLevel:
 
 def change(evidence: Evidence, cause: Cause) -> Change:
     """Least-squares estimate of a change, if nothing else has changed."""
-    visible = observable_directions(evidence, cause)
-    inverse = np.linalg.pinv(visible.gain)
+    observable = observable_directions(evidence, cause)
+    inverse = np.linalg.pinv(observable.gain)
     covariance = inverse @ inverse.T
     # a number that is partly unobservable is not reported
     lost = (
-        1 - np.diag(inverse @ visible.gain) > 1e-2
-        if visible.gain.size
+        1 - np.diag(inverse @ observable.gain) > 1e-2
+        if observable.gain.size
         else np.ones(len(cause.sizes), bool)
     )
     sigma = np.where(lost, np.inf, np.sqrt(np.diag(covariance)))
-    return Change(inverse @ (visible.q.T @ evidence.w), sigma, covariance)
+    return Change(inverse @ (observable.q.T @ evidence.w), sigma, covariance)
 
 
 def detectable(evidence: Evidence, tester: Cause, along: Array, level: float) -> float:
@@ -329,8 +329,8 @@ class ChangeTests:
     def tests(self) -> tuple[Score, ...]:
         """All tests with observable directions."""
         legs = [t for leg in self.legs for t in (leg.whole, leg.zero)]
-        retained = [station.test for station in self.stations]
-        every = (self.machine, self.scale, *legs, *retained)
+        stations = [station.test for station in self.stations]
+        every = (self.machine, self.scale, *legs, *stations)
         return tuple(t for t in every if t is not None and t.dof)
 
     def document(self, machine: Machine) -> dict[str, Any]:
@@ -382,10 +382,10 @@ def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> Change
     """
     (every, scale, *each), own, level = made_tests(evidence, machine)
     single = level.single(alpha)
-    wholes, retained = each[: len(own)], each[len(own) :]
+    wholes, of_stations = each[: len(own)], each[len(own) :]
     rows = zip(whole_legs(machine), zeros(machine), wholes, own, strict=True)
     out = ChangeTests(
-        legs=tuple(_leg(evidence, machine, *row, single) for row in rows),
+        legs=tuple(_leg_test(evidence, machine, *row, single) for row in rows),
         machine=every,
         scale=scale,
         scale_change=change(evidence, common_scale(machine)),
@@ -395,18 +395,18 @@ def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> Change
         level=single,
         stations=tuple(
             StationTest(cause.station, test, change(evidence, cause))
-            for cause, test in zip(stations_moved(evidence), retained, strict=True)
+            for cause, test in zip(stations_moved(evidence), of_stations, strict=True)
         ),
     )
     if not out.changed:
         return out
     findings = explained(evidence, single_causes(machine, evidence), alpha)
-    remainder = _beside(evidence, [f.suspect.cause for f in findings])
-    remainder = chi_square(remainder, whole_machine(machine))
-    return replace(out, findings=findings, rest=remainder)
+    rest = _project_out(evidence, [f.suspect.cause for f in findings])
+    rest = chi_square(rest, whole_machine(machine))
+    return replace(out, findings=findings, rest=rest)
 
 
-def _leg(
+def _leg_test(
     evidence: Evidence,
     machine: Machine,
     whole: Cause,
@@ -445,8 +445,8 @@ def explained(evidence: Evidence, causes: Sequence[Cause], alpha: float) -> tupl
     """
     chosen: tuple[Cause, ...] = ()
     while len(chosen) < MOST_CAUSES:
-        best = _ranked(evidence, chosen, causes)[0][1]
-        score = chi_square(_beside(evidence, chosen), best)
+        best = _rank(evidence, chosen, causes)[0][1]
+        score = chi_square(_project_out(evidence, chosen), best)
         if not score.dof or len(causes) * score.chance >= alpha:
             break
         chosen = (*chosen, best)
@@ -456,12 +456,12 @@ def explained(evidence: Evidence, causes: Sequence[Cause], alpha: float) -> tupl
                 for pair in combinations(causes, 2)
             ]
             chosen = max(pairs, key=lambda item: item[0])[1]
-        chosen = _exchanged(evidence, chosen, causes)
-    findings = [_finding(evidence, chosen, k, causes) for k in range(len(chosen))]
+        chosen = _exchange(evidence, chosen, causes)
+    findings = [_explanation(evidence, chosen, k, causes) for k in range(len(chosen))]
     return tuple(sorted(findings, key=lambda f: -f.suspect.chi2))
 
 
-def _exchanged(
+def _exchange(
     evidence: Evidence, chosen: tuple[Cause, ...], causes: Sequence[Cause]
 ) -> tuple[Cause, ...]:
     """Causes with each one replaced by the most likely given the others, repeated until none
@@ -471,14 +471,14 @@ def _exchanged(
         before = chosen
         for k in range(len(chosen)):
             others = chosen[:k] + chosen[k + 1 :]
-            best = _ranked(evidence, others, causes)[0][1]
+            best = _rank(evidence, others, causes)[0][1]
             chosen = (*chosen[:k], best, *chosen[k + 1 :])
         if all(old is new for old, new in zip(before, chosen, strict=True)):
             break
     return chosen
 
 
-def _ranked(
+def _rank(
     evidence: Evidence, others: tuple[Cause, ...], causes: Sequence[Cause]
 ) -> list[tuple[float, Cause]]:
     """Causes with twice the log odds of the data for them together with others, best first."""
@@ -487,29 +487,27 @@ def _ranked(
     return sorted(scored, key=lambda item: -item[0])
 
 
-def _finding(
+def _explanation(
     evidence: Evidence, chosen: tuple[Cause, ...], place: int, causes: Sequence[Cause]
 ) -> Explanation:
     """One of the identified causes given the others, with the causes that cannot be distinguished
     from it.
     """
     own, others = chosen[place], chosen[:place] + chosen[place + 1 :]
-    remainder = _beside(evidence, others)
+    rest = _project_out(evidence, others)
     # a cause that explains no more than no change at all is no rival, however weak the best is
     nothing = twice_log_odds(evidence, joined_causes(others)) if others else 0.0
     least = max(twice_log_odds(evidence, joined_causes(chosen)) - DISTINCT_LOG_ODDS, nothing)
-    near = [c for score, c in _ranked(evidence, others, causes) if score > least and c is not own]
-    suspects = [
-        Suspect(c, change(remainder, c), chi_square(remainder, c).chi2) for c in (own, *near)
-    ]
-    return Explanation(suspects[0], chi_square(remainder, own), tuple(suspects[1:]))
+    near = [c for score, c in _rank(evidence, others, causes) if score > least and c is not own]
+    suspects = [Suspect(c, change(rest, c), chi_square(rest, c).chi2) for c in (own, *near)]
+    return Explanation(suspects[0], chi_square(rest, own), tuple(suspects[1:]))
 
 
-def _beside(evidence: Evidence, chosen: Sequence[Cause]) -> Evidence:
+def _project_out(evidence: Evidence, chosen: Sequence[Cause]) -> Evidence:
     """Evidence with the directions of other causes projected out."""
-    remainder = evidence
+    out = evidence
     for cause in chosen:
-        q = observable_directions(remainder, cause).q
+        q = observable_directions(out, cause).q
         rest = np.linalg.svd(q, full_matrices=True)[0][:, q.shape[1] :]
-        remainder = replace(remainder, w=rest.T @ remainder.w, by=rest.T @ remainder.by)
-    return remainder
+        out = replace(out, w=rest.T @ out.w, by=rest.T @ out.by)
+    return out

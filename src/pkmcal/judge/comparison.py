@@ -178,30 +178,30 @@ def compare_with_drawing(
     itself. The nominal machine is evaluated at its own poses or at those of the calibrated one,
     whichever suits it better; at the latter without ``by_drawing``.
     """
-    visible = np.flatnonzero(prediction.observed)
+    observed = np.flatnonzero(prediction.observed)
     m = measurements.joints.shape[1]
-    place = np.searchsorted(visible, rows)
+    place = np.searchsorted(observed, rows)
     flat = (place[:, None] * m + np.arange(m)).reshape(-1)
     noise, by = prediction.noise[np.ix_(flat, flat)], prediction.by_machine[flat]
     weights = Weights.by(np.einsum("kikj->kij", noise.reshape(len(rows), m, len(rows), m)))
-    new = prediction.errors.of(rows)
-    old = errors_on(drawing, measurements.joints[visible], prediction.T_base_platform[visible]).of(
-        place
-    )
+    calibrated = prediction.errors.of(rows)
+    nominal = errors_on(
+        drawing, measurements.joints[observed], prediction.T_base_platform[observed]
+    ).of(place)
     if by_drawing is not None:
         own = by_drawing.errors.of(rows)
-        if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(old.residuals)):
-            old = own
-    before, after = weights.of(old.residuals), weights.of(new.residuals)
+        if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(nominal.residuals)):
+            nominal = own
+    before, after = weights.of(nominal.residuals), weights.of(calibrated.residuals)
     return BesideDrawing(
         rows=rows,
-        calibrated=new,
-        drawing=old,
+        calibrated=calibrated,
+        drawing=nominal,
         before=before,
         after=after,
         floor=weights.floor,
         ratio=improvement_ratio(before, after),
-        promise=promise(new.residuals, noise, by @ covariance @ by.T),
+        promise=promise(calibrated.residuals, noise, by @ covariance @ by.T),
     )
 
 
@@ -254,9 +254,9 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
 
     shape, covariance = residuals.shape, noise + machine
     scale = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
-    above_limit = values > NULL_EIGENVALUE_SHARE * values[-1]
-    whiten = (vectors[:, above_limit] / np.sqrt(values[above_limit])).T / scale
+    eigenvalues, eigenvectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
+    significant = eigenvalues > NULL_EIGENVALUE_SHARE * eigenvalues[-1]
+    whiten = (eigenvectors[:, significant] / np.sqrt(eigenvalues[significant])).T / scale
     white = whiten @ residuals.reshape(-1)
     design = whiten @ np.tile(np.eye(shape[1]), (shape[0], 1))
     spread = np.linalg.pinv(design.T @ design)

@@ -151,34 +151,34 @@ def hold(
     machine: Machine,
     measurements: Measurements,
     start: State,
-    irls_weight: Trust | None = None,
+    data_weights: Trust | None = None,
     magnified: Measurements | None = None,
 ) -> Held:
     """Estimate poses, stations and boards with the machine fixed.
 
-    start : stations, mounts and poses in frames near those of the machine. irls_weight : weights
+    start : stations, mounts and poses in frames near those of the machine. data_weights : weights
     and noise of the data; without it they are estimated, as well as the tubes' radii. magnified :
     the measurements with an unknown magnification for each camera
     (:func:`~pkmcal.judge.causes.magnified`), to separate it from a change of the machine. Raises
     ResultError if the poses are not found.
     """
-    still = held_machine(machine, radii=irls_weight is None)
-    shading = SHADING_SIGMA if irls_weight is None else irls_weight.shading
-    if irls_weight is not None:
-        noise = measurements.joint_noise * irls_weight.readings
+    still = held_machine(machine, radii=data_weights is None)
+    shading = SHADING_SIGMA if data_weights is None else data_weights.shading
+    if data_weights is not None:
+        noise = measurements.joint_noise * data_weights.readings
         measurements = replace(measurements, joint_noise=noise)
         magnified = magnified and replace(magnified, joint_noise=noise)
     assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
-    if irls_weight is None:
+    if data_weights is None:
         linear, unknowns = assembled.problem.linearize(begin), assembled.problem.unknowns.count
         unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
         if int(linear.usable.sum()) + len(linear.shared_by) < unknowns:
             raise too_little(machine, measurements)
-        result = solve_batch(assembled.problem, begin, scale_readings=False)
-        problem, solution = result.info.problem, result.solution
+        fit = solve_batch(assembled.problem, begin, scale_readings=False)
+        problem, solution = fit.info.problem, fit.solution
     else:
-        problem = assembled.trusting(irls_weight.weights)
+        problem = assembled.trusting(data_weights.weights)
         solution = minimise(problem, begin)
     if solution.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(
@@ -187,10 +187,10 @@ def hold(
         )
     state: BatchState = solution.state
     still = still.with_values(problem.theta(state)[0])
-    if irls_weight is None or magnified is None:
+    if data_weights is None or magnified is None:
         return Held(still, assembled.observed, problem, state, ("machine",))
-    opened = assemble(still, magnified, default_gauge(still), shading=irls_weight.shading)
-    problem = opened.trusting(irls_weight.weights)
+    opened = assemble(still, magnified, default_gauge(still), shading=data_weights.shading)
+    problem = opened.trusting(data_weights.weights)
     state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
     return Held(still, assembled.observed, problem, state, ("machine", "intrinsics"))
 
@@ -202,11 +202,11 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
     measurements do not help.
     """
     layout = machine.layout
-    shifted = np.flatnonzero((layout.actuated >= 0) & ~layout.rod_reads)
-    if len(measurements.edges) and not measurements.on_platform.any() and shifted.size:
+    moved = np.flatnonzero((layout.actuated >= 0) & ~layout.rod_reads)
+    if len(measurements.edges) and not measurements.on_platform.any() and moved.size:
         return InputError(
             f"the readings of {machine.name} cannot be predicted from photographs of its legs yet",
-            found=f"{named(shifted, layout.n_legs)} on cranks or sliders, where edges are located"
+            found=f"{named(moved, layout.n_legs)} on cranks or sliders, where edges are located"
             " with the readings that are to be predicted",
             expected="a board on the platform, or a tracker's table of its poses, besides",
             next_step="Add one of these (observe: [legs, board]), or calibrate two sessions of"
@@ -253,9 +253,9 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
     problem, state = held.problem.opened(held.state)
     # Rows on machine, magnifications and stations, with all other unknowns eliminated.
     names = (*held.unknowns, "stations") if stations else held.unknowns
-    rows, remainder = reduced_rows(Information(problem, state), names)
+    rows, residual = reduced_rows(Information(problem, state), names)
     if stations:
-        rows, remainder = _with_fixed_stations(rows, remainder, state.T_camera_base[0], n, prior)
+        rows, residual = _with_fixed_stations(rows, residual, state.T_camera_base[0], n, prior)
     n_cameras = rows.shape[1] - n - 6 * len(stations)
     # Reduction to the observable directions, with columns in units of typical changes.
     size = np.concatenate(
@@ -272,7 +272,7 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
     # noise is drawn in this basis: signs must not depend on rounding
     sign = np.sign(vt[np.arange(len(vt)), np.abs(vt).argmax(axis=1)])[observable]
     by = (sign * s[observable])[:, None] * vt[observable] / size
-    projected = -sign * (u[:, observable].T @ remainder)
+    projected = -sign * (u[:, observable].T @ residual)
     # Whitening by noise and the calibration's error, which has no part for magnifications.
     errors = np.delete(by, n + np.arange(n_cameras), axis=1)
     spread = np.eye(len(projected)) + errors @ covariance @ errors.T
@@ -284,21 +284,21 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
 
 
 def _with_fixed_stations(
-    rows: Array, remainder: Array, values: Array, n: int, prior: CalibrationPrior
+    rows: Array, residual: Array, T_camera_base: Array, n: int, prior: CalibrationPrior
 ) -> tuple[Array, Array]:
     """Rows with the stations reduced to the kept ones, and residuals at the calibration's poses.
 
-    rows : by n parameters, all stations' poses ``values`` (S, 4, 4), and cameras; returned by
+    rows : by n parameters, all stations' poses T_camera_base (S, 4, 4), and cameras; returned by
     parameters, cameras and the kept stations. The other stations are eliminated.
     """
     six = np.arange(6)
-    all_stations = n + np.arange(6 * len(values))
+    all_stations = n + np.arange(6 * len(T_camera_base))
     own = (n + 6 * np.array(prior.stations)[:, None] + six).ravel()
     q = column_space(rows[:, np.setdiff1d(all_stations, own)])
-    rows, remainder = rows - q @ (q.T @ rows), remainder - q @ (q.T @ remainder)
-    off = pose_difference(prior.T_camera_base, values[list(prior.stations)]).ravel()
-    remainder = remainder + rows[:, own] @ off
-    return np.concatenate([np.delete(rows, all_stations, axis=1), rows[:, own]], axis=1), remainder
+    rows, residual = rows - q @ (q.T @ rows), residual - q @ (q.T @ residual)
+    off = pose_difference(prior.T_camera_base, T_camera_base[list(prior.stations)]).ravel()
+    residual = residual + rows[:, own] @ off
+    return np.concatenate([np.delete(rows, all_stations, axis=1), rows[:, own]], axis=1), residual
 
 
 def _by_camera(T_camera_base: Array) -> Array:

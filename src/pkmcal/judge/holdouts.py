@@ -82,5 +82,5 @@ def by_regions(
     drawing: Machine, measurements: Measurements, whole: Estimate, n: int
 ) -> tuple[HoldOut, ...]:
     """Holdouts of n regions of the workspace, one after the other."""
-    value = by_region(drawing, whole, measurements, n)
-    return tuple(hold_out(drawing, measurements, whole, region) for region in value)
+    regions = by_region(drawing, whole, measurements, n)
+    return tuple(hold_out(drawing, measurements, whole, region) for region in regions)

@@ -78,18 +78,18 @@ def measured_new_data(
     the progress.
     """
     return calibrate_session(
-        replace(session, machine=saved.machine, stations=_as_then(saved, session)),
+        replace(session, machine=saved.machine, stations=_stations_as_calibrated(saved, session)),
         seed=seed,
         progress=lambda text, part: progress(text, share * part),
     )
 
 
-def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
+def _stations_as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     """Stations with the camera response and the half turn of images that the calibration found.
 
     The session's own response has precedence. A few new images determine both worse.
     """
-    then = {row["name"]: row.get("response") for row in saved.document["stations"]}
+    responses = {row["name"]: row.get("response") for row in saved.document["stations"]}
     turned = {
         row["file"]: load_camera(saved.path.parent / written_camera(row["file"]))
         for row in saved.document.get("cameras", ())
@@ -99,21 +99,23 @@ def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     for station in session.stations:
         # a hand-held image has its own name after that of its entry
         names = (
-            (name for name in then if name.startswith(f"{station.entry}-"))
+            (name for name in responses if name.startswith(f"{station.entry}-"))
             if station.handheld
             else iter([station.name])
         )
-        value = then.get(next(names, station.name))
-        reference_values = value is not None and not station.response_given
+        response = responses.get(next(names, station.name))
+        has_response = response is not None and not station.response_given
         camera = station.camera
-        own = turned.get(station.camera_file)
+        turned_camera = turned.get(station.camera_file)
         # otherwise the file has been corrected since, or is another one
-        if own is not None and np.allclose(camera.turned_by_half().parameters, own.parameters):
-            camera = own
+        if turned_camera is not None and np.allclose(
+            camera.turned_by_half().parameters, turned_camera.parameters
+        ):
+            camera = turned_camera
         station_then = replace(station, camera=camera)
         out.append(
-            replace(station_then, response=value, response_given=True)
-            if reference_values
+            replace(station_then, response=response, response_given=True)
+            if has_response
             else station_then
         )
     return tuple(out)

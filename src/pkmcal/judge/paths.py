@@ -58,16 +58,16 @@ def line_path(
     """Straightness of the tool's path through the configurations ``rows``, observed and
     computed.
     """
-    visible = prediction.T_base_platform[rows][prediction.observed[rows]]
+    observed = prediction.T_base_platform[rows][prediction.observed[rows]]
     by: list[Straightness | None] = []
     for machine in (drawing, prediction.machine):
-        result = machine.forward_result(session.joints[rows])
-        closes = bool(result.converged.all())
-        by.append(straightness(result.T_base_platform[:, :3, 3]) if closes else None)
+        fk = machine.forward_result(session.joints[rows])
+        closes = bool(fk.converged.all())
+        by.append(straightness(fk.T_base_platform[:, :3, 3]) if closes else None)
     return LinePath(
         name=name,
         n=len(rows),
-        seen=straightness(visible[:, :3, 3]) if len(visible) >= SHORTEST_PATH else None,
+        seen=straightness(observed[:, :3, 3]) if len(observed) >= SHORTEST_PATH else None,
         drawing=by[0],
         calibrated=by[1],
     )

@@ -105,28 +105,30 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
-    picks = _picks(held, linear.value.shape[-1])
+    picks = _reading_selector(held, linear.value.shape[-1])
     n, m, n_rows = picks.shape
 
     # L = E P E^T, the redundancy of each configuration's readings.
     along = picks @ own
     along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
-    residual = np.eye(m) - along - beside @ beside.mT  # L
-    if float(np.linalg.eigvalsh(residual).min(initial=1.0)) < LEAST_REDUNDANCY_SHARE:
+    redundancy = np.eye(m) - along - beside @ beside.mT  # L
+    if float(np.linalg.eigvalsh(redundancy).min(initial=1.0)) < LEAST_REDUNDANCY_SHARE:
         raise too_little(machine, measurements)
-    alone = np.linalg.inv(residual)
-    units = _size(held)[..., None] * alone
+    alone = np.linalg.inv(redundancy)
+    units = _reading_per_sigma(held)[..., None] * alone
 
     # Leave-one-out poses, the errors at these, and the derivatives by the fixed machine.
-    value = _without_own(held, linear, reduced, picks.mT @ alone @ picks)
+    leave_one_out = _leave_one_out(held, linear, reduced, picks.mT @ alone @ picks)
     by = _by_machine(held, own, shared[: n * n_rows]).reshape(n, n_rows, -1)
     joints = measurements.joints[held.observed]
-    errors = _errors(held.machine, joints, value.T_base_platform[0], value.internal[0])
+    errors = _errors(
+        held.machine, joints, leave_one_out.T_base_platform[0], leave_one_out.internal[0]
+    )
     return Prediction(
         machine=held.machine,
         observed=held.observed,
-        T_base_platform=_among_all(value.T_base_platform[0], held.observed),
+        T_base_platform=_among_all(leave_one_out.T_base_platform[0], held.observed),
         errors=ReadingErrors(
             _among_all(errors.residuals, held.observed),
             _among_all(errors.position, held.observed),
@@ -139,7 +141,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     )
 
 
-def _picks(held: Held, n_rows: int) -> Array:
+def _reading_selector(held: Held, n_rows: int) -> Array:
     """E (K', m, r): selects the rows of readings among those of a configuration."""
     problem, state = held.problem, held.state
     n_poses, n_equations = state.T_base_platform.shape[1], problem.layout.n_equations
@@ -152,7 +154,7 @@ def _picks(held: Held, n_rows: int) -> Array:
     return out
 
 
-def _size(held: Held) -> Array:
+def _reading_per_sigma(held: Held) -> Array:
     """Reading (K', m) that corresponds to one standard deviation of its row, m or rad, with its
     sign.
     """
@@ -163,7 +165,7 @@ def _size(held: Held) -> Array:
     return sign * np.hypot(PERFECT_CLOSURE_SIGMA, SOFT_READING_NOISE * slope) / slope
 
 
-def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> BatchState:
+def _leave_one_out(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> BatchState:
     """Poses of leave-one-out fits, each without the configuration's own readings.
 
     alone : E^T L^-1 E (K', r, r). ``R^-1 Q^T (1 - A N^+ S^T) alone y`` is the change of the own
@@ -172,9 +174,9 @@ def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> 
     directions count as exact.
     """
     half = inverse_root(rows_on_shared(linear, reduced)[0][0], RANK_TOLERANCE, loose=False)
-    shifted = alone @ linear.value[0, ..., None]
-    others = half @ (half.T @ (reduced.rows[0].mT @ shifted))
-    own = reduced.q[0].mT @ (shifted - linear.by_shared[0] @ others)
+    moved = alone @ linear.value[0, ..., None]
+    others = half @ (half.T @ (reduced.rows[0].mT @ moved))
+    own = reduced.q[0].mT @ (moved - linear.by_shared[0] @ others)
     own = np.linalg.solve(reduced.r[0], own)[..., 0]
     shared = np.zeros((1, held.problem.unknowns.count))
     return held.problem.retract(held.state, shared, own[None])

@@ -86,19 +86,21 @@ def validation_verdict(
     )
     floor = finite_rms(np.concatenate([np.full(len(g.rows), g.floor) for g in groups]))
     gain = improvement_ratio(before, after)
-    reasons = [*_not_better(gain), *_broken(groups, units)]
+    reasons = [*_not_better(gain), *_promise_findings(groups, units)]
     again = int(repeated[judged.rows].sum()) if judged and repeated is not None else 0
     every = judged is not None and again == len(judged.rows)
     where = " of regions that it did not see" if judged is None else ""
     if every:
         where = " at the poses that it was calibrated from"
     headline = _validation_headline(gain, before, after, unit, where)
-    warnings = _regions(holdouts, unit)
+    warnings = _region_findings(holdouts, unit)
     if judged and again:
         warnings.insert(0, doubtful("validation.same_poses", number=again, of=len(judged.rows)))
     if judged and gain.better:
-        warnings += _weak_words(judged, units)
-    noise = _noise(after, floor, unit, measurements, np.concatenate([g.rows for g in groups]))
+        warnings += _unweighted_findings(judged, units)
+    noise = _noise_findings(
+        after, floor, unit, measurements, np.concatenate([g.rows for g in groups])
+    )
     return Verdict(not reasons, headline, (*reasons, *warnings, *noise))
 
 
@@ -141,17 +143,17 @@ def _not_better(gain: Ratio) -> list[Finding]:
     return [wrong("validation.not_better", **facts, **words)]
 
 
-def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
+def _promise_findings(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
     """Finding on residuals larger than their standard deviations, of the first group with such."""
     for group in groups:
         if not group.promise.usual:
-            return [_too_large(group, units)]
+            return [_residual_finding(group, units)]
         if not group.promise.steady:
-            return [_in_common(group, units)]
+            return [_offset_finding(group, units)]
     return []
 
 
-def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+def _residual_finding(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     one = len(set(units)) == 1
     return wrong(
         "validation.residuals_too_large",
@@ -163,7 +165,7 @@ def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     )
 
 
-def _weak_words(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
+def _unweighted_findings(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
     """Finding if unweighted root mean squares contradict the verdict, which weights by
     observability.
     """
@@ -179,7 +181,7 @@ def _weak_words(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
     return [doubtful("validation.hardly_seen", **facts)]
 
 
-def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+def _offset_finding(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     test = group.promise
     worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
     return wrong(
@@ -192,19 +194,19 @@ def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     )
 
 
-def _noise(
+def _noise_findings(
     after: Array, floor: float, unit: str | None, measurements: Measurements, rows: Integers
 ) -> tuple[Finding, ...]:
     """Finding if the residuals of configurations ``rows`` are mostly noise, with the remedy."""
     if unit is None or finite_rms(after) > MOSTLY_NOISE * floor:
         return ()
-    visible = np.zeros((len(measurements.joints), measurements.n_stations), dtype=bool)
+    observed = np.zeros((len(measurements.joints), measurements.n_stations), dtype=bool)
     edges, poses = measurements.edges, measurements.poses
     poses = poses.select(measurements.on_platform[poses.mount])
     for one in (edges, poses):
-        visible[one.configuration, one.station] = True
-    stations = int(visible[rows].any(axis=0).sum())
-    once = int(np.sum(visible[rows].sum(axis=1) == 1))
+        observed[one.configuration, one.station] = True
+    stations = int(observed[rows].any(axis=0).sum())
+    once = int(np.sum(observed[rows].sum(axis=1) == 1))
     facts = {"noise": floor, "unit": unit, "stations": stations, "number": once, "of": len(rows)}
     if stations == 1:
         return (note("validation.noise_one_station", **facts),)
@@ -215,17 +217,17 @@ def _noise(
     return (note("validation.noise_several", **facts),)
 
 
-def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
+def _region_findings(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
     """Findings on regions in which a calibration by the others is poor."""
     out: list[Finding] = []
-    for item in holdouts:
-        off, usual = finite_rms(item.left_out.after), finite_rms(item.used.after)
+    for holdout in holdouts:
+        off, usual = finite_rms(holdout.left_out.after), finite_rms(holdout.used.after)
         if off >= POOR_REGION_FACTOR * usual:
             out.append(
                 doubtful(
                     "validation.extrapolation",
-                    item.region.name,
-                    number=len(item.left_out.rows),
+                    holdout.region.name,
+                    number=len(holdout.left_out.rows),
                     rms=off,
                     rms_used=usual,
                     unit=unit,
@@ -263,21 +265,23 @@ def watch_verdict(judged: ChangeTests, around: ComparedSession) -> Verdict:
     """Verdict on a change; usable means unchanged."""
     warnings = _warnings(around)
     if judged.changed:
-        return _changed(judged, around, warnings)
+        return _change_verdict(judged, around, warnings)
     blind = [leg for leg in judged.legs if is_blind(leg)]
     if blind:
         return Verdict(
             False,
             "These data are too few to tell whether the machine is still as calibrated.",
-            (*_blind(blind), *warnings, note("watch.more_configurations")),
+            (*_blindness_findings(blind), *warnings, note("watch.more_configurations")),
         )
     new = int(np.sum(around.observed & ~around.calibrated))
     headline = (
         f"Still as calibrated, as far as {count(new, 'new configuration')} can tell:"
-        f" {_would_have(judged)}."
+        f" {_detectable_clause(judged)}."
     )
     silent = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
-    advice = [note("watch.no_reading", _of(silent), legs=_of(silent))] if silent else []
+    advice = (
+        [note("watch.no_reading", _leg_names(silent), legs=_leg_names(silent))] if silent else []
+    )
     return Verdict(True, headline, (*warnings, *advice))
 
 
@@ -298,21 +302,22 @@ def cause_words(suspect: Suspect, names: Names = Names(), short: bool = False) -
     if cause.part == "scale":
         return f"all lengths against the readings by {_ratio(value[0], sigma[0])}"
     if cause.part == "camera":
-        above_limit = cause.camera < len(names.cameras)
-        name = names.cameras[cause.camera] if above_limit else "a camera"
+        has_name = cause.camera < len(names.cameras)
+        name = names.cameras[cause.camera] if has_name else "a camera"
         return f"the focal length of {name} by {_ratio(value[0], sigma[0])}"
     if cause.part == "station":
-        return f"the place of the camera {names.stations[cause.station]}{_place(suspect.change)}"
+        motion = _camera_motion(suspect.change)
+        return f"the place of the camera {names.stations[cause.station]}{motion}"
     if cause.part in ("base", "platform"):
         joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
         together = " together" if len(cause.legs) > 1 else ""
-        return f"{joint}{together}{_vector(suspect, short)}"
+        return f"{joint}{together}{_joint_motion(suspect, short)}"
     if cause.part == "lead":
         return f"the scale of {who}'s reading by {_ratio(value[0], sigma[0])}"
     parts = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
     what = parts.get(cause.part, f"the {cause.part} of {who}")
     if len(value) > 1:
-        return f"{what}{_vector(suspect, short)}"
+        return f"{what}{_joint_motion(suspect, short)}"
     return f"{what} by {signed(value[0], sigma[0], cause.unit)}"
 
 
@@ -332,7 +337,7 @@ def _ratio(value: float, sigma: float) -> str:
     return f"{number(value * 1e6, places, signed=True)} µm/m (±{number(sigma * 1e6, places)})"
 
 
-def _vector(suspect: Suspect, short: bool) -> str:
+def _joint_motion(suspect: Suspect, short: bool) -> str:
     """Size and direction of a joint's motion, if the data determine it."""
     cause, change = suspect.cause, suspect.change
     size = float(np.linalg.norm(change.value[:3]))
@@ -348,7 +353,7 @@ def _vector(suspect: Suspect, short: bool) -> str:
     return f"{text}, ({parts}) mm in the {cause.part} frame"
 
 
-def _place(change: Change) -> str:
+def _camera_motion(change: Change) -> str:
     """Motion and rotation of a camera, as far as the data determine them."""
     out: list[str] = []
     for part, unit, factor in ((slice(3, 6), "mm", 1e3), (slice(0, 3), "°", 180 / np.pi)):
@@ -363,14 +368,14 @@ def _place(change: Change) -> str:
     return f" by {' and '.join(out)}" if out else ""
 
 
-def _changed(
+def _change_verdict(
     judged: ChangeTests, around: ComparedSession, warnings: tuple[Finding, ...]
 ) -> Verdict:
     names = around.names
     findings = judged.findings
     if not findings:
         headline = "The machine is not as calibrated."
-        return Verdict(False, headline, (_unnamed(judged), *warnings))
+        return Verdict(False, headline, (_unidentified_finding(judged), *warnings))
     lens = all(f.suspect.cause.part == "camera" for f in findings)
     if lens:
         headline = (
@@ -379,11 +384,11 @@ def _changed(
         )
     else:
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
-    reasons = [_reason(f, k, names) for k, f in enumerate(findings)]
+    reasons = [_cause_finding(f, k, names) for k, f in enumerate(findings)]
     if judged.rest.dof and judged.rest.chance < UNEXPLAINED_CHANCE:
         remainder = {"chi2": judged.rest.chi2, "dof": judged.rest.dof, "chance": judged.rest.chance}
         reasons.append(wrong("watch.unexplained", **remainder))
-    return Verdict(False, headline, (*reasons, *warnings, _next(findings)))
+    return Verdict(False, headline, (*reasons, *warnings, _next_step(findings)))
 
 
 def _changes_headline(findings: Sequence[Explanation]) -> str:
@@ -397,7 +402,7 @@ def _changes_headline(findings: Sequence[Explanation]) -> str:
     return f"{named(legs)} {verb} changed" + (", or another that looks the same" if rivals else "")
 
 
-def _reason(value: Explanation, place: int, names: Names) -> Finding:
+def _cause_finding(value: Explanation, place: int, names: Names) -> Finding:
     """Finding of one cause: its change and its rivals."""
     cause, change = value.suspect.cause, value.suspect.change
     alternatives = [cause_words(other, names, short=True) for other in value.others[:MOST_OTHERS]]
@@ -423,15 +428,15 @@ def _reason(value: Explanation, place: int, names: Names) -> Finding:
     return wrong("watch.part", subject, **facts)
 
 
-def _unnamed(judged: ChangeTests) -> Finding:
+def _unidentified_finding(judged: ChangeTests) -> Finding:
     """Finding of a change without an identified cause."""
     legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
     if legs:
-        return wrong("watch.leg_test_fails", _of(legs), legs=_of(legs))
+        return wrong("watch.leg_test_fails", _leg_names(legs), legs=_leg_names(legs))
     return wrong("watch.machine_test_fails", chi2=judged.machine.chi2, dof=judged.machine.dof)
 
 
-def _next(findings: Sequence[Explanation]) -> Finding:
+def _next_step(findings: Sequence[Explanation]) -> Finding:
     parts = {f.suspect.cause.part for f in findings}
     if parts == {"camera"}:
         return note("watch.next_camera")
@@ -442,7 +447,7 @@ def _next(findings: Sequence[Explanation]) -> Finding:
     return note("watch.next_part")
 
 
-def _would_have(judged: ChangeTests) -> str:
+def _detectable_clause(judged: ChangeTests) -> str:
     """Changes that would have been detected, in words."""
     zeros = [leg for leg in judged.legs if leg.zero is not None and leg.zero.dof]
     if not zeros:
@@ -461,16 +466,18 @@ def least_size(legs: Sequence[LegTest]) -> tuple[str, str]:
     return " to ".join(dict.fromkeys(sizes)), name
 
 
-def _blind(legs: Sequence[LegTest]) -> tuple[Finding, ...]:
+def _blindness_findings(legs: Sequence[LegTest]) -> tuple[Finding, ...]:
     """Findings on legs for which these data are insufficient."""
     nothing = [leg for leg in legs if not np.isfinite(leg.detects_zero)]
     little = [leg for leg in legs if np.isfinite(leg.detects_zero)]
     out: list[Finding] = []
     if nothing:
-        out.append(wrong("watch.leg_blind", _of(nothing), legs=_of(nothing)))
+        out.append(wrong("watch.leg_blind", _leg_names(nothing), legs=_leg_names(nothing)))
     if little:
         least = with_unit(*least_size(little))
-        out.append(wrong("watch.leg_weak", _of(little), legs=_of(little), least=least))
+        out.append(
+            wrong("watch.leg_weak", _leg_names(little), legs=_leg_names(little), least=least)
+        )
     return tuple(out)
 
 
@@ -478,7 +485,7 @@ def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
     out: list[Finding] = []
     for s in around.stations_moved:
         name = around.names.stations[s.station]
-        facts = {"station": name, "by": _place(s.change), "value": s.change.value}
+        facts = {"station": name, "by": _camera_motion(s.change), "value": s.change.value}
         out.append(doubtful("watch.station_moved", name, **facts))
     both = around.calibrated & around.observed
     if both.any():
@@ -489,6 +496,6 @@ def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
     return tuple(out)
 
 
-def _of(tests: Sequence[LegTest]) -> str:
+def _leg_names(tests: Sequence[LegTest]) -> str:
     """Names of the legs of tests."""
     return named(j for test in tests for j in test.legs)

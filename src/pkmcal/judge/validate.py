@@ -102,50 +102,50 @@ def validate_calibration(
 
     check_number("validate", "regions", regions)
     check_number("validate", "seed", seed)
-    values = progress or (lambda _text, _share: None)
+    report = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
-        lines, reference_values = paths_of(session), calibrated_rows(saved, session)
+        lines, calibrated = paths_of(session), calibrated_rows(saved, session)
         if not regions:
-            check_new(reference_values, _photographed(session), *NOT_INDEPENDENT)
-        remeasured = measured_new_data(saved, session, seed, values, 0.8)
+            check_new(calibrated, _has_image(session), *NOT_INDEPENDENT)
+        remeasured = measured_new_data(saved, session, seed, report, 0.8)
         session = replace(remeasured.session, machine=session.machine)
         estimate = remeasured.estimate
         data = estimate.stated_edge_noise(remeasured.measurements)
 
-        values("Predicting the readings", 0.8)
-        drawing = drawing_of(saved)
+        report("Predicting the readings", 0.8)
+        nominal = drawing_of(saved)
         prediction = predict(saved.machine, data, estimate.state)
         if not regions:
-            check_new(reference_values, prediction.observed, *NOT_INDEPENDENT)
+            check_new(calibrated, prediction.observed, *NOT_INDEPENDENT)
         judged, failed = None, tuple[Finding, ...]()
-        repeated = ~reference_values & repeated_rows(saved, session)
-        new = np.flatnonzero(prediction.observed & ~reference_values)
+        repeated = ~calibrated & repeated_rows(saved, session)
+        new = np.flatnonzero(prediction.observed & ~calibrated)
         if new.size:
             try:
-                by_drawing = predict(drawing, data, estimate.state)
+                by_drawing = predict(nominal, data, estimate.state)
             except PkmcalError as error:
                 # the nominal machine is too far off for its poses to be found
                 by_drawing = None
                 why = str(error).rstrip(".")
                 failed = (note("validation.nominal_fails", why=why),)
             judged = compare_with_drawing(
-                drawing, saved.covariance, data, prediction, by_drawing, new
+                nominal, saved.covariance, data, prediction, by_drawing, new
             )
 
-        values("Holding out regions", 0.9)
-        held_out = by_regions(drawing, data, estimate, regions) if regions else ()
+        report("Holding out regions", 0.9)
+        held_out = by_regions(nominal, data, estimate, regions) if regions else ()
         verdict = validation_verdict(judged, held_out, saved.machine, data, repeated)
         return Validation(
             calibration=saved,
             session=session,
             verdict=replace(verdict, findings=(*verdict.findings, *failed)),
             judged=judged,
-            calibrated=reference_values,
+            calibrated=calibrated,
             repeated=repeated,
             regions=held_out,
-            paths=tuple(line_path(*line, drawing, session, prediction) for line in lines.items()),
+            paths=tuple(line_path(*line, nominal, session, prediction) for line in lines.items()),
             timings={**remeasured.timings, "all": time.perf_counter() - began},
         )
 
@@ -160,7 +160,7 @@ def drawing_of(saved: SavedCalibration) -> Machine:
     return replace(saved.machine, parameters=table, values=saved.drawing.copy())
 
 
-def _photographed(session: Session) -> Booleans:
+def _has_image(session: Session) -> Booleans:
     """Mask (K,) of configurations with an image; all if there is a tracker, or for readings without
     stations.
     """

@@ -120,53 +120,53 @@ def watch_machine(
 
     check_number("watch", "alpha", alpha)
     check_number("watch", "seed", seed)
-    values = progress or (lambda _text, _share: None)
+    report = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
         _check_usable(saved)
-        session = _placed(saved, session, same_place)
-        reference_values = calibrated_rows(saved, session)
-        check_new(reference_values, np.ones_like(reference_values), *NOTHING_NEW)
-        remeasured = measured_new_data(saved, session, seed, values, 0.9)
+        session = _with_fixed_poses(saved, session, same_place)
+        calibrated = calibrated_rows(saved, session)
+        check_new(calibrated, np.ones_like(calibrated), *NOTHING_NEW)
+        remeasured = measured_new_data(saved, session, seed, report, 0.9)
         session = replace(remeasured.session, machine=session.machine)
         observed = observed_configurations(remeasured.measurements)
-        check_new(reference_values, observed, *NOTHING_NEW)
+        check_new(calibrated, observed, *NOTHING_NEW)
 
-        values("Testing for changes", 0.9)
+        report("Testing for changes", 0.9)
         old = saved.document.get("statistics") or {}
         factors = ("noise_scale", "pose_scale", "link_scale")
         before = Kinds(*(float(old.get(name, 1.0)) for name in factors))
-        irls_weight = Trust.of(remeasured.estimate, before, _readings(saved, session))
-        noise = remeasured.estimate.statistics.noise_scale * irls_weight.scale.edges
-        held = _hold_new(saved, session, remeasured, irls_weight, ~reference_values)
+        data_weights = Trust.of(remeasured.estimate, before, _reading_scale(saved, session))
+        noise = remeasured.estimate.statistics.noise_scale * data_weights.scale.edges
+        held = _hold_new(saved, session, remeasured, data_weights, ~calibrated)
         prior = saved.prior(same_place, session.station_names)
-        judged, prior, shifted = tests_with_fixed_stations(held, prior, alpha)
-        around = ComparedSession(
+        judged, prior, stations_moved = tests_with_fixed_stations(held, prior, alpha)
+        compared = ComparedSession(
             session.configurations,
-            reference_values,
+            calibrated,
             observed,
             noise / before.edges,
             names_of(session),
-            shifted,
+            stations_moved,
         )
         return Watch(
             calibration=saved,
             session=session,
-            verdict=watch_verdict(judged, around),
+            verdict=watch_verdict(judged, compared),
             judged=judged,
             residuals=held.residuals(),
-            calibrated=reference_values,
-            observed=observed & ~reference_values,
+            calibrated=calibrated,
+            observed=observed & ~calibrated,
             noise_scale=noise,
-            pose_scale=irls_weight.scale.poses,
+            pose_scale=data_weights.scale.poses,
             same_place=tuple(session.station_names[k] for k in prior.stations),
-            stations_moved=shifted,
+            stations_moved=stations_moved,
             timings={**remeasured.timings, "all": time.perf_counter() - began},
         )
 
 
-def _readings(saved: SavedCalibration, session: Session) -> float:
+def _reading_scale(saved: SavedCalibration, session: Session) -> float:
     """Factor on the stated noise of readings found by the calibration, if the session states the
     same noise; else 1.
     """
@@ -182,7 +182,9 @@ def names_of(session: Session) -> Names:
     return Names(tuple(cameras), session.station_names)
 
 
-def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> Session:
+def _with_fixed_poses(
+    saved: SavedCalibration, session: Session, same_place: Sequence[str]
+) -> Session:
     """Session with the calibration's poses of the kept stations.
 
     Raises `InputError` for a station that the session, or the calibration, does not have.
@@ -214,12 +216,12 @@ def tests_with_fixed_stations(
     If moved cameras explain the data better than any change of the machine, they are freed and the
     tests repeated; so the false-alarm rate remains alpha.
     """
-    shifted: list[StationTest] = []
+    moved: list[StationTest] = []
     while True:
         judged = detect_changes(change_evidence(held, prior), held.machine, alpha)
         if not judged.moved:
-            return judged, prior, tuple(shifted)
-        shifted += [s for s in judged.stations if s.station in judged.moved]
+            return judged, prior, tuple(moved)
+        moved += [s for s in judged.stations if s.station in judged.moved]
         prior = prior.only([s for s in prior.stations if s not in judged.moved])
 
 
@@ -227,26 +229,26 @@ def _hold_new(
     saved: SavedCalibration,
     session: Session,
     remeasured: Calibration,
-    irls_weight: Trust,
+    data_weights: Trust,
     keep: Booleans,
 ) -> Held:
     """Fit of the new configurations, mask (K,) ``keep``, with the calibrated machine fixed."""
     data = remeasured.estimate.stated_edge_noise(remeasured.measurements)
     cameras = [station.camera for station in session.stations]
-    wide = magnified(data, remeasured.observation, cameras) if cameras else None
-    retained = Kinds(
-        irls_weight.robust.edges[keep[data.edges.configuration]],
-        irls_weight.robust.poses[
+    magnified_data = magnified(data, remeasured.observation, cameras) if cameras else None
+    weights = Kinds(
+        data_weights.robust.edges[keep[data.edges.configuration]],
+        data_weights.robust.poses[
             keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]
         ],
-        irls_weight.robust.links[data.links_among(keep)],
+        data_weights.robust.links[data.links_among(keep)],
     )
     return hold(
         saved.machine,
         select(data, keep),
         remeasured.estimate.state,
-        replace(irls_weight, robust=retained),
-        select(wide, keep) if wide else None,
+        replace(data_weights, robust=weights),
+        select(magnified_data, keep) if magnified_data else None,
     )
 
 

@@ -86,8 +86,8 @@ def neighbours(
         unit = np.array([NEIGHBOUR_RANGE_SHARE] * 3 + [NEIGHBOUR_RANGE_SHARE * size] * 3)
         motion = machine.layout.motion
         delta = rng.uniform(-1, 1, (len(poses), 6)) * unit @ motion @ motion.T
-        shifted = on_manifold(machine.layout, machine.values, perturb(poses, delta))
-        poses = shifted.T_base_platform[shifted.converged]
+        projected = on_manifold(machine.layout, machine.values, perturb(poses, delta))
+        poses = projected.T_base_platform[projected.converged]
     joints = machine.inverse(poses)
     finite = np.isfinite(joints).all(axis=-1)
     poses, joints = poses[finite], joints[finite]

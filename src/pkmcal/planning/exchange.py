@@ -132,9 +132,9 @@ class O1Index:
 
     def slope(self, covariance: Array) -> Array:
         """Slope by C, through its inverse."""
-        values, vectors = np.linalg.eigh(np.linalg.inv(covariance))
-        excess = np.maximum(values - 1.0, LEAST_DIRECTION_INFORMATION)
-        return vectors * (values / np.sqrt(2 * len(values) * excess))
+        eigenvalues, eigenvectors = np.linalg.eigh(np.linalg.inv(covariance))
+        excess = np.maximum(eigenvalues - 1.0, LEAST_DIRECTION_INFORMATION)
+        return eigenvectors * (eigenvalues / np.sqrt(2 * len(eigenvalues) * excess))
 
 
 def _tool(info: CandidateRows) -> Index:
@@ -152,9 +152,9 @@ PLAN_INDICES: Mapping[str, Callable[[CandidateRows], Index]] = {
 
 def _root(matrix: Array) -> Array:
     """F (p, k) with F F^T = matrix, without directions of negligible eigenvalues."""
-    values, vectors = np.linalg.eigh(matrix)
-    retained_rows = values > 1e-12 * values[-1]
-    return vectors[:, retained_rows] * np.sqrt(values[retained_rows])
+    eigenvalues, eigenvectors = np.linalg.eigh(matrix)
+    significant = eigenvalues > 1e-12 * eigenvalues[-1]
+    return eigenvectors[:, significant] * np.sqrt(eigenvalues[significant])
 
 
 class Greedy(NamedTuple):
@@ -263,11 +263,11 @@ class _Work:
         rows = rows[top]
         across = rows @ self._covariance
         inner = np.eye(rows.shape[1]) + across @ rows.mT
-        shifted = across @ self._directions.T
-        after = now - shifted.mT @ np.linalg.solve(inner, shifted)
-        value = self._index.value(after)
+        on_machine = across @ self._directions.T
+        after = now - on_machine.mT @ np.linalg.solve(inner, on_machine)
+        index = self._index.value(after)
         # While some direction has no information, the largest eigenvalue is the same for all
         # candidates.
-        same = value <= value.min() + EXCHANGE_GAIN_ROUNDING * np.abs(value.min())
+        same = index <= index.min() + EXCHANGE_GAIN_ROUNDING * np.abs(index.min())
         spread = np.where(same, after.trace(axis1=1, axis2=2), np.inf)
         return int(begin + top[np.argmin(spread)])

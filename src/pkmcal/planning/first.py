@@ -145,7 +145,7 @@ def first_edges(
     """
     machine = session.machine
     numbers = numbered(session.camera_of_station[[p.station for p in photographs]])
-    few = [
+    images = [
         replace(p.select(own), station=number)
         for number, (p, own) in enumerate(zip(photographs, rows, strict=True))
     ]
@@ -154,27 +154,27 @@ def first_edges(
         if len(edges) < FEWEST_FIRST_EDGES:
             raise ResultError("too few edges to tell what others will give", found=len(edges))
         return Measurements(
-            edges, session.joints, session.joint_noise, len(few), numbers, shaded=True
+            edges, session.joints, session.joint_noise, len(images), numbers, shaded=True
         )
 
-    passes = legs.search_stations(placed_at(few, T_camera_base, poses), machine)
+    passes = legs.search_stations(placed_at(images, T_camera_base, poses), machine)
     coarse = replace(measurements(concatenate([one.edges for one in passes])), shaded=False)
     # The accuracy of the search is a pixel, so its noise is not estimated.
     start = start_state(machine, coarse, T_camera_base)
     estimate = bundle(machine, coarse, start, scale_noise=False)
     state = estimate.state
-    placed = placed_at(few, state.T_camera_base, state.T_base_platform)
+    placed = placed_at(images, state.T_camera_base, state.T_base_platform)
     passes = legs.measure_stations(placed, estimate.machine, {})
     fine = measurements(concatenate([one.edges for one in passes]))
     held = refinement_of(session, refine=False)
     fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
     start = replace(state, intrinsics=np.zeros_like(held.at))
     estimate = bundle(machine, fine, start)
-    return _edge_information(few, rows, estimate, fine.edges)
+    return _edge_information(images, rows, estimate, fine.edges)
 
 
 def _edge_information(
-    few: Sequence[Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
+    images: Sequence[Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
 ) -> FirstEdges:
     """Information of each expected edge; lost edges have none."""
     machine, state = estimate.machine, estimate.state
@@ -182,31 +182,33 @@ def _edge_information(
     n_edges, n_legs = len(tubes), machine.n_legs
     number = np.full((n_legs, int(tubes.tube.max()) + 1, 2), -1)
     number[tubes.leg, tubes.tube, tubes.side] = np.arange(n_edges)
-    pairs = np.array([(p.station, k) for p in few for k in p.configuration])
+    pairs = np.array([(p.station, k) for p in images for k in p.configuration])
     ideal, _ = simulate_edges(
         machine,
         state.T_camera_base,
-        tuple(p.camera.binned(p.binning) for p in few),
+        tuple(p.camera.binned(p.binning) for p in images),
         state.T_base_platform,
         EXACT_EDGE_NOISE,
         np.random.default_rng(FIRST_EDGES_SEED),
         photographs=pairs,
     )
 
-    shape = (len(few), len(state.T_base_platform), n_edges)
+    shape = (len(images), len(state.T_base_platform), n_edges)
 
     def place(some: EdgeSet) -> tuple[Integers, Integers, Integers]:
         return some.station, some.configuration, number[some.leg, some.tube, some.side]
 
-    expected, retained_rows, whole = (np.zeros(shape, dtype=bool) for _ in range(3))
+    # Expected edges by station, configuration and edge, and the inliers among them.
+    expected, inlier, whole = (np.zeros(shape, dtype=bool) for _ in range(3))
     expected[place(ideal)] = True
     # Edges that are hidden for the most part are not expected, so their loss does not count.
     length = np.ptp(ideal.span, axis=1)
     longest = np.zeros(n_edges)
     np.maximum.at(longest, place(ideal)[2], length)
     whole[place(ideal)] = length > EXPECTED_EDGE_FREE_SHARE * longest[place(ideal)[2]]
-    retained_rows[place(edges.select(estimate.edge_weights > 0.5))] = True
-    retained_rows &= expected
+    inlier[place(edges.select(estimate.edge_weights > 0.5))] = True
+    inlier &= expected
+    # Information of each edge in px^-2 of shift and tilt.
     unit = np.zeros((*shape, 2, 2))
     unit[place(ideal)] = pixel_turns(ideal)
     scale = estimate.edge_noise.scale[edges.tube]
@@ -221,19 +223,20 @@ def _edge_information(
     long[place(ideal)] = pixel_lengths(ideal)
     own_shading = estimate.edge_noise.shading[tubes.tube]
     pools = tuple(
-        _pools(information[s], long[s], expected[s], kind, own_shading) for s in range(len(few))
+        _pools(information[s], long[s], expected[s], kind, own_shading) for s in range(len(images))
     )
-    sigma = np.full((len(few), n_legs), np.nan)
+    # Standard deviation of the shift of each leg's edges, px: noise and individual shading.
+    sigma = np.full((len(images), n_legs), np.nan)
     pixel = np.linalg.norm(edges.shift, axis=-1)
     across = np.hypot(
         scale * np.sqrt(edges.covariance[:, 0, 0]) / pixel, estimate.edge_noise.shading[edges.tube]
     )
-    for s, j in np.ndindex(len(few), n_legs):
+    for s, j in np.ndindex(len(images), n_legs):
         mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)
         sigma[s, j] = np.median(across[mine]) if mine.any() else np.nan
     by_station = tuple(
-        EdgesOf(own, whole[s, p.configuration], (retained_rows & whole)[s, p.configuration])
-        for s, (own, p) in enumerate(zip(rows, few, strict=True))
+        EdgesOf(own, whole[s, p.configuration], (inlier & whole)[s, p.configuration])
+        for s, (own, p) in enumerate(zip(rows, images, strict=True))
     )
     return FirstEdges(estimate, pools, sigma, by_station)
 
@@ -289,9 +292,9 @@ def drawn_edges(
             if rng is None:
                 own[mine] = np.tensordot(chance, pool.information, axes=1)
             else:
-                drawn = rng.random((len(mine), 1)) > np.cumsum(chance, axis=1)
+                below = rng.random((len(mine), 1)) > np.cumsum(chance, axis=1)
                 own[mine] = pool.information[
-                    np.minimum(drawn.sum(axis=1), len(pool.information) - 1)
+                    np.minimum(below.sum(axis=1), len(pool.information) - 1)
                 ]
     informative = np.linalg.eigvalsh(own)[:, 0] > 0
     edges, own = replace(edges, shading=shading).select(informative), own[informative]

@@ -129,8 +129,8 @@ class CandidateRows:
         """
         scale = np.sqrt(np.diag(information))
         half = np.linalg.cholesky(information / np.outer(scale, scale))
-        residual = np.linalg.solve(half, (self.machine / scale).T)
-        return residual.T @ residual
+        whitened = np.linalg.solve(half, (self.machine / scale).T)
+        return whitened.T @ whitened
 
     def tool(self, covariance: Array) -> tuple[float, float]:
         """Standard deviations of the platform's position (m) and turn (rad) for a covariance (p,
@@ -147,13 +147,13 @@ def information_of(
     rig: Rig,
     candidates: Candidates,
     work: Array,
-    reference_values: CalibrationPrior | None = None,
+    calibration_prior: CalibrationPrior | None = None,
     rng: np.random.Generator | None = None,
     wanted: int | None = None,
 ) -> CandidateRows:
     """Rows of all candidates.
 
-    work : T_base_platform (M, 4, 4) of the workspace. reference_values : prior of an earlier
+    work : T_base_platform (M, 4, 4) of the workspace. calibration_prior : prior of an earlier
     calibration, in place of the nominal model. rng : as for
     :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : number of each group that will be
     measured, by default all: it determines the correlation of edges with common shading. Raises
@@ -166,38 +166,38 @@ def information_of(
     share = 1.0 if wanted is None or each < 2 else min((wanted - 1) / (each - 1), 1.0)
     assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
-    direction, u = machine_directions(machine, problem), problem.unknowns
+    directions, u = machine_directions(machine, problem), problem.unknowns
     reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
     rows[assembled.observed] = reduced  # candidates that show nothing have no information
     prior = problem.prior
-    if reference_values is not None:  # it includes the nominal model's priors
+    if calibration_prior is not None:  # it includes the nominal model's priors
         prior = prior[~prior[:, u.machine].any(axis=1)]
     total = prior.T @ prior
     for part in (u.stations, u.mounts):
         total[part, part] += np.eye(part.stop - part.start) / UNMEASURED_PLACE_SIGMA**2
-    if reference_values is not None:
-        at, values = _prior_information(
-            reference_values, machine, problem, rig.T_station_base, direction
+    if calibration_prior is not None:
+        at, added = _prior_information(
+            calibration_prior, machine, problem, rig.T_station_base, directions
         )
-        total[np.ix_(at, at)] += values
-    directed = np.zeros((len(direction.of_z), u.count))
-    directed[:, u.machine] = direction.of_z
+        total[np.ix_(at, at)] += added
+    directed = np.zeros((len(directions.of_z), u.count))
+    directed[:, u.machine] = directions.of_z
     return CandidateRows(
         rows=rows,
         group=candidates.group,
         where=joints / motor_spans(joints, machine.joint_ranges),
         information=total,
         machine=directed,
-        work=tool_by_free(rig, problem, machine.inverse(work), work) @ direction.to_z,
+        work=tool_by_free(rig, problem, machine.inverse(work), work) @ directions.to_z,
     )
 
 
 def _check_observed(rig: Rig, candidates: Candidates, measurements: Measurements) -> None:
     """Raise `InputError` if a group of stations measures nothing in any configuration."""
     edges, poses = measurements.edges.configuration, measurements.poses.configuration
-    in_view = np.unique(candidates.group[np.concatenate([edges, poses])])
-    lost = np.setdiff1d(candidates.group, in_view)
+    measured = np.unique(candidates.group[np.concatenate([edges, poses])])
+    lost = np.setdiff1d(candidates.group, measured)
     if not lost.size:
         return
     names = [rig.names[s] for s in candidates.groups[lost[0]]]
@@ -214,9 +214,10 @@ def machine_directions(machine: Machine, problem: Problem) -> Directions:
     """Directions of the machine at its present values."""
     tolerance = machine.parameters.tolerances_free()
     moves = move_generators(machine.layout, machine.values) @ conventions(machine)
-    shifted = np.linalg.lstsq(problem.free, moves, rcond=None)[0]
-    basis = np.linalg.qr(shifted / tolerance[:, None], mode="complete")[0][:, shifted.shape[1] :]
-    return Directions(tolerance[:, None] * basis, basis.T / tolerance, shifted)
+    frame_changes = np.linalg.lstsq(problem.free, moves, rcond=None)[0]
+    basis = np.linalg.qr(frame_changes / tolerance[:, None], mode="complete")[0]
+    basis = basis[:, frame_changes.shape[1] :]
+    return Directions(tolerance[:, None] * basis, basis.T / tolerance, frame_changes)
 
 
 def _prior_information(
@@ -224,7 +225,7 @@ def _prior_information(
     machine: Machine,
     problem: Problem,
     T_station_base: Array,
-    sense: Directions,
+    directions: Directions,
 ) -> tuple[Integers, Array]:
     """Columns of the shared unknowns and the information (k, k) of an earlier calibration on them.
 
@@ -232,23 +233,23 @@ def _prior_information(
     variance of a prior sigma: they move the kept stations with the machine and are not observable.
     """
     u, n = problem.unknowns, len(machine.values)
-    retained_rows = np.array(prior.stations, dtype=int)
-    to_free = np.zeros((u.n_free + 6 * len(retained_rows), n + 6 * len(retained_rows)))
+    fixed_stations = np.array(prior.stations, dtype=int)
+    to_free = np.zeros((u.n_free + 6 * len(fixed_stations), n + 6 * len(fixed_stations)))
     to_free[: u.n_free, :n] = problem.structure.to_free
-    to_free[u.n_free :, n:] = np.eye(6 * len(retained_rows))
+    to_free[u.n_free :, n:] = np.eye(6 * len(fixed_stations))
     frames = conventions(machine)
-    shifted = [sense.span]
-    if len(retained_rows):
-        stations = station_generators(T_station_base[retained_rows]) @ frames[:12]
-        shifted.append(stations.reshape(-1, frames.shape[1]))
-    shifted = np.concatenate(shifted)
-    size = np.append(machine.parameters.tolerances_free(), np.ones(6 * len(retained_rows)))
-    share = shifted / size[:, None]
-    shifted = shifted / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
-    spread = to_free @ prior.covariance @ to_free.T + shifted @ shifted.T
-    values, vectors = np.linalg.eigh(spread / np.outer(size, size))
-    half = vectors / np.sqrt(np.maximum(values, DIRECTION_VARIANCE_FLOOR)) / size[:, None]
-    columns = u.stations.start + 6 * retained_rows[:, None] + np.arange(6)
+    frame_changes = [directions.span]
+    if len(fixed_stations):
+        stations = station_generators(T_station_base[fixed_stations]) @ frames[:12]
+        frame_changes.append(stations.reshape(-1, frames.shape[1]))
+    frame_changes = np.concatenate(frame_changes)
+    size = np.append(machine.parameters.tolerances_free(), np.ones(6 * len(fixed_stations)))
+    share = frame_changes / size[:, None]
+    frame_changes = frame_changes / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
+    spread = to_free @ prior.covariance @ to_free.T + frame_changes @ frame_changes.T
+    eigenvalues, eigenvectors = np.linalg.eigh(spread / np.outer(size, size))
+    half = eigenvectors / np.sqrt(np.maximum(eigenvalues, DIRECTION_VARIANCE_FLOOR)) / size[:, None]
+    columns = u.stations.start + 6 * fixed_stations[:, None] + np.arange(6)
     at = np.concatenate([np.arange(u.n_free), columns.ravel()])
     return at, half @ half.T
 

@@ -164,16 +164,16 @@ def plan_measurements(
     _check(rig, count, index, free_places, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
-    drawn = configurations(
+    candidates = configurations(
         rig.machine, max(PLAN_CANDIDATES, CANDIDATES_FOR_EACH_WANTED * count), rng
     )
     progress(0.1)
     tried: tuple[TriedPlace, ...] = ()
     if free_places or best_of:
-        rig, reference_values, tried = _with_places(
-            subject, work, drawn, count, index, free_places, best_of
+        rig, prior, tried = _with_stations(
+            subject, work, candidates, count, index, free_places, best_of
         )
-        subject = replace(subject, rig=rig, prior=reference_values)
+        subject = replace(subject, rig=rig, prior=prior)
     progress(0.3)
     if together is None:  # one camera is carried; several, or a tracker, measure at once
         tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
@@ -181,11 +181,11 @@ def plan_measurements(
         together = len(rig.names) > 1 and several
     stations = range(len(rig.names))
     groups = (tuple(stations),) if together else tuple((s,) for s in stations)
-    made = _Making(rig, subject.prior, groups, count, index, work)
-    pool = made.pool(Candidates.of_all(groups, *drawn))
-    item = made.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
+    selection = _Selection(rig, subject.prior, groups, count, index, work)
+    pool = selection.pool(Candidates.of_all(groups, *candidates))
+    chosen = selection.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
     progress(0.9)
-    return _ordered(subject, made, item, pool, region, together, tried, rng)
+    return _routed_plan(subject, selection, chosen, pool, region, together, tried, rng)
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
@@ -227,7 +227,7 @@ class _Pool(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Making:
+class _Selection:
     """Selection of configurations for a rig, with its options."""
 
     rig: Rig
@@ -250,7 +250,7 @@ class _Making:
         size = np.inf
         for k in range(BETTERING_ROUNDS):
             progress(0.5 + 0.5 * k / BETTERING_ROUNDS)
-            pool, start = self._about(best, rng)
+            pool, start = self._with_neighbours(best, rng)
             chosen = np.sort(exchanged(pool.info, start, index))
             best = pool.candidates.only(chosen)
             covariance = pool.info.covariance(pool.info.of(chosen))
@@ -259,7 +259,9 @@ class _Making:
                 break
         return best
 
-    def _about(self, best: Candidates, rng: np.random.Generator) -> tuple[_Pool, Integers]:
+    def _with_neighbours(
+        self, best: Candidates, rng: np.random.Generator
+    ) -> tuple[_Pool, Integers]:
         """Pool of the chosen candidates and their variations for the same group, and the indices of
         the chosen ones.
         """
@@ -282,11 +284,11 @@ def _accuracy(info: CandidateRows, covariance: Array, count: float) -> Accuracy:
     return Accuracy(count, *info.tool(covariance))
 
 
-def _ordered(
+def _routed_plan(
     subject: Subject,
-    made: _Making,
-    value: Candidates,
-    drawn: _Pool,
+    selection: _Selection,
+    chosen: Candidates,
+    pool: _Pool,
     region: Region,
     together: bool,
     tried: tuple[TriedPlace, ...],
@@ -295,27 +297,27 @@ def _ordered(
     """Plan of the chosen configurations, in the order of the shortest path, with its predicted
     accuracy.
     """
-    machine, count, groups = subject.rig.machine, made.count, made.groups
+    machine, count, groups = subject.rig.machine, selection.count, selection.groups
     # edges with drawn rather than mean information, as real images have
-    own = made.pool(value, np.random.default_rng(PLAN_SEED)).info
-    index, every = PLAN_INDICES[made.index](own), np.arange(len(value.group))
+    own = selection.pool(chosen, np.random.default_rng(PLAN_SEED)).info
+    index, every = PLAN_INDICES[selection.index](own), np.arange(len(chosen.group))
     nested = greedy(own, count, index)
     curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
     covariance = own.covariance(own.of(every))
     promised = _accuracy(own, covariance, count)
     more = [_accuracy(own, own.covariance(own.of(every, t)), t * count) for t in CAPTURE_MULTIPLES]
-    by_chance, at_random = _by_chance(made, drawn, rng)
+    by_chance, at_random = _random_accuracy(selection, pool, rng)
     rank = np.empty(len(every), dtype=int)
     rank[nested.chosen] = every // len(groups) + 1
-    order, blocked, travel = _route(machine, value, rng)
+    order, blocked, travel = _route(machine, chosen, rng)
     return MeasurementPlan(
         subject=subject,
-        stations=tuple(tuple(subject.rig.names[s] for s in groups[value.group[k]]) for k in order),
-        names=_new_names(value.group[order], subject.names),
-        joints=value.joints[order],
-        T_base_platform=value.T_base_platform[order],
+        stations=tuple(tuple(subject.rig.names[s] for s in groups[chosen.group[k]]) for k in order),
+        names=_new_names(chosen.group[order], subject.names),
+        joints=chosen.joints[order],
+        T_base_platform=chosen.T_base_platform[order],
         rank=rank[order],
-        index=made.index,
+        index=selection.index,
         value=float(index.value(covariance)),
         at_random=at_random,
         now=_accuracy(own, own.covariance(own.information), 0),
@@ -323,7 +325,7 @@ def _ordered(
         by_chance=by_chance,
         curve=(*curve, promised, *more),
         region=region,
-        work=made.work,
+        work=selection.work,
         blocked=blocked,
         travel=travel,
         tried=tried,
@@ -345,28 +347,30 @@ def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[Accuracy, float]:
+def _random_accuracy(
+    selection: _Selection, pool: _Pool, rng: np.random.Generator
+) -> tuple[Accuracy, float]:
     """Accuracy and index with configurations drawn uniformly over the joints' ranges, mean of
     several draws.
     """
-    index, n_groups = PLAN_INDICES[made.index](drawn.info), len(made.groups)
-    n = len(drawn.info.group) // n_groups
+    index, n_groups = PLAN_INDICES[selection.index](pool.info), len(selection.groups)
+    n = len(pool.info.group) // n_groups
     evenly = np.arange(n // 2, n)  # the first half is at the ends of the ranges
-    count = min(made.count, len(evenly))
-    results: list[tuple[float, float, float]] = []
+    count = min(selection.count, len(evenly))
+    figures: list[tuple[float, float, float]] = []
     for _ in range(RANDOM_PLANS_COMPARED):
         rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
-        covariance = drawn.info.covariance(drawn.info.of(np.concatenate(rows)))
-        results.append((*drawn.info.tool(covariance), float(index.value(covariance))))
-    position, orientation, value = np.mean(results, axis=0).tolist()
-    return Accuracy(made.count, position, orientation), value
+        covariance = pool.info.covariance(pool.info.of(np.concatenate(rows)))
+        figures.append((*pool.info.tool(covariance), float(index.value(covariance))))
+    position, orientation, value = np.mean(figures, axis=0).tolist()
+    return Accuracy(selection.count, position, orientation), value
 
 
 # ------------------------------------------------------------------ the way between them
 
 
 def _route(
-    machine: Machine, value: Candidates, rng: np.random.Generator
+    machine: Machine, chosen: Candidates, rng: np.random.Generator
 ) -> tuple[Integers, Booleans, tuple[float, float]]:
     """Order (n,) of the configurations, group by group, blocked steps (n,), and the lengths of this
     path and of a random one.
@@ -375,9 +379,9 @@ def _route(
     order: list[Integers] = []
     barred: list[Booleans] = []
     own, chance = 0.0, 0.0
-    for g in range(len(value.groups)):
-        rows = np.flatnonzero(value.group == g)
-        joints, poses = value.joints[rows], value.T_base_platform[rows]
+    for g in range(len(chosen.groups)):
+        rows = np.flatnonzero(chosen.group == g)
+        joints, poses = chosen.joints[rows], chosen.T_base_platform[rows]
         apart = motor_distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
         path, blocked = _free_path(machine, joints, poses, home, apart)
         order.append(rows[path])
@@ -394,7 +398,7 @@ def _free_path(
     bars = np.zeros((len(joints), len(joints)), dtype=bool)
     first = apart[-1, :-1].copy()
     path = shortest_path(apart[:-1, :-1], first, bars)
-    blocked = _blocked(machine, joints[path], poses[path], home)
+    blocked = _blocked_steps(machine, joints[path], poses[path], home)
     for _ in range(REROUTING_ATTEMPTS):
         steps = np.flatnonzero(blocked[1:])
         if not len(steps) and not blocked[0]:
@@ -403,11 +407,11 @@ def _free_path(
         if blocked[0]:
             first[path[0]] += len(joints) * apart.max()
         path = shortest_path(apart[:-1, :-1], first, bars)
-        blocked = _blocked(machine, joints[path], poses[path], home)
+        blocked = _blocked_steps(machine, joints[path], poses[path], home)
     return path, blocked
 
 
-def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
+def _blocked_steps(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
     """Whether the step to each configuration (n,) is blocked: with all motors moving uniformly, the
     closure fails or legs touch.
     """
@@ -425,10 +429,10 @@ def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Bool
 # ------------------------------------------------------------------ places of the camera
 
 
-def _with_places(
+def _with_stations(
     subject: Subject,
     work: Array,
-    drawn: Configurations,
+    candidates: Configurations,
     count: int,
     index: str,
     free_places: int | None,
@@ -441,15 +445,14 @@ def _with_places(
     """
     rig = subject.rig
     if free_places:
-        wide, spots = _around(rig)
+        wide, poses = _on_sphere(rig)
     else:
-        wide, spots = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
-    few = np.unique(np.linspace(0, len(drawn.joints) - 1, FOR_PLACES).astype(int))
-    part = Configurations(*(x[few] for x in drawn))
-    reference_values = subject.prior and subject.prior.only(())
+        wide, poses = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
+    few = np.unique(np.linspace(0, len(candidates.joints) - 1, FOR_PLACES).astype(int))
+    part = Configurations(*(x[few] for x in candidates))
+    machine_prior = subject.prior and subject.prior.only(())
     infos = [
-        _view_information(wide.only([s]), part, work, reference_values)
-        for s in range(len(wide.names))
+        _view_information(wide.only([s]), part, work, machine_prior) for s in range(len(wide.names))
     ]
     first = next((info for info in infos if info is not None), None)
     if first is None:
@@ -478,12 +481,12 @@ def _with_places(
     wanted = free_places or best_of or 1
     best = np.sort(exchanged(whole, greedy(whole, wanted, rule).chosen, rule))
     tried = tuple(
-        TriedPlace(place, float(alone[k]), bool(k in best)) for k, place in enumerate(spots)
+        TriedPlace(place, float(alone[k]), bool(k in best)) for k, place in enumerate(poses)
     )
     chosen = wide.only(best.tolist())
     if free_places:
         names = tuple(f"place{n + 1}" for n in range(len(best)))
-        return replace(chosen, names=names), reference_values, tried
+        return replace(chosen, names=names), machine_prior, tried
     prior = subject.prior and subject.prior.only(best.tolist())
     if prior is not None:  # renumber the stations of the prior
         prior = replace(prior, stations=tuple(np.searchsorted(best, prior.stations).tolist()))
@@ -500,7 +503,7 @@ def _view_information(
         return None
 
 
-def _around(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:
+def _on_sphere(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:
     """Rig with its first camera at every pose on a sphere, with the instruments of that camera."""
     one = next(one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom))
     board = "platform" if isinstance(one, BoardFrom) else None

@@ -105,14 +105,14 @@ class BoardFrom:
         """Poses of the board where enough corners are visible."""
         T = self.T_camera_base @ at.T_base_platform[rows] @ self.T_platform_board
         there = apply(T[:, None], self.points)
-        prediction = self._visible_corners(
+        visible = self._visible_corners(
             At(at.machine, at.joints[rows], at.T_base_platform[rows]), T, there
         )
         by_point = self.camera.project_jacobians(there)[0]
         by_pose = np.concatenate([-by_point @ skew(there - T[:, None, :3, 3]), by_point], axis=-1)
-        by_pose = np.where(prediction[..., None, None], by_pose, 0.0) / self.sigma
+        by_pose = np.where(visible[..., None, None], by_pose, 0.0) / self.sigma
         normal = np.einsum("knip,kniq->kpq", by_pose, by_pose)
-        enough = prediction.sum(axis=1) >= LEAST_CORNERS_WEIGHED
+        enough = visible.sum(axis=1) >= LEAST_CORNERS_WEIGHED
         covariance = np.linalg.inv(normal[enough])
         return pose_set(self.station, rows[enough], self.mount, T[enough], covariance)
 
@@ -210,11 +210,11 @@ class Rig:
         at = At(self.machine, joints, T_base_platform)
         for one in self.instruments:
             rows = pairs[pairs[:, 0] == one.station, 1]
-            value = one.measure(at, rows, rng)
-            if isinstance(value, EdgeSet):
-                edges.append(value)
+            predicted = one.measure(at, rows, rng)
+            if isinstance(predicted, EdgeSet):
+                edges.append(predicted)
             else:
-                poses.append(value)
+                poses.append(predicted)
         edges = concatenate(edges)
         return Measurements(
             edges=edges,

@@ -49,15 +49,15 @@ def shortest_path(
         rest = np.flatnonzero(remaining)
         order.append(int(rest[np.argmin(cost[order[-1], rest])]))
         remaining[order[-1]] = False
-    direction = np.array([*order, n])
+    path = np.array([*order, n])
     for _ in range(ROUTE_CHANGES_A_POINT * n):
         gain, better = max(
-            (_turned(direction, cost), _best_move(direction, cost)), key=lambda item: item[0]
+            (_best_reversal(path, cost), _best_move(path, cost)), key=lambda item: item[0]
         )
         if gain < ROUTE_GAIN_ROUNDING * cost.max():
             break
-        direction = better
-    return direction[1:-1]
+        path = better
+    return path[1:-1]
 
 
 def length(path: Integers, apart: Array, first: Array | None = None) -> float:
@@ -66,7 +66,7 @@ def length(path: Integers, apart: Array, first: Array | None = None) -> float:
     return begin + float(apart[path[:-1], path[1:]].sum())
 
 
-def _turned(path: Integers, cost: Array) -> tuple[float, Integers]:
+def _best_reversal(path: Integers, cost: Array) -> tuple[float, Integers]:
     """Best gain by reversing a stretch i to j (2-opt), and the path after it."""
     before, here, after = path[:-2], path[1:-1], path[2:]
     now = cost[before, here][:, None] + cost[here, after]
@@ -81,7 +81,7 @@ def _best_move(path: Integers, cost: Array) -> tuple[float, Integers]:
     """Best gain by moving a stretch of up to three points between two others, and the path after
     it.
     """
-    results: list[tuple[float, int, int, int]] = []
+    moves: list[tuple[float, int, int, int]] = []
     step = cost[path[:-1], path[1:]]
     for size in range(1, min(MOST_POINTS_MOVED_TOGETHER, len(path) - 3) + 1):
         i = np.arange(1, len(path) - size)
@@ -92,10 +92,10 @@ def _best_move(path: Integers, cost: Array) -> tuple[float, Integers]:
         gain = without[:, None] - with_
         gain[(j >= i[:, None] - 1) & (j <= i[:, None] + size - 1)] = -np.inf
         a, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        results.append((float(gain[a, b]), int(i[a]), size, int(b)))
-    if not results:
+        moves.append((float(gain[a, b]), int(i[a]), size, int(b)))
+    if not moves:
         return -np.inf, path
-    gain, i, size, j = max(results)
+    gain, i, size, j = max(moves)
     part, rest = path[i : i + size], np.delete(path, np.s_[i : i + size])
     j = j if j < i else j - size
     return gain, np.concatenate([rest[: j + 1], part, rest[j + 1 :]])

@@ -153,7 +153,7 @@ def of_machine(
     rng = np.random.default_rng(seed)
     noise = f"Readings are taken to be good to {brief(joint_noise * 1e6)} µm (or µrad)"
     if tracker is not None:
-        rig = _tracked(machine, tracker, joint_noise)
+        rig = _tracker_rig(machine, tracker, joint_noise)
         return Subject(rig, None, tuple(columns), (), (noise + ", as told.",))
     cameras = tuple(cameras)
     stations = default_stations(machine, cameras, rng, "platform" if board else None)
@@ -170,7 +170,7 @@ def of_machine(
         mounts, T_mount = (), None
         what = f"edges of legs to {edge:g} px"
     else:
-        place = _bracket(machine, board, cameras, T_camera_base, rng)
+        place = _best_board_pose(machine, board, cameras, T_camera_base, rng)
         instruments = tuple(
             BoardFrom(s, camera, T, board.points, place, corner) for s, (camera, T) in placed
         )
@@ -192,7 +192,7 @@ def of_machine(
     return Subject(rig, None, tuple(columns), (), words, fields)
 
 
-def _bracket(
+def _best_board_pose(
     machine: Machine, board: Board, cameras: tuple[Camera, ...], T: Array, rng: np.random.Generator
 ) -> Array:
     """T_platform_board (4, 4) at which a board on the platform is visible best."""
@@ -212,7 +212,7 @@ def check_tubes(machine: Machine, where: str) -> None:
     )
 
 
-def _tracked(machine: Machine, noise: tuple[float, float | None], joint_noise: float) -> Rig:
+def _tracker_rig(machine: Machine, noise: tuple[float, float | None], joint_noise: float) -> Rig:
     """Rig of a tracker in the base frame, with its target at the platform's origin."""
     position, turn = noise
     whiten = np.diag([0.0 if turn is None else 1 / turn] * 3 + [1 / position] * 3)
@@ -244,7 +244,7 @@ def subject_of_session(
     hand-held cameras.
     """
     if anywhere:
-        session = _one_camera(session)
+        session = _first_camera_session(session)
     by_hand = [station.name for station in session.stations if station.handheld]
     if by_hand:
         raise InputError(
@@ -257,23 +257,25 @@ def subject_of_session(
     if saved is not None:
         session = replace(session, machine=saved.machine)
         words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
-    in_view = _Photographed.of(session, saved, np.random.default_rng(seed))
-    T_camera_base = _places(session, saved, in_view, anywhere, seed)
-    rig, board, corner_source = _rig(session, saved, in_view, T_camera_base, edge, corner, seed)
-    reference_values = None
+    images = _SessionImages.of(session, saved, np.random.default_rng(seed))
+    T_camera_base = _station_poses(session, saved, images, anywhere, seed)
+    rig, board, corner_source = _rig(session, saved, images, T_camera_base, edge, corner, seed)
+    prior = None
     if saved is not None:
-        prior = [name for name in session.station_names if same_place and name in saved.placed]
-        reference_values = saved.prior(prior, session.station_names)
+        fixed_stations = [
+            name for name in session.station_names if same_place and name in saved.placed
+        ]
+        prior = saved.prior(fixed_stations, session.station_names)
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
     fields = board.document if board else None
-    return Subject(rig, reference_values, columns, names, (*words, *corner_source), fields)
+    return Subject(rig, prior, columns, names, (*words, *corner_source), fields)
 
 
 def _rig(
     session: Session,
     saved: SavedCalibration | None,
-    in_view: _Photographed,
+    images: _SessionImages,
     T_camera_base: Array,
     edge: float,
     corner: float,
@@ -287,13 +289,14 @@ def _rig(
     instruments: list[Instrument] = []
     mounts: list[Mount] = []
     T_mount: list[Array] = []
+    # The board on the platform.
     has_board = any("board" in s.observe for s in session.stations)
     board: Board | None = None
     if has_board and session.board is not None and session.board_body == "platform":
         board = load_board(session.board)
         mounts.append(Mount(BOARD_MOUNT_NAME, "platform", board.tolerance))
-        T_mount.append(_board_place(session, board, saved, in_view, T_camera_base, seed))
-        sigma, corner_source = _corner_noise(in_view.boards, corner)
+        T_mount.append(_board_pose(session, board, saved, images, T_camera_base, seed))
+        sigma, corner_source = _corner_noise(images.boards, corner)
         words.append(corner_source)
         for s, station in enumerate(session.stations):
             if "board" in station.observe:
@@ -301,17 +304,19 @@ def _rig(
                 instruments.append(
                     BoardFrom(s, station.camera, T_camera_base[s], board.points, place, sigma)
                 )
+    # The legs.
     shading = SHADING_SIGMA
     legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
     if legs:
         check_tubes(session.machine, f"{session.document['mechanism']}, legs")
         pixels, pools, shading, corner_source = _edge_noise(
-            session, legs, in_view, T_camera_base, edge
+            session, legs, images, T_camera_base, edge
         )
         words.append(corner_source)
         for s, binning, pool in zip(legs, pixels, pools, strict=True):
             camera = session.stations[s].camera
             instruments.append(LegsFrom(s, camera, T_camera_base[s], pool, binning))
+    # The trackers' targets.
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         place = _saved_target(saved, table.name)
         mounts.append(Mount(table.name, "platform"))
@@ -332,7 +337,7 @@ def _rig(
     return rig, board, words
 
 
-def _one_camera(session: Session) -> Session:
+def _first_camera_session(session: Session) -> Session:
     """Session with its first camera only, on a tripod; hand-held images do not determine a
     station.
     """
@@ -348,7 +353,7 @@ def _one_camera(session: Session) -> Session:
     return replace(session, stations=(first,), trackers=())
 
 
-class _Photographed(NamedTuple):
+class _SessionImages(NamedTuple):
     """Images of legs of a session, the boards in them, and the localized stations (S, 4, 4).
 
     T_camera_base : None without images, or with a calibration that has the stations.
@@ -361,17 +366,17 @@ class _Photographed(NamedTuple):
     @classmethod
     def of(
         cls, session: Session, saved: SavedCalibration | None, rng: np.random.Generator
-    ) -> _Photographed:
+    ) -> _SessionImages:
         if not any(station.photographs for station in session.stations):
             return cls([], Boards(), None)
         photographs = read_photographs(session)
         boards = boards_of(session, photographs)
-        if saved is not None and _saved_places(session, saved) is not None:
+        if saved is not None and _saved_station_poses(session, saved) is not None:
             return cls(photographs, boards, None)
         return cls(photographs, boards, localize_stations(session, photographs, boards, rng))
 
 
-def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
+def _saved_station_poses(session: Session, saved: SavedCalibration) -> Array | None:
     """Poses (S, 4, 4) of all stations in a calibration; None if one is missing."""
     there = {station.name: inverse(station.T_base_camera) for station in saved.stations}
     if not all(name in there for name in session.station_names):
@@ -379,10 +384,10 @@ def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
     return np.stack([there[name] for name in session.station_names])
 
 
-def _places(
+def _station_poses(
     session: Session,
     saved: SavedCalibration | None,
-    in_view: _Photographed,
+    images: _SessionImages,
     anywhere: bool,
     seed: int,
 ) -> Array:
@@ -391,11 +396,11 @@ def _places(
 
     anywhere : use a default pose for a station without a source, instead of raising InputError.
     """
-    reference_values = None if saved is None else _saved_places(session, saved)
-    if reference_values is None:
-        reference_values = in_view.T_camera_base
-    if reference_values is not None:
-        return reference_values
+    poses = None if saved is None else _saved_station_poses(session, saved)
+    if poses is None:
+        poses = images.T_camera_base
+    if poses is not None:
+        return poses
     out: list[Array] = []
     for station in session.stations:
         if station.T_camera_base is None and anywhere:
@@ -417,25 +422,25 @@ def _places(
 
 
 def _edge_noise(
-    session: Session, legs: list[int], in_view: _Photographed, T_camera_base: Array, edge: float
+    session: Session, legs: list[int], images: _SessionImages, T_camera_base: Array, edge: float
 ) -> tuple[tuple[int, ...], tuple[Pools, ...], float, str]:
     """Binning and pools of each station with legs, the shading, and a sentence on their source."""
     why = "no photograph tells it yet"
-    if len(in_view.photographs) == len(legs):
+    if len(images.photographs) == len(legs):
         rows = [
             spread_over(p.configuration, len(legs), PLAN_PHOTOGRAPHS_A_STATION)
-            for p in in_view.photographs
+            for p in images.photographs
         ]
         try:
             poses = platform_poses(session)
-            first = first_edges(session, in_view.photographs, rows, T_camera_base[legs], poses)
+            first = first_edges(session, images.photographs, rows, T_camera_base[legs], poses)
         except (PkmcalError, np.linalg.LinAlgError):
             # `check` and `calibrate` report what is wrong with these images; the plan uses defaults
             why = "the photographs that there are do not tell it; pkmcal check says why"
         else:
             count = sum(len(row) for row in rows)
             words = f"How good edges are is told by {count} of the photographs that there are."
-            pixels = tuple(p.binning for p in in_view.photographs)
+            pixels = tuple(p.binning for p in images.photographs)
             return pixels, first.pools, first.estimate.statistics.shading, words
     # without images their sharpness is not known
     pixels = tuple(first_binning(session.stations[s].camera.image_size) for s in legs)
@@ -452,8 +457,8 @@ def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
     ]
     if not sigma:
         return corner, f"Corners are taken to be good to {corner:g} px: no photograph tells it yet."
-    values = float(np.median(sigma))
-    return values, f"Corners of the board are good to {brief(values)} px in the photographs."
+    median = float(np.median(sigma))
+    return median, f"Corners of the board are good to {brief(median)} px in the photographs."
 
 
 def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
@@ -465,25 +470,25 @@ def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
     return None
 
 
-def _board_place(
+def _board_pose(
     session: Session,
     board: Board,
     saved: SavedCalibration | None,
-    in_view: _Photographed,
+    images: _SessionImages,
     T_camera_base: Array,
     seed: int,
 ) -> Array:
     """T_platform_board (4, 4): as calibrated, from images, or where the board is visible best."""
-    reference_values = _saved_target(saved, BOARD_MOUNT_NAME)
-    if reference_values is not None:
-        return reference_values
-    if in_view.boards.stations:
-        measurements = measurements_of(session, in_view.boards)
+    calibrated = _saved_target(saved, BOARD_MOUNT_NAME)
+    if calibrated is not None:
+        return calibrated
+    if images.boards.stations:
+        measurements = measurements_of(session, images.boards)
         return start_mounts(measurements, T_camera_base, platform_poses(session, most=True))[0]
     users = [s for s, station in enumerate(session.stations) if "board" in station.observe]
     cameras = tuple(session.stations[s].camera for s in users)
     rng = np.random.default_rng(seed)
     try:
-        return _bracket(session.machine, board, cameras, T_camera_base[users], rng)
+        return _best_board_pose(session.machine, board, cameras, T_camera_base[users], rng)
     except GeometryError as error:
         raise error.as_input("session.yaml, stations") from None

@@ -138,61 +138,60 @@ class SimulatedCalibrations:
         readings = capture.joints + design.reading_noise * rng.standard_normal(
             (batch.runs, *capture.joints.shape)
         )
-        one = assemble(capture.machine, capture.measurements(design.reading_noise), self.gauge)
-        problem = one.problem
-        data = replace(problem.data, joints=readings[:, one.observed])
+        template = assemble(capture.machine, capture.measurements(design.reading_noise), self.gauge)
+        problem = template.problem
+        data = replace(problem.data, joints=readings[:, template.observed])
         if len(capture.edges):
-            data = _measured_edges(design, capture, one, theta, poses, internal, rng)
-            data = replace(data, joints=readings[:, one.observed])
+            data = _measured_edges(design, capture, template, theta, poses, internal, rng)
+            data = replace(data, joints=readings[:, template.observed])
         pose_data = problem.pose_data
         if len(capture.views):
-            pose_data = _measured_boards(design, capture, one, poses, rng)
+            pose_data = _measured_boards(design, capture, template, poses, rng)
         off = STATION_START_SIGMAS * rng.standard_normal((batch.runs, len(capture.cameras), 6))
         stations = perturb(capture.T_camera_base, off)
         problem = replace(problem, data=data, pose_data=pose_data)
-        assembled = replace(one, problem=problem)
+        assembled = replace(template, problem=problem)
         start = _start(capture, assembled, stations, readings)
-        mounts = np.array(one.priors) == "mount"
+        mounts = np.array(template.priors) == "mount"
         # the prior is a metre wide: the same for all runs
         there = problem.prior_values(start).mean(axis=0)
         target = np.where(mounts, there, problem.prior_target)
-        assembled = replace(one, problem=replace(problem, prior_target=target))
+        assembled = replace(template, problem=replace(problem, prior_target=target))
         return SimulatedSessions(capture, theta, poses, internal, assembled, start)
 
     def solve(self, batch: Batch, data: SimulatedSessions) -> dict[Key, Fitted]:
         """Joint estimate of all runs, in the gauge of the result."""
         problem = data.assembled.problem
-        value = solve_batch(problem, data.start)
+        fit = solve_batch(problem, data.start)
         n, own = batch.runs, problem.layout.own_motion.shape[1]
-        used = sum(counts(problem, value.weight))
+        # Degrees of freedom: inliers, closures and priors, less own and shared unknowns.
+        used = sum(counts(problem, fit.weight))
         k = int(data.assembled.observed.sum())
         dof = used + k * (problem.layout.n_equations - own) + len(problem.prior)
         dof = dof - problem.unknowns.count
-        scale = np.maximum(value.noise_scale, value.scale.poses)
-        good = np.array([stop is Stop.CONVERGED for stop in value.solution.stop])
-        parameters = [self._in_gauge(data, value, run) for run in range(n)]
+        scale = np.maximum(fit.noise_scale, fit.scale.poses)
+        good = np.array([stop is Stop.CONVERGED for stop in fit.solution.stop])
+        parameters = [self._in_gauge(data, fit, run) for run in range(n)]
         return {
             JOINT_ESTIMATE_KEY: Fitted(
                 np.array([theta for theta, _ in parameters]),
                 extra={
-                    "chi2": value.solution.cost / dof,
+                    "chi2": fit.solution.cost / dof,
                     "scale": scale,
-                    "steps": value.solution.steps.astype(float),
+                    "steps": fit.solution.steps.astype(float),
                     "failed": 1.0 - (good & (scale <= TOO_NOISY)),
                 },
                 covariance=np.array([covariance for _, covariance in parameters]),
             )
         }
 
-    def _in_gauge(
-        self, data: SimulatedSessions, value: BatchResult, run: int
-    ) -> tuple[Array, Array]:
+    def _in_gauge(self, data: SimulatedSessions, fit: BatchResult, run: int) -> tuple[Array, Array]:
         """Parameters (P,) in the result's gauge and their covariance (P, P)."""
         machine, p = data.capture.machine, data.theta.shape[1]
         state = state_of(
-            data.assembled, take(value.solution.state, np.array([run])), _truth(data, run)
+            data.assembled, take(fit.solution.state, np.array([run])), _truth(data, run)
         )
-        shared = value.covariance[run]
+        shared = fit.covariance[run]
         full = machine_covariance(data.assembled.problem, machine, state, shared, self.gauge)
         theta = machine.parameters.unit_axes(in_gauge(machine, state, self.gauge).theta)
         return theta, full[:p, :p]
@@ -220,7 +219,7 @@ class SimulatedCalibrations:
         machine, true = data.capture.machine, _truth(data, run)
         theta = fit.theta[run]
         covariance = np.zeros((len(theta),) * 2) if fit.covariance is None else fit.covariance[run]
-        values = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
+        true_theta = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         sigma = np.where(sigma > ROUNDING_SIGMA, sigma, np.nan)
         # An axis is a unit vector: its largest component follows from the other two, and changes
@@ -229,7 +228,7 @@ class SimulatedCalibrations:
         largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
         sigma[axes[np.arange(len(axes)), largest]] = np.nan
         off = tool_error_and_sigma(machine, theta, covariance, true, joints, every=every)
-        return np.stack([theta - values, sigma]), np.stack(off)
+        return np.stack([theta - true_theta, sigma]), np.stack(off)
 
 
 def judged(parameters: Array, tool: Array, fit: Fitted) -> Sample:
@@ -240,14 +239,14 @@ def judged(parameters: Array, tool: Array, fit: Fitted) -> Sample:
     tau).
     """
     size, stated = _sizes(tool[0]), _sizes(tool[1])
-    values = {
+    figures = {
         "parameters": parameters[0],
         "tool": tool[0],
         "position": size[1], "orientation": size[0],
         "position_sigma": stated[1], "orientation_sigma": stated[0],
         "covered": covered(*parameters), "covered_tool": covered(*tool),
     }  # fmt: skip
-    return Sample(values | fit.extra, {"parameters": parameters[1], "tool": tool[1]})
+    return Sample(figures | fit.extra, {"parameters": parameters[1], "tool": tool[1]})
 
 
 def tool_error_and_sigma(
@@ -269,25 +268,35 @@ def tool_error_and_sigma(
     """
     n = len(theta)
     # register the truth to the result rather than to the nominal model
-    value = replace(machine, parameters=replace(machine.parameters, drawing=theta), values=theta)
-    over = changed_frames(machine.layout, true, *alignment(value, true, BestFit()))
+    calibrated = replace(
+        machine, parameters=replace(machine.parameters, drawing=theta), values=theta
+    )
+    registered = changed_frames(machine.layout, true, *alignment(calibrated, true, BestFit()))
     there = replace(true, theta=theta)
-    keep = transformation(value, there, BestFit())[:n, :n]
+    keep = transformation(calibrated, there, BestFit())[:n, :n]
     # Forward kinematics of the result and of the truth at the same readings.
     home = np.broadcast_to(machine.home(), (len(joints), 4, 4))
-    drawn = forward(machine.layout, machine.parameters.drawing, joints, home)
-    one = forward(machine.layout, theta, joints, drawn.T_base_platform, drawn.internal)
-    other = forward(machine.layout, over.theta, joints, one.T_base_platform, one.internal)
-    good = one.converged & other.converged
+    nominal_fk = forward(machine.layout, machine.parameters.drawing, joints, home)
+    calibrated_fk = forward(
+        machine.layout, theta, joints, nominal_fk.T_base_platform, nominal_fk.internal
+    )
+    true_fk = forward(
+        machine.layout,
+        registered.theta,
+        joints,
+        calibrated_fk.T_base_platform,
+        calibrated_fk.internal,
+    )
+    good = calibrated_fk.converged & true_fk.converged
     # Error and its covariance, both without the components that are changes of frames.
-    poses = one.T_base_platform[good]
-    by = pose_by_parameters(value, joints[good], poses) @ keep
-    by = without_frames(value, poses, by, every=every)
-    off = pose_difference(poses, other.T_base_platform[good])[..., None]
-    off = without_frames(value, poses, off, every=every)[..., 0]
-    variance = np.einsum("kip,pq,kiq->ki", by, covariance, by)
+    poses = calibrated_fk.T_base_platform[good]
+    by_parameters = pose_by_parameters(calibrated, joints[good], poses) @ keep
+    by_parameters = without_frames(calibrated, poses, by_parameters, every=every)
+    error = pose_difference(poses, true_fk.T_base_platform[good])[..., None]
+    error = without_frames(calibrated, poses, error, every=every)[..., 0]
+    variance = np.einsum("kip,pq,kiq->ki", by_parameters, covariance, by_parameters)
     out = np.full((2, len(joints), 6), np.nan)
-    out[0, good], out[1, good] = off, np.sqrt(np.maximum(variance, 0.0))
+    out[0, good], out[1, good] = error, np.sqrt(np.maximum(variance, 0.0))
     out[:, out[1] < ROUNDING_SIGMA] = np.nan  # the machine cannot move in this direction
     return out[0], out[1]
 
@@ -358,15 +367,15 @@ def _machines(
 def _measured_edges(
     design: Design,
     capture: Capture,
-    one: Assembled,
+    template: Assembled,
     theta: Array,
     poses: Array,
     internal: Array,
     rng: np.random.Generator,
 ) -> EdgeData:
     """Edge measurements of all runs, at their places in the problem."""
-    machine, edges, at = capture.machine, capture.edges, one.places.edges
-    blocks, runs, n = one.problem.blocks, len(theta), len(capture.edges)
+    machine, edges, at = capture.machine, capture.edges, template.places.edges
+    blocks, runs, n = template.problem.blocks, len(theta), len(capture.edges)
     ends = limb_ends(machine.layout, theta[:, None], capture.joints, poses, internal)
     radius = theta[:, blocks.radius[at.row, at.place]]
     normal, basis, first = np.empty((runs, n, 3)), np.empty((runs, n, 3, 2)), np.empty((runs, n, 3))
@@ -398,11 +407,13 @@ def _measured_edges(
     # Errors in px: independent noise, the camera's edge shift, and the shading of the tube's side.
     error = design.edge_noise * rng.standard_normal((2, runs, n))
     camera = blocks.camera[at.row, at.place]
-    outward = SHIFT_SIGMA * rng.standard_normal((runs, one.problem.unknowns.n_cameras))[:, camera]
+    outward = (
+        SHIFT_SIGMA * rng.standard_normal((runs, template.problem.unknowns.n_cameras))[:, camera]
+    )
     line = blocks.line[at.row, at.place]
     lines = rng.standard_normal((runs, int(line.max(initial=0)) + 1))
     alone = rng.standard_normal((runs, n))
-    own = OWN_SHADING / SHADING_SIGMA * _own(line, normal[0], rng, runs)
+    own = OWN_SHADING / SHADING_SIGMA * _own_shading(line, normal[0], rng, runs)
     shaded = design.shading * (np.where(line < 0, alone, lines[:, line]) + own)
     turn = by_shift * (error[0] + outward + shaded)[..., None] + by_tilt * error[1][..., None]
     normal = normal + (basis @ turn[..., None])[..., 0]
@@ -416,14 +427,14 @@ def _measured_edges(
         return np.moveaxis(at.filled(np.moveaxis(values, 0, 1)), 2, 0)
 
     return replace(
-        one.problem.data,
+        template.problem.data,
         basis=placed(basis)[:, :, :, None],
         white=placed(whiten),
         optics=placed(by_shift[..., None]),
     )
 
 
-def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> Array:
+def _own_shading(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> Array:
     """Individual shading of edges (n,), (runs, n) of unit variance.
 
     It is correlated between edges of the same line by the angle between their normals (n, 3).
@@ -443,12 +454,12 @@ def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> 
 
 
 def _measured_boards(
-    design: Design, capture: Capture, one: Assembled, poses: Array, rng: np.random.Generator
+    design: Design, capture: Capture, template: Assembled, poses: Array, rng: np.random.Generator
 ) -> PoseData:
     """Board poses of all runs, with the covariance that follows from the noise of the corners."""
     if capture.board is None or capture.T_platform_board is None:
-        return one.problem.pose_data
-    at, (station, row) = one.places.poses, capture.views.T
+        return template.problem.pose_data
+    at, (station, row) = template.places.poses, capture.views.T
     true = capture.T_camera_base[station] @ poses[:, row] @ capture.T_platform_board
     information = np.empty((*true.shape[:2], 6, 6))
     for number, camera in enumerate(capture.cameras):
@@ -463,15 +474,15 @@ def _measured_boards(
     covariance = np.linalg.inv(information)
     covariance = 0.5 * (covariance + covariance.mT)
     root = np.linalg.cholesky(covariance)
-    in_view = perturb(true, (root @ rng.standard_normal((*true.shape[:2], 6, 1)))[..., 0])
+    measured = perturb(true, (root @ rng.standard_normal((*true.shape[:2], 6, 1)))[..., 0])
 
     def placed(values: Array, empty: Array) -> Array:
         out = np.moveaxis(at.filled(np.moveaxis(values, 0, 1)), 2, 0)
         return np.where(at.present[..., None, None], out, empty)
 
     return replace(
-        one.problem.pose_data,
-        T_station_target=placed(in_view, np.eye(4)),
+        template.problem.pose_data,
+        T_station_target=placed(measured, np.eye(4)),
         whiten=placed(np.linalg.inv(root), np.zeros((6, 6))),
     )
 

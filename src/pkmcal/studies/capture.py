@@ -141,11 +141,13 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
             distance=design.distance, elevation=design.elevation,
         )  # fmt: skip
         T_camera_base = np.stack([place.T_camera_base() for place in places])
+    # Candidate configurations, more than needed.
     n = design.configurations
     wanted = n if design.shared else n * design.stations
     poses, joints = draw_configurations(
         machine, 2 * wanted + SPARE_CONFIGURATIONS_DRAWN, design.extreme, rng
     )
+    # Visibility of board and legs at each station.
     board = T_platform_board = None
     visible = np.ones((design.stations, len(joints)), dtype=bool)
     if by_board:
@@ -154,8 +156,8 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
         T_platform_board = place_board(
             whole, board, "platform", cameras, T_camera_base, poses, whole.inverse(poses), rng
         )
-        display = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        visible &= display.mean(axis=-1) >= LEAST_BOARD_SHARE_IN_IMAGE
+        corner_visible = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        visible &= corner_visible.mean(axis=-1) >= LEAST_BOARD_SHARE_IN_IMAGE
     if "legs" in design.observe:
         visible &= np.stack(
             [
@@ -163,16 +165,17 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
                 for camera, T in zip(cameras, T_camera_base, strict=True)
             ]
         )
-    rows, photographs = _chosen(visible, n, shared=design.shared)
+    # The first configurations that are in view.
+    rows, pairs = _chosen(visible, n, shared=design.shared)
     poses, joints = poses[rows], joints[rows]
     edges = EdgeSet.empty()
     if "legs" in design.observe:
-        edges = _edges(machine, cameras, T_camera_base, poses, joints, photographs)
+        edges = _edges(machine, cameras, T_camera_base, poses, joints, pairs)
     views, corners = np.zeros((0, 2), dtype=int), np.zeros((0, 0), dtype=bool)
     if board is not None and T_platform_board is not None:
-        views = photographs
-        display = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        corners = display[views[:, 0], views[:, 1]]
+        views = pairs
+        corner_visible = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        corners = corner_visible[views[:, 0], views[:, 1]]
     return Capture(
         machine, cameras, T_camera_base, poses, joints, edges, views, corners, board,
         T_platform_board,
@@ -209,12 +212,12 @@ def _edges(
     T_camera_base: Array,
     poses: Array,
     joints: Array,
-    photographs: Integers,
+    pairs: Integers,
 ) -> EdgeSet:
     """Exact edges that are visible in the images (M, 2) of station and configuration."""
     tubes, sets = tubes_of(machine), list[EdgeSet]()
     for station, (camera, T) in enumerate(zip(cameras, T_camera_base, strict=True)):
-        rows = photographs[photographs[:, 0] == station, 1]
+        rows = pairs[pairs[:, 0] == station, 1]
         ends = machine.ends_at(joints[rows], poses[rows])
         radius = machine.values[tubes.radius]
         exact, _ = visible_edges(camera, tubes, radius, apply(T, ends.a), apply(T, ends.b))

@@ -28,12 +28,12 @@ def _is_address(text: str) -> bool:
         return False
 
 
-def _version() -> str:
+def _pkmcal_version() -> str:
     """Version of pkmcal, here or on a worker."""
     return version("pkmcal")
 
 
-def _worked(task: Job) -> SolvedBatch:
+def _work_on_one_thread(task: Job) -> SolvedBatch:
     """Result of a task, computed on a worker.
 
     The worker's linear algebra is limited to one thread for good: tasks may overlap, and a limit
@@ -78,10 +78,10 @@ def on_cluster(address: str) -> Runner:
             ) from None
         log = logging.getLogger("distributed.client")
         level = log.level
-        log.setLevel(logging.CRITICAL)  # _done reports a lost scheduler
+        log.setLevel(logging.CRITICAL)  # _run_tasks reports a lost scheduler
         try:
-            workers = _checked(client, address)
-            _done(client, tasks, finished)
+            workers = _count_threads(client, address)
+            _run_tasks(client, tasks, finished)
         finally:
             client.close()
             log.setLevel(level)
@@ -90,7 +90,7 @@ def on_cluster(address: str) -> Runner:
     return runner
 
 
-def _checked(client: Any, address: str) -> int:
+def _count_threads(client: Any, address: str) -> int:
     """Number of the cluster's threads; raises InputError if any worker has another version."""
     try:
         client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
@@ -102,25 +102,27 @@ def _checked(client: Any, address: str) -> int:
             next_step=f"Start one with: dask worker {address}",
         ) from None
     try:
-        versions = set(client.run(_version).values())
+        versions = set(client.run(_pkmcal_version).values())
     except (ImportError, AttributeError) as error:
         versions = {str(error)}
-    if versions != {_version()}:
+    if versions != {_pkmcal_version()}:
         raise InputError(
             "the cluster's workers have another pkmcal, so they would not give the same numbers",
             where="--scheduler",
             found=", ".join(sorted(versions)),
-            expected=_version(),
-            next_step=f"Install pkmcal {_version()} where the workers run",
+            expected=_pkmcal_version(),
+            next_step=f"Install pkmcal {_pkmcal_version()} where the workers run",
         )
     return sum(client.nthreads().values())
 
 
-def _done(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
+def _run_tasks(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
     """Run all tasks; Dask repeats the tasks of a worker that has died on another one."""
     from distributed import CancelledError, KilledWorker, as_completed
 
-    futures = {client.submit(_worked, task, pure=False): k for k, task in enumerate(tasks)}
+    futures = {
+        client.submit(_work_on_one_thread, task, pure=False): k for k, task in enumerate(tasks)
+    }
     try:
         for future in as_completed(list(futures), loop=client.loop):
             number = futures.pop(future)

@@ -85,15 +85,15 @@ def run_all(
     parts.sort(key=lambda part: (part[1], part[0]))
     done: dict[int, SolvedBatch] = {}
     for k, part in enumerate(parts):
-        value = store.load(*part) if store else None
-        if value is not None:
-            done[k] = value
-    remainder = [k for k in range(len(parts)) if k not in done]
+        stored = store.load(*part) if store else None
+        if stored is not None:
+            done[k] = stored
+    pending = [k for k in range(len(parts)) if k not in done]
     if progress and done:
         progress(settings[0].doing, len(done) / len(parts))
 
     def finished(task: int, result: SolvedBatch) -> None:
-        k = remainder[task]
+        k = pending[task]
         cell, number, _ = parts[k]
         if store:
             store.save(cell, number, result)
@@ -102,7 +102,7 @@ def run_all(
             progress(settings[cell].doing, len(done) / len(parts))
 
     jobs = [Job(settings[cell], batch, names[cell] if names else "")
-            for cell, _, batch in (parts[k] for k in remainder)]  # fmt: skip
+            for cell, _, batch in (parts[k] for k in pending)]  # fmt: skip
     workers = (runner or on_cores)(jobs, finished) if jobs else 1
     wall = time.perf_counter() - began
     out: list[StudyResult[S]] = []

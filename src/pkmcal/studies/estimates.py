@@ -49,8 +49,8 @@ class Fitted:
 
 def nominal_estimate(machine: Machine, runs: int) -> Fitted:
     """Nominal parameters as an estimate."""
-    values = machine.parameters.drawing
-    return Fitted(np.broadcast_to(values, (runs, len(values))))
+    nominal = machine.parameters.drawing
+    return Fitted(np.broadcast_to(nominal, (runs, len(nominal))))
 
 
 def joint(problem: Problem, start: BatchState) -> BatchResult:
@@ -58,15 +58,15 @@ def joint(problem: Problem, start: BatchState) -> BatchResult:
     return solve_batch(problem, start, robust=False, scale_noise=False)
 
 
-def freedom(data: SimulatedRuns, layout: LimbLayout, reference_values: int) -> int:
+def freedom(data: SimulatedRuns, layout: LimbLayout, shared_rank: int) -> int:
     """Degrees of freedom of the joint problem.
 
-    reference_values : rank of the unknowns shared by all configurations, less the number of their
+    shared_rank : rank of the unknowns shared by all configurations, less the number of their
     priors.
     """
     boards = 0 if data.view.T_platform_board is None else 6
     rows = 4 * data.axis.shape[2] + boards + layout.n_equations
-    return data.count * (rows - layout.own_motion.shape[1]) - reference_values
+    return data.count * (rows - layout.own_motion.shape[1]) - shared_rank
 
 
 def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generator) -> Array:
@@ -78,8 +78,8 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     reduced = eliminate(problem.linearize(state))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
     s, vt, scale = scaled_directions(rows)
-    above_limit = s > UNTOLD_SINGULAR_SHARE * s[:, :1]
-    spread = np.where(above_limit, 1 / np.where(above_limit, s, 1.0), 0.0)
+    identifiable = s > UNTOLD_SINGULAR_SHARE * s[:, :1]
+    spread = np.where(identifiable, 1 / np.where(identifiable, s, 1.0), 0.0)
     # The symmetric root is unique, whereas the signs of singular vectors depend on rounding.
     draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
     return (vt.mT @ draw)[..., 0] / scale

@@ -139,9 +139,11 @@ class SweepResult:
         """
         lines = [f"{self.subject.name}, {count(self.runs, 'calibration')} a combination"]
         for cell in self.found:
-            result, error, stated = (1e3 * value for value in (*cell.position, cell.position_sigma))
+            position, error, stated = (
+                1e3 * value for value in (*cell.position, cell.position_sigma)
+            )
             lines.append(
-                f"  {in_words(cell.values) or 'as it is'}: tool {brief(result)} ±"
+                f"  {in_words(cell.values) or 'as it is'}: tool {brief(position)} ±"
                 f" {brief(error)} mm,"
                 f" stated {brief(stated)} mm, {number(100 * cell.covered.value, 1)} % of the 95 %"
                 f" intervals hold, {number(100 * cell.failed.value, 1)} % failed"
@@ -161,8 +163,8 @@ class SweepResult:
     @property
     def gains(self) -> list[Gain]:
         """Gains of the names with two usable values or more, largest first."""
-        item = (self._gain(name) for name in self.varied)
-        return sorted((gain for gain in item if gain), key=lambda g: -g.times)
+        gains = (self._gain(name) for name in self.varied)
+        return sorted((gain for gain in gains if gain), key=lambda g: -g.times)
 
     def _gain(self, name: str) -> Gain | None:
         """Gain by one name; None with fewer than two usable values."""
@@ -174,7 +176,9 @@ class SweepResult:
         before, after = means[worst], means[best]
         freedom = min(cell.freedom for cell in self.found if np.isfinite(cell.position.value))
         pairs = len(means) * (len(means) - 1) // 2
-        sure = before.value - after.value > _by_chance(before.error, after.error, freedom, pairs)
+        sure = before.value - after.value > _chance_difference(
+            before.error, after.error, freedom, pairs
+        )
         return Gain(name, worst, best, before.value, after.value, sure)
 
     def at(self, name: str, value: Value) -> Summary:
@@ -235,17 +239,17 @@ def study(
     check_number("study", "runs", runs)
     check_number("study", "seed", seed)
     runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
-    begun = subject_of(subject)
-    varied = parsed(begun, vary)
-    cells = cells_of(begun, varied)
+    studied = subject_of(subject)
+    varied = parsed(studied, vary)
+    cells = cells_of(studied, varied)
     settings = [cell.setting for cell in cells]
     title = " ".join([subject, *vary])
     names = [in_words(cell.values) for cell in cells]
     opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
     with opened as store:
         results = run_all(settings, runs, seed, progress, runner, store, names)
-    value = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
-    return SweepResult(begun, varied, tuple(cells), tuple(results), value, runs, seed)
+    found = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
+    return SweepResult(studied, varied, tuple(cells), tuple(results), found, runs, seed)
 
 
 def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
@@ -306,7 +310,7 @@ def clustered(values: Array, batch: Integers) -> Summary:
     return Summary(mean, spread * float(np.sqrt(groups / (groups - 1))))
 
 
-def _by_chance(one: float, other: float, freedom: int, pairs: int) -> float:
+def _chance_difference(one: float, other: float, freedom: int, pairs: int) -> float:
     """Difference of two means with these standard errors that chance exceeds in 5 % of the cases.
 
     freedom : degrees of freedom of each standard error. pairs : number of compared pairs, of which

@@ -234,10 +234,12 @@ class HexapodByAxes:
         draws = batch.generator(PAPER_A_BOUND_STREAM).normal(
             size=(DRAWS_FROM_BOUND, batch.runs, root.shape[-1], 1)
         )
-        shifted = np.mean(
+        effector_by_bound = np.mean(
             [effector(theta) for theta in data.theta + (root @ draws)[..., 0]], axis=0
         )
-        out[PAPER_A_BOUND,] = _sample(machine, np.linalg.norm(rows @ root, axis=-1), shifted)
+        out[PAPER_A_BOUND,] = _sample(
+            machine, np.linalg.norm(rows @ root, axis=-1), effector_by_bound
+        )
         return out
 
 
@@ -247,10 +249,10 @@ def _sample(
     """Sample with errors (B, 30) of the parameters, also by group, and (B, 4) of the
     end-effector.
     """
-    values = {name: errors[:, at] for name, at in parameters_by_group(machine).items()}
-    values |= {"parameters": errors}
-    values |= {name: effector[:, k] for k, name in enumerate(END_EFFECTOR_QUANTITIES)}
-    return Sample(values | (fit.extra if fit else {}), fit.sigma if fit else {})
+    figures = {name: errors[:, at] for name, at in parameters_by_group(machine).items()}
+    figures |= {"parameters": errors}
+    figures |= {name: effector[:, k] for k, name in enumerate(END_EFFECTOR_QUANTITIES)}
+    return Sample(figures | (fit.extra if fit else {}), fit.sigma if fit else {})
 
 
 @dataclass(frozen=True)
@@ -290,9 +292,9 @@ class JointByAxes(HexapodByAxes):
         errors = (fit.theta - data.theta) @ thirty(machine).rows.T
         parameters = np.stack([errors, fit.sigma["parameters"]])
         tool = _tool(machine, data.theta, fit, batch.generator(END_EFFECTOR_STREAM))
-        values = fit.extra | {"failed": (fit.extra["chi2"] > RIGHT_MINIMUM_CHI2).astype(float)}
-        values["scale"] = np.ones(batch.runs)
-        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, Fitted(fit.theta, extra=values))}
+        figures = fit.extra | {"failed": (fit.extra["chi2"] > RIGHT_MINIMUM_CHI2).astype(float)}
+        figures["scale"] = np.ones(batch.runs)
+        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, Fitted(fit.theta, extra=figures))}
 
 
 def converged(study: StudyResult[HexapodByAxes]) -> int:
@@ -337,28 +339,28 @@ def thirty(machine: Machine) -> Thirty:
     The origin is in the first centre, x points to the third, and the fifth is in the x-y plane. Six
     coordinates of each body vanish in these frames; twelve each remain, followed by the offsets.
     """
-    values = machine.parameters.drawing
+    theta = machine.parameters.drawing
     held = {(0, 0), (0, 1), (0, 2), (2, 1), (2, 2), (4, 2)}
     names: list[str] = []
     rows: list[Array] = []
-    drawn: list[float] = []
+    nominal: list[float] = []
     for letter, index in zip("AB", centre_index(machine.layout), strict=True):
-        points = values[index]
+        points = theta[index]
         x = points[2] - points[0]
         x = x / np.linalg.norm(x)
         z = np.cross(x, points[4] - points[0])
         z = z / np.linalg.norm(z)
         frame = np.stack([x, np.cross(z, x), z])
         for leg, axis in sorted(set(np.ndindex(6, 3)) - held):
-            row = np.zeros(len(values))
+            row = np.zeros(len(theta))
             row[index[leg]] = frame[axis]
             names.append(f"{letter}{leg + 1} {'xyz'[axis]}")
             rows.append(row)
-            drawn.append(float(frame[axis] @ (points[leg] - points[0])))
+            nominal.append(float(frame[axis] @ (points[leg] - points[0])))
     names += [f"q{leg + 1}" for leg in range(6)]
-    rows += list(np.eye(len(values))[machine.layout.rod])
-    drawn += values[machine.layout.rod].tolist()
-    return Thirty(tuple(names), np.array(rows), np.array(drawn))
+    rows += list(np.eye(len(theta))[machine.layout.rod])
+    nominal += theta[machine.layout.rod].tolist()
+    return Thirty(tuple(names), np.array(rows), np.array(nominal))
 
 
 def parameters_by_group(machine: Machine) -> dict[str, Integers]:
@@ -419,7 +421,7 @@ def joint_from_readings(data: SimulatedRuns, start: Start) -> Fitted:
     solution = joint(problem, state)
     theta, nz = problem.theta(solution.solution.state), z.shape[1]
     # The gauge fixes 12 of the nz free parameters; each station has 6 unknowns.
-    dof = freedom(data, machine.layout, reference_values=nz - 12 + 6 * PAPER_A_STATIONS)
+    dof = freedom(data, machine.layout, shared_rank=nz - 12 + 6 * PAPER_A_STATIONS)
     spread = in_frames(machine, problem, theta)
     stated = spread @ solution.info.covariance[:, :nz, :nz] @ spread.mT
     rows = thirty(machine).rows
@@ -455,9 +457,9 @@ def root_of_bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Ar
     T = np.broadcast_to(data.view.T_camera_base, (n, PAPER_A_STATIONS, 4, 4))
     state = BatchState(z, T, data.T_base_platform, np.zeros((n, 1, 1)))
     covariance = Information(problem, state).covariance[:, :nz, :nz]
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-    root = root @ vectors.mT  # the symmetric root is unique
+    eigenvalues, eigenvectors = np.linalg.eigh(covariance)
+    root = eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None]
+    root = root @ eigenvectors.mT  # the symmetric root is unique
     return in_frames(machine, problem, data.theta) @ root
 
 
@@ -476,9 +478,11 @@ def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator)
     f = register(theta[:, platform], data.theta[:, platform])[:, None]
     b1 = data.theta[:, None, platform[0]]  # the gauge holds A1 and B1 at their nominal values
     columns: list[Array] = []
-    for shifted in (T, e @ T @ inverse(f)):
-        columns.append(np.linalg.norm(apply(shifted, b1) - apply(T_true, b1), axis=-1).mean(axis=1))
-        turn = shifted[..., :3, :3] @ T_true[..., :3, :3].mT
+    for estimated in (T, e @ T @ inverse(f)):
+        columns.append(
+            np.linalg.norm(apply(estimated, b1) - apply(T_true, b1), axis=-1).mean(axis=1)
+        )
+        turn = estimated[..., :3, :3] @ T_true[..., :3, :3].mT
         columns.append(np.linalg.norm(rotation_vector(turn), axis=-1).mean(axis=1))
     return np.stack(columns, axis=-1)
 

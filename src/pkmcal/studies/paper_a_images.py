@@ -50,14 +50,14 @@ def measured_noise(seed: int, progress: Callable[[str, float], None]) -> Measure
             seed=seed,
             progress=rendered,
         )
-        value = study_repeats(
+        repeats = study_repeats(
             folder,
             seed=seed,
             progress=lambda text, share: progress(
                 text, RENDERING_PROGRESS_SHARE + (1 - RENDERING_PROGRESS_SHARE) * share
             ),
         )
-    return MeasuredNoise(_noise(value.middle), _noise(value.bound), value.middle.shift)
+    return MeasuredNoise(_noise(repeats.middle), _noise(repeats.bound), repeats.middle.shift)
 
 
 def _noise(row: LegScatter) -> AxisNoise:

@@ -103,7 +103,7 @@ def reproduce(options: Options) -> Outcome:
         done = 0.6
         measured = measured_noise(options.seed, options.within(0.0, done))
     share = (1 - done) * (0.1 if options.long else 0.5)
-    value, narrow = (
+    study, narrow = (
         run(setting, options.runs, options.seed, options.within(begin, begin + share))
         for setting, begin in (
             (HexapodByAxes(), done),
@@ -114,35 +114,35 @@ def reproduce(options: Options) -> Outcome:
     by_poses: dict[int, HexapodByAxesStudy] = {}  # by number of poses at a station
     for poses in PROTOTYPE_POSES if options.long else ():
         upto = done + (1 - done) * poses / sum(PROTOTYPE_POSES)
-        values = options.within(done, upto)
-        same = poses == value.setting.poses
-        setting = replace(value.setting, poses=poses)
-        by_poses[poses] = value if same else run(setting, options.runs, options.seed, values)
+        progress = options.within(done, upto)
+        same = poses == study.setting.poses
+        setting = replace(study.setting, poses=poses)
+        by_poses[poses] = study if same else run(setting, options.runs, options.seed, progress)
         done = upto
-    figures = paper_a_figures(value)
+    figures = paper_a_figures(study)
     elapsed = perf_counter() - began
-    words = _words(value, narrow, figures, measured, elapsed)
+    words = _words(study, narrow, figures, measured, elapsed)
     return words.reproduction(
         (
             words.part("noise", table_1(measured), more=["measured"] if measured else []),
-            _figure_part(words, value),
-            words.part("effector", _effector_table(value), _readings_table(value, narrow)),
+            _figure_part(words, study),
+            words.part("effector", _effector_table(study), _readings_table(study, narrow)),
             words.part(
                 "groups",
                 Table(
                     "RMSE, mm",
                     ("", *(PAPER_A_QUANTITY_LABELS[g] for g in PAPER_A_PARAMETER_GROUPS)),
                     tuple(
-                        _by_method(value, [Column(name, 3, 4) for name in PAPER_A_PARAMETER_GROUPS])
+                        _by_method(study, [Column(name, 3, 4) for name in PAPER_A_PARAMETER_GROUPS])
                     ),
                 ),
             ),
             *([_poses_part(words, by_poses)] if by_poses else []),
             words.part("how"),
         ),
-        checks=paper_a_checks(value),
+        checks=paper_a_checks(study),
         remarks=[name for name in PAPER_A_REMARKS if words.values.get(name, True)],
-        numbers={**_numbers(value, narrow, figures, by_poses, elapsed), **_noise(measured)},
+        numbers={**_numbers(study, narrow, figures, by_poses, elapsed), **_noise(measured)},
     )
 
 
@@ -400,38 +400,40 @@ def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Tab
 def _poses_part(words: Words, studies: dict[int, HexapodByAxesStudy]) -> Part:
     """Section on the accuracy by number of poses at a station."""
     poses = sorted(studies)
-    results = {n: studies[n].of(PAPER_A_JOINT)["displacement"].times(1e3) for n in poses}
+    displacements = {n: studies[n].of(PAPER_A_JOINT)["displacement"].times(1e3) for n in poses}
     least = [1e3 * studies[n].of(PAPER_A_BOUND)["displacement"].value for n in poses]
     rows = [
         Row(
             str(n),
-            (number(results[n].value, 4), number(results[n].error, 4), number(bound, 4),
+            (number(displacements[n].value, 4), number(displacements[n].error, 4), number(bound, 4),
              number(PROTOTYPE_POSES[n], 3)),
         )
         for n, bound in zip(poses, least, strict=True)
     ]  # fmt: skip
     heads = ("poses a station", "found", "± Monte-Carlo", "bound", "prototype")
     title = "Displacement of the end-effector, joint estimate, mm"
-    drawn = _falling(poses, [results[n] for n in poses], least)
+    figure = _poses_plot(poses, [displacements[n] for n in poses], least)
     return words.part(
         "poses",
         Table(title, heads, tuple(rows)),
-        plots={"poses": {"figure": drawn, "height": 380}},
+        plots={"poses": {"figure": figure, "height": 380}},
     )
 
 
-def _falling(poses: list[int], results: list[Summary], least: list[float]) -> dict[str, Any]:
+def _poses_plot(
+    poses: list[int], displacements: list[Summary], least: list[float]
+) -> dict[str, Any]:
     """Plot of the end-effector's error (mm) by number of poses at a station, on logarithmic
     axes.
     """
     as_root = [least[-1] * (poses[-1] / n) ** 0.5 for n in poses]
-    two_sigma = [2 * s.error for s in results]
+    two_sigma = [2 * s.error for s in displacements]
     data = [
         trace("Cramér-Rao bound", poses, least, "--ink", "lines",
                line={"color": "--ink", "dash": "dot", "width": 1.5}),
         trace("as N to the power of −½", poses, as_root, "--quiet", "lines",
                line={"color": "--quiet", "dash": "dash", "width": 1.5}),
-        trace("joint estimate", poses, [s.value for s in results], "--calibrated",
+        trace("joint estimate", poses, [s.value for s in displacements], "--calibrated",
                error_y={"array": two_sigma, "color": "--calibrated"}),
         trace("independent prototype", PROTOTYPE_POSES, PROTOTYPE_POSES.values(),
                "--drawing", "markers",
@@ -497,12 +499,12 @@ def _numbers(
 
 
 def _accuracy(s: HexapodByAxesStudy, method: str) -> dict[str, Any]:
-    results = {
+    summaries = {
         name: s.of(method)[name] for name in (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
     }
     return {
-        "found": {name: summary.value for name, summary in results.items()},
-        "standard_error": {name: summary.error for name, summary in results.items()},
+        "found": {name: summary.value for name, summary in summaries.items()},
+        "standard_error": {name: summary.error for name, summary in summaries.items()},
     }
 
 

@@ -144,12 +144,12 @@ class HexapodByLegs:
         where, _, name = batch.population.partition(", ")
         methods = PAPER_B_CASES[name].methods if name else (ROBUST_REGRESSION,)
         rng = batch.generator(1)
-        results = [solved(one, methods, rng) for one in data]
-        values = hexapod_with_cylinder_legs().parameters.drawing
-        theta = np.broadcast_to(values, (batch.runs, len(values)))
+        centres = [solved(one, methods, rng) for one in data]
+        nominal = hexapod_with_cylinder_legs().parameters.drawing
+        theta = np.broadcast_to(nominal, (batch.runs, len(nominal)))
         return {
             (where, name or CONTROLLED_POPULATION, method): Fitted(
-                theta, extra={"centres": np.stack([f[method] for f in results])}
+                theta, extra={"centres": np.stack([f[method] for f in centres])}
             )
             for method in methods
         }
@@ -160,14 +160,14 @@ class HexapodByLegs:
         """Errors of the base centres."""
         del batch
         truth = np.stack([one.centres for one in data])
-        camera, drawing = data[0].view.camera, hexapod_with_cylinder_legs().base_centers()
+        camera, nominal = data[0].view.camera, hexapod_with_cylinder_legs().base_centers()
         pixel = camera.project(truth)
         out: dict[Key, Sample] = {}
         for key, fit in fits.items():
             centres = fit.extra["centres"]
             off = centres - truth
-            T = register(np.broadcast_to(drawing, centres.shape), centres)
-            laid = apply(T[:, None], drawing)
+            T = register(np.broadcast_to(nominal, centres.shape), centres)
+            laid = apply(T[:, None], nominal)
             square = np.sum((centres - laid) ** 2, axis=-1)
             out[key] = Sample(
                 {
@@ -212,11 +212,11 @@ def drawn_machine(rng: np.random.Generator) -> Machine:
     """Machine drawn by the prior sigmas; radii are nominal, since a wrong radius is a case of its
     own.
     """
-    drawing = hexapod_with_cylinder_legs()
-    values = true_machine(drawing, 1.0, rng).values.copy()
-    radii = np.array(drawing.parameters.kinds) == "radius"
-    values[radii] = drawing.values[radii]
-    return drawing.with_values(values)
+    nominal = hexapod_with_cylinder_legs()
+    values = true_machine(nominal, 1.0, rng).values.copy()
+    radii = np.array(nominal.parameters.kinds) == "radius"
+    values[radii] = nominal.values[radii]
+    return nominal.with_values(values)
 
 
 @cache
@@ -273,16 +273,16 @@ def solved(
     one: MeasuredHexapod, methods: tuple[str, ...], rng: np.random.Generator
 ) -> dict[str, Array]:
     """Base centres (L, 3), camera frame, by each of the methods."""
-    drawing = hexapod_with_cylinder_legs().base_centers()
+    nominal = hexapod_with_cylinder_legs().base_centers()
     out: dict[str, Array] = {}
     for method in PAPER_B_REGRESSIONS:
         if method in methods or method == ROBUST_REGRESSION:
-            value = linear.centres(one.machine, one.measurements, method, rng)
-            out[method] = value.centres[0]
+            estimate = linear.centres(one.machine, one.measurements, method, rng)
+            out[method] = estimate.centres[0]
     start = out[ROBUST_REGRESSION]
     if SCALED_BY_RATIO in methods:
-        out[SCALED_BY_RATIO] = start / linear.scale_ratio(start, drawing)
-        out[SCALED_BY_SIMILARITY] = start / linear.procrustes_scale(start, drawing)
+        out[SCALED_BY_RATIO] = start / linear.scale_ratio(start, nominal)
+        out[SCALED_BY_SIMILARITY] = start / linear.procrustes_scale(start, nominal)
     if PAPER_B_JOINT in methods:
         out[PAPER_B_JOINT] = jointly_estimated_centres(one, start)
     return {method: out[method] for method in methods}

@@ -53,7 +53,7 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     """Run the same motion with every estimate. centres : (R, L, 3) by [B] eq. 14, camera frame, for
     each run.
     """
-    machine, drawing = controlled_machine(), hexapod_with_cylinder_legs()
+    machine, nominal = controlled_machine(), hexapod_with_cylinder_legs()
     view = views_by_name()[PERSPECTIVE_VIEW]
     true = machine_view(machine, view.T_camera_base)
     eye = Eye.of(true, view.camera)
@@ -62,17 +62,17 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     exact = Uncertainty(np.zeros((len(machine.values),) * 2), np.zeros(3), np.zeros(3))
     beliefs: dict[str, Belief] = {}
     for name, (position, degrees) in CAMERA_BY_HAND_ERRORS.items():
-        value = estimates(
-            true, drawing.values, exact, runs, rng, position, float(np.radians(degrees))
+        drawn_beliefs = estimates(
+            true, nominal.values, exact, runs, rng, position, float(np.radians(degrees))
         )
-        beliefs.setdefault("true", value[0])
-        beliefs[name] = replace(value[3], name=name)
+        beliefs.setdefault("true", drawn_beliefs[0])
+        beliefs[name] = replace(drawn_beliefs[3], name=name)
     T = np.broadcast_to(view.T_camera_base, (runs, 4, 4))
-    values = np.tile(drawing.values, (runs, 1))
-    values[:, centre_index(machine.layout)[0]] = apply(inverse(T)[:, None], centres)
-    beliefs[E2] = _belief(E2, "Linear", true, values, T)
-    fitted = register(np.broadcast_to(drawing.base_centers(), centres.shape), centres)
-    as_drawn = np.broadcast_to(drawing.values, values.shape)
+    theta = np.tile(nominal.values, (runs, 1))
+    theta[:, centre_index(machine.layout)[0]] = apply(inverse(T)[:, None], centres)
+    beliefs[E2] = _belief(E2, "Linear", true, theta, T)
+    fitted = register(np.broadcast_to(nominal.base_centers(), centres.shape), centres)
+    as_drawn = np.broadcast_to(nominal.values, theta.shape)
     beliefs[E1] = _belief(E1, "Drawing, fitted", true, as_drawn, fitted)
     start, goal = (
         np.broadcast_to(machine.forward(q), (runs, 4, 4))

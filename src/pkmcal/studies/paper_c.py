@@ -189,22 +189,22 @@ class H4ByBoard:
                 tool_errors(machine.layout, fit.theta, at, self.turn, self.shift)
                 for at in (near, far)
             )
-            values = {
+            figures = {
                 "chi2": np.full(batch.runs, np.nan),
                 "shift": one.shift, "turn": one.turn,
                 "larger_shift": other.shift, "larger_turn": other.turn,
             }  # fmt: skip
             if papers and method != PAPER_C_BOUND:
                 off = control_residuals(machine, fit, data)
-                values |= {
+                figures |= {
                     "control_mean": off.mean(axis=1),
                     "control_rms": np.sqrt(np.mean(off**2, axis=1)),
                     "straightness": straightness_along_rulers(machine, fit.theta, data, lines),
                     "square": square(machine, fit.theta, data),
                 }
             if papers and name == "design":
-                values["table_2"] = table_2_of(machine, fit.theta)
-            out[kind, name, method] = Sample(values | fit.extra)
+                figures["table_2"] = table_2_of(machine, fit.theta)
+            out[kind, name, method] = Sample(figures | fit.extra)
         return out | {("design", ROTATION_AXIS_METHOD): axis_of_rotation(data)} if papers else out
 
 
@@ -240,11 +240,11 @@ def start(machine: Machine, data: SimulatedRuns) -> State:
     """Starting state of every method, B runs: nominal parameters, camera and board by the closed
     form.
     """
-    n, values = data.count, machine.parameters.drawing
-    fk = forward(machine.layout, values, data.joints[:, :n], machine.home())
+    n, nominal = data.count, machine.parameters.drawing
+    fk = forward(machine.layout, nominal, data.joints[:, :n], machine.home())
     pair = solve_pairs(fk.T_base_platform, data.T_camera_board[:, :n], size_of(machine))
     return State(
-        values,
+        nominal,
         pair.T_camera_base[:, None],
         fk.T_base_platform,
         np.zeros(1),
@@ -259,9 +259,9 @@ def at_poses(
     whitened: bool, use_drawing: bool = False,
 ) -> PoseFit:  # fmt: skip
     """Fit by [C] eq. 3 or 5, as printed or whitened. begin : state by :func:`start`."""
-    n, in_view = data.count, data.T_camera_board
+    n, measured = data.count, data.T_camera_board
     problem, state = pose_problem(
-        machine, measurements(data), in_view[:, :n], data.joints[:, :n], begin, form
+        machine, measurements(data), measured[:, :n], data.joints[:, :n], begin, form
     )
     noise = np.broadcast_to(np.diag(data.noise.pose**2), (n, 6, 6)) if whitened else None
     return fit_machine_to_poses(
@@ -327,17 +327,17 @@ def axis_of_rotation(data: SimulatedRuns) -> Sample:
     spread : of the axis over pairs of poses, rad. expected : the same by noise alone. tilt : root
     mean square over single poses, rad. chi2 : per degree of freedom of a common axis.
     """
-    results = [
+    axes = [
         rotation_axis(measurements(data, run).poses, "schoenflies")
         for run in range(len(data.theta))
     ]
     return Sample(
         {
-            "spread": np.array([f.spread for f in results]),
-            "expected": np.array([f.expected_spread for f in results]),
-            "tilt": np.array([np.sqrt(np.mean(f.tilt**2)) for f in results]),
-            "chi2": np.array([f.chi2 / f.dof for f in results]),
-            "dof": np.array([f.dof for f in results]),
+            "spread": np.array([f.spread for f in axes]),
+            "expected": np.array([f.expected_spread for f in axes]),
+            "tilt": np.array([np.sqrt(np.mean(f.tilt**2)) for f in axes]),
+            "chi2": np.array([f.chi2 / f.dof for f in axes]),
+            "dof": np.array([f.dof for f in axes]),
         }
     )
 

@@ -131,17 +131,17 @@ def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check,
     old = largest_side(study, ("design", PAPER_C_DRAWING))
     new = largest_side(study, ("design", EQ3_AS_PRINTED))
     every = ranks(study)
-    results = {key: every[key] for key in PAPER_C_RANKS}
+    measured_ranks = {key: every[key] for key in PAPER_C_RANKS}
     expected_ranks, wanted = (
         ", ".join(f"{rank} ({count})" for rank, count in values.values())
-        for values in (results, PAPER_C_RANKS)
+        for values in (measured_ranks, PAPER_C_RANKS)
     )
     axis = study.of("design", ROTATION_AXIS_METHOD)["chi2"].value
     dof = study.values("dof", "design", ROTATION_AXIS_METHOD)
     allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
-    compared = (PAPER_C_JOINT, PAPER_C_BOUND)
+    methods = (PAPER_C_JOINT, PAPER_C_BOUND)
     over = [
-        ratio_of_figures(*(study.of(kind, kind, method)["larger_shift"] for method in compared))
+        ratio_of_figures(*(study.of(kind, kind, method)["larger_shift"] for method in methods))
         for kind in H4_MODEL_KINDS[:2]
     ]
     right = [study.of(kind, kind, PAPER_C_JOINT)["chi2"].value for kind in H4_MODEL_KINDS]
@@ -170,7 +170,7 @@ def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check,
             "ranks, Models 12 and 31 (unknowns estimated)",
             expected_ranks,
             wanted,
-            results == PAPER_C_RANKS,
+            measured_ranks == PAPER_C_RANKS,
         ),
         Check(
             "χ² per degree of freedom of one axis of rotation, mean",

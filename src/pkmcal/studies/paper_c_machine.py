@@ -123,13 +123,15 @@ def true_values(kind: H4ModelKind, off: Deviations, runs: int, rng: np.random.Ge
         names = table.free_names()
         still = [".platform." in n or ".along" in n or ".axis" in n for n in names]
         sigma = np.where(still, 0.0, sigma)
-    values = table.drawing + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
+    theta = table.drawing + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
     for leg, motor in enumerate(machine.layout.actuated, start=1):
-        values[:, table.index(f"legs[{leg}].base.angle")] = -IDENTIFIED_TABLE_2.q0[motor]
-    return _paired(machine, values, off.rods, rng) if kind == "rods" else values
+        theta[:, table.index(f"legs[{leg}].base.angle")] = -IDENTIFIED_TABLE_2.q0[motor]
+    return _with_paired_rods(machine, theta, off.rods, rng) if kind == "rods" else theta
 
 
-def _paired(machine: Machine, values: Array, rods: float, rng: np.random.Generator) -> Array:
+def _with_paired_rods(
+    machine: Machine, values: Array, rods: float, rng: np.random.Generator
+) -> Array:
     """Equal rods of a forearm and equal arms of a motor, except for the difference between the
     rods.
     """

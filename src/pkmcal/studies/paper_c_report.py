@@ -195,8 +195,8 @@ def _control_mean(s: H4ByBoardStudy, model_and_method: tuple[str, str]) -> Array
 
     After a calibration their signs are random, so these are root mean squares over the runs.
     """
-    value = s.values("control_mean", "design", *model_and_method)
-    return value.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(value)
+    means = s.values("control_mean", "design", *model_and_method)
+    return means.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(means)
 
 
 def _table_3(s: H4ByBoardStudy) -> Table:
@@ -208,9 +208,9 @@ def _table_3(s: H4ByBoardStudy) -> Table:
     rows: list[Row] = []
     for label, which, key in VALIDATION_TABLE_ROWS:
         ours = (_control_mean(s, which), each_rms(s.values("control_rms", "design", *which)))
-        for what, paper, item in zip(("mean", "rms"), TABLE_3[key], ours, strict=True):
+        for what, paper, figures in zip(("mean", "rms"), TABLE_3[key], ours, strict=True):
             rows.append(Row(f"{label}, {what}: the paper", two_digits(paper), "paper"))
-            rows.append(Row("  found", two_digits(item)))
+            rows.append(Row("  found", two_digits(figures)))
     heads = ("", "q₁", "q₂", "q₃", "q₄")
     return Table("Table 3: residuals of the motors, mrad", heads, tuple(rows))
 
@@ -225,9 +225,9 @@ def _table_4(s: H4ByBoardStudy) -> Table:
         if key:
             one, two = TABLE_4[key]
             rows.append(Row(f"{label}: the paper", (mm(one, 2), mm(two, 2), "", ""), "paper"))
-        value = each_rms(s.values("straightness", "design", *which))
+        straightness = each_rms(s.values("straightness", "design", *which))
         name = "  found" if key else f"  found, {label}"
-        rows.append(Row(name, tuple(mm(float(v)) for v in value)))
+        rows.append(Row(name, tuple(mm(float(v)) for v in straightness)))
     return Table(
         "Table 4: straightness, mm",
         ("", "200 mm, x", "200 mm, y", "400 mm, x", "400 mm, y"),
@@ -298,13 +298,13 @@ def _accuracy_plot(s: H4ByBoardStudy) -> dict[str, Any]:
             labels.append(f"{PAPER_C_MODEL_LABELS[name]}, {PAPER_C_METHOD_LABELS[method]}")
             places.append(place)
             errors[place] = 1e3 * s.of(kind, name, method)["larger_shift"].value
-            reference_values = PAPER_C_PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
-            if reference_values:
-                printed[place] = float(reference_values)
+            prototype = PAPER_C_PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
+            if prototype:
+                printed[place] = float(prototype)
         colour = {"design": "--drawing", "calibration": "--calibrated", "rods": "--leg3"}[kind]
         # horizontal bars, for the length of their names
-        lying = bars(TRUE_MACHINE_HEADINGS[kind], errors.values(), errors, color=colour)
-        data.append({**lying, "orientation": "h", "width": 0.8})
+        horizontal = bars(TRUE_MACHINE_HEADINGS[kind], errors.values(), errors, color=colour)
+        data.append({**horizontal, "orientation": "h", "width": 0.8})
     marks = {"color": "--ink", "size": 9, "symbol": "diamond-open"}
     data.append(
         trace("independent prototype", printed.values(), printed, "--ink", "markers", marker=marks)
@@ -395,13 +395,15 @@ def _accuracy(s: H4ByBoardStudy, *key: str) -> dict[str, Any]:
     """Figures of one method for programs, with the prototype's, in mm and mrad, if there are
     any.
     """
-    value = s.of(*key)
-    chi2, printed = value["chi2"].value, PAPER_C_PROTOTYPE.get(key)
+    summaries = s.of(*key)
+    chi2, printed = summaries["chi2"].value, PAPER_C_PROTOTYPE.get(key)
     figures = [printed.get(name) for name in ("larger_shift", "larger_turn")] if printed else None
     return {
         **dict(zip(("truth", "model", "method"), key, strict=True)),
-        **{name: value[name].value for name in ("shift", "turn", "larger_shift", "larger_turn")},
-        **{f"{name}_error": value[name].error for name in ("larger_shift", "larger_turn")},
+        **{
+            name: summaries[name].value for name in ("shift", "turn", "larger_shift", "larger_turn")
+        },
+        **{f"{name}_error": summaries[name].error for name in ("larger_shift", "larger_turn")},
         "chi2": None if np.isnan(chi2) else chi2,
         "runs": len(s.values("shift", *key)),
         "prototype": figures and [v and float(v) for v in figures],

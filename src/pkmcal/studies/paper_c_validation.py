@@ -49,8 +49,10 @@ def control_residuals(machine: Machine, fit: Fitted, data: SimulatedRuns) -> Arr
     n = data.count
     poses = data.T_base_platform[:, n:]
     if fit.T_camera_base is not None and fit.T_mount is not None:
-        in_view = data.T_camera_board[:, n:]
-        poses = inverted(fit.T_camera_base)[:, None] @ in_view @ inverted(fit.T_mount)[:, None]
+        T_camera_board = data.T_camera_board[:, n:]
+        poses = (
+            inverted(fit.T_camera_base)[:, None] @ T_camera_board @ inverted(fit.T_mount)[:, None]
+        )
         poses = taken(machine.layout.motion, poses).pose
     return readings_at_poses(machine.layout, fit.theta[:, None], poses) - data.joints[:, n:]
 
@@ -113,7 +115,7 @@ def square(machine: Machine, theta: Array, data: SimulatedRuns) -> Array:
     )
     poses = schoenflies(np.concatenate([corners, np.zeros((4, 1))], axis=1))
     readings = readings_at_poses(machine.layout, theta[..., None, :], poses)
-    went = forward(data.machine.layout, data.theta[:, None], readings, poses).T_base_platform
-    points = went[..., :3, 3]
+    reached = forward(data.machine.layout, data.theta[:, None], readings, poses).T_base_platform
+    points = reached[..., :3, 3]
     sides = np.linalg.norm(np.roll(points, -1, axis=-2) - points, axis=-1)
     return sides - VALIDATION_SQUARE_SIDE

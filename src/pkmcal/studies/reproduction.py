@@ -89,7 +89,7 @@ class Words:
         values : further values that the text names.
         """
         units = study.setting.quantities
-        display = {
+        figures = {
             ", ".join(key): {
                 name: summary.times(units[name].factor) for name, summary in accuracy.items()
             }
@@ -97,10 +97,10 @@ class Words:
         }
         numbers: dict[str, Any] = {
             "found": {
-                m: {q: DisplayNumber(s.value) for q, s in a.items()} for m, a in display.items()
+                m: {q: DisplayNumber(s.value) for q, s in a.items()} for m, a in figures.items()
             },
             "error": {
-                m: {q: DisplayNumber(s.error) for q, s in a.items()} for m, a in display.items()
+                m: {q: DisplayNumber(s.error) for q, s in a.items()} for m, a in figures.items()
             },
             "setting": study.setting,
             "runs": study.runs,
@@ -129,9 +129,11 @@ class Words:
         """
         own = self.document["parts"][name]
         texts = [*own["text"], *(own[key] for key in more)]
-        drawn = tuple(Plot(key, **own["plots"][key], **plot) for key, plot in (plots or {}).items())
+        figures = tuple(
+            Plot(key, **own["plots"][key], **plot) for key, plot in (plots or {}).items()
+        )
         title, text = own["title"], tuple(self.say(t) for t in texts)
-        return Part(name, title, text, plots=drawn, tables=tables)
+        return Part(name, title, text, plots=figures, tables=tables)
 
     def reproduction(
         self,
@@ -217,19 +219,19 @@ def accuracy_rows(
     the figures ``printed`` by an independent prototype.
     """
     setting: StudySetting = study.setting
-    results = [
+    figures = [
         (column, study.accuracy[key][column.quantity].times(quantity.factor))
         for column in columns
         for quantity in [setting.quantities[column.quantity]]
     ]
-    cells = (number(s.value, c.places) if isfinite(s.value) else "" for c, s in results)
+    cells = (number(s.value, c.places) if isfinite(s.value) else "" for c, s in figures)
     rows = [Row(name, tuple(cells))]
     if errors:
-        cells = (number(s.error, c.error_places) for c, s in results)
+        cells = (number(s.error, c.error_places) for c, s in figures)
         rows.append(Row("  ± Monte-Carlo error", tuple(cells), "prototype"))
-    reference_values = tuple((printed or {}).get(c.quantity, "") for c in columns)
-    if any(reference_values):
-        rows.append(Row("  independent prototype", reference_values, "prototype"))
+    prototype = tuple((printed or {}).get(c.quantity, "") for c in columns)
+    if any(prototype):
+        rows.append(Row("  independent prototype", prototype, "prototype"))
     return rows
 
 
@@ -281,15 +283,15 @@ def compared(
     out: list[Compared] = []
     for key, figures in prototype.items():
         for quantity, printed in figures.items():
-            display = study.setting.quantities[quantity]
-            count = study.of(*key)[quantity].times(display.factor)
+            definition = study.setting.quantities[quantity]
+            measured = study.of(*key)[quantity].times(definition.factor)
             rounding = 0.5 * 10.0 ** -len(printed.partition(".")[2])
             allowed = tolerance(key, quantity)
             name = named(key, quantity)
             out.append(
                 Compared(
-                    key, quantity, count, float(printed), rounding, allowed, held(key),
-                    name, display.unit,
+                    key, quantity, measured, float(printed), rounding, allowed, held(key),
+                    name, definition.unit,
                 )
             )  # fmt: skip
     return out

@@ -122,8 +122,8 @@ def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
     poses, mounts = PoseSet.empty(), ()
     if view.T_platform_board is not None:
         whiten = np.broadcast_to(np.diag(1 / data.noise.pose), (n, 6, 6))
-        in_view = data.T_camera_board[run, :n]
-        poses = PoseSet(view.station[:n], np.arange(n), none, in_view, whiten)
+        measured = data.T_camera_board[run, :n]
+        poses = PoseSet(view.station[:n], np.arange(n), none, measured, whiten)
         mounts = (Mount("board", "platform"),)
     stations = len(view.T_camera_base)
     return Measurements(
@@ -159,18 +159,18 @@ def joint_problem(
     """
     n = data.count
     assembled = assemble(machine, measurements(data), gauge, use_drawing=use_drawing)
-    one, at = assembled.problem, assembled.places.edges
-    blocks, numbers = one.blocks, replace(one.data, joints=data.joints[:, :n])
+    template, at = assembled.problem, assembled.places.edges
+    blocks, edge_data = template.blocks, replace(template.data, joints=data.joints[:, :n])
     if data.view.legs.size:
         axis = data.axis.reshape(len(data.axis), -1, 4)
         radius = machine.parameters.drawing[blocks.radius[at.row, at.place]]
-        count = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
-        basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in count)
-        basis[:, at.row, at.place], white[:, at.row, at.place] = count
+        whitened = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
+        basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in whitened)
+        basis[:, at.row, at.place], white[:, at.row, at.place] = whitened
         blocks = replace(blocks, side=np.broadcast_to([0, 1], (*at.shape, 2)))
         none = np.zeros((1, *at.shape, 4, 1))
-        numbers = replace(numbers, basis=basis, white=white, optics=none)
-    poses = one.pose_data
+        edge_data = replace(edge_data, basis=basis, white=white, optics=none)
+    poses = template.pose_data
     if data.view.T_platform_board is not None:
         poses = replace(poses, T_station_target=data.T_camera_board[:, :n, None])
-    return replace(one, blocks=blocks, data=numbers, pose_data=poses)
+    return replace(template, blocks=blocks, data=edge_data, pose_data=poses)

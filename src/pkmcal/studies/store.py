@@ -62,8 +62,8 @@ class Store:
                     raise InputError(
                         "the folder holds the batches of another study",
                         where=f"{path}, digest",
-                        found=_in_words(before),
-                        expected=_in_words(own),
+                        found=_description_text(before),
+                        expected=_description_text(own),
                         next_step="Name another folder with -o, or remove this one",
                     )
             else:
@@ -149,6 +149,6 @@ def _description(path: Path) -> dict[str, Any]:
     )
 
 
-def _in_words(description: Mapping[str, Any]) -> str:
+def _description_text(description: Mapping[str, Any]) -> str:
     parts = [f"{description.get('study')}", f"seed {description.get('seed')}"]
     return ", ".join([*parts, f"pkmcal {description.get('pkmcal')}"])

@@ -71,13 +71,13 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
         verdict=Verdict(
             usable=not bad and not failing,
             headline=_headline(study, gains, bad),
-            findings=(*map(_reason, bad), *map(_failing, failing)),
+            findings=(*map(_coverage_finding, bad), *map(_failure_finding, failing)),
         ),
         stamp="Deviations hold" if not bad and not failing else "Look closer",
-        figures=_cards(study),
+        figures=_key_figures(study),
         parts=(
             Part("accuracy", "Accuracy", tables=(_table(study),), plots=_curves(study)),
-            _honesty(study),
+            _coverage_part(study),
             Part(
                 "how",
                 "How it was found",
@@ -110,10 +110,10 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
         text = f"The stated deviations hold: {share} of the 95 % intervals do."
     if len(study.found) == 1:
         cell = study.found[0]
-        residual = amount(cell.position.value, "m")
-        if _turns(study):
-            residual += f" and {amount(cell.orientation.value, 'rad')}"
-        return f"Calibrations leave {residual} at the tool. {text}"
+        error = amount(cell.position.value, "m")
+        if _rotates(study):
+            error += f" and {amount(cell.orientation.value, 'rad')}"
+        return f"Calibrations leave {error} at the tool. {text}"
     sure = [gain for gain in gains if gain.sure]
     if not sure:
         return f"{text} Nothing of what was varied shows beyond chance in so many runs."
@@ -127,7 +127,7 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     )
 
 
-def _reason(cell: CellFindings) -> Finding:
+def _coverage_finding(cell: CellFindings) -> Finding:
     where = in_words(cell.values) if cell.values else ""
     return wrong(
         "study.coverage",
@@ -139,7 +139,7 @@ def _reason(cell: CellFindings) -> Finding:
     )
 
 
-def _failing(cell: CellFindings) -> Finding:
+def _failure_finding(cell: CellFindings) -> Finding:
     where = in_words(cell.values) if cell.values else ""
     return wrong("study.fails", where, of=where or None, percent=100 * cell.failed.value)
 
@@ -158,26 +158,34 @@ def value_with_unit(study: SweepResult, name: str, value: Value) -> str:
 # ------------------------------------------------------------------ cards and tables
 
 
-def _turns(study: SweepResult) -> bool:
+def _rotates(study: SweepResult) -> bool:
     """Whether the platform rotates at all; that of a delta robot does not."""
     return not all(cell.orientation.value == 0 for cell in study.found)
 
 
-def _cards(study: SweepResult) -> tuple[Figure, ...]:
+def _key_figures(study: SweepResult) -> tuple[Figure, ...]:
     """Key figures of the best combination."""
     best = min(study.found, key=lambda cell: np.nan_to_num(cell.position.value, nan=np.inf))
     which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
-    off = ((brief(1e3 * best.position.value), "mm"), (brief(1e3 * best.orientation.value), "mrad"))
-    below = ((brief(1e3 * best.position_95), "mm"), (brief(1e3 * best.orientation_95), "mrad"))
-    display = slice(None) if _turns(study) else slice(1)
+    errors = (
+        (brief(1e3 * best.position.value), "mm"),
+        (brief(1e3 * best.orientation.value), "mrad"),
+    )
+    percentiles = (
+        (brief(1e3 * best.position_95), "mm"),
+        (brief(1e3 * best.orientation_95), "mrad"),
+    )
+    columns = slice(None) if _rotates(study) else slice(1)
     return (
         Figure(
             "How far off is the tool after a calibration?",
-            off[display],
+            errors[columns],
             f"{which}; ± {brief(1e3 * best.position.error)} mm by chance",
         ),
         Figure(
-            "What stays below in 95 % of the workspace?", below[display], "over all runs and poses"
+            "What stays below in 95 % of the workspace?",
+            percentiles[columns],
+            "over all runs and poses",
         ),
         Figure(
             "Do its 95 % intervals hold?",
@@ -194,7 +202,7 @@ def _cards(study: SweepResult) -> tuple[Figure, ...]:
 
 def _table(study: SweepResult) -> Table:
     """Table with one row for each combination."""
-    rows, turns = list[Row](), _turns(study)
+    rows, turns = list[Row](), _rotates(study)
     for cell in study.found:
         turn = (
             _with_error(1e3 * cell.orientation.value, 1e3 * cell.orientation.error),
@@ -230,7 +238,7 @@ def _with_error(value: float, error: float) -> str:
     return f"{number(value, places)} ± {number(error, places)}"
 
 
-def _honesty(study: SweepResult) -> Part:
+def _coverage_part(study: SweepResult) -> Part:
     """Coverage of intervals of each nominal size, and for each kind of parameter."""
     kinds: dict[str, list[float]] = {}
     for cell in study.found:
@@ -252,8 +260,8 @@ def _honesty(study: SweepResult) -> Part:
         "Where an interval of 95 % holds the truth in 95 of 100 calibrations, its deviation may be"
         " believed. Above the line deviations are on the safe side, below it they promise too much."
     )
-    return Part("honesty", "Do the stated deviations hold?", (text,), plots=(_held(study),),
-                tables=(table,))  # fmt: skip
+    plots = (_coverage_plot(study),)
+    return Part("honesty", "Do the stated deviations hold?", (text,), plots=plots, tables=(table,))
 
 
 def _kind(name: str) -> str:
@@ -324,7 +332,7 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
     return tuple(out)
 
 
-def _held(study: SweepResult) -> Plot:
+def _coverage_plot(study: SweepResult) -> Plot:
     """Plot of actual against nominal coverage, all combinations together."""
     x = 100 * COVERAGE_INTERVALS
     used = [cell for cell in study.found if np.isfinite(cell.held).all()]
@@ -379,8 +387,8 @@ def _cell(cell: CellFindings) -> dict[str, Any]:
     summaries = ("position", "orientation", "covered", "covered_tool", "failed")
     out: dict[str, Any] = {"values": dict(cell.values), "runs": cell.runs}
     for name in summaries:
-        results = getattr(cell, name)
-        out[name] = {"value": results.value, "standard_error": results.error}
+        summary = getattr(cell, name)
+        out[name] = {"value": summary.value, "standard_error": summary.error}
     for name in ("position_95", "orientation_95", "position_sigma", "orientation_sigma", "chi2"):
         out[name] = getattr(cell, name)
     out["intervals"] = {

@@ -162,6 +162,7 @@ def _of_session(session: Session) -> StudySubject:
             found="photographs by hand" if session.stations else "trackers alone",
             next_step="Study the machine itself: pkmcal study with its mechanism file",
         )
+    # What a study leaves out of the session.
     on_base = session.board is not None and session.board_body == "base"
     findings: list[Finding] = []
     if on_base:
@@ -170,33 +171,36 @@ def _of_session(session: Session) -> StudySubject:
         findings.append(note("study.without_trackers"))
     if session.workspace is not None:
         findings.append(note("study.whole_reach"))
-    words = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
-    if any(own != words[0] for own in words) or not words[0]:
+    observed = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
+    if any(own != observed[0] for own in observed) or not observed[0]:
         raise InputError(
             "a study needs stations that all observe the same, legs or a board on the platform",
             where=str(session.folder),
-            found=listed([" and ".join(sorted(own)) or "the base's board" for own in words], 4),
+            found=listed([" and ".join(sorted(own)) or "the base's board" for own in observed], 4),
         )
-    places = [station.T_camera_base for station in session.stations]
-    above_limit = [place for place in places if place is not None]
-    if len(above_limit) < len(places):
+    # Stations keep their poses if all are known, and the number of their configurations.
+    poses = [station.T_camera_base for station in session.stations]
+    given = [place for place in poses if place is not None]
+    if len(given) < len(poses):
         findings.append(note("study.chosen_stations"))
-    in_view = [{p.configuration for p in station.photographs} for station in session.stations]
+    by_station = [{p.configuration for p in station.photographs} for station in session.stations]
     usual = Design.configurations
-    if not any(in_view):
+    if not any(by_station):
         findings.append(note("study.no_images", number=usual))
     board = None if session.board is None or on_base else load_board(session.board)
     design = Design(
         session.machine,
         tuple(station.camera for station in session.stations),
-        stations=len(places),
-        T_camera_base=np.stack(above_limit) if len(above_limit) == len(places) else None,
-        observe=tuple(word for word in ("legs", "board") if word in words[0]),
+        stations=len(poses),
+        T_camera_base=np.stack(given) if len(given) == len(poses) else None,
+        observe=tuple(word for word in ("legs", "board") if word in observed[0]),
         board=board,
-        configurations=max(2, round(float(np.median([len(own) for own in in_view]))))
-        if any(in_view)
+        configurations=max(2, round(float(np.median([len(own) for own in by_station]))))
+        if any(by_station)
         else usual,
-        shared=len(in_view) > 1 and any(in_view) and all(own == in_view[0] for own in in_view),
+        shared=len(by_station) > 1
+        and any(by_station)
+        and all(own == by_station[0] for own in by_station),
         reading_noise=session.joint_noise,
     )
     return StudySubject(f"the session {session.folder}", design, tuple(findings))
@@ -268,13 +272,13 @@ def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> li
     for values in product(*varied.values()):
         chosen = dict(zip(varied, values, strict=True))
         if isinstance(subject.design, JointByAxes):
-            out.append(Cell(chosen, _paper(subject.design, chosen)))
+            out.append(Cell(chosen, _paper_setting(subject.design, chosen)))
         else:
             out.append(Cell(chosen, SimulatedCalibrations(_design(subject.design, chosen))))
     return out
 
 
-def _paper(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
+def _paper_setting(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
     """Setting of [A] 4.3 with other values."""
     own: dict[str, Any] = {
         {"configurations": "poses", "legs": "legs_observed", "reading_noise": "joint_noise"}.get(
@@ -291,8 +295,8 @@ def _paper(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
 
 def _design(design: Design, values: Mapping[str, Value]) -> Design:
     """Design with other values; stations are chosen anew if their poses no longer fit."""
-    shifted = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
-    if shifted:
+    affects_stations = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
+    if affects_stations:
         design = replace(design, T_camera_base=None)
     if "stations" in values and len(design.cameras) > 1:
         design = replace(design, cameras=design.cameras[:1])

@@ -116,21 +116,23 @@ class _Pool:
             number = self.next()
             while number is not None:
                 with self._process() as process:
-                    while number is not None and (answer := _answer(process, self.tasks[number])):
-                        self._answered(number, answer)
+                    while number is not None and (
+                        answer := _result_of(process, self.tasks[number])
+                    ):
+                        self._handle_result(number, answer)
                         number = self.next()
                 if number is not None:  # the process has died at this task
-                    number = self._again(number)
+                    number = self._retry(number)
         except BaseException as error:  # noqa: BLE001 - raised again where the study was begun
             self.failed(error)
 
-    def _answered(self, number: int, answer: bytes) -> None:
+    def _handle_result(self, number: int, answer: bytes) -> None:
         result = pickle.loads(answer)
         if isinstance(result, BaseException):
             raise result
         self.done(number, result)
 
-    def _again(self, number: int) -> int | None:
+    def _retry(self, number: int) -> int | None:
         """Number of the task of a dead process, to be run again; None if the pool is stopped.
 
         Raises ResultError if the task has cost MOST_DEATHS_A_BATCH processes.
@@ -180,24 +182,24 @@ class _Worker:
         self.process.wait()
 
 
-def _answer(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
+def _result_of(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
     """Pickled result of a task from a process; None if the process has died."""
     if process.stdin is None or process.stdout is None:
         return None
     try:
-        _send(process.stdin, task)
+        _write_message(process.stdin, task)
     except OSError:
         return None
-    return _received(process.stdout)
+    return _read_message(process.stdout)
 
 
-def _send(stream: IO[bytes], message: Any) -> None:
+def _write_message(stream: IO[bytes], message: Any) -> None:
     content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
     stream.write(MESSAGE_SIZE_FORMAT.pack(len(content)) + content)
     stream.flush()
 
 
-def _received(stream: IO[bytes]) -> bytes | None:
+def _read_message(stream: IO[bytes]) -> bytes | None:
     """Next message of a stream; None at its end or if the message is truncated."""
     head = stream.read(MESSAGE_SIZE_FORMAT.size)
     if len(head) < MESSAGE_SIZE_FORMAT.size:
@@ -209,12 +211,12 @@ def _received(stream: IO[bytes]) -> bytes | None:
 
 def answer_tasks(source: IO[bytes], target: IO[bytes]) -> None:
     """Run tasks until their source ends; exceptions are returned as results."""
-    while (message := _received(source)) is not None:
+    while (message := _read_message(source)) is not None:
         try:
             answer: Any = work(pickle.loads(message))
         except Exception as error:  # noqa: BLE001 - the study's own process tells it
             answer = error
-        _send(target, answer)
+        _write_message(target, answer)
 
 
 def run_worker() -> None:
