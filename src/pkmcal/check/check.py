@@ -191,7 +191,7 @@ def _more_broken_error(session: Session, number: int, count: int) -> InputError:
 
 
 @dataclass(frozen=True)
-class _Kinematics:
+class _NominalKinematics:
     """Kinematics of the nominal machine at the readings.
 
     poses : T_base_platform (K, 4, 4), None if the closure fails at some readings. singularity :
@@ -204,7 +204,7 @@ class _Kinematics:
     findings: tuple[Finding, ...]
 
 
-def _kinematics(session: Session, rng: np.random.Generator) -> _Kinematics:
+def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematics:
     """Whether the nominal machine closes at all readings, with its singularity and assembly modes
     there.
     """
@@ -217,7 +217,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Kinematics:
             first = session.machine.inverse(poses[0])
         modes = session.machine.assembly_modes(first, rng)
     except PkmcalError as error:
-        return _Kinematics(None, math.nan, 0, (of_error(error),))
+        return _NominalKinematics(None, math.nan, 0, (of_error(error),))
     findings: list[Finding] = []
     weak = [session.configurations[k] for k in np.flatnonzero(fk.singularity < NEAR_SINGULAR)]
     if weak:
@@ -227,7 +227,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Kinematics:
         turn = float(np.rad2deg(turns[turns > 1e-3].min()))
         first_name = session.configurations[0]
         findings.append(doubtful("configurations.other_assembly", first_name, turn=turn))
-    return _Kinematics(poses, float(fk.singularity.min()), len(modes), tuple(findings))
+    return _NominalKinematics(poses, float(fk.singularity.min()), len(modes), tuple(findings))
 
 
 class _ImageChecks(NamedTuple):
@@ -250,7 +250,7 @@ def _check_images(
     """
     whole = [p for p in photographs if p is not None]
 
-    def unlooked() -> tuple[StationCheck, ...]:
+    def unsearched() -> tuple[StationCheck, ...]:
         """Checks of stations in which the machine cannot be searched for."""
         n_legs, observed = session.machine.n_legs, zip(session.stations, photographs, strict=True)
         return tuple(
@@ -263,9 +263,9 @@ def _check_images(
     try:
         check_observable(session)
     except InputError as error:
-        return _ImageChecks(unlooked(), (of_error(error),))
+        return _ImageChecks(unsearched(), (of_error(error),))
     if poses is None or len(whole) < len(legs_stations(session)):
-        return _ImageChecks(unlooked(), ())
+        return _ImageChecks(unsearched(), ())
     # Broken images have been reported already.
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
@@ -273,7 +273,7 @@ def _check_images(
         boards = look_for_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
-        return _ImageChecks(unlooked(), boards.findings)
+        return _ImageChecks(unsearched(), boards.findings)
     turn_findings = () if lost else pose_findings(session, boards.boards)
     located = localize(  # with the random numbers of `calibrate`
         session,
