@@ -1,1 +1,1 @@
-"""What ``import pkmcal`` gives: the commands' work as functions, results that show themselves."""
+"""Public functions of ``import pkmcal``: the commands' work, with results that have a summary."""

@@ -17,27 +17,28 @@ from pkmcal.session.load import Session
 
 @dataclass(frozen=True, repr=False)
 class CalibrationResult(Calibration):
-    """A calibration that can be saved: ``summary()``, ``parameters``, ``machine``, ``verdict``,
-    ``tool_error(poses)``, ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()``,
-    ``save(folder)`` and ``record(path)``. Covariances and residuals are in ``estimate``.
+    """Calibration that can be saved.
+
+    ``summary()``, ``parameters``, ``machine``, ``verdict``, ``tool_error(poses)``,
+    ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()``, ``save(folder)`` and
+    ``record(path)``. Covariances and residuals are in ``estimate``.
     """
 
     def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
-        """Write what ``pkmcal calibrate`` writes: report.html, mechanism.yaml, calibration.json.
+        """Write the files of ``pkmcal calibrate``: report.html, mechanism.yaml, calibration.json.
 
         folder : a new or empty one, or one of an earlier calibration, which is kept in a dated
-            folder beside it unless ``force`` replaces it.
-        Returns that folder, None where nothing was kept. Raises InputError where the folder holds
-        anything else, or cannot be written.
+        folder beside it unless ``force`` replaces it. Returns that dated folder, None if nothing
+        was kept. Raises InputError if the folder holds anything else, or cannot be written.
         """
         return save(self, folder, force=force)
 
     def record(self, path: Path | str) -> None:
-        """Write a recording, NAME.rrd, of photographs, edges, poses and the result, which rerun's
-        viewer plays (``rerun NAME.rrd``).
+        """Write a recording, NAME.rrd, of images, edges, poses and the result for rerun's viewer
+        (``rerun NAME.rrd``).
 
-        Needs ``pip install '.[rerun]'``. Raises InputError without it, or where the file
-        cannot be written or a photograph not be read any more.
+        Needs ``pip install '.[rerun]'``. Raises InputError without it, if the file cannot be
+        written, or if an image cannot be read any more.
         """
         write_rrd(self, path)
 
@@ -51,24 +52,24 @@ def calibrate(
     holdout: int = 0,
     progress: Callable[[str, float], None] | None = None,
 ) -> CalibrationResult:
-    """Calibrate the machine of a session; nothing is written.
+    """Calibrate the machine of a session, without writing files.
 
     Parameters
     ----------
     session :
-        Its folder, or one that :func:`pkmcal.load_session` has loaded.
+        A session's folder, or a session loaded by :func:`pkmcal.load_session`.
     method :
-        ``bundle``, the joint estimate, or a paper's own for comparison: ``four-step`` ([A]),
+        ``bundle``, the joint estimate, or a paper's method for comparison: ``four-step`` ([A]),
         ``linear`` ([B]), ``inverse-kinematic`` ([C]).
     seed :
-        Of the random search for the stations' poses.
+        Seed of the random search for the stations' poses.
     refine_camera :
-        Estimate the cameras' intrinsics as well, from their calibration's covariance on.
+        Estimate the cameras' intrinsics as well, with their calibration's covariance as prior.
     holdout :
-        Poses, spread over the workspace, to leave out and to judge the result by; configurations
-        with the same readings are of one pose.
+        Number of poses, spread over the workspace, that are not used and on which the result is
+        tested; configurations with the same readings are one pose.
     progress :
-        Called with the step in words and the share that is done, 0 to 1.
+        Called with a text and the share done, 0 to 1.
 
     Returns
     -------
@@ -79,12 +80,12 @@ def calibrate(
     Raises
     ------
     pkmcal.errors.InputError
-        The session or an argument is at fault; it says where and what to do.
+        The session or an argument is invalid; the error has the place and the next step.
     pkmcal.errors.ResultError
-        Nothing can be said from these data.
+        These data do not allow a result.
 
     """
-    value = run(
+    calibration = run(
         session,
         method=method,
         seed=seed,
@@ -92,29 +93,31 @@ def calibrate(
         holdout=holdout,
         progress=progress,
     )
-    # a result that is held should not hold its photographs, too
-    retained = replace(value, photographs={})
-    return CalibrationResult(**{one.name: getattr(retained, one.name) for one in fields(retained)})
+    # release the images, which a long-lived result need not keep in memory
+    without_images = replace(calibration, photographs={})
+    return CalibrationResult(
+        **{one.name: getattr(without_images, one.name) for one in fields(without_images)}
+    )
 
 
 def load_result(source: Path | str) -> SavedCalibration:
-    """Read a calibration that ``pkmcal calibrate``, or ``result.save``, has written.
+    """Read a calibration written by ``pkmcal calibrate`` or ``result.save``.
 
     Parameters
     ----------
     source :
-        Its folder, or the calibration.json in it.
+        A calibration's folder, or the calibration.json in it.
 
     Returns
     -------
     SavedCalibration
-        ``summary()``, ``parameters``, ``machine``, ``tool_error(poses)`` and the plots, as of
-        :func:`pkmcal.calibrate`.
+        ``summary()``, ``parameters``, ``machine``, ``tool_error(poses)`` and the plots, as in
+        the result of :func:`pkmcal.calibrate`.
 
     Raises
     ------
     pkmcal.errors.InputError
-        The file is missing, is no calibration, or was changed by hand.
+        The file is missing, is not a calibration, or was edited by hand.
 
     """
     return load(source)

@@ -1,4 +1,4 @@
-"""``pkmcal.plan``: the next configurations worth measuring."""
+"""``pkmcal.plan``: the next configurations to measure."""
 
 from __future__ import annotations
 
@@ -49,57 +49,58 @@ def plan(
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
 ) -> MeasurementPlan:
-    """Choose the configurations that determine a machine best; nothing is written.
+    """Choose the configurations that determine a machine best, without writing files.
 
     Parameters
     ----------
     subject :
-        A session, loaded or its folder, as far as it was measured already; or a machine, a
-        built-in one's name or a mechanism file, with an assumed camera.
+        A session or its folder, with its existing measurements; or a machine, the name of a
+        built-in one or a mechanism file, with an assumed camera.
     count :
-        Configurations from each place.
+        Number of configurations at each station.
     index :
-        What is minimised: the tool's variance, or the indices D, E and O1.
+        Criterion to be minimized: the tool's variance, or one of the indices D, E and O1.
     places :
-        Number of camera places to choose as well, on a sphere about the machine.
+        Number of stations to choose as well, on a sphere around the machine.
     best_of :
-        Of a session: number of its stations to choose.
+        Number of the session's stations to choose; sessions only.
     after :
-        Of a session: the calibration to continue from; the usable one in its folder unless given.
+        Calibration to continue from, by default the usable one in the session's folder; sessions
+        only.
     from_drawing :
-        Of a session: ignore the calibration in its folder.
+        Ignore the calibration in the session's folder; sessions only.
     same_place :
-        Of a session: the cameras stand as they stood in the calibration.
+        The cameras still have their poses of the calibration; sessions only.
     together :
-        Whether all stations measure each configuration, or each its own; by default together where
+        Whether all stations measure each configuration, or each its own; by default together if
         there are several cameras, or a tracker.
     camera :
-        Of a machine: its camera or its file; a small industrial one of 1280 x 960 unless given. It
-        stands in three places, or one where a board, a panorama or ``places`` needs no more.
+        Camera or its file, by default a small industrial one of 1280 x 960 px; machines only. It
+        has three stations, or one if a board, a panoramic camera or ``places`` needs no more.
     board :
-        Of a machine: a board on its platform is seen, not its legs.
+        Observe a board on the platform instead of the legs; machines only.
     tracker :
-        Of a machine: a tracker instead of a camera; standard deviations of its positions (m) and of
-        its turns (rad; None where it measures points).
+        Standard deviations of the positions (m) and turns (rad; None if it measures points) of a
+        tracker instead of a camera; machines only.
     edge_noise, corner_noise :
-        Standard deviations of edges and of a board's corners where no image tells them, px.
+        Standard deviations of edges and of a board's corners without images, px.
     joint_noise :
-        Of a machine: standard deviation of a reading, m or rad.
+        Standard deviation of a reading, m or rad; machines only.
     seed :
         Seed for all random numbers.
     progress :
-        Called with the share that is done, 0 to 1.
+        Called with the share done, 0 to 1.
 
     Returns
     -------
     MeasurementPlan
-        ``joints`` (n, m), ``names``, ``T_base_platform`` (n, 4, 4), in the order in which to
-        measure; ``now``, ``promised`` and ``by_chance``, how sure the tool is.
+        ``joints`` (n, m), ``names``, ``T_base_platform`` (n, 4, 4) in the order of measurement;
+        ``now``, ``promised`` and ``by_chance``, standard deviations of the tool.
 
     Raises
     ------
     pkmcal.errors.InputError
-        What cannot be planned.
+        The subject or an option does not allow a plan.
 
     """
     folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
@@ -114,11 +115,11 @@ def plan(
             )
             session = subject if isinstance(subject, Session) else None
             session = session or load_session(folder or "", measured=False)
-            source = as_it_stands(
+            rig_subject = as_it_stands(
                 session, after, from_drawing=from_drawing, same_place=same_place,
                 anywhere=places is not None, edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
-            return run(source, region=session.workspace, **planned)
+            return run(rig_subject, region=session.workspace, **planned)
         _check_options(
             "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
         )
@@ -127,11 +128,11 @@ def plan(
             eye = camera_of_size(PLANNED_IMAGE_SIZE)
         else:
             eye = camera if isinstance(camera, Camera) else load_camera(camera)
-        # what cannot be planned is the machine's or the camera's fault, by the name it was given
+        # Errors are located at the machine's or the camera's name as given.
         name = machine.name if isinstance(subject, Machine) else str(subject)
         try:
             one = board or places or view_angle(eye) > PANORAMIC_HALF_VIEW
-            source = of_machine(
+            rig_subject = of_machine(
                 machine,
                 [eye] * (1 if one else PLACES_AROUND_A_MACHINE),
                 machine.joint_names,
@@ -145,13 +146,13 @@ def plan(
         except InputError as error:
             raise error.located(name) from None
         try:
-            return run(source, **planned)
+            return run(rig_subject, **planned)
         except InputError as error:
             raise error.located(str(camera) if isinstance(camera, Path | str) else name) from None
 
 
 def _check_options(owner: str, given: Mapping[str, object]) -> None:
-    """Raise `InputError` for options that mean nothing for this subject."""
+    """Raise `InputError` for options that do not apply to this subject."""
     for name, value in given.items():
         if value:
             raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")

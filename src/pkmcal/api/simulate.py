@@ -1,4 +1,4 @@
-"""``pkmcal.simulate``: a session with photographs and known truth."""
+"""``pkmcal.simulate``: a simulated session with images and known truth."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ def simulate(
     progress: Callable[[int, int], None] | None = None,
     **settings: Any,
 ) -> Session:
-    """Simulate a session into a new folder: photographs, readings, and the truth in truth.json.
+    """Simulate a session in a new folder: images, readings, and the truth in truth.json.
 
     Parameters
     ----------
     folder :
         A new or empty one.
     mechanism :
-        A built-in machine's name, a mechanism file, or a loaded machine. A drawing without visible
-        cylinders gets one on each rod.
+        A built-in machine's name, a mechanism file, or a loaded machine. A nominal model without
+        visible cylinders gets one on each rod.
     camera :
-        A camera's file, or a loaded camera; a small industrial one of 800 x 600 unless given.
+        A camera's file, or a loaded camera; by default a small industrial one of 800 x 600 px.
     seed :
-        Of everything that is drawn.
+        Seed for all random numbers.
     progress :
-        Called with the photographs done and in all.
+        Called with the number of finished images and of all images.
     settings :
         Fields of :class:`pkmcal.simulation.Settings`: ``stations=3``, ``configurations=15``,
-        ``tolerance=1.0`` (how far the machine is off its drawing), ``joint_noise=3e-6``,
+        ``tolerance=1.0`` (standard deviation of the machine in prior sigmas), ``joint_noise=3e-6``,
         ``board=``, ``finish="metal"`` and so on.
 
     Returns
     -------
     Session
-        As :func:`pkmcal.load_session` loads it. ``pkmcal.simulation.load_truth(folder)`` reads its
-        truth; ``pkmcal.compare`` holds a machine beside that.
+        As loaded by :func:`pkmcal.load_session`. ``pkmcal.simulation.load_truth(folder)`` reads the
+        truth; ``pkmcal.compare`` compares a machine with it.
 
     Raises
     ------
     pkmcal.errors.InputError
-        The folder is not empty, or a machine, a camera or a setting cannot be.
+        The folder is not empty, or the machine, the camera or a setting is invalid.
 
     """
     names = [one.name for one in fields(Settings)]
@@ -70,9 +70,9 @@ def simulate(
             )
     check_number("simulate", "seed", seed)
     _check_settings(settings)
-    drawing = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
+    nominal = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
     eye = camera if isinstance(camera, Camera) else load_camera(camera) if camera else demo_camera()
-    machine = to_simulate(drawing, drawing.name)
+    machine = to_simulate(nominal, nominal.name)
     simulate_session(folder, machine, eye, Settings(**settings), seed=seed, progress=progress)
     return load_session(folder)
 
@@ -81,7 +81,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     """Raise InputError for a number of the settings, or of their sensor, that is out of range."""
     for name, value in settings.items():
         if name == "stations" and not isinstance(value, int | float):
-            continue  # where they stand
+            continue  # poses of the stations instead of their number
         if name in RANGES["simulate"]:
             each: Any = value if name == "shake" else (value,)
             for one in each:

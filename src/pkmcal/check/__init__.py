@@ -1,1 +1,1 @@
-"""What is wrong with a session, before any work is spent on it; and how its repeats scatter."""
+"""Checks of a session before its calibration, and the scatter of its repeated measurements."""

@@ -1,7 +1,7 @@
-"""What would make the photographs better, and what they promise, in words.
+"""Advice on better images, and the forecast of a capture, as findings and tables.
 
-Advice is given from what is measured: where legs are hidden, where edges that ought to be seen are
-lost and what is the matter with them, and from where the stations look.
+Advice follows from measurements: where legs are hidden, where expected edges are lost and why, and
+the directions from which the stations look.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.wording import brief, count, listed, named
 
 ADVICE_WORTH_FACTOR = 1.2
-"""Factor on a standard deviation from which its cause is worth advice: as much as half as many
-photographs again would gain."""
+"""Minimum gain of a standard deviation, as a factor, that is worth advice: that of half as many
+images in addition.
+"""
 INFORMATION_LOST_SHARE = 1 - 1 / ADVICE_WORTH_FACTOR**2
-"""Share of the information that is lost by then."""
+"""Share of the information that is lost with that factor."""
 POOR_LEG = 0.5
-"""Share of what legs tell on average below which one of them is named."""
+"""Information of a leg, relative to the mean of all legs, below which the leg is named."""
 EDGE_SHARES_LEGEND = (
     "Shares of what all edges tell about the machine, by leg and station.",
     "Variance: of the platform's position, what comes from the leg's edges: where",
@@ -44,21 +45,21 @@ ONE_LEGEND = (
 
 
 def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, ...]:
-    """Advice, the most useful first."""
+    """Advice for a session, the most useful first."""
     out = [
-        *_second_place(forecast),
+        *_second_station(forecast),
         *_from_one_side(inspection),
-        *_hidden(inspection),
-        *_slim(inspection),
+        *_hidden_legs(inspection),
+        *_slim_tubes(inspection),
     ]
     if forecast is not None:
         for station, edges in zip(inspection.stations, forecast.edges, strict=True):
-            out += _lost(inspection, station, edges)
+            out += _lost_edges(inspection, station, edges)
     return tuple(out)
 
 
-def _second_place(forecast: Forecast | None) -> list[Finding]:
-    """Whether another place would do more than more photographs from this one."""
+def _second_station(forecast: Forecast | None) -> list[Finding]:
+    """Advice to use a second station, if it gains more than further images at the only one."""
     if forecast is None or not forecast.second * ADVICE_WORTH_FACTOR < forecast.position:
         return []
     return [
@@ -72,10 +73,10 @@ def _second_place(forecast: Forecast | None) -> list[Finding]:
 
 
 def _from_one_side(inspection: Inspection) -> list[Finding]:
-    """Whether the stations look along nearly the same line.
+    """Advice if all stations look along nearly the same line.
 
-    What one camera sees badly, along its line of sight, another sees by the sine of the angle
-    between the two.
+    What one camera determines badly, along its line of sight, another determines by the sine of the
+    angle between the two lines.
     """
     cameras = [station.photographs.camera for station in inspection.stations]
     if len(cameras) < 2 or any(view_angle(camera) >= PANORAMIC_HALF_VIEW for camera in cameras):
@@ -94,16 +95,16 @@ def _from_one_side(inspection: Inspection) -> list[Finding]:
     return [note("images.one_side", degrees=angle)]
 
 
-def _hidden(inspection: Inspection) -> list[Finding]:
-    """Legs that no station sees well."""
-    in_view = [station for station in inspection.stations if station.quality is not None]
-    if not in_view or len(in_view) < len(inspection.stations):
+def _hidden_legs(inspection: Inspection) -> list[Finding]:
+    """Advice on legs that are hidden from every station."""
+    recognised = [station for station in inspection.stations if station.quality is not None]
+    if not recognised or len(recognised) < len(inspection.stations):
         return []
-    hidden = np.stack([s.quality.hidden.mean(axis=0) for s in in_view if s.quality is not None])
+    hidden = np.stack([s.quality.hidden.mean(axis=0) for s in recognised if s.quality is not None])
     best = np.argmin(np.nan_to_num(hidden, nan=np.inf), axis=0)
     least = hidden[best, np.arange(hidden.shape[1])]
     out: list[Finding] = []
-    for s, station in enumerate(in_view):
+    for s, station in enumerate(recognised):
         bad = np.flatnonzero((least > INFORMATION_LOST_SHARE) & (best == s))
         if not bad.size:
             continue
@@ -114,14 +115,14 @@ def _hidden(inspection: Inspection) -> list[Finding]:
                 legs=named(bad),
                 number=bad.size,
                 share=float(least[bad].mean()),
-                station=station.name if len(in_view) > 1 else None,
+                station=station.name if len(recognised) > 1 else None,
             )
         )
     return out
 
 
-def _slim(inspection: Inspection) -> list[Finding]:
-    """Tubes so narrow in a station's photographs that the profiles of both edges overlap."""
+def _slim_tubes(inspection: Inspection) -> list[Finding]:
+    """Advice on tubes so narrow in a station's images that the profiles of both edges overlap."""
     tubes, least = tubes_of(inspection.session.machine), 2 * PROFILE_REACH_INSIDE
     out: list[Finding] = []
     for station in inspection.stations:
@@ -140,8 +141,10 @@ def _slim(inspection: Inspection) -> list[Finding]:
     return out
 
 
-def _lost(inspection: Inspection, station: StationInspection, edges: EdgesOf) -> list[Finding]:
-    """Why edges that ought to be seen are lost, where these are many."""
+def _lost_edges(
+    inspection: Inspection, station: StationInspection, edges: EdgesOf
+) -> list[Finding]:
+    """Advice on the cause of lost edges, if many of the expected ones are lost."""
     expected, lost = int(edges.expected.sum()), edges.expected & ~edges.valid
     if station.quality is None or not expected or lost.sum() <= INFORMATION_LOST_SHARE * expected:
         return []
@@ -177,7 +180,9 @@ def _lost(inspection: Inspection, station: StationInspection, edges: EdgesOf) ->
 
 
 def _sheet(station: StationInspection) -> str:
-    """Before which the darker and the brighter legs stand out more, those that do least."""
+    """Brightness of a background with better contrast for the quartile of legs of least
+    contrast.
+    """
     if station.quality is None:
         return "white"
     level = station.quality.level[np.isfinite(station.quality.level)]
@@ -188,7 +193,7 @@ def _sheet(station: StationInspection) -> str:
 
 
 def forecast_figure(forecast: Forecast) -> Figure:
-    """The card."""
+    """Key figure of the forecast."""
     return Figure(
         f"What would {forecast.photographs} such photographs a station give?",
         ((brief(forecast.position * 1e3), "mm"), (brief(math.degrees(forecast.orientation)), "°")),
@@ -197,7 +202,7 @@ def forecast_figure(forecast: Forecast) -> Figure:
 
 
 def forecast_part(forecast: Forecast) -> Part:
-    """What a capture would give, and which legs tell it."""
+    """Section on the predicted accuracy of a capture, and the legs that determine it."""
     stations = tuple(dict.fromkeys(leg.station for leg in forecast.legs))
     numbers = tuple(dict.fromkeys(leg.leg for leg in forecast.legs))
     by = {(leg.station, leg.leg): leg for leg in forecast.legs}
@@ -224,9 +229,9 @@ def forecast_part(forecast: Forecast) -> Part:
             Row(
                 str(j),
                 (
-                    *(_part(by[s, j].tells) for s in stations),
-                    _part(total[j]),
-                    _part(sum(by[s, j].variance for s in stations)),
+                    *(_percent(by[s, j].tells) for s in stations),
+                    _percent(total[j]),
+                    _percent(sum(by[s, j].variance for s in stations)),
                 ),
                 mark=Level.NOTE if j in poor else "good",
             )
@@ -235,7 +240,7 @@ def forecast_part(forecast: Forecast) -> Part:
         together = [sum(by[s, j].tells for j in numbers) for s in stations]
         variance = sum(leg.variance for leg in forecast.legs)
         all_ = Row(
-            "all", tuple(_part(x) for x in (*together, sum(together), variance)), mark="good"
+            "all", tuple(_percent(x) for x in (*together, sum(together), variance)), mark="good"
         )
         head = ("Leg", *stations, "Together", "Variance")
         shares = Table(
@@ -251,7 +256,7 @@ def forecast_part(forecast: Forecast) -> Part:
 
 
 def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
-    """The forecast, and the legs that tell least, with what is the matter with them."""
+    """Sentences on the forecast, and on the legs with the least information and their causes."""
     photographs = sum(len(edges.photographs) for edges in forecast.edges)
     out = [
         f"{forecast.photographs} such photographs a station, over the joints' ranges, would"
@@ -281,8 +286,14 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
 
 def _cells(leg: LegForecast) -> tuple[str, ...]:
     sigma = f"{leg.sigma:.2f} px" if math.isfinite(leg.sigma) else "–"
-    return _part(leg.seen), _part(leg.found), sigma, _part(leg.tells), _part(leg.variance)
+    return (
+        _percent(leg.seen),
+        _percent(leg.found),
+        sigma,
+        _percent(leg.tells),
+        _percent(leg.variance),
+    )
 
 
-def _part(share: float) -> str:
+def _percent(share: float) -> str:
     return f"{share:.0%}" if math.isfinite(share) else "–"

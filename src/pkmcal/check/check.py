@@ -1,8 +1,8 @@
-"""Find what is wrong with a session before any work is spent on it.
+"""Checks of a session before it is calibrated.
 
-Everything that `load_session` refuses, then what only the photographs can tell: whether they
-decode, are exposed and sharp, and whether the machine and the boards are recognised in them; then
-what readings and measured poses tell before any calibration.
+All that `load_session` refuses, then what only images show: whether they can be decoded, are well
+exposed and sharp, and whether machine and boards are recognized in them; then what readings and
+measured poses show before a calibration.
 """
 
 from __future__ import annotations
@@ -61,27 +61,27 @@ from pkmcal.session.starter import untouched_files
 from pkmcal.wording import listed
 
 BROKEN_PHOTOGRAPHS_NAMED = 10
-"""Broken photographs of a station that are named one by one; the others are counted."""
+"""Number of broken images of a station that are reported individually; the others are counted."""
 OTHER_MODE = np.deg2rad(20.0)
-"""Turn to another assembly below which one could be taken for the other."""
+"""Rotation to another assembly mode below which one can be mistaken for the other, rad."""
 STROKE_END_SHARE = 0.15
-"""Part of a joint's range, at either end, in which a reading is an extreme one."""
+"""Part of a joint's range, at either end, whose readings count as extreme."""
 
 
 def check_session(
     folder: Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
 ) -> SessionCheck:
-    """Look through a session; what is wrong comes back as findings, nothing is raised.
+    """Check a session; faults are returned as findings, never raised.
 
     seed : of the random searches, as in `calibrate`.
     """
-    # As in `calibrate`: threads inside the linear algebra would only be in each other's way.
+    # as in `calibrate`: threads inside the linear algebra would hinder each other
     with threadpool_limits(1, "blas"):
         return _check(Path(folder), seed, progress or (lambda _text, _share: None))
 
 
 def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionCheck:
-    """:func:`check_session`, step by step."""
+    """Steps of :func:`check_session`."""
     progress("Reading the session", 0.0)
     findings = [*untouched_files(folder)]
     try:
@@ -90,20 +90,20 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
     progress("Reading photographs", 0.1)
-    photographs, broken = _decoded(session)
+    photographs, broken = _decode_images(session)
     progress("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
-    in_view = _observed(session, photographs, motion.poses, seed, progress)
-    stations, joints = in_view.stations, joint_checks(session)
-    findings += [*broken, *motion.findings, *in_view.findings, *joint_findings(session, joints)]
+    observed = _check_images(session, photographs, motion.poses, seed, progress)
+    stations, joints = observed.stations, joint_checks(session)
+    findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
     findings += numbering_note(session)
     progress("What such photographs will give", 0.8)
-    by_hand = any(station.handheld for station in session.stations)  # no place to come back to
+    by_hand = any(station.handheld for station in session.stations)  # no station for further images
     expected = None
-    if in_view.inspection and not by_hand:
+    if observed.inspection and not by_hand:
         try:
-            expected = forecast(in_view.inspection)
+            expected = forecast(observed.inspection)
         except (PkmcalError, np.linalg.LinAlgError) as error:
             findings.append(note("images.no_forecast", why=str(error).rstrip(".")))
     for station in stations:
@@ -119,13 +119,13 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
         singularity=motion.singularity,
         assemblies=motion.assemblies,
         forecast=expected,
-        advice=advice(in_view.inspection, expected) if in_view.inspection else (),
-        look=in_view.inspection,
+        advice=advice(observed.inspection, expected) if observed.inspection else (),
+        look=observed.inspection,
     )
 
 
 def _workspace(session: Session) -> list[Finding]:
-    """Whether the drawing's machine comes to the workspace that the session names."""
+    """Finding if the nominal machine does not reach the session's workspace."""
     if session.workspace is None:
         return []
     try:
@@ -135,13 +135,16 @@ def _workspace(session: Session) -> list[Finding]:
     return []
 
 
-def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]:
-    """Each station's photographs of legs; those that cannot be decoded are findings."""
+def _decode_images(session: Session) -> tuple[list[Photographs | None], list[Finding]]:
+    """Images of legs by station, None for a station without any, and findings on those that cannot
+    be decoded.
+    """
     out: list[Photographs | None] = []
     findings: list[Finding] = []
     room = CACHED_IMAGE_BYTES
     for number, station in enumerate(session.stations):
-        if "legs" not in station.observe:  # decoded one by one where the board is looked for
+        # images of the board are decoded one by one in the search for it
+        if "legs" not in station.observe:
             out.append(None)
             continue
         rows: list[int] = []
@@ -162,7 +165,7 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
             rows.append(photo.configuration)
             files.append((photo.path, label))
         if broken > BROKEN_PHOTOGRAPHS_NAMED:
-            more = _more_broken(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED)
+            more = _more_broken_error(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED)
             findings.append(of_error(more, station=station.name))
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
@@ -175,8 +178,8 @@ def _decoded(session: Session) -> tuple[list[Photographs | None], list[Finding]]
     return out, findings
 
 
-def _more_broken(session: Session, number: int, count: int) -> InputError:
-    """The error about all photographs of a station that cannot be decoded but those named."""
+def _more_broken_error(session: Session, number: int, count: int) -> InputError:
+    """Error on the broken images of a station that are not reported individually."""
     name = session.stations[number].name
     return InputError(
         "photographs cannot be decoded",
@@ -188,8 +191,12 @@ def _more_broken(session: Session, number: int, count: int) -> InputError:
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """poses : T_base_platform (K, 4, 4), None where the drawing cannot take the readings."""
+class _NominalKinematics:
+    """Kinematics of the nominal machine at the readings.
+
+    poses : T_base_platform (K, 4, 4), None if the closure fails at some readings. singularity :
+    least over the configurations. assemblies : number of assembly modes at the first readings.
+    """
 
     poses: Array | None
     singularity: float
@@ -197,17 +204,20 @@ class _Motion:
     findings: tuple[Finding, ...]
 
 
-def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
-    """Whether the drawing's machine closes at all readings, and how well it is held there."""
+def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematics:
+    """Whether the nominal machine closes at all readings, with its singularity and assembly modes
+    there.
+    """
     try:
         poses = platform_poses(session, most=not legs_stations(session))
         fk = session.machine.forward_result(session.joints, poses)
         first = session.joints[0]
-        if session.machine.layout.overdetermined:  # with errors they close in no pose
+        # an overdetermined machine does not close at readings with errors
+        if session.machine.layout.overdetermined:
             first = session.machine.inverse(poses[0])
         modes = session.machine.assembly_modes(first, rng)
     except PkmcalError as error:
-        return _Motion(None, math.nan, 0, (of_error(error),))
+        return _NominalKinematics(None, math.nan, 0, (of_error(error),))
     findings: list[Finding] = []
     weak = [session.configurations[k] for k in np.flatnonzero(fk.singularity < NEAR_SINGULAR)]
     if weak:
@@ -217,51 +227,55 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
         turn = float(np.rad2deg(turns[turns > 1e-3].min()))
         first_name = session.configurations[0]
         findings.append(doubtful("configurations.other_assembly", first_name, turn=turn))
-    return _Motion(poses, float(fk.singularity.min()), len(modes), tuple(findings))
+    return _NominalKinematics(poses, float(fk.singularity.min()), len(modes), tuple(findings))
 
 
-class _Observed(NamedTuple):
-    """inspection : None where the machine could not be looked for."""
+class _ImageChecks(NamedTuple):
+    """Results of the images. inspection : None if the machine could not be searched for."""
 
     stations: tuple[StationCheck, ...]
     findings: tuple[Finding, ...]
     inspection: Inspection | None = None
 
 
-def _observed(
+def _check_images(
     session: Session,
     photographs: list[Photographs | None],
     poses: Array | None,
     seed: int,
     progress: CalibrationProgress,
-) -> _Observed:
-    """What the photographs of every station show, and what is to be said of it."""
+) -> _ImageChecks:
+    """Checks of the images of every station: boards, localization, and the start of a
+    calibration.
+    """
     whole = [p for p in photographs if p is not None]
 
-    def unlooked() -> tuple[StationCheck, ...]:
-        """Stations in which the machine could not even be looked for."""
-        n_legs, value = session.machine.n_legs, zip(session.stations, photographs, strict=True)
+    def unsearched() -> tuple[StationCheck, ...]:
+        """Checks of stations in which the machine cannot be searched for."""
+        n_legs, observed = session.machine.n_legs, zip(session.stations, photographs, strict=True)
         return tuple(
-            _summary(station, unrecognised_quality(p.images if p else [], n_legs), recognised=False)
-            for station, p in value
+            _station_check(
+                station, unrecognised_quality(p.images if p else [], n_legs), recognised=False
+            )
+            for station, p in observed
         )
 
     try:
         check_observable(session)
     except InputError as error:
-        return _Observed(unlooked(), (of_error(error),))
+        return _ImageChecks(unsearched(), (of_error(error),))
     if poses is None or len(whole) < len(legs_stations(session)):
-        return _Observed(unlooked(), ())
-    # Of photographs that are broken is told already.
+        return _ImageChecks(unsearched(), ())
+    # Broken images have been reported already.
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
     if not lost:
         boards = look_for_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
-        return _Observed(unlooked(), boards.findings)
-    turns = () if lost else pose_findings(session, boards.boards)
-    located = localize(  # by the random numbers of `calibrate`
+        return _ImageChecks(unsearched(), boards.findings)
+    turn_findings = () if lost else pose_findings(session, boards.boards)
+    located = localize(  # with the random numbers of `calibrate`
         session,
         whole,
         boards.boards,
@@ -271,47 +285,50 @@ def _observed(
     settled: Settled | PkmcalError | None = None
     if isinstance(located.result, PkmcalError):
         settled = located.result
-    elif not lost and not any(finding.level is Level.WRONG for finding in turns):
-        settled = _settled(session, located.result, seed, progress)
-    retained = located.result if not isinstance(settled, Settled) else settled.case
-    rejected = () if isinstance(retained, PkmcalError) else retained.session.rejected
+    elif not lost and not any(finding.level is Level.WRONG for finding in turn_findings):
+        settled = _calibration_start(session, located.result, seed, progress)
+    case = located.result if not isinstance(settled, Settled) else settled.case
+    rejected = () if isinstance(case, PkmcalError) else case.session.rejected
     findings = [
-        *([_refused(settled)] if isinstance(settled, PkmcalError) else []),
+        *([_refusal(settled)] if isinstance(settled, PkmcalError) else []),
         *boards.findings,
-        *turns,
+        *turn_findings,
         *(one.finding for one in rejected),
     ]
     if isinstance(settled, Settled):
         findings += [*(one.finding for one in settled.turned), *settled.findings]
-        findings += _verdict_of_poses(settled)
-    stations = [  # as it is known of one that observes no legs
+        heights = settled.case.session.heights_alone
+        findings += _height_findings(settled) if heights else _pose_scale_findings(settled)
+    stations = [  # default for stations that observe no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
     places = _search_results(session, whole, located)
-    # one on a tripod was recognised all the same, and its quality tells why it may be left out
-    gone = {one.station.name for one in rejected if one.station.handheld}
-    if isinstance(retained, PkmcalError):  # of photographs by hand none was placed then
-        gone = {station.name for station in session.stations if station.handheld}
+    # A rejected station on a tripod was recognized, and its quality may explain the rejection.
+    rejected_names = {one.station.name for one in rejected if one.station.handheld}
+    if isinstance(case, PkmcalError):  # no hand-held image was localized then
+        rejected_names = {station.name for station in session.stations if station.handheld}
     parts: list[StationInspection] = []
     for p in whole:
-        if p.station not in places:  # another station's fault came first
+        if p.station not in places:  # the search ended at the fault of another station
             summary = unrecognised_quality(p.images, session.machine.n_legs)
-            stations[p.station] = _summary(session.stations[p.station], summary, recognised=False)
+            stations[p.station] = _station_check(
+                session.stations[p.station], summary, recognised=False
+            )
             continue
-        place = places[p.station]
-        recognised = place.good and stations[p.station].name not in gone
-        stations[p.station], station_edges = _station(session, p, place, poses, recognised)
+        pose = places[p.station]
+        recognised = pose.good and stations[p.station].name not in rejected_names
+        stations[p.station], station_edges = _check_station(session, p, pose, poses, recognised)
         parts.append(station_edges)
     stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
     station_edges = Inspection(session, poses, tuple(parts)) if parts else None
-    return _Observed(stations, tuple(findings), station_edges)
+    return _ImageChecks(stations, tuple(findings), station_edges)
 
 
-def _settled(
+def _calibration_start(
     session: Session, case: Case, seed: int, progress: CalibrationProgress
 ) -> Settled | PkmcalError:
-    """Where `calibrate` begins, or why it would not."""
+    """Start of a calibration as `calibrate` computes it, or the error with which it would end."""
     clock = Clock(lambda text, share: progress(text, 0.4 + 0.4 * share))
     try:
         return settle(session, case, False, seed, clock)
@@ -319,9 +336,9 @@ def _settled(
         return error
 
 
-def _refused(error: PkmcalError) -> Finding:
-    """Why `calibrate` gives no result, as it says so: wrong where the session is at fault, doubtful
-    where these data tell too little.
+def _refusal(error: PkmcalError) -> Finding:
+    """Finding of an error of `calibrate`: wrong if the session is at fault, doubtful if its data
+    are insufficient.
     """
     return of_error(error, Level.WRONG if error.exit_code > 1 else Level.DOUBTFUL)
 
@@ -329,11 +346,12 @@ def _refused(error: PkmcalError) -> Finding:
 def _search_results(
     session: Session, photographs: list[Photographs], located: Localization
 ) -> dict[int, LocalizedPose]:
-    """Where the search for each station ended, by its number; without those not searched."""
+    """Localized poses by station number, without stations that were not searched."""
     fixed = [p.station for p in photographs if not session.stations[p.station].handheld]
-    results = located.recognition.localizations if located.recognition else ()
-    places = dict(zip(fixed, results, strict=bool(results)))
-    for k, one in located.places.items():  # what chance is to others, another place is to one alone
+    localizations = located.recognition.localizations if located.recognition else ()
+    places = dict(zip(fixed, localizations, strict=bool(localizations)))
+    # for a hand-held image, the probability of a rival pose takes the place of that of chance
+    for k, one in located.places.items():
         places[k] = LocalizedPose(
             one.T_camera_base[0],
             math.nan,
@@ -344,36 +362,36 @@ def _search_results(
     return places
 
 
-def _station(
+def _check_station(
     session: Session,
     photographs: Photographs,
     pose: LocalizedPose,
     poses: Array,
     recognised: bool,
 ) -> tuple[StationCheck, StationInspection]:
-    """One station in which the machine was looked for."""
+    """Check and inspection of a station in which the machine was searched for."""
     station, machine = session.stations[photographs.station], session.machine
-    value, by_hand = pose.T_camera_base, station.T_camera_base
-    what = (
-        quality(photographs, machine, value, poses[photographs.configuration])
+    T_camera_base, by_hand = pose.T_camera_base, station.T_camera_base
+    leg_quality = (
+        quality(photographs, machine, T_camera_base, poses[photographs.configuration])
         if recognised
         else unrecognised_quality(photographs.images, machine.n_legs)
     )
     summary = replace(
-        _summary(station, what, recognised=recognised),
+        _station_check(station, leg_quality, recognised=recognised),
         mismatch=pose.score,
         by_chance=pose.by_chance,
     )
     if recognised and by_hand is not None:
-        change = pose_difference(inverse(value), inverse(by_hand))
-        shifted, turned = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
-        summary = replace(summary, moved=shifted, turned=turned)
+        change = pose_difference(inverse(T_camera_base), inverse(by_hand))
+        distance, angle = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
+        summary = replace(summary, moved=distance, turned=angle)
     return summary, StationInspection(
-        station.name, photographs, by_hand, value, what if recognised else None
+        station.name, photographs, by_hand, T_camera_base, leg_quality if recognised else None
     )
 
 
-def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:
+def _station_check(station: Station, what: Quality, recognised: bool) -> StationCheck:
     some = len(what.saturated) > 0
     blur = what.blur[np.isfinite(what.blur)]
     return StationCheck(
@@ -392,7 +410,7 @@ def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:
 
 @dataclass(frozen=True)
 class BoardsCheck:
-    """All stations' boards, by the station's number, and what is to be said of them."""
+    """Boards found in the images, their checks by station number, and findings."""
 
     boards: Boards = field(default_factory=Boards)
     checks: Mapping[int, BoardCheck] = field(default_factory=dict[int, BoardCheck])
@@ -400,9 +418,9 @@ class BoardsCheck:
 
 
 def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> BoardsCheck:
-    """Look for the board in every station that observes it, nothing raised.
+    """Search for the board in every station that observes it; errors become findings.
 
-    images : all decoded photographs by the station's number.
+    images : all decoded images by station number.
     """
     findings: list[Finding] = []
     try:
@@ -411,23 +429,25 @@ def look_for_boards(session: Session, images: Mapping[int, Sequence[Integers]]) 
         return BoardsCheck(findings=(of_error(error),))
     if board is None:
         return BoardsCheck()
-    results: dict[int, StationBoard] = {}
+    station_boards: dict[int, StationBoard] = {}
     for number, station in enumerate(session.stations):
         if "board" not in station.observe:
             continue
         try:
-            results[number] = station_board(session, board, number, images[number])
+            station_boards[number] = station_board(session, board, number, images[number])
         except InputError as error:
             findings.append(of_error(error, station=station.name))
-    checks = {number: _board_check(one) for number, one in results.items()}
+    checks = {number: _board_check(one) for number, one in station_boards.items()}
     for number, check in checks.items():
         findings += board_findings(session, number, check)
-    boards = Boards(results, session.board_body, board.tolerance)
+    boards = Boards(station_boards, session.board_body, board.tolerance)
     return BoardsCheck(boards, checks, tuple(findings))
 
 
-def _unseen(one: StationBoard) -> str:
-    """The outer row or column that is never seen though all others are."""
+def _unseen_border(one: StationBoard) -> str:
+    """Outer row or column of the board that no image shows while all others are visible; empty if
+    none.
+    """
     board = one.views.board
     if board.type == "aruco_grid":
         return ""
@@ -447,7 +467,7 @@ def _board_check(one: StationBoard) -> BoardCheck:
         rms=float(np.median(views.rms)),
         scatter=stood.scatter if stood else math.nan,
         distance=float(np.median(np.linalg.norm(views.poses.T_camera_board[:, :3, 3], axis=-1))),
-        unseen=_unseen(one),
+        unseen=_unseen_border(one),
     )
 
 
@@ -455,57 +475,50 @@ def _board_check(one: StationBoard) -> BoardCheck:
 
 
 def joint_checks(session: Session) -> tuple[JointCheck, ...]:
-    """All joints' readings."""
-    names: list[JointCheck] = []
+    """Ranges of all joints' readings."""
+    checks: list[JointCheck] = []
     for k, name in enumerate(session.document["joints"]["columns"]):
-        values, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
+        readings, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
         stroke = high - low
         ends = (
-            int(np.sum(values < low + STROKE_END_SHARE * stroke)),
-            int(np.sum(values > high - STROKE_END_SHARE * stroke)),
+            int(np.sum(readings < low + STROKE_END_SHARE * stroke)),
+            int(np.sum(readings > high - STROKE_END_SHARE * stroke)),
         )
-        used = float(np.ptp(values) / stroke)
-        names.append(JointCheck(name, float(values.min()), float(values.max()), used, ends))
-    return tuple(names)
+        used = float(np.ptp(readings) / stroke)
+        checks.append(JointCheck(name, float(readings.min()), float(readings.max()), used, ends))
+    return tuple(checks)
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:
-    """How the platform turns, by the poses that were measured."""
+    """Findings on the platform's rotations in the measured poses."""
     if not session.trackers and (not boards.stations or boards.body == "base"):
         return []
     try:
         measurements = measurements_of(session, boards)
         return turning(session, measurements.poses, measurements.on_platform)
     except PkmcalError as error:
-        return [_refused(error)]
+        return [_refusal(error)]
 
 
-def _verdict_of_poses(settled: Settled) -> list[Finding]:
-    """Whether the mechanism, its parameters adjusted, explains the poses that were measured."""
-    if settled.case.session.heights_alone:
-        return _verdict_of_heights(settled)
-    return _unexplained_poses(settled)
-
-
-def _verdict_of_heights(settled: Settled) -> list[Finding]:
-    """The model violations and the uneven bed that `calibrate` will find."""
-    turns = settled.turns
-    value = model_violations(
+def _height_findings(settled: Settled) -> list[Finding]:
+    """Findings on the model violations and the uneven bed that `calibrate` will report."""
+    fit = settled.turns
+    tested = model_violations(
         settled.case.session,
-        turns.observation,
-        turns.measurements,
-        turns.estimate,
-        linearize_at_solution(turns.measurements, turns.estimate),
+        fit.observation,
+        fit.measurements,
+        fit.estimate,
+        linearize_at_solution(fit.measurements, fit.estimate),
     )
     return [
-        *(replace(one.finding, level=Level.DOUBTFUL) for one in value.violations),
-        *discrepancy_findings(value.errors),
-        *([] if explains_heights(value.errors) else _unexplained_poses(settled)),
+        *(replace(one.finding, level=Level.DOUBTFUL) for one in tested.violations),
+        *discrepancy_findings(tested.errors),
+        *([] if explains_heights(tested.errors) else _pose_scale_findings(settled)),
     ]
 
 
-def _unexplained_poses(settled: Settled) -> list[Finding]:
-    """A finding where measured poses scatter more than their noise."""
+def _pose_scale_findings(settled: Settled) -> list[Finding]:
+    """Finding if measured poses scatter more than their noise."""
     scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
     if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
         return []

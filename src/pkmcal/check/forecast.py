@@ -1,10 +1,10 @@
-"""What a full capture would give, told by a station's first photographs.
+"""Predicted accuracy of a full capture, from a station's first images.
 
-The first photographs are measured as `calibrate` measures them. How much each edge tells there, in
-pixels, and lost edges nothing, is what such edges will tell: every edge that the machine would show
-in configurations drawn over its joints' ranges gets what one of its like told, drawn at random.
-With these the problem of the joint estimate is assembled as for a real session, and its covariance
-followed to the platform.
+The first images are measured as `calibrate` measures them. The information of their edges, in
+pixels and with lost edges as zero, predicts that of others: every edge that is visible in
+configurations drawn over the joints' ranges gets the information of a similar one, drawn at random.
+With these edges the problem of the joint estimate is assembled as for a real session, and its
+covariance is propagated to the platform.
 """
 
 from __future__ import annotations
@@ -26,23 +26,24 @@ from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
 from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, draw_configurations, view_angle
 
 NEAR_END = 0.15
-"""Part of a joint's range, at either end, in which a reading is an extreme one."""
+"""Part of a joint's range, at either end, whose readings count as extreme."""
 SECOND_PLACE_TURN = np.pi / 2
-"""How far round the machine a second place is tried: what one camera sees worst, along its line of
-sight, the other sees best."""
+"""Angle around the machine of a second station, rad: the direction that one camera determines
+worst, along its line of sight, the other determines best.
+"""
 FORECAST_SEED = 7
 
 
 @dataclass(frozen=True)
 class LegForecast:
-    """One leg (from 1) seen from one station.
+    """Forecast for one leg (from 1) at one station.
 
-    seen : share of its edges' points that nothing hides, in all photographs. found : share of the
-    edges that ought to be seen whose place was measured and agrees with all others, in the first
-    photographs; NaN where none ought to be. sigma : px across, median of these. tells : share of
-    what all edges of the capture tell about the machine (their information in units of the
-    drawing's tolerances). variance : share of the variance of the platform's position that comes
-    from its edges' errors: where it is large, a better view of this leg gains most.
+    seen : share of its edges' points that are not hidden, in all images. found : share of the
+    expected edges that were measured and are inliers, in the first images; NaN without expected
+    ones. sigma : their median standard deviation, px across. tells : share of the information of
+    all edges of the capture on the machine (in units of the prior sigmas). variance : share of the
+    variance of the platform's position that comes from the errors of its edges: a better view of a
+    leg with a large share gains most.
     """
 
     station: str
@@ -56,13 +57,13 @@ class LegForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What ``photographs`` a station like the first ones would give.
+    """Predicted accuracy with ``photographs`` images at each station.
 
     position, orientation : standard deviations of the platform's pose at given readings, mean over
     poses, m and rad, as `calibrate` states them. readings, drawing : shares of the position's
-    variance; the legs' edges make the rest. second : position, m, where half of the
-    photographs are taken a quarter round the machine; NaN where there is more than one station, or
-    a camera that looks all round. edges : by station, for advice.
+    variance from readings and priors; the rest comes from edges. second : position, m, if half of
+    the images are taken a quarter turn around the machine; NaN with several stations or a panoramic
+    camera. edges : by station, for advice.
     """
 
     photographs: int
@@ -78,14 +79,14 @@ class Forecast:
 def forecast(
     inspection: Inspection, photographs: int = CONFIGURATIONS_A_CAPTURE
 ) -> Forecast | None:
-    """The forecast from the first photographs; None where the machine was not recognised in all.
+    """Forecast by the first images; None if the machine was not recognized at all stations.
 
-    By the legs alone, whatever boards and trackers say besides. Raises a `PkmcalError` or a
-    `LinAlgError` where these photographs do not carry one.
+    Only legs are used, not boards and trackers. Raises a `PkmcalError` or a `LinAlgError` if these
+    images do not allow a forecast.
     """
     machine, stations = inspection.session.machine, inspection.stations
     whole = bool(stations) and all(station.recognised for station in stations)
-    # where hinges turn is not known where nothing was measured
+    # the angles of hinges are not known without measurements
     if not whole or machine.layout.n_internal:
         return None
     first = first_edges(
@@ -95,12 +96,12 @@ def forecast(
         np.stack([station.T_camera_base for station in stations]),
         inspection.poses,
     )
-    capture = _planned(inspection, first, photographs)
+    capture = _planned_capture(inspection, first, photographs)
     information = _capture_information(capture)
     second = np.nan
     one = stations[0].photographs
     if len(stations) == 1 and view_angle(one.camera) < PANORAMIC_HALF_VIEW:
-        second = _capture_information(_two_places(capture)).position
+        second = _capture_information(_with_second_station(capture)).position
     return Forecast(
         photographs=photographs,
         position=information.position,
@@ -114,7 +115,7 @@ def forecast(
 
 
 class _Capture(NamedTuple):
-    """Pairs (M, 2) of station and configuration that are photographed by a rig."""
+    """Images by a rig: pairs (M, 2) of station and configuration."""
 
     rig: Rig
     T_base_platform: Array
@@ -123,7 +124,7 @@ class _Capture(NamedTuple):
 
 
 class _CaptureInformation(NamedTuple):
-    """What a capture tells of the platform; share, variance : (S, L)."""
+    """Accuracy of the platform by a capture; share, variance : (S, L)."""
 
     position: float
     orientation: float
@@ -133,8 +134,10 @@ class _CaptureInformation(NamedTuple):
     drawing: float
 
 
-def _planned(inspection: Inspection, first: FirstEdges, photographs: int) -> _Capture:
-    """Configurations over the joints' ranges, as many extreme ones among them as so far."""
+def _planned_capture(inspection: Inspection, first: FirstEdges, photographs: int) -> _Capture:
+    """Capture with configurations over the joints' ranges, with the present share of extreme
+    ones.
+    """
     machine, stations = first.estimate.machine, inspection.stations
     low, high = machine.joint_ranges.T
     margin = NEAR_END * (high - low)
@@ -148,7 +151,7 @@ def _planned(inspection: Inspection, first: FirstEdges, photographs: int) -> _Ca
     number = np.arange(photographs)
     pairs = [all_pairs([s], number + (0 if shared else photographs * s)) for s in range(len(rows))]
     T_camera_base = first.estimate.state.T_camera_base
-    in_view = zip(stations, T_camera_base, first.pools, strict=True)
+    cameras = zip(stations, T_camera_base, first.pools, strict=True)
     rig = Rig(
         machine,
         tuple(station.name for station in stations),
@@ -157,15 +160,17 @@ def _planned(inspection: Inspection, first: FirstEdges, photographs: int) -> _Ca
         inspection.session.joint_noise,
         tuple(
             LegsFrom(k, s.photographs.camera, T, pools, s.photographs.binning)
-            for k, (s, T, pools) in enumerate(in_view)
+            for k, (s, T, pools) in enumerate(cameras)
         ),
         shading=first.estimate.statistics.shading,
     )
     return _Capture(rig, poses[:wanted], readings[:wanted], np.concatenate(pairs))
 
 
-def _two_places(capture: _Capture) -> _Capture:
-    """The only station's photographs, every other one taken a quarter round the machine."""
+def _with_second_station(capture: _Capture) -> _Capture:
+    """Capture of a single station, with every other image taken a quarter turn around the
+    machine.
+    """
     rig = capture.rig
     (one,) = (x for x in rig.instruments if isinstance(x, LegsFrom))
     middle = np.concatenate([rig.machine.base_centers(), capture.T_base_platform[:, :3, 3]])
@@ -184,12 +189,12 @@ def _two_places(capture: _Capture) -> _Capture:
 
 
 def _capture_information(capture: _Capture) -> _CaptureInformation:
-    """What a capture tells of the platform.
+    """Accuracy of the platform by a capture.
 
-    With N = sum of N_g the information of all groups of rows (legs at stations, readings, drawing)
-    and J the derivative of the platform's place, its covariance J N^-1 J^T is the sum over g of
-    J N^-1 N_g N^-1 J^T: what comes from each group's errors. What edges tell of the machine is
-    the trace of their N_g, its parameters in units of their tolerances.
+    With N = sum of N_g the information of all groups of rows (legs at stations, readings, priors)
+    and J the derivative of the platform's position, its covariance J N^-1 J^T is the sum over g of
+    J N^-1 N_g N^-1 J^T, the contributions of each group's errors. The information of edges on the
+    machine is the trace of their N_g, with parameters in units of their prior sigmas.
     """
     rig, machine = capture.rig, capture.rig.machine
     n_stations = len(rig.names)
@@ -210,7 +215,7 @@ def _capture_information(capture: _Capture) -> _CaptureInformation:
     part = np.sum((rows @ place.T) ** 2, axis=-1)  # (K, r)
     prior = float(np.sum((info.linear.shared_by @ place.T) ** 2))
     tolerance = machine.parameters.tolerances_free()
-    values = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
+    row_information = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
     at = assembled.places.edges
 
     def by_leg(of_rows: Array) -> Array:
@@ -219,7 +224,7 @@ def _capture_information(capture: _Capture) -> _CaptureInformation:
         np.add.at(out, (edges.station, edges.leg), own)
         return out
 
-    share, shares = by_leg(part), by_leg(values)
+    share, shares = by_leg(part), by_leg(row_information)
     readings = float(part[:, problem.closure_rows].sum())
     whole = float(share.sum()) + readings + prior
     return _CaptureInformation(
@@ -241,13 +246,13 @@ def _by_leg(
         for j in np.unique(tubes.leg):
             mine = tubes.leg == j
             expected = int(edges.expected[:, mine].sum())
-            value = int(edges.valid[:, mine].sum())
+            inliers = int(edges.valid[:, mine].sum())
             out.append(
                 LegForecast(
                     station=station.name,
                     leg=int(j) + 1,
                     seen=float("nan") if hidden is None else float(1 - hidden[j]),
-                    found=value / expected if expected else float("nan"),
+                    found=inliers / expected if expected else float("nan"),
                     sigma=float(first.sigma[s, j]),
                     tells=float(information.share[s, j]),
                     variance=float(information.variance[s, j]),

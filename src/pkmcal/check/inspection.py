@@ -1,4 +1,4 @@
-"""Where the check found the machine in photographs: what its pictures and its forecast use."""
+"""Localization of the machine in a check's images, used by its pictures and its forecast."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pkmcal.session.load import Session
 
 @dataclass(frozen=True)
 class StationInspection:
-    """One station in whose photographs the machine was looked for.
+    """Station in whose images the machine was searched for.
 
-    name : the station's. photographs : decoded; ``photographs.station`` is its number.
-    by_hand : T_camera_base (4, 4) as the session says, None where it does not. T_camera_base : (4,
-    4) where the search ended. quality : on the legs, None where the machine was not recognised.
+    name : of the station. photographs : decoded images; ``photographs.station`` is the station's
+    number. by_hand : T_camera_base (4, 4) of the session, None without one. T_camera_base : (4, 4)
+    end of the search. quality : of the legs, None if the machine was not recognized.
     """
 
     name: str
@@ -28,17 +28,19 @@ class StationInspection:
 
     @property
     def recognised(self) -> bool:
-        """Whether the machine was recognised."""
+        """Whether the machine was recognized."""
         return self.quality is not None
 
     def few(self) -> Integers:
-        """Numbers of the few photographs that are looked at closely."""
+        """Indices of the images that are shown."""
         return spread_over(self.photographs.configuration)
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """A session's stations that observe legs. poses : T_base_platform (K, 4, 4) by the drawing."""
+    """Stations of a session that observe legs. poses : T_base_platform (K, 4, 4) by the nominal
+    model.
+    """
 
     session: Session
     poses: Array
@@ -46,6 +48,6 @@ class Inspection:
 
     @property
     def measured(self) -> tuple[Integers, ...]:
-        """Numbers of the photographs that tell a forecast, by station."""
+        """Indices of the images that are measured for the forecast, by station."""
         n = len(self.stations)
         return tuple(spread_over(s.photographs.configuration, n) for s in self.stations)

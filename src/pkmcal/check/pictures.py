@@ -1,6 +1,6 @@
-"""A check's photographs with the drawing laid over, before and after the station's pose was found.
+"""Images of a check with the nominal model overlaid, by the given and by the localized pose.
 
-On the page, and as PNG files, of large photographs binned as their edges are looked for.
+For the page, and as PNG files, in which large images are binned as for the search for edges.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from pkmcal.pages.overlays import Drawn, Picture, Spot, machine_laid_over
 from pkmcal.pages.page import N_COLOURS
 
 DRAWN_PIXEL_BINARY_DIGITS = 4
-"""Binary digits of a pixel to which cv2 draws."""
+"""Binary digits of the fractions of a pixel in cv2's drawing functions."""
 CAPTION_BAR_HEIGHT = 26
-"""Height (px) of the line above each picture that says what it shows."""
+"""Height (px) of the caption above each image."""
 PANE_GAP = 6
-"""Pixels between the two."""
+"""Distance (px) between the two images."""
 
 
 def with_pictures(inspection: Inspection) -> Part:
-    """The page's section: the stations' first photographs, each by every pose that there is."""
+    """Section of the page with the stations' first images, each with every available pose."""
     pairs: list[tuple[Picture, ...]] = []
     for station in inspection.stations:
         for k in station.few():
@@ -67,9 +67,7 @@ def with_pictures(inspection: Inspection) -> Part:
 
 
 def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
-    """The poses, T_camera_base, by which the drawing is laid over, each with its name; first that
-    by hand.
-    """
+    """Poses T_camera_base for overlays with their captions; the given pose comes first."""
     after = "pose found" if station.recognised else "best pose found, not recognised"
     by_hand = () if station.by_hand is None else (("pose by hand", station.by_hand),)
     return *by_hand, (after, station.T_camera_base)
@@ -78,8 +76,9 @@ def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
 def drawing_over_photograph(
     inspection: Inspection, station: StationInspection, camera: Camera, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
-    """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
-    joint centres. camera : the station's, or that of binned photographs.
+    """Visible silhouettes of the nominal tubes in image k, and the joint centres.
+
+    camera : of the station, or of its binned images.
     """
     configuration = int(station.photographs.configuration[k])
     return machine_laid_over(
@@ -95,7 +94,7 @@ def drawing_over_photograph(
 
 
 def picture_names(inspection: Inspection) -> dict[tuple[int, int], str]:
-    """File names by station and photograph."""
+    """File names by station and image."""
     out: dict[tuple[int, int], str] = {}
     for s, station in enumerate(inspection.stations):
         photographs = inspection.session.stations[station.photographs.station].photographs
@@ -105,7 +104,7 @@ def picture_names(inspection: Inspection) -> dict[tuple[int, int], str]:
 
 
 def write_pictures(inspection: Inspection, folder: Path) -> None:
-    """All photographs as PNG, by hand to the left and as found to the right; all or none."""
+    """Write all images as PNG, the given pose left and the localized one right; all or none."""
     import cv2
 
     with staged_folder(folder) as stage:
@@ -117,7 +116,7 @@ def write_pictures(inspection: Inspection, folder: Path) -> None:
 
 
 def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:
-    """Photograph k in colour, (h, w, 3) uint8, blue first as cv2 has it."""
+    """Image k in colour with its overlays, (h, w, 3) uint8, in cv2's order BGR."""
     import cv2
 
     name = inspection.session.configurations[int(station.photographs.configuration[k])]
@@ -137,7 +136,7 @@ def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:
 
 
 def _draw(pane: Any, edges: tuple[Drawn, ...], spots: tuple[Spot, ...]) -> None:
-    """Lines and joints into a picture, each on a dark one so that it shows on white, too."""
+    """Draw lines and joints into an image, each on a dark one for contrast with white."""
     import cv2
 
     def fixed(points: Any) -> Any:
@@ -164,15 +163,17 @@ def _draw(pane: Any, edges: tuple[Drawn, ...], spots: tuple[Spot, ...]) -> None:
 
 
 def _colour(leg: int) -> tuple[int, int, int]:
-    """The leg's colour on photographs, blue first."""
+    """Colour of a leg on images, BGR."""
     return leg_colours()[(leg - 1) % N_COLOURS]
 
 
 @cache
 def leg_colours() -> tuple[tuple[int, int, int], ...]:
-    """What the page's style sheet gives legs on photographs: it stands once, there."""
+    """Colours of legs on images from the page's style sheet, the only place that defines them;
+    BGR.
+    """
     style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
     (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)", style, flags=re.MULTILINE)
-    results = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
-    numbers = [int(results[str(k + 1)], 16) for k in range(N_COLOURS)]
+    colours = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
+    numbers = [int(colours[str(k + 1)], 16) for k in range(N_COLOURS)]
     return tuple((n & 255, n >> 8 & 255, n >> 16) for n in numbers)

@@ -1,4 +1,4 @@
-"""What a check found: the session's stations, boards and joints, and what is to be said of it."""
+"""Results of a check: stations, boards and joints of a session, and the findings."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pkmcal.outcome.finding import Finding, Level, first_error
 
 @dataclass(frozen=True)
 class BoardCheck:
-    """The board in one station's photographs.
+    """Board in the images of one station.
 
-    found : photographs that show it. corners : mean number in these, of ``corners_of``. rms : px
-    off their predicted places. scatter : px by which a board on the base wanders from photograph
-    to photograph; nan where it need not stand still, or is seen once. distance : m. unseen : an
-    outer row or column that no photograph shows though it shows all others, in words.
+    found : number of images that show it. corners : their mean number in these, of ``corners_of``.
+    rms : distance from the predicted positions, px. scatter : motion in px of a board on the base
+    between images; NaN if it need not be still, or is visible once. distance : m. unseen : outer
+    row or column that no image shows while all others are visible, in words.
     """
 
     found: int
@@ -34,8 +34,10 @@ class BoardCheck:
 
 @dataclass(frozen=True)
 class JointCheck:
-    """One joint's readings, m or rad; used : share of its range, ends : readings near either end
-    of it (NaN and 0 where the mechanism file gives no range).
+    """Readings of one joint, m or rad.
+
+    used : share of its range. ends : numbers of readings near either end of it. NaN and 0 if the
+    mechanism file gives no range.
     """
 
     name: str
@@ -47,12 +49,12 @@ class JointCheck:
 
 @dataclass(frozen=True)
 class StationCheck:
-    """One station. mismatch : 0 perfect, 1 nothing fits; by_chance : probability that wrong
-    readings fit as well; NaN where not looked for.
+    """Check of one station.
 
-    moved, turned : from the pose by hand to the one found, m and rad. legs : mean number found in
-    a photograph. saturated, black : mean shares of the legs' pixels. blur : median, px. board :
-    where the station observes one and it was found.
+    mismatch : 0 for a perfect match, 1 for none. by_chance : probability that wrong readings match
+    as well. Both are NaN without a search. moved, turned : from the given to the localized pose, m
+    and rad. legs : mean number found in an image. saturated, black : mean shares of the legs'
+    pixels. blur : median, px. board : None if the station observes none or it was not found.
     """
 
     name: str
@@ -71,11 +73,12 @@ class StationCheck:
 
 @dataclass(frozen=True)
 class SessionCheck:
-    """All that was found. singularity : least over the configurations, 1 good, 0 singular.
+    """Results of a check.
 
-    assemblies : ways to assemble the machine at the first configuration's readings. forecast : what
-    a full capture would give, where the first photographs tell. advice : what would make it better.
-    look : where the machine was looked for, for pictures; None where it could not be.
+    singularity : least over the configurations, 1 good, 0 singular. assemblies : number of assembly
+    modes at the first configuration's readings. forecast : accuracy of a full capture, if the first
+    images allow it. advice : improvements. look : localization of the machine for pictures; None if
+    it could not be searched for.
     """
 
     folder: str
@@ -93,11 +96,11 @@ class SessionCheck:
 
     @property
     def exit_code(self) -> int:
-        """2 where calibrating would be refused, 1 where its result would be doubtful, else 0."""
+        """2 if a calibration would be refused, 1 if its result would be doubtful, else 0."""
         return exit_code_of(self.findings)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything under its name, for ``--json``, and the first error as every command's."""
+        """Document for ``--json``, with the first error as in every command."""
         case = self.forecast and replace(self.forecast, edges=())
         out = json_value(asdict(replace(self, look=None, forecast=case, findings=(), advice=())))
         out.pop("look")
@@ -109,6 +112,6 @@ class SessionCheck:
 
 
 def exit_code_of(findings: Sequence[Finding]) -> int:
-    """2 where one of them is wrong, 1 where one is doubtful, else 0."""
+    """2 if a finding is wrong, 1 if one is doubtful, else 0."""
     levels = {finding.level for finding in findings}
     return 2 if Level.WRONG in levels else 1 if Level.DOUBTFUL in levels else 0

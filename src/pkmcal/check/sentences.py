@@ -1,4 +1,4 @@
-"""What is told of a checked session: what is doubtful in sentences, and the outcome."""
+"""Findings of a check, and its outcome."""
 
 from __future__ import annotations
 
@@ -22,19 +22,21 @@ from pkmcal.session.readings import same_pose
 from pkmcal.wording import count, listed
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
-"""Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""
+"""Share of saturated pixels on the legs beyond which edges are lost; a highlight has a tenth."""
 TOO_DARK = 0.5
-"""Share of black pixels on the legs beyond which the legs have no shading left."""
+"""Share of black pixels on the legs beyond which they have no shading left."""
 BLUR_STILL_MEASURED = 1.7
-"""Blur (px) beyond which edges are not measured well: the model of an edge ends at 1.5."""
+"""Blur (px) beyond which edges are measured badly: the model of an edge ends at 1.5."""
 FEW_LEGS = 0.5
-"""Share of the legs found in a station's photographs below which it hardly contributes."""
+"""Share of the legs found in a station's images below which the station hardly contributes."""
 POOR_CORNERS = 0.5
-"""px rms from which the corners are worse than any sharp photograph of a flat board has them."""
+"""Residual of corners (px rms) beyond that of any sharp image of a flat board."""
 LITTLE_USED = 0.5
 """Share of a joint's range below which its configurations are crowded."""
 FEW_CONFIGURATIONS = 8
-"""Configurations below which standard deviations are large and mistakes go unnoticed."""
+"""Number of configurations below which standard deviations are large and mistakes are not
+detected.
+"""
 STATION_LEGEND = (
     "By chance: probability of other readings fitting as well (of a photograph by",
     "hand, another place); good below 0.001, or 0.01 near a pose or by hand.",
@@ -52,9 +54,10 @@ KINEMATICS_SENTENCE = (
 
 
 def link_findings(session: Session, poses: Array | None) -> list[Finding]:
-    """How far what links configurations is from the nominal machine, a note for each kind.
+    """Notes on the difference between links of configurations and the nominal machine, one for each
+    kind.
 
-    poses : T_base_platform (K, 4, 4) by the nominal machine, None where it has none.
+    poses : T_base_platform (K, 4, 4) by the nominal machine; None if it has none.
     """
     out: list[Finding] = []
     for links in session.links:
@@ -74,39 +77,39 @@ def link_findings(session: Session, poses: Array | None) -> list[Finding]:
 
 
 def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
-    """What is doubtful about a station's photographs, of a machine of so many legs."""
-    results: list[Finding] = []
+    """Findings on the images of a station. n_legs : of the machine."""
+    findings: list[Finding] = []
     at = {"subject": station.name, "station": station.name}
     where = "legs" if station.recognised else "pictures"
     if station.saturated > OVEREXPOSED_PIXEL_SHARE:
-        results.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
+        findings.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
     if station.black > TOO_DARK:
-        results.append(doubtful("images.black", **at, share=station.black, where=where))
+        findings.append(doubtful("images.black", **at, share=station.black, where=where))
     if station.blur > BLUR_STILL_MEASURED:
-        results.append(doubtful("images.blurred", **at, blur=station.blur))
+        findings.append(doubtful("images.blurred", **at, blur=station.blur))
     if station.recognised and station.legs < FEW_LEGS * n_legs:
-        results.append(doubtful("images.few_legs", **at, number=station.legs, of=n_legs))
-    return results
+        findings.append(doubtful("images.few_legs", **at, number=station.legs, of=n_legs))
+    return findings
 
 
 def board_findings(session: Session, number: int, check: BoardCheck) -> list[Finding]:
-    """What is doubtful about the board in a station's photographs; number : from 0."""
+    """Findings on the board in a station's images. number : of the station, from 0."""
     station = session.stations[number]
     at = {"subject": station.name, "station": station.name}
-    results: list[Finding] = []
+    findings: list[Finding] = []
     if check.rms > POOR_CORNERS:
-        results.append(doubtful("board.corners_off", **at, rms=check.rms))
+        findings.append(doubtful("board.corners_off", **at, rms=check.rms))
     if check.unseen:
-        results.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
+        findings.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
     if session.board_body == "base" and check.found == 1 and len(station.photographs) > 1:
-        results.append(note("board.seen_once", **at))
-    return results
+        findings.append(note("board.seen_once", **at))
+    return findings
 
 
 def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Finding]:
-    """What is doubtful, or worth knowing, about where the machine was photographed."""
+    """Findings on the ranges and the number of configurations."""
     findings: list[Finding] = []
-    if session.heights_alone:  # a bed lies where it lies
+    if session.heights_alone:  # the bed determines the configurations
         return findings
     crowded = [joint for joint in joints if joint.used < LITTLE_USED]
     if crowded:
@@ -116,11 +119,11 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
     count = len(session.configurations)
     if count < FEW_CONFIGURATIONS:
         findings.append(note("configurations.too_few", number=count))
-    return findings + _poses_of_many_names(session)
+    return findings + _repeated_pose_findings(session)
 
 
-def _poses_of_many_names(session: Session) -> list[Finding]:
-    """That configurations are of one pose, by their readings, and how to say so."""
+def _repeated_pose_findings(session: Session) -> list[Finding]:
+    """Note on configurations with the same pose by their readings, and how to declare repeats."""
     owner = same_pose(session.joints, session.joint_noise)
     first, names = np.unique(owner, return_counts=True)
     if len(first) == len(owner):
@@ -138,7 +141,7 @@ def _poses_of_many_names(session: Session) -> list[Finding]:
         if len({owner[photo.configuration] for photo in station.photographs})
         < len({photo.configuration for photo in station.photographs})
     }
-    if not session.stations:  # a tracker's table has one row a configuration
+    if not session.stations:  # a tracker's table has one row for each configuration
         return [note("configurations.equal_rows", **facts)]
     if not again:
         return [note("configurations.equal_names", **facts, name=same[0])]
@@ -152,7 +155,7 @@ def _poses_of_many_names(session: Session) -> list[Finding]:
 
 
 def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome:
-    """What was found, for people and programs; study : of the session's repeats."""
+    """Outcome for people and programs. study : of the session's repeats."""
     findings = (*check.findings, *(study.findings if study else ()))
     headlines = (
         f"Nothing is wrong. Next: pkmcal calibrate {shlex.quote(check.folder)}",
@@ -162,7 +165,7 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
     code = exit_code_of(findings)
     refused = any(finding.error is not None for finding in findings)
     name = check.folder
-    if Path(name).name in ("", ".."):  # "." and the like name nothing to a reader
+    if Path(name).name in ("", ".."):  # "." and ".." are no names for a reader
         name = resolved(Path(name)).name or name
     parts: tuple[Part, ...] = ()
     if check.machine:
@@ -204,12 +207,12 @@ def _stations_table(check: SessionCheck) -> Table:
             levels.add(Level.WRONG)
         worst = [level for level in Level if level in levels]
         mark: Mark = worst[0] if worst else "good"
-        shifted = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
+        motion = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
         finite = station.recognised and math.isfinite(station.legs)
         cells = (
             str(station.photographs),
             _number(station.by_chance, "{:.0e}"),
-            shifted if math.isfinite(station.moved) else "–",
+            motion if math.isfinite(station.moved) else "–",
             f"{station.legs:.1f}/{check.n_legs}" if finite else "–",
             _number(station.saturated, "{:.0%}"),
             _number(station.black, "{:.0%}"),

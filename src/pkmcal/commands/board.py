@@ -1,4 +1,4 @@
-"""``pkmcal board``: a calibration board to print, true to scale."""
+"""``pkmcal board``: PDF page of a calibration board in true size."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def board(
     from pkmcal.errors import InputError
     from pkmcal.files import write_bytes
 
-    source = file / "board.yaml" if file.is_dir() else file
-    target = out or source.with_suffix(".pdf")
-    pdf, name = sheet_pdf(load_board(source, label=str(source)), paper)
+    board_file = file / "board.yaml" if file.is_dir() else file
+    target = out or board_file.with_suffix(".pdf")
+    pdf, name = sheet_pdf(load_board(board_file, label=str(board_file)), paper)
     there = os.path.lexists(target)
     regular = target.is_file() and not target.is_symlink()
     if there and not (regular and b"/Producer (pkmcal)" in target.read_bytes()):
@@ -52,7 +52,7 @@ def board(
             (
                 console.MARK_SIGNS["note"],
                 "Print it in actual size (100 %), measure the two rulers, and write what the"
-                f" board measures over all into {source.name}.",
+                f" board measures over all into {board_file.name}.",
             ),
         ],
     )

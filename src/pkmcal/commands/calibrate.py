@@ -1,4 +1,4 @@
-"""``pkmcal calibrate``: from a session to a calibrated machine on disk."""
+"""``pkmcal calibrate``: calibration of a session's machine, written to files."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def calibrate(
     folder = out or default_output(loaded.folder / "calibration")
     check_output(folder, force=force)
     with console.progress(quiet or as_json) as progress:
-        value = run(
+        calibration = run(
             loaded,
             method=method,
             seed=seed,
@@ -78,14 +78,14 @@ def calibrate(
             progress=progress,
         )
         progress("Writing the report", 0.97)
-        outcome = outcome_of(value)
-        with output_lock(folder):  # another run may have written there meanwhile
+        outcome = outcome_of(calibration)
+        with output_lock(folder):  # another process may have written there since the first check
             over = check_output(folder, force=force)
             archive_folder = None if force else keep_earlier(folder, outcome.texts)
             write_outcome(outcome, folder, CALIBRATION_FILES, over)
         files = dict(CALIBRATION_FILES)
         if rrd is not None:
-            write_rrd(value, rrd)
+            write_rrd(calibration, rrd)
             files[str(rrd.absolute())] = "rerun opens it"
     return answer(
         outcome, folder, files, archive_folder=archive_folder, as_json=as_json, quiet=quiet

@@ -1,4 +1,4 @@
-"""``pkmcal camera``: a camera calibrated from photographs of a board."""
+"""``pkmcal camera``: calibration of a camera with images of a board."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OTHER_CAMERA_FILES = {
 
 
 class CameraFileForm(StrEnum):
-    """Other programs' camera files."""
+    """Formats of other programs' camera files."""
 
     OPENCV = "opencv"
     ROS = "ros"
@@ -82,7 +82,10 @@ def camera(
 
 
 def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
-    """A session's photographs of its board, all of one camera, and the board's file."""
+    """Image files of a session's board, all of one camera, and the board's file.
+
+    Raises InputError if no station observes a board, several cameras do, or there are no files.
+    """
     from pkmcal.errors import InputError
     from pkmcal.files import read_yaml, validated_document, wanted_file
     from pkmcal.session.schema import session_schema
@@ -90,8 +93,8 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
 
     session = read_yaml(folder / "session.yaml")
     schema = validated_document(session, session_schema())
-    in_view = [schema.cameras[name] for name in schema.observers("board")]
-    if not in_view or schema.board is None:
+    observers = [schema.cameras[name] for name in schema.observers("board")]
+    if not observers or schema.board is None:
         raise InputError(
             "no station of this session observes a board",
             where=session.where("stations"),
@@ -106,7 +109,7 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
             found=schema.board.file,
             expected=wanted_file(board),
         )
-    cameras = sorted({station.camera for station in in_view})
+    cameras = sorted({station.camera for station in observers})
     if len(cameras) > 1:
         raise InputError(
             "the session's boards are seen by several cameras",
@@ -115,7 +118,7 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
             expected="one camera at a time",
             next_step="Name one camera's photographs: pkmcal camera IMAGES... --board FILE",
         )
-    patterns = [glob.escape(station.images) for station in in_view]
+    patterns = [glob.escape(station.images) for station in observers]
     wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]
     paths = sorted({folder / name for text in wild for name in glob.glob(text, root_dir=folder)})
     if not paths:
@@ -124,7 +127,9 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
 
 
 def photographs(images: list[Path]) -> list[Path]:
-    """The photographs named, folders opened; in the order of their names."""
+    """Image files of the arguments in the order of their names, with folders replaced by their
+    content.
+    """
     from pkmcal.errors import InputError
     from pkmcal.files import IMAGE_FILE_ENDINGS
 
@@ -148,7 +153,7 @@ def photographs(images: list[Path]) -> list[Path]:
 
 
 def board_file_of(images: list[Path]) -> Path:
-    """board.yaml in the photographs' folder, or in the one above it."""
+    """board.yaml in the folder of the images, or in the folder above; InputError without it."""
     from pkmcal.errors import InputError
     from pkmcal.files import resolved
 

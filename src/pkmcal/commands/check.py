@@ -1,4 +1,4 @@
-"""``pkmcal check``: what is wrong with a session, before any work is spent."""
+"""``pkmcal check``: checks of a session before it is calibrated."""
 
 from __future__ import annotations
 

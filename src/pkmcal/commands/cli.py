@@ -1,7 +1,8 @@
-"""The command line. What a command does stands in :mod:`pkmcal.commands`; here, what all share.
+"""Command line: entry point, lazy commands, errors and exit codes. Each command is a module of
+:mod:`pkmcal.commands`.
 
 Exit codes: 0 done; 1 ran, but the result should not be used; 2 the input is wrong; 70 a defect of
-pkmcal; 130 interrupted. No mistake of a user's ends in a traceback.
+pkmcal; 130 interrupted. No mistake of a user ends in a traceback.
 """
 
 from __future__ import annotations
@@ -27,16 +28,17 @@ from pkmcal.commands.streams import LostOutput, withstanding
 from pkmcal.errors import InputError, PkmcalError, legible
 
 INTERNAL_ERROR_EXIT = 70
-"""sysexits.h's EX_SOFTWARE: an internal error, which is nothing that a user did."""
+"""EX_SOFTWARE of sysexits.h: an internal error, not one of the user."""
 INTERRUPTED_EXIT = 130
-"""What shells give a program that was ended by Ctrl-C."""
+"""Exit code that shells give to a program ended by Ctrl-C."""
 DEBUG_VARIABLE = "PKMCAL_DEBUG"
 UNCOLLECTED_OBJECTS_ALLOWED = 20_000
-"""Objects more than before at which Python looks for circles among them, instead of 700: a command
-makes 80,000 as it is loaded, which live until it ends."""
+"""Threshold of Python's garbage collector, instead of 700: loading a command creates 80,000 objects
+that live until it ends.
+"""
 
 _UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
-"""The base of all complaints about options; typer gives it no public name."""
+"""Base class of typer's errors about options, which has no public name."""
 
 COMMANDS_IN_ORDER = (
     "demo",
@@ -56,25 +58,28 @@ COMMANDS_IN_ORDER = (
     "study",
     "reproduce",
 )
-"""In the order of the help: the order in which a newcomer needs them. Each is the function of its
-name in the module of its name."""
+"""Commands in the order of the help, which is that in which a newcomer needs them. Each is the
+function of its name in the module of its name.
+"""
 
 
 class _Commands(typer.core.TyperGroup):
-    """The commands, each loaded when it is asked for."""
+    """Group of commands, each imported when it is used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*COMMANDS_IN_ORDER, *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         return (
-            _made(cmd_name) if cmd_name in COMMANDS_IN_ORDER else super().get_command(ctx, cmd_name)
+            _typer_command(cmd_name)
+            if cmd_name in COMMANDS_IN_ORDER
+            else super().get_command(ctx, cmd_name)
         )
 
 
 @cache
-def _made(name: str) -> Any:
-    """One of our commands, as typer has it: to read the options of all takes it 20 ms."""
+def _typer_command(name: str) -> Any:
+    """A command as typer's object; building those of all commands would take 20 ms."""
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     alone.command(name)(getattr(import_module(f"pkmcal.commands.{name}"), name))
     return typer.main.get_command(alone)
@@ -115,12 +120,13 @@ def _top(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code."""
+    """Run one command; return its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments is None:  # a process of its own: at its end no circle need be looked for
+    # in a process of our own, reference cycles need not be collected at the end
+    if arguments is None:
         gc.set_threshold(UNCOLLECTED_OBJECTS_ALLOWED)
         atexit.register(gc.freeze)
-    # What OpenCV cannot read is told in sentences of our own.
+    # pkmcal reports itself what OpenCV cannot read.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     with withstanding():
         try:
@@ -128,37 +134,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
         except KeyboardInterrupt:
             code = INTERRUPTED_EXIT
-        except Exception as error:  # noqa: BLE001 - the last resort, which tells defects from mistakes
-            return _failed(error, words)
+        except Exception as error:  # noqa: BLE001 - the last resort: a defect, or a user's mistake
+            return _report_error(error, words)
         if code == INTERRUPTED_EXIT:  # typer turns Ctrl-C into this code
-            return _failed(KeyboardInterrupt(), words)
+            return _report_error(KeyboardInterrupt(), words)
         return code if isinstance(code, int) else 0
 
 
-def _failed(error: BaseException, words: list[str]) -> int:
-    """Tell an error in words, or as JSON where that was asked for; returns the exit code."""
+def _report_error(error: BaseException, words: list[str]) -> int:
+    """Report an error as text, or as JSON with ``--json``; return the exit code."""
     if os.environ.get(DEBUG_VARIABLE):
         sys.stderr.write(legible("".join(traceback.format_exception(error)), keep="\n"))
-    message, code = _in_words(error, words)
+    message, code = _as_pkmcal_error(error, words)
     if "--json" in words and not isinstance(error, LostOutput):
         try:
             typer.echo(json.dumps({**message.as_dict(), "exit_code": code}, ensure_ascii=False))
             sys.stdout.flush()
         except LostOutput:
-            pass  # what went wrong first is told, where something still can be
+            pass  # report the first error on standard error, if possible
         else:
             return code
     print_error(str(message))
     return code
 
 
-def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]:
-    """Any error as one of ours, and its exit code."""
+def _as_pkmcal_error(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]:
+    """Any error as a PkmcalError, with its exit code."""
     if isinstance(error, PkmcalError):
         return error, error.exit_code
     if isinstance(error, _UsageError):
         command = words[0] + " " if words and words[0] in COMMANDS_IN_ORDER else ""
-        message = InputError(_usage(error), next_step=f"See pkmcal {command}--help")
+        message = InputError(_usage_message(error), next_step=f"See pkmcal {command}--help")
         return message, message.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED_EXIT
@@ -185,20 +191,25 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
     return defect, INTERNAL_ERROR_EXIT
 
 
-_SUGGESTED = re.compile(r"(Did you mean|\(Possible options:).*")
-_MACHINERY = ((r"Value error, ", ""), (r"Input should be", "it should be"), (r", unable to .*", ""))
-"""In the complaints of typer's own checks: what names their inside, and what a reader needs."""
+_SUGGESTION = re.compile(r"(Did you mean|\(Possible options:).*")
+_TYPER_PHRASES = (
+    (r"Value error, ", ""),
+    (r"Input should be", "it should be"),
+    (r", unable to .*", ""),
+)
+"""Replacements in the messages of typer's own checks, which name internals."""
 
 
-def _usage(error: Exception) -> str:
-    """A complaint about words of the command line, with the one known word that most likely was
-    meant; typer's own suggestions are as many as resemble it from afar.
+def _usage_message(error: Exception) -> str:
+    """Message of an error about the command line, with the closest known word.
+
+    typer's own suggestions are removed, because they include words of little similarity.
     """
     from pkmcal.files import closest
 
     message = " ".join(getattr(error, "format_message", error.__str__)().split())
-    message = _SUGGESTED.sub("", message).rstrip("?. ")
-    for inside, instead in _MACHINERY:
+    message = _SUGGESTION.sub("", message).rstrip("?. ")
+    for inside, instead in _TYPER_PHRASES:
         message = re.sub(inside, instead, message)
     guess: str | None = None
     if option := re.match(r"No such option:? '?-*([^\s']+)", message):

@@ -1,4 +1,6 @@
-"""A calibration against the truth of its simulated session; read only when all else is done."""
+"""Comparison of a calibration with the truth of its simulated session, after everything is
+written.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,16 @@ if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
 WITHIN_TRUTH_SIGMAS = 2.0
-"""Standard deviations within which 95 % of the values should lie."""
+"""Standard deviations within which 95 % of the values should be."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Of a machine against the true one, frames laid over each other: m and rad.
+    """Errors of a machine with respect to the true one, after registration of the frames: m and
+    rad.
 
-    centre : mean distance of the joint centres. offset : root mean square. position,
-    orientation : mean error of the platform's pose at the session's readings.
+    centre : mean distance of the joint centres. offset : root mean square. position, orientation :
+    mean error of the platform's pose at the session's readings.
     """
 
     centre: float
@@ -38,8 +41,10 @@ class Errors:
 
 @dataclass(frozen=True)
 class AgainstTruth:
-    """Errors before and after; count : values with a standard deviation, within : of them,
-    those nearer to the truth than two of theirs.
+    """Errors of the nominal and of the calibrated machine.
+
+    count : number of values with a standard deviation. within : number of those within two standard
+    deviations of the truth.
     """
 
     drawing: Errors
@@ -49,12 +54,12 @@ class AgainstTruth:
 
 
 def compare_with_truth(calibration: Calibration, session_folder: Path) -> AgainstTruth:
-    """Compare with ``truth.json`` in the session's folder."""
-    drawing = calibration.session.machine
-    truth = load_truth(session_folder, drawing)
+    """Compare a calibration with ``truth.json`` in the session's folder."""
+    nominal = calibration.session.machine
+    truth = load_truth(session_folder, nominal)
     off = _in_sigmas(calibration, truth)
     return AgainstTruth(
-        drawing=_errors(drawing, truth),
+        drawing=_errors(nominal, truth),
         calibrated=_errors(calibration.machine, truth),
         count=off.size,
         within=int(np.sum(off < WITHIN_TRUTH_SIGMAS)),
@@ -62,17 +67,17 @@ def compare_with_truth(calibration: Calibration, session_folder: Path) -> Agains
 
 
 def _errors(machine: Machine, truth: Truth) -> Errors:
-    value = machine_errors(machine, truth.machine, truth.joints)
+    errors = machine_errors(machine, truth.machine, truth.joints)
     return Errors(
-        centre=float(value.centre.mean()),
-        offset=rms(value.offset) if value.offset.size else 0.0,
-        position=float(np.nanmean(value.position)),
-        orientation=float(np.nanmean(value.orientation)),
+        centre=float(errors.centre.mean()),
+        offset=rms(errors.offset) if errors.offset.size else 0.0,
+        position=float(np.nanmean(errors.position)),
+        orientation=float(np.nanmean(errors.orientation)),
     )
 
 
 def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
-    """Distances of the values from the truth in standard deviations, in the result's frames."""
+    """Errors of the values in standard deviations, in the result's gauge."""
     estimate = calibration.estimate
     true = State(
         theta=truth.machine.values,
@@ -80,11 +85,11 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
         T_base_platform=truth.T_base_platform,
         edge_shift=np.zeros_like(estimate.state.edge_shift),
     )
-    drawing = calibration.session.machine
-    covariance, table = in_gauge(drawing, true, default_gauge(drawing)), drawing.parameters
-    # an axis by its two turns: along itself it changes by squares of small angles only
-    error = table.to_free(estimate.machine.values) - table.to_free(covariance.theta)
+    nominal = calibration.session.machine
+    true_in_gauge, table = in_gauge(nominal, true, default_gauge(nominal)), nominal.parameters
+    # An axis has two free turns; along itself it changes only to second order.
+    error = table.to_free(estimate.machine.values) - table.to_free(true_in_gauge.theta)
     to_free = np.linalg.pinv(table.free_matrix())
     sigma = np.sqrt(np.maximum(np.diag(to_free @ estimate.covariance @ to_free.T), 0.0))
-    above_limit = sigma > 1e-9  # what defines the frames has no deviation
-    return np.abs(error)[above_limit] / sigma[above_limit]
+    free = sigma > 1e-9  # values that define the gauge have no standard deviation
+    return np.abs(error)[free] / sigma[free]

@@ -1,5 +1,5 @@
-"""What commands take alike, and how they say things: results to stdout, progress and errors to
-stderr, each kind in one way.
+"""Options shared by commands, and output to the terminal: results to stdout, progress and errors to
+stderr.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and no
 
 
 def number_option(command: str, name: str, metavar: str, described: str, *flags: str) -> Any:
-    """A numeric option with its range in :data:`pkmcal.ranges.RANGES`, which its help tells.
+    """Numeric option that is validated by its range in :data:`pkmcal.ranges.RANGES`; the help shows
+    the range.
 
-    described : its help. flags : as they are written; ``--name`` unless given.
+    described : help text. flags : names of the option; ``--name`` by default.
     """
     long = flags[-1] if flags else f"--{name.replace('_', '-')}"
 
@@ -51,7 +52,7 @@ def _seed(value: int) -> int:
 
 
 Seed = Annotated[
-    int, typer.Option("--seed", metavar="N", callback=_seed, help="Of all random draws.")
+    int, typer.Option("--seed", metavar="N", callback=_seed, help="Seed for all random numbers.")
 ]
 
 SessionFolder = Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")]
@@ -70,26 +71,26 @@ MARK_SIGNS = {
     "wrong": "[red]✗[/]",
 }
 ROW_SOURCE_STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
-"""Of a table's rows, by whose figures they are."""
+"""Styles of a table's rows by the source of their figures."""
 PROGRESS_LINE_INTERVAL = 10.0
-"""Seconds from one line about the progress to the next, where there is no terminal."""
+"""Seconds between two lines of progress without a terminal."""
 WIDEST_NAME = 32
-"""Letters of a row's name up to which it stays on one line."""
+"""Maximum number of characters of a row's name that is not wrapped."""
 
 
 def folder(given: str) -> Any:
-    """The option of the folder in which results go; given : its help."""
+    """Option of the output folder. given : help text."""
     return typer.Option("-o", "--out", metavar="DIR", help=given)
 
 
 @cache
 def _legible_console() -> type[Console]:
-    """Rich's console, on which all text is legible; only Rich's own colours control a terminal."""
+    """Rich's console with all text made legible; only Rich's own control codes reach a terminal."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
 
     class LegibleConsole(Console):
-        """As Rich's."""
+        """Console with legible text."""
 
         def render(
             self, renderable: RenderableType, options: ConsoleOptions | None = None
@@ -104,17 +105,17 @@ def _legible_console() -> type[Console]:
 
 
 def out() -> Console:
-    """The console of results."""
+    """Console for results."""
     return _legible_console()(highlight=False)
 
 
 def err() -> Console:
-    """The console of progress and errors."""
+    """Console for progress and errors."""
     return _legible_console()(stderr=True, highlight=False)
 
 
 def print_error(sentence: str) -> None:
-    """One error to stderr: wrapped and coloured on a terminal, one line elsewhere."""
+    """Print an error to stderr: wrapped and coloured on a terminal, in one line elsewhere."""
     console = err()
     if console.is_terminal:
         print_points(console, [("[bold red]Error:[/]", sentence)])
@@ -123,19 +124,19 @@ def print_error(sentence: str) -> None:
 
 
 def print_json(data: Mapping[str, Any]) -> None:
-    """The one JSON object of a command."""
+    """Print the single JSON object of a command."""
     from pkmcal.files import json_text
 
     sys.stdout.write(json_text(data))
 
 
 def print_points(console: Console, points: Iterable[tuple[str, str]]) -> None:
-    """Sentences that wrap beside the mark before each: (mark in markup, text)."""
+    """Print sentences that wrap beside their marks: pairs of mark (in markup) and text."""
     from rich.text import Text
 
     for mark, text in points:
         before = Text.from_markup(f"{mark} " if mark else "")
-        # Paths and numbers stay whole; a word that is wider than the terminal runs over.
+        # Paths and numbers are not split; a word that is wider than the terminal runs over.
         lines = textwrap.wrap(
             text,
             max(console.width - before.cell_len, 20),
@@ -147,7 +148,7 @@ def print_points(console: Console, points: Iterable[tuple[str, str]]) -> None:
 
 
 def print_files(console: Console, files: Iterable[tuple[str, str]]) -> None:
-    """Paths, each with what it is."""
+    """Print paths with their descriptions."""
     files = [(legible(path), what) for path, what in files]
     widest = max(len(path) for path, _ in files)
     for path, what in files:
@@ -155,34 +156,32 @@ def print_files(console: Console, files: Iterable[tuple[str, str]]) -> None:
 
 
 def print_table(console: Console, table: Table) -> None:
-    """A table without lines: its title, as many columns as a terminal is to show, its legend."""
+    """Print a table without lines: title, the columns that are for the terminal, and legend."""
     from rich.table import Table as Rich
 
     columns = table.columns[: table.first]
     marked = any(row.mark for row in table.rows)
-    display = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    grid = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
     if marked:
-        display.add_column()
+        grid.add_column()
     short = max((len(row.name) for row in table.rows), default=0) <= WIDEST_NAME
     for place, heading in enumerate(columns):
         left = place == 0 or place in table.words
-        display.add_column(
-            heading, justify="left" if left else "right", no_wrap=not place and short
-        )
+        grid.add_column(heading, justify="left" if left else "right", no_wrap=not place and short)
     for row in table.rows:
         mark = [MARK_SIGNS[row.mark] if row.mark else ""] if marked else []
         cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])
-        display.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
+        grid.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
     console.print()
     if table.title:
         console.print(legible(table.title), style="bold", markup=False)
-    console.print(display)
+    console.print(grid)
     for line in table.legend:
         console.print(f"   {line}", style="dim", markup=False)
 
 
 def escaped(text: str) -> str:
-    """Text of one line that may hold brackets, safe from being taken for markup."""
+    """Text of one line, with brackets escaped so that they are not read as markup."""
     from rich.markup import escape
 
     return escape(legible(text))
@@ -190,16 +189,18 @@ def escaped(text: str) -> str:
 
 @contextmanager
 def progress(quiet: bool = False) -> Generator[TextProgress]:
-    """A bar on stderr for as long as the block runs; where that is no terminal, such as a log or a
-    pipe, a plain line every PROGRESS_LINE_INTERVAL seconds.
+    """Context with a progress callback, which draws a bar on stderr.
+
+    If stderr is not a terminal but a log or a pipe, it prints a plain line every
+    PROGRESS_LINE_INTERVAL seconds.
     """
     if quiet:
         yield lambda _text, _share: None
         return
     console = err()
     if not console.is_terminal:
-        with _lines() as values:
-            yield values
+        with _progress_lines() as report:
+            yield report
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -215,8 +216,10 @@ def progress(quiet: bool = False) -> Generator[TextProgress]:
 
 
 @contextmanager
-def _lines() -> Generator[TextProgress]:
-    """Lines about what is being done, as long as the block runs; none of what ends before."""
+def _progress_lines() -> Generator[TextProgress]:
+    """Context with a progress callback that prints lines at intervals; short commands print
+    none.
+    """
     begin, over, step = time.monotonic(), threading.Event(), [("", 0.0)]
 
     def report(text: str, share: float) -> None:
@@ -229,7 +232,7 @@ def _lines() -> Generator[TextProgress]:
                 passed = f"{share:.0%}, {time.monotonic() - begin:.0f} s"
                 sys.stderr.write(f"{legible(text)} ({passed})\n")
 
-    # by itself, for a step may take minutes in which nothing else is told
+    # in a thread, because a step may take minutes without a call of report
     thread = threading.Thread(target=print_lines, daemon=True)
     thread.start()
     try:
@@ -240,12 +243,12 @@ def _lines() -> Generator[TextProgress]:
 
 
 def counted(progress: TextProgress, upto: float = 1.0) -> Callable[[int, int], None]:
-    """A callback of photographs done and in all, told as a share of `upto`."""
+    """Callback of the numbers of finished and of all images, as progress from 0 to `upto`."""
     return lambda done, total: progress(f"Photograph {done} of {total}", upto * done / total)
 
 
 def can_show() -> bool:
-    """Whether there is a person with a browser in front of a screen."""
+    """Whether there is a user with a screen and a browser."""
     if os.environ.get("CI") or not sys.stdout.isatty():
         return False
     if sys.platform.startswith("linux"):

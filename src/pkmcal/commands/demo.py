@@ -1,4 +1,4 @@
-"""``pkmcal demo``: a simulated session, calibrated, and compared with its truth."""
+"""``pkmcal demo``: a simulated session, its calibration, and the comparison with the truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME = "session", "calibration"
 FAST_SIZE = (480, 360)
 FAST_CONFIGURATIONS = 4
 SIMULATING_SHARE = 0.85
-"""Share of the time that rendering takes."""
+"""Share of rendering in the progress."""
 
 
 def demo(
@@ -70,12 +70,12 @@ def demo(
         progress("Writing the report", 0.98)
         outcome = outcome_of(calibration)
         write_outcome(outcome, result, CALIBRATION_FILES)
-    # Only now, with everything written, is the truth looked at.
+    # The truth is read only now, when everything is written.
     comparison = compare_with_truth(calibration, session)
-    photographs = sum(len(station.photographs) for station in calibration.session.stations)
+    n_images = sum(len(station.photographs) for station in calibration.session.stations)
     outcome = replace(
         outcome,
-        subject=f"A {calibration.machine.name}, not built quite as drawn, in {photographs}"
+        subject=f"A {calibration.machine.name}, not built quite as drawn, in {n_images}"
         f" simulated photographs: {session}",
         summary={
             **(outcome.summary or {}),
@@ -96,7 +96,7 @@ def demo(
 
 
 def _make_room(out: Path) -> None:
-    """Remove an earlier demonstration; anything else in the folder is somebody's."""
+    """Remove an earlier demonstration; raise InputError if the folder holds anything else."""
     from pkmcal.files import default_output, entries, remove_folder
 
     standing = entries(default_output(out) if out == DEMO_FOLDER else out)
@@ -111,12 +111,12 @@ def _make_room(out: Path) -> None:
             expected="a new or empty folder, or an earlier demonstration to replace",
             next_step="Name another folder with -o",
         )
-    for name in standing:  # the session last: it tells whose the folder is
+    for name in standing:  # the session last, because it identifies the folder as a demonstration
         remove_folder(out / name)
 
 
 def _print_comparison(out: Console, value: AgainstTruth) -> None:
-    """Errors before and after, and whether the standard deviations were honest."""
+    """Print errors before and after, and the share of values within two standard deviations."""
     from pkmcal.outcome import Row, Table
 
     before, after = value.drawing, value.calibrated

@@ -1,4 +1,4 @@
-"""``pkmcal diff``: two calibrations, or drawings, and what the difference does to the tool."""
+"""``pkmcal diff``: difference of two calibrations or nominal models, and its effect on the tool."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ def diff(
         check_own_folder(out, DIFFERENCE_FILES, "a difference")
     with console.progress(as_json) as progress, threadpool_limits(1, "blas"):
         progress("Comparing", 0.1)
-        value = difference(a, b)
-    saved = value.b.saved or value.a.saved
+        compared = difference(a, b)
+    saved = compared.b.saved or compared.a.saved
     folder = out or Path("diff")
     if out is None:
         if saved is not None:
-            # without following links, which may lead out of somebody else's folder
+            # Links are not followed: they may lead out of the user's folder.
             beside, here = Path(os.path.normpath(saved.path.absolute())), Path.cwd()
             beside = beside.parent.parent / "diff"
             folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
         check_own_folder(default_output(folder), DIFFERENCE_FILES, "a difference")
-    outcome = outcome_of(value)
+    outcome = outcome_of(compared)
     texts = {DIFFERENCE_DOCUMENT: json_text(outcome.document)}
-    with output_lock(folder):  # another run may have written there meanwhile
+    with output_lock(folder):  # another process may have written there since
         archive_folder = (
             None if force else keep_earlier(folder, texts, DIFFERENCE_DOCUMENT, DIFFERENCE_PAGE)
         )

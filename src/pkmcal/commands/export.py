@@ -1,4 +1,4 @@
-"""``pkmcal export``: a machine for other programs."""
+"""``pkmcal export``: files of a machine for other programs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def export(
 
     exporter_of(to)
     source = load_source(calibration, session)
-    folder = out or default_output(_beside(calibration, to))
+    folder = out or default_output(_default_folder(calibration, to))
     made = run(source, to, force=force)
     write_export(made, folder)
     if as_json:
@@ -58,9 +58,10 @@ def export(
     return 0
 
 
-def _beside(calibration: str, to: str) -> Path:
-    """Beside a calibration's folder, or here for a machine that is only a file or a name. Links are
-    not followed: they may lead out of somebody else's folder.
+def _default_folder(calibration: str, to: str) -> Path:
+    """Folder beside a calibration's folder, or in the current one for a machine's file or name.
+
+    Links are not followed: they may lead out of the user's folder.
     """
     path = Path(calibration)
     folder = path.parent if path.is_file() and path.suffix == ".json" else path
@@ -70,7 +71,7 @@ def _beside(calibration: str, to: str) -> Path:
 
 
 def summary(made: Export, source: MachineSource, folder: Path) -> dict[str, Any]:
-    """What the command says, for programs."""
+    """Document that the command prints for programs."""
     return {
         "exit_code": 0,
         "format": made.exporter.name,
@@ -89,13 +90,15 @@ def summary(made: Export, source: MachineSource, folder: Path) -> dict[str, Any]
 
 
 def _trial(made: Export, folder: Path) -> str | None:
-    """A command that tries the files out, from here and as often as one likes."""
+    """Shell command that tries out the files from the current folder; None if the format has
+    none.
+    """
     trial = made.exporter.trial
     return f"(cd {shlex.quote(str(folder))} && {trial})" if trial else None
 
 
 def print_export(out: Console, made: Export, source: MachineSource, folder: Path) -> None:
-    """What the command says, for people."""
+    """Print the result for people."""
     state = "good" if source.calibrated and source.usable else "doubtful"
     console.print_points(out, [(console.MARK_SIGNS[state], f"{source.origin}: {source.headline}")])
     points = [
@@ -111,5 +114,5 @@ def print_export(out: Console, made: Export, source: MachineSource, folder: Path
     console.print_files(out, [(str(folder / name), made.exporter.title) for name in made.files])
     if trial := _trial(made, folder):
         out.print()
-        # in one line however narrow the terminal is: it is there to be copied
+        # not wrapped, so that it can be copied
         out.print(f"  {trial}", soft_wrap=True, markup=False, highlight=False)

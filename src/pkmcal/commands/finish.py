@@ -1,8 +1,9 @@
-"""The end of every command: its outcome written, told to people or programs, and judged.
+"""Output of commands: the outcome written to files, printed for people or programs, and the exit
+code.
 
-``files`` are the names of what is written, in the order in which they are told, each with what it
-is for a person. ``NAME.html`` gets the outcome's page and ``NAME.json`` its document, where the
-outcome holds no text of that name itself.
+``files`` maps the names of the files, in the order in which they are listed, to descriptions.
+``NAME.html`` is the outcome's page and ``NAME.json`` its document, unless the outcome holds a text
+of that name.
 """
 
 from __future__ import annotations
@@ -33,10 +34,9 @@ def finish(
     archive_folder: Path | None = None,
     as_json: bool = False,
 ) -> int:
-    """Write the files, tell what was found, and return the exit code.
+    """Write the files, print the outcome, and return the exit code.
 
-    over : files of an earlier result, of which none is to stay. archive_folder : where a copy of it
-    is.
+    over : files of an earlier result, which are removed. archive_folder : folder of its copy.
     """
     with console.progress(as_json) as progress:
         progress("Writing the report", 0.97)
@@ -47,7 +47,7 @@ def finish(
 def write_outcome(
     outcome: Outcome, folder: Path, files: Mapping[str, str], over: Collection[str] = ()
 ) -> None:
-    """Write the files, whole or not at all."""
+    """Write all files atomically."""
     from pkmcal.files import write_folder
 
     write_folder(folder, contents(outcome, files), over)
@@ -62,9 +62,9 @@ def answer(
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Tell what was found and where it stands, and return the exit code.
+    """Print the outcome and the paths of its files, and return the exit code.
 
-    quiet : say nothing of a result that may be used, and one sentence of another.
+    quiet : print nothing for a usable result, and one sentence for another.
     """
     if as_json:
         earlier = {"kept": str(archive_folder)} if archive_folder else {}
@@ -91,7 +91,7 @@ def answer(
 
 
 def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str | bytes]:
-    """The content of each of the files."""
+    """Content of each file."""
     from pkmcal.files import json_text
     from pkmcal.pages.page import page_html
 
@@ -105,7 +105,7 @@ def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str | byte
 
 
 def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[str, Any]:
-    """The one JSON object of a command."""
+    """Single JSON object that a command prints."""
     return {
         "exit_code": outcome.exit_code,
         **({"files": {name: str(folder / name) for name in files}} if files else {}),
@@ -114,7 +114,7 @@ def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[st
 
 
 def print_outcome(out: Console, outcome: Outcome) -> None:
-    """What a command found, for people: the verdict, numbers, and what to look at."""
+    """Print an outcome for people: verdict, figures, tables, findings and checks."""
     verdict, findings = outcome.verdict, outcome.findings
     if outcome.subject:
         console.print_points(out, [("", outcome.subject)])

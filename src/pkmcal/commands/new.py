@@ -1,4 +1,4 @@
-"""``pkmcal new``: a commented session to fill in."""
+"""``pkmcal new``: template of a session with comments."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FELT_FILE_DESCRIPTIONS = {
     "joints.csv": "the carriages when the bed was felt",
     "poses.csv": "the tool's height above the bed there",
 }
-"""Of a session that is whole."""
+"""Descriptions of the files of a complete session of a printer."""
 PHOTOGRAPHS_DESCRIPTION = "where the photographs go"
 
 
@@ -62,7 +62,7 @@ def new(
 
     if printer is not None or probed is not None:
         others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
-        return _of_printer(folder, printer, probed, board, places or 1, others, as_json)
+        return _new_printer_session(folder, printer, probed, board, places or 1, others, as_json)
     what: ObservedChoice | None = (
         "both" if board and legs else "board" if board else "legs" if legs else None
     )
@@ -70,10 +70,10 @@ def new(
     if plain and not as_json and on_terminal():
         machine, what, places = _dialogue()
     names = write_session(folder, machine, what, places or 1)
-    return _summary_lines(folder, names, as_json)
+    return _print_session(folder, names, as_json)
 
 
-def _of_printer(
+def _new_printer_session(
     folder: Path,
     printer: Path | None,
     probed: Path | None,
@@ -82,7 +82,9 @@ def _of_printer(
     others: Mapping[str, object],
     as_json: bool,
 ) -> int:
-    """A printer's session; others : what else was asked, which does not go with it."""
+    """Write a printer's session. others : options given in addition, which exclude
+    ``--printer``.
+    """
     from pkmcal.errors import InputError
     from pkmcal.printers.session import write_printer_session
 
@@ -100,27 +102,31 @@ def _of_printer(
             expected="neither --machine nor --legs, and --probed or --board",
         )
     names = write_printer_session(folder, printer, probed, "board" if board else None, places)
-    return _summary_lines(folder, names, as_json, done=not board, of_printer=True)
+    return _print_session(folder, names, as_json, done=not board, of_printer=True)
 
 
-def _summary_lines(
+def _print_session(
     folder: Path,
     names: Sequence[str],
     as_json: bool,
     done: bool = False,
     of_printer: bool = False,
 ) -> int:
-    """What was written; done : nothing is missing in it. of_printer : drawn by its firmware."""
+    """Print the files written. done : nothing is missing in the session. of_printer : its nominal
+    model is from a firmware's file.
+    """
     if as_json:
         console.print_json({"folder": str(folder), "files": names})
         return 0
     out = console.out()
     out.print("A session:\n" if done else "A session to fill in:\n", style="bold")
-    drawn = {"mechanism.yaml": FELT_FILE_DESCRIPTIONS["mechanism.yaml"]} if of_printer else {}
-    what = {**SESSION_FILE_DESCRIPTIONS, **(FELT_FILE_DESCRIPTIONS if done else drawn)}
-    reference_values = [name for name in what if name in names]
-    others = sorted(set(names) - set(reference_values))
-    rows = [(name, what[name]) for name in reference_values] + [
+    printer_files = (
+        {"mechanism.yaml": FELT_FILE_DESCRIPTIONS["mechanism.yaml"]} if of_printer else {}
+    )
+    what = {**SESSION_FILE_DESCRIPTIONS, **(FELT_FILE_DESCRIPTIONS if done else printer_files)}
+    described = [name for name in what if name in names]
+    others = sorted(set(names) - set(described))
+    rows = [(name, what[name]) for name in described] + [
         (name, PHOTOGRAPHS_DESCRIPTION) for name in others
     ]
     console.print_files(out, [(str(folder / name), what) for name, what in rows])
@@ -134,12 +140,12 @@ def _summary_lines(
 
 
 def on_terminal() -> bool:
-    """Whether somebody is there to answer."""
+    """Whether a user can answer."""
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def _dialogue() -> tuple[str | None, ObservedChoice | None, int]:
-    """What somebody at a terminal wants: the machine, what is seen of it, from how many places."""
+    """Machine, observed parts and number of stations, by a dialogue."""
     from rich.prompt import IntPrompt, Prompt
 
     from pkmcal.mechanisms import catalogue, load_mechanism
@@ -150,15 +156,15 @@ def _dialogue() -> tuple[str | None, ObservedChoice | None, int]:
         "Which one is most like yours",
         choices=names, show_choices=False, default="gough-stewart",
     )  # fmt: skip
-    drawn = load_mechanism(machine)
+    nominal = load_mechanism(machine)
     what: ObservedChoice | None = None
-    if any(leg.tubes for leg in drawn.document.legs):
+    if any(leg.tubes for leg in nominal.document.legs):
         answer = Prompt.ask(
             "What does the camera see of it",
             choices=["legs", "board", "both"], default="legs",
         )  # fmt: skip
         what = "both" if answer == "both" else "board" if answer == "board" else "legs"
-    elif drawn.redundancy > 0:
+    elif nominal.redundancy > 0:
         console.out().print("Its readings alone tell its geometry: no camera is needed.")
         return machine, None, 1
     else:

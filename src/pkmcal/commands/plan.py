@@ -1,4 +1,4 @@
-"""``pkmcal plan``: the next configurations worth measuring, and where to put the camera."""
+"""``pkmcal plan``: the next configurations to measure, and the poses of the camera."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def plan(
     ] = CONFIGURATIONS_A_CAPTURE,
     index: Annotated[
         Literal["tool", "D", "E", "O1"],
-        typer.Option(help="What is to be small: the tool's variance, or D, E, O1."),
+        typer.Option(help="Criterion to minimize: the tool's variance, or D, E, O1."),
     ] = "tool",
     places: Annotated[
         int | None,
@@ -59,10 +59,10 @@ def plan(
     ] = None,
     after: Annotated[
         Path | None,
-        typer.Option(metavar="CALIBRATION", help="What is known already: a calibrated machine."),
+        typer.Option(metavar="CALIBRATION", help="Calibration to continue from."),
     ] = None,
     from_drawing: Annotated[
-        bool, typer.Option("--from-drawing", help="As if nothing had been calibrated.")
+        bool, typer.Option("--from-drawing", help="Ignore the calibration in the session.")
     ] = False,
     same_place: Annotated[
         bool,
@@ -75,34 +75,36 @@ def plan(
         ),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of a MACHINE: its camera's file.")
+        Path | None, typer.Option(metavar="FILE", help="Camera file, for a MACHINE.")
     ] = None,
     size: Annotated[
-        str, typer.Option(metavar="WxH", help="Of a MACHINE: pixels, without a camera file.")
+        str, typer.Option(metavar="WxH", help="Image size without a camera file, for a MACHINE.")
     ] = "{}x{}".format(*PLANNED_IMAGE_SIZE),
     board: Annotated[
-        bool, typer.Option("--board", help="Of a MACHINE: a board on its platform is seen.")
+        bool, typer.Option("--board", help="Observe a board on the platform, for a MACHINE.")
     ] = False,
     tracker: Annotated[
         str | None,
         typer.Option(
-            metavar="M[,RAD]", help="Of a MACHINE: a tracker, or probe, of this noise instead."
+            metavar="M[,RAD]", help="Noise of a tracker or probe used instead, for a MACHINE."
         ),
     ] = None,
     edge_noise: Annotated[
         float,
-        console.number_option("plan", "edge_noise", "PX", "Of an edge, where no photograph tells."),
+        console.number_option(
+            "plan", "edge_noise", "PX", "Noise of an edge, if no image determines it."
+        ),
     ] = NOMINAL_EDGE_SIGMA,
     corner_noise: Annotated[
         float,
         console.number_option(
-            "plan", "corner_noise", "PX", "Of a board's corner, where no photograph tells."
+            "plan", "corner_noise", "PX", "Noise of a board's corner, if no image determines it."
         ),
     ] = NOMINAL_CORNER_SIGMA,
     joint_noise: Annotated[
         float,
         console.number_option(
-            "plan", "joint_noise", "M", "Of a MACHINE: noise of a reading, m or rad."
+            "plan", "joint_noise", "M", "Noise of a reading, m or rad, for a MACHINE."
         ),
     ] = UNTOLD_READING_NOISE,
     seed: console.Seed = 0,
@@ -125,7 +127,7 @@ def plan(
     sized = None if session is not None or camera else camera_of_size(parsed_size(size))
     with console.progress(as_json) as progress:
         progress("Looking at what there is", 0.0)
-        value = run(
+        planned = run(
             subject,
             count=configurations,
             index=index,
@@ -144,11 +146,11 @@ def plan(
             seed=seed,
             progress=lambda share: progress("Choosing configurations", 0.1 + 0.85 * share),
         )
-    return finish(outcome_of(value), folder, files, over=over, as_json=as_json)
+    return finish(outcome_of(planned), folder, files, over=over, as_json=as_json)
 
 
 def _tracker(text: str) -> tuple[float, float | None]:
-    """A tracker's noise, m and rad, of a text such as 2e-5 or 2e-5,1e-4."""
+    """Noise of a tracker, m and rad, from a text such as 2e-5 or 2e-5,1e-4."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:

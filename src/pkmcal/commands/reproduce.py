@@ -1,4 +1,4 @@
-"""``pkmcal reproduce``: the papers' figures computed again, beside what the papers print."""
+"""``pkmcal reproduce``: the papers' figures recomputed, beside the printed ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ REPRODUCTION_FOLDER = Path("reproduction")
 
 
 class Paper(StrEnum):
-    """A paper that can be reproduced."""
+    """Papers that can be reproduced."""
 
     A = "a"
     B = "b"
@@ -57,17 +57,17 @@ def reproduce(
     wanted = [paper.value for paper in dict.fromkeys(papers or list(Paper))]
     with console.progress(as_json) as progress:
         options = Options(runs, seed, long, photographs, progress)
-        results = {paper: computed(paper, options) for paper in wanted}
+        outcomes = {paper: computed(paper, options) for paper in wanted}
     texts = {
         name: text
-        for paper, outcome in results.items()
+        for paper, outcome in outcomes.items()
         for name, text in contents(outcome, files[paper]).items()
     }
     write_folder(out, texts)
     if not as_json:
-        return max(answer(outcome, out, files[paper]) for paper, outcome in results.items())
-    code = max(outcome.exit_code for outcome in results.values())
-    documents = {paper: outcome.document for paper, outcome in results.items()}
+        return max(answer(outcome, out, files[paper]) for paper, outcome in outcomes.items())
+    code = max(outcome.exit_code for outcome in outcomes.values())
+    documents = {paper: outcome.document for paper, outcome in outcomes.items()}
     written = [str(out / name) for name in texts]
     console.print_json({"papers": documents, "files": written, "exit_code": code})
     return code

@@ -1,4 +1,6 @@
-"""``pkmcal servo``: control by the legs in the image, simulated with the calibrated machine."""
+"""``pkmcal servo``: simulated visual servoing by the legs in the image, with a calibrated
+machine.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from pkmcal.errors import InputError
 
 SERVO_FILES = {"servo.html": PAGE_DESCRIPTION, "servo.json": NUMBERS_DESCRIPTION}
 MOST_SAMPLES = 5000
-"""Samples of a run; more take minutes and hundreds of megabytes."""
+"""Maximum number of samples of a run; more take minutes and hundreds of megabytes."""
 
 
 def servo(
@@ -38,11 +40,13 @@ def servo(
         str | None, typer.Option(metavar="1,2,3", help="Legs that the camera sees; all.")
     ] = None,
     runs: Annotated[
-        int, console.number_option("servo", "runs", "N", "Ways to go, of every estimate.")
+        int, console.number_option("servo", "runs", "N", "Number of motions, for every estimate.")
     ] = 60,
     gain: Annotated[
         float,
-        console.number_option("servo", "gain", "G", "Part of the error corrected in a second."),
+        console.number_option(
+            "servo", "gain", "G", "Part of the error that is corrected in a second."
+        ),
     ] = 1.0,
     rate: Annotated[float, console.number_option("servo", "rate", "HZ", "Images a second.")] = 25.0,
     delay: Annotated[
@@ -73,10 +77,11 @@ def servo(
         ),
     ] = 3.0,
     start: Annotated[
-        str | None, typer.Option(metavar="POSE", help="x,y,z,rx,ry,rz of every run (m, rad).")
+        str | None,
+        typer.Option(metavar="POSE", help="Start of every run: x,y,z,rx,ry,rz (m, rad)."),
     ] = None,
     goal: Annotated[
-        str | None, typer.Option(metavar="POSE", help="The same of every run's goal.")
+        str | None, typer.Option(metavar="POSE", help="Goal of every run, in the same form.")
     ] = None,
     out: Annotated[Path | None, console.folder("servo unless given.")] = None,
     seed: console.Seed = 0,
@@ -123,6 +128,6 @@ def servo(
     try:
         with console.progress(as_json) as progress:
             outcome = outcome_of(study_servoing(scene, plan, progress))
-    except InputError as error:  # what a camera does not see is told with its file
+    except InputError as error:  # located at the camera's file, which determines what is in view
         raise error if error.where or camera is None else error.located(str(camera)) from None
     return finish(outcome, folder, SERVO_FILES, as_json=as_json)

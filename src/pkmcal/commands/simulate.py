@@ -1,4 +1,4 @@
-"""``pkmcal simulate``: a session with known truth."""
+"""``pkmcal simulate``: a simulated session with known truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from pkmcal.cameras import Camera
 
 SMALLEST_PICTURE_SIDE, LARGEST_PICTURE_SIDE = 64, 8192
-"""Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
+"""Limits of an image's width and height in px: below, legs are too narrow to have edges; above,
+memory does not suffice.
+"""
 
 
 def simulate(
@@ -96,8 +98,8 @@ def simulate(
 
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     planned = rehearsal_of(plan) if plan else None
-    drawing = planned.machine if planned else load_mechanism(mechanism, label=None)
-    machine = to_simulate(drawing, str(plan or mechanism))
+    nominal = planned.machine if planned else load_mechanism(mechanism, label=None)
+    machine = to_simulate(nominal, str(plan or mechanism))
     place = "platform" if on_platform else "base"
     settings = Settings(
         stations=stations,
@@ -139,7 +141,7 @@ def simulate(
             " truth is in its truth.json, which no calibration reads.",
         )
     ]
-    if machine is not drawing:
+    if machine is not nominal:
         points.append(
             (
                 console.MARK_SIGNS["note"],
@@ -153,7 +155,7 @@ def simulate(
 
 
 def parsed_size(text: str) -> tuple[int, int]:
-    """(width, height) of a text such as 800x600."""
+    """(width, height) from a text such as 800x600."""
     match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text.strip())
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:

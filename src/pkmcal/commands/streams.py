@@ -1,8 +1,8 @@
-"""Standard output and standard error, whatever stands at their other end.
+"""Standard output and standard error that tolerate closed pipes and missing streams.
 
-What is told must not change what is done, nor the exit code: a reader such as ``head`` may leave,
-and the rest goes nowhere; standard error may go anywhere, or nowhere. Only an answer that cannot be
-given, on a full disk or a closed standard output, is an error, and one that is told once.
+Output must not change the work nor the exit code: a reader such as ``head`` may leave, and the rest
+is discarded; standard error may go nowhere. Only a result that cannot be written, to a full disk or
+a closed standard output, is an error, which is raised once.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 READER_GONE_ERRORS = {errno.EPIPE} | ({errno.EINVAL} if os.name == "nt" else set())
-"""What a pipe says whose reader has gone; Windows has a word of its own."""
+"""Errors of a pipe whose reader has left; Windows has its own."""
 
 
 class LostOutput(InputError):
-    """Standard output takes nothing more."""
+    """Standard output cannot be written any more."""
 
 
 @contextmanager
 def withstanding() -> Generator[None]:
-    """Have streams that bear all this in the place of sys.stdout and sys.stderr.
+    """Context in which sys.stdout and sys.stderr tolerate such failures.
 
-    Terminals, and streams that a caller has put there, stay. Where a program is started with one of
-    them closed, Python has None there, and the next file that is opened would get its number.
+    Terminals and streams that a caller has set are kept. In a program that is started with one of
+    them closed, Python has None there, and the next file to be opened would get its descriptor.
     """
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = _withstanding(sys.stdout, 1), _withstanding(sys.stderr, 2)
+    sys.stdout, sys.stderr = _robust_stream(sys.stdout, 1), _robust_stream(sys.stderr, 2)
     try:
         yield
     finally:
         sys.stdout, sys.stderr = before
 
 
-def _withstanding(stream: TextIO | None, number: int) -> TextIO:
+def _robust_stream(stream: TextIO | None, number: int) -> TextIO:
     raises = number == 1
     if stream is None:
         while (taken := os.open(os.devnull, os.O_RDONLY)) < number:
@@ -52,9 +52,9 @@ def _withstanding(stream: TextIO | None, number: int) -> TextIO:
             os.close(taken)
         return _text(_Stream(number, raises=raises), "utf-8")
     if isinstance(stream, io.TextIOWrapper):
-        # a terminal that lacks a sign shows ? for it; that is no reason to fail
+        # a character that the terminal lacks becomes ?, rather than an error
         stream.reconfigure(errors="replace")
-        # without PYTHONUNBUFFERED there is a buffer between
+        # raw is below the buffer, which PYTHONUNBUFFERED removes
         raw = getattr(stream.buffer, "raw", stream.buffer)
         if isinstance(raw, io.FileIO) and not stream.isatty():
             stream.flush()
@@ -63,14 +63,14 @@ def _withstanding(stream: TextIO | None, number: int) -> TextIO:
 
 
 class _Stream(io.FileIO):
-    """A file that fails once at most; raises : whether that is raised, as LostOutput."""
+    """File that fails at most once. raises : whether the failure is raised as LostOutput."""
 
     def __init__(self, number: int, *, raises: bool) -> None:
         super().__init__(number, "w", closefd=False)
         self._raises = raises
 
     def write(self, data: ReadableBuffer, /) -> int:
-        """Write what can be written; after a failure, nothing."""
+        """Write data; after a failure, discard them."""
         try:
             return super().write(data)
         except OSError as error:

@@ -1,4 +1,4 @@
-"""``pkmcal study``: accuracy before anything is bought, by simulation."""
+"""``pkmcal study``: accuracy of calibrations by simulation, before anything is bought."""
 
 from __future__ import annotations
 
@@ -34,11 +34,13 @@ def study(
         console.number_option("study", "runs", "N", "Simulations of each combination."),
     ] = 100,
     seed: console.Seed = 0,
-    out: Annotated[Path, console.folder("Results, and what is finished.")] = STUDY_FOLDER,
-    table: Annotated[Literal["csv", "parquet"], typer.Option(help="Of the table of runs.")] = "csv",
+    out: Annotated[Path, console.folder("Folder for results and finished batches.")] = STUDY_FOLDER,
+    table: Annotated[
+        Literal["csv", "parquet"], typer.Option(help="Format of the table of runs.")
+    ] = "csv",
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="A Dask cluster's, to work there; it is trusted."),
+        typer.Option(metavar="ADDRESS", help="Scheduler of a trusted Dask cluster to use."),
     ] = None,
     as_json: console.Json = False,
 ) -> int:

@@ -1,4 +1,4 @@
-"""``pkmcal validate``: a calibration on data that it did not see."""
+"""``pkmcal validate``: errors of a calibration on independent data."""
 
 from __future__ import annotations
 

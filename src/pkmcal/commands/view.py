@@ -1,4 +1,4 @@
-"""``pkmcal view``: a session's photographs with the machine laid over, on a local page."""
+"""``pkmcal view``: local page of a session's images with the machine overlaid."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def view(
         loaded, calibration or (beside if (beside / "calibration.json").is_file() else None)
     )
     if calibration is not None:
-        _ = viewed.saved  # a wrong one is told before a page stands
+        _ = viewed.saved  # raises for an unusable file before the page is served
     token = new_token()
     with listening_socket(port) as socket_:
         port = socket_.getsockname()[1]

@@ -1,4 +1,4 @@
-"""``pkmcal watch``: is a machine still as calibrated."""
+"""``pkmcal watch``: test of whether a machine has changed since its calibration."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def watch(
     folder = out or default_output(loaded.folder / "watch")
     check_own_folder(folder, WATCH_FILES, "what watch writes", "an earlier look")
     with console.progress(as_json) as progress:
-        value = run(
+        tests = run(
             calibration,
             loaded,
             alpha=alpha,
@@ -53,4 +53,4 @@ def watch(
             same_place=same_place or (),
             progress=progress,
         )
-    return finish(outcome_of(value), folder, WATCH_FILES, as_json=as_json)
+    return finish(outcome_of(tests), folder, WATCH_FILES, as_json=as_json)

@@ -1,1 +1,1 @@
-"""A calibrated machine held against new data: validation, hold-outs, and the watch for changes."""
+"""Calibrated machines tested on new data: validation, holdouts, and detection of changes."""

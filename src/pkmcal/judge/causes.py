@@ -1,8 +1,8 @@
-"""What may have changed, as directions of the machine's parameters: legs, their parts, warming.
+"""Causes of a change as directions of the machine's parameters: legs, their parts, thermal
+expansion.
 
-Beside them stands a camera whose picture became larger. Focus, temperature and a lens that was
-touched change the focal length first; its effect on edges and boards is not a machine's, but some
-of it looks like one.
+They include the magnification of a camera. Focus, temperature and touching a lens change the focal
+length first; its effect on edges and boards is not that of a machine, but partly looks like one.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ JOINT_SIDES: tuple[JointSide, JointSide] = ("base", "platform")
 
 @dataclass(frozen=True)
 class Cause:
-    """A change that is looked for.
+    """Possible change of the machine or its cameras.
 
     part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``,
-    ``station``. columns : (P, k), the change of the machine's parameters (m, rad) by k numbers; or
-    (P + C, k), then of the cameras' magnification; or of all columns of
-    :class:`~pkmcal.judge.fixed_machine.Evidence`. sizes : (k,) usual ones: a drawing's tolerance,
+    ``station``. columns : (P, k), change of the machine's parameters (m, rad) by k numbers; or (P +
+    C, k), with the cameras' magnifications; or for all columns of
+    :class:`~pkmcal.judge.fixed_machine.Evidence`. sizes : (k,) their typical values: a prior sigma,
     USUAL_RATIO_CHANGE, or USUAL_STATION_MOVE. legs : from 0. unit : of the k numbers: m, rad, or
-    nothing for a ratio. camera, station : numbers in the session.
+    empty for a ratio. camera, station : indices in the session.
     """
 
     part: str
@@ -48,7 +48,9 @@ class Cause:
 
 
 def arms(machine: Machine) -> tuple[tuple[int, ...], ...]:
-    """Legs that one motor moves together, from 0, in the order of their first; the rest alone."""
+    """Groups of legs that one motor moves, from 0, in the order of their first leg; other legs are
+    groups of one.
+    """
     column = machine.layout.actuated
     groups: dict[int, list[int]] = {}
     for leg in range(machine.n_legs):
@@ -58,12 +60,14 @@ def arms(machine: Machine) -> tuple[tuple[int, ...], ...]:
 
 
 def whole_legs(machine: Machine) -> tuple[Cause, ...]:
-    """Everything of each arm but its tubes."""
+    """Cause with all parameters of each arm, except those of its tubes."""
     return tuple(_of_names(machine, "all", legs) for legs in arms(machine))
 
 
 def zeros(machine: Machine) -> tuple[Cause | None, ...]:
-    """The zero of each arm's reading, None for one without: what a slipped encoder changes."""
+    """Cause with the zero of each arm's reading, as changed by a slipped encoder; None for an arm
+    without one.
+    """
     return tuple(
         cause if (cause := _of_names(machine, "zero", legs)).sizes.size else None
         for legs in arms(machine)
@@ -71,12 +75,12 @@ def zeros(machine: Machine) -> tuple[Cause | None, ...]:
 
 
 def whole_machine(machine: Machine) -> Cause:
-    """Everything but the tubes."""
+    """Cause with all parameters except those of the tubes."""
     return _of_names(machine, "all", tuple(range(machine.n_legs)))
 
 
 def common_scale(machine: Machine) -> Cause:
-    """All lengths longer by one factor against the readings, by its excess over 1."""
+    """Cause with a common scale of all lengths relative to the readings, by its excess over 1."""
     table = machine.parameters
     lengths = np.array(
         [u == "m" and k != "axis" for u, k in zip(table.units, table.kinds, strict=True)]
@@ -86,14 +90,14 @@ def common_scale(machine: Machine) -> Cause:
 
 
 def magnification(machine: Machine, camera: int) -> Cause:
-    """A camera's picture larger by a factor, by its excess over 1."""
+    """Cause with the magnification of a camera, by its excess over 1."""
     column = np.zeros((len(machine.parameters) + camera + 1, 1))
     column[-1] = 1.0
     return Cause("camera", (), column, np.array([USUAL_RATIO_CHANGE]), "", camera)
 
 
 def stations_moved(evidence: Evidence) -> tuple[Cause, ...]:
-    """Each camera that is said to have been left in place turned and moved, (phi, s)."""
+    """Cause with the motion (phi, s) of each camera that is assumed to be unmoved."""
     columns = np.eye(evidence.by.shape[1])[
         :, evidence.by.shape[1] - 6 * len(evidence.fixed_stations) :
     ]
@@ -111,8 +115,8 @@ def stations_moved(evidence: Evidence) -> tuple[Cause, ...]:
 
 
 def single_causes(machine: Machine, evidence: Evidence | None = None) -> tuple[Cause, ...]:
-    """All that one mishap may change: a part of a leg, neighbouring joints, scale; and, as far as
-    the evidence has columns for them, a lens, or a camera's place.
+    """All causes that a single event may have: a part of a leg, neighbouring joints, a common
+    scale; and, if the evidence has columns for them, a lens or a moved camera.
     """
     out = [
         cause
@@ -121,7 +125,7 @@ def single_causes(machine: Machine, evidence: Evidence | None = None) -> tuple[C
         if (cause := _of_names(machine, part, legs)).sizes.size
     ]
     for side in JOINT_SIDES:
-        for pair in _neighbours(machine, side):  # a mount that both share
+        for pair in _neighbours(machine, side):  # a common mount of both
             one, other = (joint_of(machine, side, leg) for leg in pair)
             out.append(Cause(side, pair, one.columns + other.columns, one.sizes, "m"))
     out.append(common_scale(machine))
@@ -133,7 +137,7 @@ def single_causes(machine: Machine, evidence: Evidence | None = None) -> tuple[C
 
 
 def joined_causes(causes: Sequence[Cause]) -> Cause:
-    """Several causes at once, each by its own numbers."""
+    """Several causes together, each with its own numbers."""
     n = max(len(cause.columns) for cause in causes)
     columns = [np.pad(c.columns, ((0, n - len(c.columns)), (0, 0))) for c in causes]
     return Cause(
@@ -146,16 +150,17 @@ def joined_causes(causes: Sequence[Cause]) -> Cause:
 
 
 def joint_of(machine: Machine, side: JointSide, leg: int) -> Cause:
-    """A leg's joint on one side, base or platform, moved by a vector."""
+    """Cause with the displacement of a leg's joint on base or platform."""
     index = centre_index(machine.layout)[side == "platform"][leg]
     columns = np.eye(len(machine.parameters))[:, index]
     return Cause(side, (leg,), columns, machine.parameters.tolerance[index], "m")
 
 
 def _of_names(machine: Machine, part: str, legs: tuple[int, ...]) -> Cause:
-    """The parameters of some legs' part, each changed by itself; two rods of an arm as well.
+    """Cause with the parameters of a part of several legs, each with its own change, also of two
+    rods of an arm.
 
-    A motor's zero is one number, and its reading's scale, however many rods hang on it.
+    The zero of a motor, and the scale of its reading, is one number for all of its rods.
     """
     table = machine.parameters
     rows = [
@@ -172,9 +177,9 @@ def _of_names(machine: Machine, part: str, legs: tuple[int, ...]) -> Cause:
 
 
 def _neighbours(machine: Machine, side: JointSide) -> list[tuple[int, int]]:
-    """Pairs of legs whose joints on one side are each other's nearest, and not of one arm."""
+    """Pairs of legs whose joints on one side are mutually nearest, but not of one arm."""
     index = centre_index(machine.layout)[side == "platform"]
-    if machine.n_legs < 4:  # three joints have no sides
+    if machine.n_legs < 4:  # all pairs of three joints are neighbours
         return []
     centres = machine.values[index]
     apart = np.linalg.norm(centres[:, None] - centres, axis=2)
@@ -182,7 +187,7 @@ def _neighbours(machine: Machine, side: JointSide) -> list[tuple[int, int]]:
     nearest = np.argmin(apart, axis=1)
     own = {pair for arm in arms(machine) for pair in [(i, j) for i in arm for j in arm]}
     pairs = {(min(i, j), max(i, j)) for i, j in enumerate(nearest.tolist()) if nearest[j] == i}
-    # a mount that two joints share is shorter than the way to the next one
+    # a common mount is shorter than the distance to the next joint
     close = [p for p in pairs if apart[p] < 0.7 * np.sort(apart[p[0]])[1]]
     return sorted(set(close) - own)
 
@@ -190,11 +195,11 @@ def _neighbours(machine: Machine, side: JointSide) -> list[tuple[int, int]]:
 def magnified(
     measurements: Measurements, observation: Observation, cameras: Sequence[Camera]
 ) -> Measurements:
-    """The measurements with one more unknown a camera: the excess of its focal lengths over the
-    calibrated ones, relative.
+    """Measurements with one more unknown for each camera: the relative excess of its focal lengths
+    over the calibrated ones.
 
-    cameras : (S,) of the stations that have one, which come first. Edges get their answer by the
-    pixels that support them; a board's pose has it by its corners.
+    cameras : (S,) of the stations with one, which come first. Derivatives of edges follow from the
+    pixels that support them, those of a board's pose from its corners.
     """
     number = np.asarray(measurements.camera_of_station)
     n_cameras = int(number.max(initial=-1)) + 1

@@ -1,9 +1,9 @@
-"""Tests of a change of a calibrated machine, their power, and what explains a change best.
+"""Tests for a change of a calibrated machine, their power, and the causes that explain a change.
 
-For a cause with columns D the statistic is the length of w's part along X D
-(:class:`~pkmcal.judge.fixed_machine.Evidence`): chi-square of as many degrees of freedom as X D has
-directions that the data see at all. Its null distribution holds whatever they are, for what is left
-out depends on X alone.
+For a cause with columns D the statistic is the squared length of the projection of w onto X D
+(:class:`~pkmcal.judge.fixed_machine.Evidence`): chi-square with as many degrees of freedom as X D
+has observable directions. The null distribution holds for any selection of directions, because it
+depends on X alone.
 """
 
 from __future__ import annotations
@@ -33,20 +33,23 @@ from pkmcal.judge.fixed_machine import Evidence
 from pkmcal.mechanisms import Machine
 
 LEAST_OBSERVABLE_DEVIATIONS = 1.0
-"""Standard deviations that a change of one tolerance must make for its direction to be tested; a
-direction that is hardly seen would only add noise to the test."""
+"""Minimum effect, in standard deviations, of a change by one prior sigma, for its direction to be
+tested; less observable directions would only add noise to the test.
+"""
 DETECTION_POWER = 0.9
 """Probability with which a detectable change is detected."""
 WATCH_NOISE_DRAWS = 20_000
-"""Draws of noise: a share of 0.01 of them is then known to 7 % of itself."""
+"""Number of draws of noise: a share of 0.01 of them is known to a relative 7 %."""
 DISTINCT_LOG_ODDS = 2 * np.log(100.0)
-"""Two causes are told apart where one makes the data a hundred times as likely as the other."""
+"""Two causes are distinguished if one makes the data a hundred times as likely as the other (twice
+the log odds).
+"""
 MOST_CAUSES = 4
-"""Changes that are looked for one after the other; more are a machine that was taken apart."""
+"""Maximum number of changes that are identified; more occur in a machine that was taken apart."""
 
 
 class ObservableCause(NamedTuple):
-    """What the data see of a cause: q (n, d) orthonormal in w, and gain (d, k) with q^T X D."""
+    """Observable directions of a cause: q (n, d), orthonormal in w, and gain (d, k) = q^T X D."""
 
     q: Array
     gain: Array
@@ -54,10 +57,10 @@ class ObservableCause(NamedTuple):
 
 @dataclass(frozen=True)
 class Change:
-    """A cause's k numbers as the data tell them, if nothing else changed.
+    """Estimate of a cause's k numbers, if nothing else has changed.
 
-    value, sigma : (k,) m, rad or a ratio. covariance : (k, k). What is not seen is left at zero,
-    with an infinite sigma.
+    value, sigma : (k,) m, rad or a ratio. covariance : (k, k). Unobservable numbers are zero with
+    an infinite sigma.
     """
 
     value: Array
@@ -65,12 +68,12 @@ class Change:
     covariance: Array
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Document for programs."""
         return {"change": self.value, "sigma": self.sigma}
 
 
 def observable_directions(evidence: Evidence, cause: Cause) -> ObservableCause:
-    """The directions in w of a cause that the data see."""
+    """Observable directions in w of a cause."""
     scaled = evidence.along(cause.columns * cause.sizes)
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
     observable = s > LEAST_OBSERVABLE_DEVIATIONS
@@ -78,7 +81,7 @@ def observable_directions(evidence: Evidence, cause: Cause) -> ObservableCause:
 
 
 def chi_square(evidence: Evidence, cause: Cause) -> Score:
-    """Whether the data show the cause."""
+    """Score test of a cause."""
     from scipy.special import chdtrc
 
     q = observable_directions(evidence, cause).q
@@ -87,11 +90,11 @@ def chi_square(evidence: Evidence, cause: Cause) -> Score:
 
 
 def twice_log_odds(evidence: Evidence, cause: Cause) -> float:
-    """Twice the log of how many times likelier the data are with the cause than with no change.
+    """Twice the log of the Bayes factor of a cause against no change.
 
-    The change's numbers are averaged over normal distributions of their ``sizes``: what one cause
-    explains by 0.5 mm and another by 8 mm is rather the first's, and a cause of three numbers must
-    explain more than one of a single number.
+    The numbers of the change are averaged over normal distributions with their ``sizes``: of two
+    causes, one that explains the data by 0.5 mm is more likely than one that needs 8 mm, and a
+    cause with three numbers must explain more than a cause with a single one.
     """
     q, gain = observable_directions(evidence, cause)
     projected, scaled = q.T @ evidence.w, gain * cause.sizes
@@ -102,37 +105,35 @@ def twice_log_odds(evidence: Evidence, cause: Cause) -> float:
 
 @dataclass(frozen=True)
 class CommonLevel:
-    """What several tests made at once are worth.
+    """Joint significance of several tests on the same data.
 
-    least : (WATCH_NOISE_DRAWS,) the smallest chance of all tests in each draw of pure noise, in
-    order. count : of the tests that see anything.
+    least : (WATCH_NOISE_DRAWS,) least p-value of all tests in each draw of pure noise, sorted.
+    count : number of tests with observable directions.
     """
 
     least: Array
     count: int
 
     def adjusted(self, chance: float) -> float:
-        """How often noise gives any of the tests such a chance, or a smaller one.
+        """Probability that noise gives any of the tests such a p-value, or a smaller one.
 
-        Where the draws are too few to tell, the chance times the number of tests (Bonferroni).
+        Beyond the resolution of the draws, the p-value times the number of tests (Bonferroni).
         """
         often = (np.searchsorted(self.least, chance, side="right") + 1) / (len(self.least) + 1)
         return float(min(often, self.count * chance, 1.0))
 
     def single(self, alpha: float) -> float:
-        """The chance below which a single test counts, so that noise makes any of them count with
-        probability alpha.
-        """
+        """Level of a single test for which the family-wise false-alarm rate is alpha."""
         inside = int(alpha * (len(self.least) + 1)) - 1
         drawn = float(self.least[inside]) if inside >= 0 and self.count else 0.0
         return max(drawn, alpha / max(self.count, 1))
 
 
 def common_level(evidence: Evidence, causes: Sequence[Cause]) -> CommonLevel:
-    """The tests of several causes made at once: the same noise goes through all of them.
+    """Joint significance of the tests of several causes, which all have the same noise.
 
-    Tests overlap (legs share what poses take up), so that the usual allowance for their number
-    would be too careful; the null distribution of the smallest chance is drawn instead.
+    The tests are correlated (the legs share the nuisance poses), so a Bonferroni correction would
+    be too conservative; the null distribution of the least p-value is simulated instead.
     """
     from scipy.special import chdtrc
 
@@ -147,24 +148,24 @@ def common_level(evidence: Evidence, causes: Sequence[Cause]) -> CommonLevel:
 
 
 def change(evidence: Evidence, cause: Cause) -> Change:
-    """The change by least squares, nothing else changed."""
-    visible = observable_directions(evidence, cause)
-    inverse = np.linalg.pinv(visible.gain)
+    """Least-squares estimate of a change, if nothing else has changed."""
+    observable = observable_directions(evidence, cause)
+    inverse = np.linalg.pinv(observable.gain)
     covariance = inverse @ inverse.T
-    # a number of which a part is not seen is not told
+    # a number that is partly unobservable is not reported
     lost = (
-        1 - np.diag(inverse @ visible.gain) > 1e-2
-        if visible.gain.size
+        1 - np.diag(inverse @ observable.gain) > 1e-2
+        if observable.gain.size
         else np.ones(len(cause.sizes), bool)
     )
     sigma = np.where(lost, np.inf, np.sqrt(np.diag(covariance)))
-    return Change(inverse @ (visible.q.T @ evidence.w), sigma, covariance)
+    return Change(inverse @ (observable.q.T @ evidence.w), sigma, covariance)
 
 
 def detectable(evidence: Evidence, tester: Cause, along: Array, level: float) -> float:
-    """The smallest change along a direction that a test at a level detects with DETECTION_POWER.
+    """Smallest change along a direction that a test at a level detects with DETECTION_POWER.
 
-    along : (P,) the change of the parameters by one unit (m, rad). inf where it is not seen.
+    along : (P,) change of the parameters by one unit (m, rad). inf if it is not observable.
     """
     from scipy.special import chdtri, chndtrinc
 
@@ -179,7 +180,7 @@ def detectable(evidence: Evidence, tester: Cause, along: Array, level: float) ->
 def detectable_range(
     evidence: Evidence, tester: Cause, part: Cause, level: float
 ) -> tuple[float, float]:
-    """Smallest detectable changes of a part in the direction that is seen best, and worst."""
+    """Smallest detectable changes of a part in its most and in its least observable direction."""
     q = observable_directions(evidence, tester).q
     if not q.shape[1] or not part.sizes.size:
         return float("inf"), float("inf")
@@ -191,13 +192,13 @@ def detectable_range(
 
 @dataclass(frozen=True)
 class LegTest:
-    """One leg, or the legs of one motor.
+    """Tests of one leg, or of the legs of one motor.
 
-    legs : from 0. whole : test of all its numbers but the tubes' radii. zero : of its reading's
-    zero alone, with the change of it, if nothing else changed; None for a leg without a reading.
-    unit, tolerance : of that zero. detects_zero : smallest change of it (m or rad) that is detected
-    with DETECTION_POWER. detects_base, detects_platform : the same of its joints (m), in the
-    direction seen best, and worst.
+    legs : from 0. whole : test of all parameters except those of the tubes. zero : test of the
+    reading's zero, change : its estimate, if nothing else has changed; None for a leg without a
+    reading. unit, tolerance : of that zero. detects_zero : smallest change of it (m or rad) that is
+    detected with DETECTION_POWER. detects_base, detects_platform : the same for the joints (m), in
+    the most and the least observable direction.
     """
 
     legs: tuple[int, ...]
@@ -212,12 +213,12 @@ class LegTest:
 
     @property
     def chance(self) -> float:
-        """The smaller of both adjusted chances; NaN where nothing is seen of the leg."""
+        """Smaller of both adjusted p-values; NaN if nothing of the leg is observable."""
         both = [t.adjusted for t in (self.whole, self.zero) if t and t.dof]
         return min(both) if both else float("nan")
 
     def document(self) -> dict[str, Any]:
-        """For programs, legs from 1; what a test does not see is null."""
+        """Document for programs, legs from 1; null for what a test cannot observe."""
         zero = None
         if self.zero is not None:
             zero = {**asdict(self.zero), "unit": self.unit}
@@ -236,8 +237,10 @@ class LegTest:
 
 @dataclass(frozen=True)
 class StationTest:
-    """Whether a camera that is said to have been left in place was moved, by its number in the
-    session; change : (phi, s) in its own axes, if nothing else changed.
+    """Test of whether a camera that is assumed to be unmoved has moved.
+
+    station : index in the session. change : (phi, s) along the camera's axes, if nothing else has
+    changed.
     """
 
     station: int
@@ -247,14 +250,16 @@ class StationTest:
 
 @dataclass(frozen=True)
 class Suspect:
-    """A cause with the change that it would have made; chi2 : what it explains."""
+    """Cause with the estimate of its change. chi2 : part of chi-square that it explains."""
 
     cause: Cause
     change: Change
     chi2: float
 
     def document(self, machine: Machine) -> dict[str, Any]:
-        """For programs, with its numbers' names: parameters, or what a ratio is of."""
+        """Document for programs, with the names of its numbers: parameters, or the subject of a
+        ratio.
+        """
         columns = self.cause.columns
         names = (*machine.parameters.names, *("magnification",) * len(columns))
         numbers = [names[int(abs(column).argmax())] for column in columns.T]
@@ -271,9 +276,10 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A cause that explains the data best beside the others found.
+    """Most likely cause, given the other identified ones.
 
-    test : what it explains. others : causes that these data cannot tell from it, best first.
+    test : of what it explains. others : causes that the data do not distinguish from it, best
+    first.
     """
 
     suspect: Suspect
@@ -283,11 +289,12 @@ class Explanation:
 
 @dataclass(frozen=True)
 class ChangeTests:
-    """All tests. machine : of all legs' numbers together. scale : of all lengths by one factor.
-    stations : of each camera that is said to have been left in place.
+    """All tests for a change.
 
-    alpha : share of machines that did not change that may be flagged. level : of a single test, so
-    that all together keep alpha. rest : what the findings leave unexplained of ``machine``.
+    machine : of the numbers of all legs together. scale : of a common scale of all lengths.
+    stations : of each camera that is assumed to be unmoved. alpha : false-alarm rate of all tests
+    together. level : of a single test, for that rate. rest : ``machine`` without what the findings
+    explain.
     """
 
     legs: tuple[LegTest, ...]
@@ -302,14 +309,16 @@ class ChangeTests:
 
     @property
     def changed(self) -> bool:
-        """Whether anything is shown to have changed."""
+        """Whether a change is significant."""
         return min((t.adjusted for t in self.tests), default=1.0) < self.alpha
 
     @property
     def moved(self) -> tuple[int, ...]:
-        """Numbers of the cameras that are said to have been left in place, and were moved rather
-        than that the machine has changed: those that explain the data best; where no single cause
-        does, those whose own test fails.
+        """Indices of cameras assumed to be unmoved that have moved, rather than that the machine
+        has changed.
+
+        Those that are identified causes; if no single cause is identified, those whose own test
+        fails.
         """
         if self.findings:
             named = [f.suspect.cause.station for f in self.findings]
@@ -318,14 +327,14 @@ class ChangeTests:
 
     @property
     def tests(self) -> tuple[Score, ...]:
-        """All tests that see anything."""
+        """All tests with observable directions."""
         legs = [t for leg in self.legs for t in (leg.whole, leg.zero)]
-        retained = [station.test for station in self.stations]
-        every = (self.machine, self.scale, *legs, *retained)
+        stations = [station.test for station in self.stations]
+        every = (self.machine, self.scale, *legs, *stations)
         return tuple(t for t in every if t is not None and t.dof)
 
     def document(self, machine: Machine) -> dict[str, Any]:
-        """All tests and findings for programs: m, rad and ratios, legs from 1."""
+        """Document of tests and findings for programs: m, rad and ratios, legs from 1."""
         return {
             "alpha": self.alpha,
             "level": self.level,
@@ -349,10 +358,10 @@ class ChangeTests:
 def made_tests(
     evidence: Evidence, machine: Machine
 ) -> tuple[tuple[Score, ...], tuple[Score | None, ...], CommonLevel]:
-    """Every test on new data, chances adjusted for their number, and what they are worth together.
+    """All tests on new data, with p-values adjusted for their number, and their joint significance.
 
-    First of all legs, of all lengths by one factor, of each arm's legs, and of each camera that was
-    left in place; then of each arm's zero, None for one without a reading.
+    First those of all legs, of a common scale, of each arm's legs, and of each camera that was left
+    in place; then those of each arm's zero, None for an arm without one.
     """
     causes = [whole_machine(machine), common_scale(machine), *whole_legs(machine)]
     causes += stations_moved(evidence)
@@ -367,16 +376,16 @@ def made_tests(
 
 
 def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> ChangeTests:
-    """Every test on new data, and what explains a change.
+    """Test for changes and identify their causes.
 
-    alpha : share of machines that did not change that may be flagged.
+    alpha : false-alarm rate, the share of unchanged machines that are flagged.
     """
     (every, scale, *each), own, level = made_tests(evidence, machine)
     single = level.single(alpha)
-    wholes, retained = each[: len(own)], each[len(own) :]
+    wholes, of_stations = each[: len(own)], each[len(own) :]
     rows = zip(whole_legs(machine), zeros(machine), wholes, own, strict=True)
     out = ChangeTests(
-        legs=tuple(_leg(evidence, machine, *row, single) for row in rows),
+        legs=tuple(_leg_test(evidence, machine, *row, single) for row in rows),
         machine=every,
         scale=scale,
         scale_change=change(evidence, common_scale(machine)),
@@ -386,18 +395,18 @@ def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> Change
         level=single,
         stations=tuple(
             StationTest(cause.station, test, change(evidence, cause))
-            for cause, test in zip(stations_moved(evidence), retained, strict=True)
+            for cause, test in zip(stations_moved(evidence), of_stations, strict=True)
         ),
     )
     if not out.changed:
         return out
     findings = explained(evidence, single_causes(machine, evidence), alpha)
-    remainder = _beside(evidence, [f.suspect.cause for f in findings])
-    remainder = chi_square(remainder, whole_machine(machine))
-    return replace(out, findings=findings, rest=remainder)
+    rest = _project_out(evidence, [f.suspect.cause for f in findings])
+    rest = chi_square(rest, whole_machine(machine))
+    return replace(out, findings=findings, rest=rest)
 
 
-def _leg(
+def _leg_test(
     evidence: Evidence,
     machine: Machine,
     whole: Cause,
@@ -406,7 +415,7 @@ def _leg(
     test_zero: Score | None,
     level: float,
 ) -> LegTest:
-    """A leg's tests, of all of it and of its zero, and what they would have found."""
+    """Tests of a leg and of its zero, with their power."""
     base, platform = (
         detectable_range(evidence, whole, joint_of(machine, side, whole.legs[0]), level)
         for side in JOINT_SIDES
@@ -428,16 +437,16 @@ def _leg(
 
 
 def explained(evidence: Evidence, causes: Sequence[Cause], alpha: float) -> tuple[Explanation, ...]:
-    """Causes one after the other, each the one that is most likely beside those before.
+    """Causes identified one after the other, each the most likely given those before.
 
-    Each must explain more than chance would in the best of so many. Of two changes, the first that
-    is found may be one that resembles both; so where there are two, all pairs are tried, and after
-    each further one those before are looked at again.
+    Each must explain more than the best of so many would by chance. The first cause found for two
+    changes may be one that resembles both; so with two causes all pairs are tried, and after each
+    further cause the earlier ones are reconsidered.
     """
     chosen: tuple[Cause, ...] = ()
     while len(chosen) < MOST_CAUSES:
-        best = _ranked(evidence, chosen, causes)[0][1]
-        score = chi_square(_beside(evidence, chosen), best)
+        best = _rank(evidence, chosen, causes)[0][1]
+        score = chi_square(_project_out(evidence, chosen), best)
         if not score.dof or len(causes) * score.chance >= alpha:
             break
         chosen = (*chosen, best)
@@ -447,58 +456,58 @@ def explained(evidence: Evidence, causes: Sequence[Cause], alpha: float) -> tupl
                 for pair in combinations(causes, 2)
             ]
             chosen = max(pairs, key=lambda item: item[0])[1]
-        chosen = _exchanged(evidence, chosen, causes)
-    findings = [_finding(evidence, chosen, k, causes) for k in range(len(chosen))]
+        chosen = _exchange(evidence, chosen, causes)
+    findings = [_explanation(evidence, chosen, k, causes) for k in range(len(chosen))]
     return tuple(sorted(findings, key=lambda f: -f.suspect.chi2))
 
 
-def _exchanged(
+def _exchange(
     evidence: Evidence, chosen: tuple[Cause, ...], causes: Sequence[Cause]
 ) -> tuple[Cause, ...]:
-    """The causes, each replaced by what is most likely beside the others, until all agree."""
+    """Causes with each one replaced by the most likely given the others, repeated until none
+    changes.
+    """
     for _ in range(MOST_CAUSES):
         before = chosen
         for k in range(len(chosen)):
             others = chosen[:k] + chosen[k + 1 :]
-            best = _ranked(evidence, others, causes)[0][1]
+            best = _rank(evidence, others, causes)[0][1]
             chosen = (*chosen[:k], best, *chosen[k + 1 :])
         if all(old is new for old, new in zip(before, chosen, strict=True)):
             break
     return chosen
 
 
-def _ranked(
+def _rank(
     evidence: Evidence, others: tuple[Cause, ...], causes: Sequence[Cause]
 ) -> list[tuple[float, Cause]]:
-    """Causes by how likely they make the data together with others (twice the log of the odds),
-    best first.
-    """
+    """Causes with twice the log odds of the data for them together with others, best first."""
     free = [c for c in causes if all(c is not other for other in others)]
     scored = [(twice_log_odds(evidence, joined_causes((*others, cause))), cause) for cause in free]
     return sorted(scored, key=lambda item: -item[0])
 
 
-def _finding(
+def _explanation(
     evidence: Evidence, chosen: tuple[Cause, ...], place: int, causes: Sequence[Cause]
 ) -> Explanation:
-    """One of the chosen causes beside the others, with what cannot be told from it."""
+    """One of the identified causes given the others, with the causes that cannot be distinguished
+    from it.
+    """
     own, others = chosen[place], chosen[:place] + chosen[place + 1 :]
-    remainder = _beside(evidence, others)
-    # what explains no more than nothing would is no rival, however weak the best
+    rest = _project_out(evidence, others)
+    # a cause that explains no more than no change at all is no rival, however weak the best is
     nothing = twice_log_odds(evidence, joined_causes(others)) if others else 0.0
     least = max(twice_log_odds(evidence, joined_causes(chosen)) - DISTINCT_LOG_ODDS, nothing)
-    near = [c for score, c in _ranked(evidence, others, causes) if score > least and c is not own]
-    suspects = [
-        Suspect(c, change(remainder, c), chi_square(remainder, c).chi2) for c in (own, *near)
-    ]
-    return Explanation(suspects[0], chi_square(remainder, own), tuple(suspects[1:]))
+    near = [c for score, c in _rank(evidence, others, causes) if score > least and c is not own]
+    suspects = [Suspect(c, change(rest, c), chi_square(rest, c).chi2) for c in (own, *near)]
+    return Explanation(suspects[0], chi_square(rest, own), tuple(suspects[1:]))
 
 
-def _beside(evidence: Evidence, chosen: Sequence[Cause]) -> Evidence:
-    """The evidence without what other causes explain: their directions taken out."""
-    remainder = evidence
+def _project_out(evidence: Evidence, chosen: Sequence[Cause]) -> Evidence:
+    """Evidence with the directions of other causes projected out."""
+    out = evidence
     for cause in chosen:
-        q = observable_directions(remainder, cause).q
+        q = observable_directions(out, cause).q
         rest = np.linalg.svd(q, full_matrices=True)[0][:, q.shape[1] :]
-        remainder = replace(remainder, w=rest.T @ remainder.w, by=rest.T @ remainder.by)
-    return remainder
+        out = replace(out, w=rest.T @ out.w, by=rest.T @ out.by)
+    return out

@@ -1,4 +1,6 @@
-"""Two machines compared on the same data, and a promise tested: figures for a verdict."""
+"""Comparison of the calibrated with the nominal machine on the same data, and test of the stated
+covariance.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +15,22 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 RATIO_BOOTSTRAP_DRAWS = 4000
-"""Bootstrap draws: percentiles of the ratio are then known to a hundredth or two."""
+"""Number of bootstrap draws: percentiles of the ratio are known to a hundredth or two."""
 RATIO_INTERVAL_PROBABILITY = 0.95
-"""Probability that the stated interval of the ratio holds."""
+"""Probability of the stated interval of the ratio."""
 UNEXPLAINED_RESIDUAL_CHANCE = 1e-3
-"""Probability below which residuals are not explained by the deviations."""
+"""p-value below which the standard deviations do not explain the residuals."""
 ALLOWED_RESIDUAL_EXCESS = 1.5
-"""Factor by which residuals may exceed the deviations: these cover noise, and a few tenths more
-come from shading and lenses in any photographs."""
+"""Accepted ratio of residuals to standard deviations: the latter cover noise, and shading and
+lenses add a few tenths in any images.
+"""
 NULL_EIGENVALUE_SHARE = 1e-9
-"""Share of the largest eigenvalue, of scaled residuals, below which nothing can deviate."""
+"""Relative size of eigenvalues of the scaled covariance below which a direction has no variance."""
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """How many times better: value, standard deviation, and the interval that holds it for
+    """Ratio of errors: value, standard deviation, and interval of probability
     RATIO_INTERVAL_PROBABILITY.
     """
 
@@ -38,20 +41,20 @@ class Ratio:
 
     @property
     def better(self) -> bool:
-        """Whether it is above 1 beyond doubt."""
+        """Whether the ratio is significantly above 1."""
         return self.low > 1.0
 
 
 @dataclass(frozen=True)
 class Promise:
-    """Residuals against the deviations that calibration and photographs promise.
+    """Test of residuals against the standard deviations by calibration and images.
 
-    chi2, dof, chance : of all residuals. factor : residuals over promise, root mean square.
-    common : (m,) what each reading is off in all configurations alike, m or rad, and common_sigma :
-    (m,) its standard deviation; common_chance : of all of them being zero. usual, steady : whether
-    residuals, and what they have in common, are not larger than promised but for
-    ALLOWED_RESIDUAL_EXCESS. expected : (n, m) standard deviations that are promised, by_noise :
-    (n, m) the part of the photographs' and the readings' noise, m or rad.
+    chi2, dof, chance : of all residuals. factor : root mean square ratio of residuals to standard
+    deviations. common : (m,) common offset of each reading in all configurations, m or rad.
+    common_sigma : (m,) its standard deviation. common_chance : p-value of all offsets being zero.
+    usual, steady : whether the residuals, and their common offsets, agree with the standard
+    deviations times ALLOWED_RESIDUAL_EXCESS. expected : (n, m) standard deviations of the
+    residuals, m or rad. by_noise : (n, m) those by the noise of images and readings alone.
     """
 
     chi2: float
@@ -68,18 +71,18 @@ class Promise:
 
     @property
     def holds(self) -> bool:
-        """Whether the deviations may be believed."""
+        """Whether the standard deviations are credible."""
         return self.usual and self.steady
 
     @property
     def joint_rms(self) -> Array:
-        """Root mean squares (m,) of the readings' residuals that are promised, m or rad."""
+        """Expected root mean squares (m,) of the readings' residuals, m or rad."""
         return weighed_mean_and_rms(self.expected, self.by_noise)[1]
 
 
 @dataclass(frozen=True)
 class WeighedErrors:
-    """Of one machine, weighed by how well each configuration was seen; m and rad.
+    """Errors of one machine, weighted by the observability of each configuration; m and rad.
 
     joint_mean, joint_rms : (m,) of the readings' residuals ([C] Table 3). position, orientation :
     root mean squares of the tool point's errors.
@@ -93,12 +96,13 @@ class WeighedErrors:
 
 @dataclass(frozen=True)
 class BesideDrawing:
-    """A calibrated machine beside the drawing on n configurations.
+    """Calibrated and nominal machine compared on n configurations.
 
-    rows : (n,) which. calibrated, drawing : their errors there. before, after : (n,) root mean
-    squares of each configuration's residuals by the drawing and by the calibrated machine, weighed
-    by how well the photographs see them (:class:`Weights`), m or rad; floor : what the photographs'
-    noise alone gives. ratio : before over after. promise : the residuals against the deviations.
+    rows : (n,) their indices. calibrated, drawing : errors of both machines. before, after : (n,)
+    root mean squares of each configuration's residuals by the nominal and by the calibrated
+    machine, weighted by their observability in the images (:class:`Weights`), m or rad. floor :
+    expected value by the noise of the images alone. ratio : of before to after. promise : test of
+    the residuals.
     """
 
     rows: Integers
@@ -111,7 +115,7 @@ class BesideDrawing:
     promise: Promise
 
     def figures(self, errors: ReadingErrors) -> WeighedErrors:
-        """Of the drawing's or the calibrated machine's errors."""
+        """Weighted figures of the nominal or the calibrated machine's errors."""
         sigma = self.promise.by_noise
         mean, root = weighed_mean_and_rms(errors.residuals, sigma)
         each = np.sqrt(np.mean(sigma**2, axis=1))
@@ -122,9 +126,9 @@ class BesideDrawing:
         return WeighedErrors(mean, root, position, orientation)
 
     def document(self, names: tuple[str, ...]) -> dict[str, Any]:
-        """For programs, m and rad; names : K, of the configurations.
+        """Document for programs, m and rad. names : (K,) of all configurations.
 
-        weighed_rms is the verdict's, by how well each direction was seen.
+        weighed_rms is that of the verdict, weighted by the observability of each direction.
         """
         test = self.promise
         machines = {
@@ -167,49 +171,50 @@ def compare_with_drawing(
     by_drawing: Prediction | None,
     rows: Integers,
 ) -> BesideDrawing:
-    """A prediction of the calibrated machine, beside the drawing, on configurations ``rows``.
+    """Compare the prediction of the calibrated machine with the nominal machine on configurations
+    ``rows``.
 
-    covariance : (P, P) of the calibrated machine. by_drawing : the drawing's own prediction;
-    without it the drawing is judged on the calibrated machine's poses, else on those that suit it
-    best.
+    covariance : (P, P) of the calibrated machine. by_drawing : prediction of the nominal machine
+    itself. The nominal machine is evaluated at its own poses or at those of the calibrated one,
+    whichever suits it better; at the latter without ``by_drawing``.
     """
-    visible = np.flatnonzero(prediction.observed)
+    observed = np.flatnonzero(prediction.observed)
     m = measurements.joints.shape[1]
-    place = np.searchsorted(visible, rows)
+    place = np.searchsorted(observed, rows)
     flat = (place[:, None] * m + np.arange(m)).reshape(-1)
     noise, by = prediction.noise[np.ix_(flat, flat)], prediction.by_machine[flat]
     weights = Weights.by(np.einsum("kikj->kij", noise.reshape(len(rows), m, len(rows), m)))
-    new = prediction.errors.of(rows)
-    old = errors_on(drawing, measurements.joints[visible], prediction.T_base_platform[visible]).of(
-        place
-    )
+    calibrated = prediction.errors.of(rows)
+    nominal = errors_on(
+        drawing, measurements.joints[observed], prediction.T_base_platform[observed]
+    ).of(place)
     if by_drawing is not None:
         own = by_drawing.errors.of(rows)
-        if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(old.residuals)):
-            old = own
-    before, after = weights.of(old.residuals), weights.of(new.residuals)
+        if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(nominal.residuals)):
+            nominal = own
+    before, after = weights.of(nominal.residuals), weights.of(calibrated.residuals)
     return BesideDrawing(
         rows=rows,
-        calibrated=new,
-        drawing=old,
+        calibrated=calibrated,
+        drawing=nominal,
         before=before,
         after=after,
         floor=weights.floor,
         ratio=improvement_ratio(before, after),
-        promise=promise(new.residuals, noise, by @ covariance @ by.T),
+        promise=promise(calibrated.residuals, noise, by @ covariance @ by.T),
     )
 
 
 def finite_rms(values: Array) -> float:
-    """Root mean square of what is finite; NaN of nothing."""
+    """Root mean square of finite values; NaN without any."""
     return rms(values[np.isfinite(values)])
 
 
 def weighed_mean_and_rms(values: Array, sigma: Array) -> tuple[Array, Array]:
-    """Mean and root mean square over n configurations of values (n, ...), weighed by their noise.
+    """Mean and root mean square over n configurations of values (n, ...), weighted by their noise.
 
-    sigma : of the same shape; a pose that is hardly seen hardly counts. NaN is left out; of nothing
-    else, mean and root mean square are NaN.
+    sigma : of the same shape; the weight is 1 / sigma^2, so a badly observed pose hardly counts.
+    NaN values are excluded; both results are NaN without any others.
     """
     weight = np.where(np.isfinite(values), sigma**-2.0, 0.0)
     values, total = np.nan_to_num(values), weight.sum(axis=0)
@@ -219,9 +224,10 @@ def weighed_mean_and_rms(values: Array, sigma: Array) -> tuple[Array, Array]:
 
 
 def improvement_ratio(worse: Array, better: Array) -> Ratio:
-    """How many times smaller errors ``better`` (n,) are than ``worse``, root mean squares.
+    """Ratio of the root mean squares of errors ``worse`` (n,) to ``better`` (n,).
 
-    Bootstrap over configurations n, both drawn together; those without one of the two are left out.
+    Its uncertainty is that of a bootstrap over the n configurations, both drawn together;
+    configurations without one of the two are excluded.
     """
     old, new = worse**2, better**2
     both = np.isfinite(old) & np.isfinite(new)
@@ -238,19 +244,19 @@ def improvement_ratio(worse: Array, better: Array) -> Ratio:
 
 
 def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
-    """Test of finite residuals (n, m) against covariances (n m, n m) by noise and machine.
+    """Test of finite residuals (n, m) against covariances (n m, n m) by noise and by the machine.
 
-    All residuals together tell of something that the model leaves out; an error of the machine,
-    which hides in the noise of each, is found in what they have in common, by generalised least
-    squares.
+    The chi-square of all residuals shows effects that the model lacks; an error of the machine,
+    which is hidden in the noise of each residual, shows in their common offsets, by generalised
+    least squares.
     """
     from scipy.special import chdtrc
 
     shape, covariance = residuals.shape, noise + machine
     scale = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
-    above_limit = values > NULL_EIGENVALUE_SHARE * values[-1]
-    whiten = (vectors[:, above_limit] / np.sqrt(values[above_limit])).T / scale
+    eigenvalues, eigenvectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
+    significant = eigenvalues > NULL_EIGENVALUE_SHARE * eigenvalues[-1]
+    whiten = (eigenvectors[:, significant] / np.sqrt(eigenvalues[significant])).T / scale
     white = whiten @ residuals.reshape(-1)
     design = whiten @ np.tile(np.eye(shape[1]), (shape[0], 1))
     spread = np.linalg.pinv(design.T @ design)
@@ -277,11 +283,12 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
 
 @dataclass(frozen=True)
 class Weights:
-    """How well the photographs see each configuration's readings; ``of`` measures residuals by it.
+    """Weights of residuals by the observability of each configuration's readings in the images.
 
-    Plain root mean squares are ruled by what a photograph sees worst, depth, where any two machines
-    look alike. matrices : (n, m, m), the mean of their traces is m, so that units stay. floor :
-    root mean square, so weighed, of a perfect machine's residuals, m or rad.
+    Unweighted root mean squares are dominated by the direction that an image determines worst,
+    depth, in which any two machines look alike. matrices : (n, m, m); the mean of their traces is
+    m, so units are kept. floor : weighted root mean square of a perfect machine's residuals, m or
+    rad.
     """
 
     matrices: Array
@@ -289,12 +296,12 @@ class Weights:
 
     @classmethod
     def by(cls, noise: Array) -> Weights:
-        """From covariances (n, m, m) of the residuals by noise."""
+        """Weights by covariances (n, m, m) of the residuals by noise."""
         exact = np.linalg.inv(noise)
         mean = float(np.einsum("kii->k", exact).mean()) / noise.shape[-1]
         return cls(exact / mean, float(1 / np.sqrt(mean)))
 
     def of(self, residuals: Array) -> Array:
-        """Root mean square (n,) of each configuration's residuals (n, m), m or rad."""
+        """Weighted root mean square (n,) of each configuration's residuals (n, m), m or rad."""
         square = np.einsum("ki,kij,kj->k", residuals, self.matrices, residuals)
         return np.sqrt(square / residuals.shape[-1])

@@ -1,4 +1,4 @@
-"""What differs between two calibrations, two drawings, or one and the other: ``pkmcal diff``."""
+"""Difference between two calibrations, two nominal models, or one of each: ``pkmcal diff``."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from pkmcal.wording import amount, brief, count, listed, number
 
 DIFFERENCE_FORMAT = 1
 DIFFERENCE_ALPHA = 0.01
-"""Share of unchanged machines that are said to have changed all the same."""
+"""False-alarm rate: share of unchanged machines that are reported as changed."""
 SAME_NUMBER_DIFFERENCE = 1e-9
-"""m or rad; numbers that differ by less are the same."""
+"""Difference (m or rad) below which numbers are equal."""
 MOST_CHANGES_NAMED = 4
-"""Changes that the verdict names."""
+"""Maximum number of changes that the verdict names."""
 
 
 @dataclass(frozen=True)
 class ComparedMachine:
-    """One of the two. name : as it was given. saved : None of a drawing."""
+    """One of the two machines. name : as given. saved : None for a nominal model."""
 
     name: str
     machine: Machine
@@ -41,24 +41,25 @@ class ComparedMachine:
 
     @property
     def covariance(self) -> Array | None:
-        """(P, P) of its parameters; None of a drawing."""
+        """Covariance (P, P) of the parameters; None for a nominal model."""
         return None if self.saved is None else self.saved.covariance
 
     @property
     def kind(self) -> str:
-        """What it is, for people."""
+        """Kind of the machine's source, for people."""
         return "drawing" if self.saved is None else "calibration"
 
 
 @dataclass(frozen=True)
 class MachineDifference:
-    """Everything that differs.
+    """Difference between two machines.
 
-    change : b less a. chance : of a chi-square as large in a machine that did not change; 1 between
-    drawings. chances : (P,) of each parameter's change, their number allowed for; NaN of what has
-    no standard deviation. centres : base and platform, a's laid over b's. tool : what the change
-    does to the tool over the workspace, its ``after``, or why there is no map. shared :
-    configurations that both saw. assumed : sentences.
+    change : b minus a. chance : p-value of its chi-square for an unchanged machine; 1 between
+    nominal models. chances : (P,) p-values of each parameter's change, corrected for their number;
+    NaN without a standard deviation. centres : of base and platform, a's registered to b's. tool :
+    effect of the change on the tool over the workspace, as ``after`` of the map, or the reason why
+    there is no map. shared : number of configurations that both calibrations used. assumed :
+    assumptions, in sentences.
     """
 
     a: ComparedMachine
@@ -77,7 +78,7 @@ class MachineDifference:
 
     @property
     def ordered(self) -> list[int]:
-        """Parameters with a change to tell of, the one least like chance first."""
+        """Indices of the parameters that differ, the most significant first."""
         size = np.abs(self.change.change)
         some = np.flatnonzero(size > SAME_NUMBER_DIFFERENCE)
         if self.change.dof:
@@ -89,12 +90,12 @@ class MachineDifference:
 
     @property
     def significant(self) -> list[int]:
-        """Those that chance does not explain; between drawings, all that differ."""
+        """Indices of the significant parameters; between nominal models, of all that differ."""
         return [k for k in self.ordered if not self.chances[k] >= DIFFERENCE_ALPHA / 2]
 
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
-        table, value = self.a.machine.parameters, self.change
+        table, change = self.a.machine.parameters, self.change
         before = table.unit_axes(self.a.machine.values)
         sides = [
             {
@@ -111,29 +112,31 @@ class MachineDifference:
                 "changed": self.changed,
                 "a": sides[0],
                 "b": sides[1],
-                "chi2": value.chi2 if value.dof else None,
-                "dof": value.dof,
-                "chance": self.chance if value.dof else None,
+                "chi2": change.chi2 if change.dof else None,
+                "dof": change.dof,
+                "chance": self.chance if change.dof else None,
                 "parameters": [
                     {
                         "name": name,
                         "unit": table.units[k],
                         "a": before[k],
-                        "b": before[k] + value.change[k],
-                        "change": value.change[k],
-                        "sigma": value.sigma[k],
+                        "b": before[k] + change.change[k],
+                        "change": change.change[k],
+                        "sigma": change.sigma[k],
                         "chance": self.chances[k],
                     }
                     for k, name in enumerate(table.names)
                 ],
-                "tool": {"why_not": self.tool} if isinstance(self.tool, str) else _tool(self.tool),
+                "tool": {"why_not": self.tool}
+                if isinstance(self.tool, str)
+                else _tool_document(self.tool),
                 "shared_configurations": self.shared,
                 "assumed": self.assumed,
             }
         )
 
 
-def _tool(tool_map: ToolMap) -> dict[str, Any]:
+def _tool_document(tool_map: ToolMap) -> dict[str, Any]:
     document = tool_map.document()
     return {
         "region": document["region"],
@@ -146,51 +149,57 @@ def _tool(tool_map: ToolMap) -> dict[str, Any]:
 def difference(
     a: SavedCalibration | Machine | Path | str, b: SavedCalibration | Machine | Path | str
 ) -> MachineDifference:
-    """Compare two calibrations, mechanism files or built-in machines; nothing is written.
+    """Compare two calibrations, mechanism files or built-in machines, without writing files.
 
-    Raises InputError where they are not of one machine.
+    Raises InputError if they are not of the same machine.
     """
-    one, other = _compared(a), _compared(b)
+    one, other = _compared_machine(a), _compared_machine(b)
     _check_same_machine(one, other)
     both = [side.saved for side in (one, other) if side.saved is not None]
-    shared, share = _shared(both)
-    one_drawing = len(both) == 2 and _one_drawing(both)
-    value = machine_change(
+    shared, share = _shared_data(both)
+    one_drawing = len(both) == 2 and _same_nominal_model(*both)
+    change = machine_change(
         one.machine,
         other.machine,
         (one.covariance, other.covariance),
         one_drawing=one_drawing,
         shared=share,
     )
-    visible = all((saved.document.get("residuals") or {}).get("edges") for saved in both)
+    legs_observed = all((saved.document.get("residuals") or {}).get("edges") for saved in both)
     try:
         tool: ToolMap | str = map_of(
-            one.machine, value.machine, value.covariance, _region(both), legs_observed=visible
+            one.machine,
+            change.machine,
+            change.covariance,
+            _region(both),
+            legs_observed=legs_observed,
         )
     except PkmcalError as error:
         tool = f"There is no map of the workspace: {error}"
-    chance, chances = _chances(value)
+    chance, chances = _p_values(change)
     least = float(np.nanmin(chances, initial=1.0))
-    held = (value.sigma <= SAME_NUMBER_DIFFERENCE) & (np.abs(value.change) > SAME_NUMBER_DIFFERENCE)
+    held = (change.sigma <= SAME_NUMBER_DIFFERENCE) & (
+        np.abs(change.change) > SAME_NUMBER_DIFFERENCE
+    )
     changed = bool(chance < DIFFERENCE_ALPHA / 2 or least < DIFFERENCE_ALPHA / 2 or held.any())
-    free = free_of_gauge(value.machine, value.covariance)
+    free = free_of_gauge(change.machine, change.covariance)
     out = MachineDifference(
         a=one,
         b=other,
-        change=value,
+        change=change,
         chance=chance,
         chances=chances,
-        centres=joint_centres(one.machine, value.machine, free),
+        centres=joint_centres(one.machine, change.machine, free),
         tool=tool,
         shared=shared,
-        assumed=_assumed(one, other, one_drawing, shared, share),
+        assumed=_assumptions(one, other, one_drawing, shared, share),
         verdict=Verdict(True, ""),
         changed=changed,
     )
-    return _judged(out)
+    return _with_verdict(out)
 
 
-def _compared(origin: SavedCalibration | Machine | Path | str) -> ComparedMachine:
+def _compared_machine(origin: SavedCalibration | Machine | Path | str) -> ComparedMachine:
     calibration = loaded(origin) if isinstance(origin, Path | str) else origin
     if isinstance(calibration, SavedCalibration):
         name = str(origin) if isinstance(origin, Path | str) else str(calibration.path.parent)
@@ -216,36 +225,39 @@ def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
     )
 
 
-def _one_drawing(both: list[SavedCalibration]) -> bool:
-    """Whether two calibrations lean on the same values with the same tolerances."""
-    one, other = both
-    first, second = (saved.machine.parameters.tolerance for saved in both)
+def _same_nominal_model(one: SavedCalibration, other: SavedCalibration) -> bool:
+    """Whether two calibrations have the same nominal values and prior sigmas."""
+    first, second = (saved.machine.parameters.tolerance for saved in (one, other))
     same = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
     return same and np.allclose(first, second)
 
 
-def _shared(both: list[SavedCalibration]) -> tuple[int, float]:
-    """Configurations of the first that both calibrations saw, and what both saw as a share of what
-    the one that saw less did: photographs, however they are grouped, or, without any, readings that
-    agree to the last digit.
+def _shared_data(both: list[SavedCalibration]) -> tuple[int, float]:
+    """Number of the first calibration's configurations that both used, and the share of common
+    data.
+
+    Data are images, however they are grouped into configurations, or, without any, readings that
+    agree to the last digit; the share is relative to the calibration with fewer data.
     """
     if len(both) < 2:
         return 0, 0.0
-    one, other = ([_marks(saved, k) for k in np.flatnonzero(saved.used).tolist()] for saved in both)
+    one, other = (
+        [_identity(saved, k) for k in np.flatnonzero(saved.used).tolist()] for saved in both
+    )
     first, second = set().union(*one), set().union(*other)
-    number_of = sum(bool(marks & second) for marks in one)
-    fewest = min(len(first), len(second))
-    return number_of, len(first & second) / fewest if fewest else 0.0
+    n_shared = sum(bool(marks & second) for marks in one)
+    least = min(len(first), len(second))
+    return n_shared, len(first & second) / least if least else 0.0
 
 
-def _marks(saved: SavedCalibration, k: int) -> set[object]:
-    """What a configuration is known by."""
+def _identity(saved: SavedCalibration, k: int) -> set[object]:
+    """Identity of a configuration: its images, or its readings."""
     photographs = saved.document["configurations"][k].get("photographs", ())
     return set(photographs) or {tuple(saved.joints[k].tolist())}
 
 
 def _region(both: list[SavedCalibration]) -> Region | None:
-    """The workspace that the first of them was calibrated for; None for the whole reach."""
+    """Workspace of the first calibration that has one; None for all reachable poses."""
     for saved in both:
         region = (saved.document.get("tool") or {}).get("region")
         if region:
@@ -254,35 +266,33 @@ def _region(both: list[SavedCalibration]) -> Region | None:
     return None
 
 
-def _chances(machine_change: MachineChange) -> tuple[float, Array]:
-    """Of the whole, and (P,) of each parameter, their number allowed for."""
+def _p_values(change: MachineChange) -> tuple[float, Array]:
+    """p-values of the whole change and (P,) of each parameter, corrected for their number."""
     from scipy.special import chdtrc, ndtr
 
-    sigma = machine_change.sigma
-    above_limit = sigma > SAME_NUMBER_DIFFERENCE
+    sigma = change.sigma
+    has_sigma = sigma > SAME_NUMBER_DIFFERENCE
     chances = np.full(len(sigma), np.nan)
-    single = 2 * ndtr(-np.abs(machine_change.change[above_limit]) / sigma[above_limit])
-    chances[above_limit] = np.minimum(1.0, single * machine_change.dof)
-    return float(
-        chdtrc(machine_change.dof, machine_change.chi2)
-    ) if machine_change.dof else 1.0, chances
+    single = 2 * ndtr(-np.abs(change.change[has_sigma]) / sigma[has_sigma])
+    chances[has_sigma] = np.minimum(1.0, single * change.dof)
+    return float(chdtrc(change.dof, change.chi2)) if change.dof else 1.0, chances
 
 
-def _assumed(
+def _assumptions(
     a: ComparedMachine, b: ComparedMachine, one_drawing: bool, shared: int, share: float
 ) -> tuple[str, ...]:
-    """What the standard deviations of the change take for granted."""
+    """Assumptions of the change's standard deviations, in sentences."""
     out = [
         "The change leads from A to B, told in A's frames, B laid over it where the two differ"
         " least: by least squares over all free numbers, each in its tolerance."
     ]
-    drawn = [side for side in (a, b) if side.saved is None]
-    if len(drawn) == 2:
+    nominal = [side for side in (a, b) if side.saved is None]
+    if len(nominal) == 2:
         return (*out, "Drawings are taken at their word, so any difference is one.")
-    if drawn:
+    if nominal:
         return (
             *out,
-            f"The drawing {drawn[0].name} is taken at its word; the standard deviations are the"
+            f"The drawing {nominal[0].name} is taken at its word; the standard deviations are the"
             " calibration's.",
             UNMODELLED_CHANGES_TEXT,
         )
@@ -309,8 +319,8 @@ UNMODELLED_CHANGES_TEXT = (
 )
 
 
-def _judged(d: MachineDifference) -> MachineDifference:
-    """With its verdict."""
+def _with_verdict(d: MachineDifference) -> MachineDifference:
+    """Difference with its verdict."""
     refused = [
         wrong("difference.refused", side.name, reasons=" ".join(side.saved.verdict.reasons))
         for side in (d.a, d.b)
@@ -321,18 +331,20 @@ def _judged(d: MachineDifference) -> MachineDifference:
     elif not d.changed:
         headline = (
             f"No change beyond what chance explains (χ² {number(d.change.chi2, 0)} for"
-            f" {d.change.dof} degrees of freedom){_of_tool(d)}."
+            f" {d.change.dof} degrees of freedom){_tool_clause(d)}."
         )
     elif d.a.saved and d.b.saved:
-        headline = f"The calibrations differ by more than chance explains{_of_tool(d)}."
+        headline = f"The calibrations differ by more than chance explains{_tool_clause(d)}."
     elif d.change.dof:
-        headline = f"Drawing and calibration differ by more than chance explains{_of_tool(d)}."
+        headline = f"Drawing and calibration differ by more than chance explains{_tool_clause(d)}."
     else:
-        headline = f"The drawings differ{_of_tool(d)}."
-    named = [_named(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if d.changed else []
-    remainder = len(d.significant) - len(named)
-    if named and remainder > 0:
-        named.append(wrong("difference.more", number=remainder))
+        headline = f"The drawings differ{_tool_clause(d)}."
+    named = (
+        [_parameter_finding(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if d.changed else []
+    )
+    n_more = len(d.significant) - len(named)
+    if named and n_more > 0:
+        named.append(wrong("difference.more", number=n_more))
     if d.changed and not named:
         named.append(wrong("difference.together", chi2=d.change.chi2, dof=d.change.dof))
     advice: list[Finding] = []
@@ -346,8 +358,8 @@ def _judged(d: MachineDifference) -> MachineDifference:
     return replace(d, verdict=verdict)
 
 
-def _of_tool(d: MachineDifference) -> str:
-    """What it does to the tool, as the end of a sentence."""
+def _tool_clause(d: MachineDifference) -> str:
+    """Effect on the tool, as the end of a sentence."""
     if isinstance(d.tool, str):
         return ""
     _, after = d.tool.evenly
@@ -362,8 +374,8 @@ def _of_tool(d: MachineDifference) -> str:
     )
 
 
-def _named(d: MachineDifference, k: int) -> Finding:
-    """A parameter's change."""
+def _parameter_finding(d: MachineDifference, k: int) -> Finding:
+    """Finding of a parameter's change."""
     table = d.a.machine.parameters
     name = table.names[k]
     return wrong(
@@ -377,7 +389,7 @@ def _named(d: MachineDifference, k: int) -> Finding:
 
 
 def change_text(d: MachineDifference, k: int) -> str:
-    """``+0.54 mm (±0.07 mm)``, or the bare number of what has no unit."""
+    """``+0.54 mm (±0.07 mm)``, or the number alone without a unit."""
     unit = d.a.machine.parameters.units[k]
     value, sigma = float(d.change.change[k]), float(d.change.sigma[k])
     sign = "+" if value >= 0 else "−"

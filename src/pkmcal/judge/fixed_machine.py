@@ -1,15 +1,15 @@
-"""A calibrated machine held as it is, on new measurements: the regression behind every judgement.
+"""Fit of new measurements with the calibrated machine fixed: the regression behind every judgement.
 
-Nothing is calibrated anew. The machine's parameters stay where they are; the platform's poses,
-stations, boards, edge shifts and shading are found. At that point the residuals y, in standard
-deviations, have the derivative A by the machine's parameters, and P is the projector that takes out
-what all those other unknowns can explain. The truth is the calibrated values plus the calibration's
-error e, of covariance C, plus a change c; to first order
+The machine's parameters are fixed; the platform's poses, stations, boards, edge shifts and shading
+are estimated. At that point the residuals y, in standard deviations, have the derivative A by the
+machine's parameters, and P is the projector that eliminates all other unknowns, the nuisance
+parameters. The truth is the calibrated values plus the calibration's error e, of covariance C, plus
+a change c; to first order
 
-    -P y = P A (c + e) + P noise,      the noise of unit variance.
+    -P y = P A (c + e) + P noise,      with noise of unit variance.
 
-Two things are read from that: what all else predicts of a configuration's readings
-(:mod:`pkmcal.judge.prediction`), and whether there is a change c (:func:`change_evidence`).
+From this follow the prediction of a configuration's readings by all other data
+(:mod:`pkmcal.judge.prediction`), and the tests for a change c (:func:`change_evidence`).
 """
 
 from __future__ import annotations
@@ -37,19 +37,20 @@ from pkmcal.solver.search import Stop, minimise
 from pkmcal.wording import named
 
 USUAL_RATIO_CHANGE = 1e-3
-"""Of a magnification, or another ratio: the size against which it counts as seen."""
+"""Typical change of a magnification or another ratio, the scale of its observability."""
 USUAL_STATION_MOVE = 1e-2
-"""m and rad: the same of a camera's place, what a tripod makes that somebody ran into."""
+"""Typical motion of a camera, m and rad, as that of a tripod that someone ran into."""
 UNSCALED_NOISE = Kinds(1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Trust:
-    """How far new data are believed: weights (N,) of each kind, factors on its noise and on that of
-    readings, and the standard deviation (px) of shading.
+    """Weights and noise of new data.
 
-    Weights come from an estimate whose machine could move: with the machine held, a leg that has
-    changed would be taken for an error of its edges, and be let go.
+    robust : IRLS weights (N,) of each kind. scale, readings : factors on the stated noise of each
+    kind and of readings. shading : px, its standard deviation. Weights come from an estimate with a
+    free machine: with a fixed one, a leg that has changed would be taken for errors of its edges,
+    and rejected.
     """
 
     robust: Kinds[Array]
@@ -59,12 +60,12 @@ class Trust:
 
     @property
     def weights(self) -> Kinds[Array]:
-        """The weights by the noise as scaled."""
+        """Weights relative to the scaled noise."""
         return Kinds(*(w / scale**2 for w, scale in zip(self.robust, self.scale, strict=True)))
 
     @classmethod
     def full(cls, measurements: Measurements) -> Trust:
-        """All data as they are stated."""
+        """Unit weights and the stated noise."""
         counts = len(measurements.edges), len(measurements.poses), measurements.n_links
         return cls(Kinds(*map(np.ones, counts)))
 
@@ -72,10 +73,12 @@ class Trust:
     def of(
         cls, estimate: Estimate, scale: Kinds[float] = UNSCALED_NOISE, readings: float = 1.0
     ) -> Trust:
-        """An estimate's weights, for data as it found them
-        (:meth:`~pkmcal.identify.estimate.Estimate.stated_edge_noise`), where the calibration's
-        factors on the stated noise are larger by as much more; of the readings the estimate's own
-        where its data contradict their stated noise.
+        """Weights of an estimate, for data with its noise
+        (:meth:`~pkmcal.identify.estimate.Estimate.stated_edge_noise`).
+
+        scale, readings : the calibration's factors on the stated noise, used where they are larger
+        than the estimate's own. The factor of readings is the estimate's own if its data contradict
+        their stated noise.
         """
         own = estimate.statistics
         return cls(
@@ -96,11 +99,11 @@ class Trust:
 
 @dataclass(frozen=True)
 class Held:
-    """A machine held on new measurements; see the module.
+    """Fit of new measurements with a fixed machine; see the module.
 
-    machine : as held, with tubes' radii where these were found. observed : (K,). problem, state :
-    with the weights in use, and its solution. unknowns : names of the unknowns in which a change is
-    looked for: the machine's parameters, and, as intrinsics, the cameras' magnifications.
+    machine : with the tubes' radii estimated, if they were free. observed : (K,). problem, state :
+    with the final weights, and the solution. unknowns : names of the unknowns of a change: the
+    machine's parameters, and, as intrinsics, the cameras' magnifications.
     """
 
     machine: Machine
@@ -110,9 +113,10 @@ class Held:
     unknowns: tuple[Name, ...]
 
     def residuals(self) -> Array:
-        """Root mean squares of each configuration's residuals in standard deviations, (K,).
+        """Root mean squares (K,) of each configuration's residuals in standard deviations.
 
-        Its own pose takes up as many rows as it has freedoms; NaN where nothing was seen.
+        Rows are reduced by the degrees of freedom of the configuration's own pose; NaN without
+        measurements.
         """
         problem, linear = self.problem, self.problem.linearize(self.state)
         used = (np.sum((k.weight[0] > 0) * k.count, axis=1) for k in problem.kinds)
@@ -124,8 +128,8 @@ class Held:
 
 
 def held_machine(machine: Machine, radii: bool) -> Machine:
-    """The machine with nothing free, its values for a drawing; radii : but its tubes' radii, which
-    light and photographs decide.
+    """Machine with all parameters fixed, at its values as the nominal model. radii : leave the
+    tubes' radii free, because light and images influence them.
     """
     table = machine.parameters
     free = {n for n, kind in zip(table.names, table.kinds, strict=True) if kind == "radius"}
@@ -147,31 +151,34 @@ def hold(
     machine: Machine,
     measurements: Measurements,
     start: State,
-    irls_weight: Trust | None = None,
+    data_weights: Trust | None = None,
     magnified: Measurements | None = None,
 ) -> Held:
-    """Poses, stations and boards of measurements, found with the machine held.
+    """Estimate poses, stations and boards with the machine fixed.
 
-    start : stations, mounts and poses in frames near the machine's. irls_weight : how far to
-    believe the data; without it that is found here, and so are the tubes' radii. magnified : the
-    measurements with an unknown magnification a camera (:func:`~pkmcal.judge.causes.magnified`), to
-    tell that from a change of the machine. Raises ResultError where the poses are not found.
+    start : stations, mounts and poses in frames near those of the machine. data_weights : weights
+    and noise of the data; without it they are estimated, as well as the tubes' radii. magnified :
+    the measurements with an unknown magnification for each camera
+    (:func:`~pkmcal.judge.causes.magnified`), to separate it from a change of the machine. Raises
+    ResultError if the poses are not found.
     """
-    still = held_machine(machine, radii=irls_weight is None)
-    shading = SHADING_SIGMA if irls_weight is None else irls_weight.shading
-    if irls_weight is not None:
-        noise = measurements.joint_noise * irls_weight.readings
+    still = held_machine(machine, radii=data_weights is None)
+    shading = SHADING_SIGMA if data_weights is None else data_weights.shading
+    if data_weights is not None:
+        noise = measurements.joint_noise * data_weights.readings
         measurements = replace(measurements, joint_noise=noise)
         magnified = magnified and replace(magnified, joint_noise=noise)
     assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
-    if irls_weight is None:
-        if not _is_enough(assembled.problem, begin):
+    if data_weights is None:
+        linear, unknowns = assembled.problem.linearize(begin), assembled.problem.unknowns.count
+        unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
+        if int(linear.usable.sum()) + len(linear.shared_by) < unknowns:
             raise too_little(machine, measurements)
-        result = solve_batch(assembled.problem, begin, scale_readings=False)
-        problem, solution = result.info.problem, result.solution
+        fit = solve_batch(assembled.problem, begin, scale_readings=False)
+        problem, solution = fit.info.problem, fit.solution
     else:
-        problem = assembled.trusting(irls_weight.weights)
+        problem = assembled.trusting(data_weights.weights)
         solution = minimise(problem, begin)
     if solution.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(
@@ -180,31 +187,26 @@ def hold(
         )
     state: BatchState = solution.state
     still = still.with_values(problem.theta(state)[0])
-    if irls_weight is None or magnified is None:
+    if data_weights is None or magnified is None:
         return Held(still, assembled.observed, problem, state, ("machine",))
-    opened = assemble(still, magnified, default_gauge(still), shading=irls_weight.shading)
-    problem = opened.trusting(irls_weight.weights)
+    opened = assemble(still, magnified, default_gauge(still), shading=data_weights.shading)
+    problem = opened.trusting(data_weights.weights)
     state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
     return Held(still, assembled.observed, problem, state, ("machine", "intrinsics"))
 
 
-def _is_enough(problem: Problem, state: BatchState) -> bool:
-    """Whether there are as many rows as unknowns."""
-    linear = problem.linearize(state)
-    rows = int(linear.usable.sum()) + len(linear.shared_by)
-    return rows >= problem.unknowns.count + linear.by_own.shape[1] * linear.by_own.shape[-1]
-
-
 def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
-    """Why readings cannot be predicted: too little was measured, or, of legs alone whose ends are
-    moved by the readings, more of it would not help.
+    """Error if readings cannot be predicted.
+
+    There are too few measurements, or only legs whose ends move with the readings, for which more
+    measurements do not help.
     """
     layout = machine.layout
-    shifted = np.flatnonzero((layout.actuated >= 0) & ~layout.rod_reads)
-    if len(measurements.edges) and not measurements.on_platform.any() and shifted.size:
+    moved = np.flatnonzero((layout.actuated >= 0) & ~layout.rod_reads)
+    if len(measurements.edges) and not measurements.on_platform.any() and moved.size:
         return InputError(
             f"the readings of {machine.name} cannot be predicted from photographs of its legs yet",
-            found=f"{named(shifted, layout.n_legs)} on cranks or sliders, where edges are located"
+            found=f"{named(moved, layout.n_legs)} on cranks or sliders, where edges are located"
             " with the readings that are to be predicted",
             expected="a board on the platform, or a tracker's table of its poses, besides",
             next_step="Add one of these (observe: [legs, board]), or calibrate two sessions of"
@@ -219,13 +221,13 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
 
 @dataclass(frozen=True)
 class Evidence:
-    """New data as a linear regression on a change of the machine, ``w = X c + noise``.
+    """Linear regression of new data on a change of the machine, ``w = X c + noise``.
 
-    w : (n,) of unit variance. by : X (n, P + C + 6 k), by the parameters' changes in m and rad, by
-    the magnification of C cameras where that was asked for, and by how k cameras that were left in
-    place turned and moved, (phi, s) in their own axes, rad and m. An axis' own length has no part
-    in it. fixed_stations : (k,) numbers of these stations in the session.
-    Every test of a change is one on w and X: a score test, no machine is estimated.
+    w : (n,) of unit variance. by : X (n, P + C + 6 k), for the parameters' changes in m and rad,
+    the magnification of C cameras if requested, and the motion (phi, s) of k cameras that were left
+    in place, along their own axes, rad and m. The length of an axis is projected out of X.
+    fixed_stations : (k,) indices of these stations in the session. Every test for a change is a
+    score test on w and X, without an estimate of the machine.
     """
 
     w: Array
@@ -233,27 +235,29 @@ class Evidence:
     fixed_stations: tuple[int, ...] = ()
 
     def along(self, columns: Array) -> Array:
-        """X D of changes (P, k) of the parameters, (P + C, k) with cameras' magnifications, or of
-        all columns.
+        """X D for changes D (P, k) of the parameters, (P + C, k) with cameras' magnifications, or
+        of all columns.
         """
         return self.by[:, : len(columns)] @ columns
 
 
 def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
-    """What the data tell of a change from the held values: whitened by V = 1 + A C A^T with the
+    """Evidence on a change from the fixed values, whitened by V = 1 + A C A^T with the
     calibration's covariance C.
 
-    Stations that it does not know are found anew and take up what they can. Of the kept ones the
-    residuals are told at the calibration's places, by the derivatives at those found.
+    Stations unknown to the calibration are estimated, as nuisance parameters. For the kept ones,
+    residuals refer to the calibration's poses, with the derivatives at the estimated ones.
     """
     machine, n = held.machine, len(held.machine.parameters)
     covariance, stations = prior.covariance, prior.stations
     problem, state = held.problem.opened(held.state)
+    # Rows on machine, magnifications and stations, with all other unknowns eliminated.
     names = (*held.unknowns, "stations") if stations else held.unknowns
-    rows, remainder = reduced_rows(Information(problem, state), names)
+    rows, residual = reduced_rows(Information(problem, state), names)
     if stations:
-        rows, remainder = _with_fixed_stations(rows, remainder, state.T_camera_base[0], n, prior)
+        rows, residual = _with_fixed_stations(rows, residual, state.T_camera_base[0], n, prior)
     n_cameras = rows.shape[1] - n - 6 * len(stations)
+    # Reduction to the observable directions, with columns in units of typical changes.
     size = np.concatenate(
         [
             machine.parameters.tolerance,
@@ -265,10 +269,11 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
     by[:, :n] = rows[:, :n] @ _across_axes(machine) * size[:n]
     u, s, vt = np.linalg.svd(by, full_matrices=False)
     observable = s > RANK_TOLERANCE * s.max(initial=0.0)
-    # noise is drawn in this basis: its signs must not be rounding's choice
+    # noise is drawn in this basis: signs must not depend on rounding
     sign = np.sign(vt[np.arange(len(vt)), np.abs(vt).argmax(axis=1)])[observable]
     by = (sign * s[observable])[:, None] * vt[observable] / size
-    projected = -sign * (u[:, observable].T @ remainder)
+    projected = -sign * (u[:, observable].T @ residual)
+    # Whitening by noise and the calibration's error, which has no part for magnifications.
     errors = np.delete(by, n + np.arange(n_cameras), axis=1)
     spread = np.eye(len(projected)) + errors @ covariance @ errors.T
     lower = np.linalg.cholesky(0.5 * (spread + spread.T))
@@ -279,24 +284,26 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
 
 
 def _with_fixed_stations(
-    rows: Array, remainder: Array, values: Array, n: int, prior: CalibrationPrior
+    rows: Array, residual: Array, T_camera_base: Array, n: int, prior: CalibrationPrior
 ) -> tuple[Array, Array]:
-    """Rows by n parameters, all stations' places (S, 4, 4) and cameras, as rows by parameters,
-    cameras and the kept stations; and the residuals with these at the calibration's places.
+    """Rows with the stations reduced to the kept ones, and residuals at the calibration's poses.
+
+    rows : by n parameters, all stations' poses T_camera_base (S, 4, 4), and cameras; returned by
+    parameters, cameras and the kept stations. The other stations are eliminated.
     """
     six = np.arange(6)
-    all_stations = n + np.arange(6 * len(values))
+    all_stations = n + np.arange(6 * len(T_camera_base))
     own = (n + 6 * np.array(prior.stations)[:, None] + six).ravel()
     q = column_space(rows[:, np.setdiff1d(all_stations, own)])
-    rows, remainder = rows - q @ (q.T @ rows), remainder - q @ (q.T @ remainder)
-    off = pose_difference(prior.T_camera_base, values[list(prior.stations)]).ravel()
-    remainder = remainder + rows[:, own] @ off
-    return np.concatenate([np.delete(rows, all_stations, axis=1), rows[:, own]], axis=1), remainder
+    rows, residual = rows - q @ (q.T @ rows), residual - q @ (q.T @ residual)
+    off = pose_difference(prior.T_camera_base, T_camera_base[list(prior.stations)]).ravel()
+    residual = residual + rows[:, own] @ off
+    return np.concatenate([np.delete(rows, all_stations, axis=1), rows[:, own]], axis=1), residual
 
 
 def _by_camera(T_camera_base: Array) -> Array:
-    """Changes (omega, tau) of T_camera_base (4, 4) as the camera turns by phi and moves by s in its
-    own axes, (6, 6): points become Exp(-phi) (p - s) there.
+    """Changes (omega, tau) of T_camera_base (4, 4) by a rotation phi and a motion s of the camera
+    along its own axes, (6, 6): points become Exp(-phi) (p - s) in its frame.
     """
     out = -np.eye(6)
     out[3:, :3] = skew(T_camera_base[:3, 3])
@@ -304,7 +311,7 @@ def _by_camera(T_camera_base: Array) -> Array:
 
 
 def _across_axes(machine: Machine) -> Array:
-    """Projector (P, P) that takes out what would only make axes longer."""
+    """Projector (P, P) that removes changes of the lengths of axes."""
     table = machine.parameters
     values, out = table.unit_axes(machine.values), np.eye(len(table))
     for index in table.axes:

@@ -1,4 +1,4 @@
-"""What a calibration predicts of configurations that were held out of it."""
+"""Predictions of a calibration for configurations that were held out of it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from pkmcal.mechanisms import Machine
 
 @dataclass(frozen=True)
 class HoldOut:
-    """Configurations left out, judged, beside those that the calibration used.
+    """Comparison on configurations that were held out, and on those that the calibration used.
 
-    estimate : from the rest.
+    estimate : from the latter.
     """
 
     region: Neighbours
@@ -30,7 +30,7 @@ class HoldOut:
     used: BesideDrawing
 
     def document(self, names: tuple[str, ...]) -> dict[str, Any]:
-        """For programs; names : K, of the configurations."""
+        """Document for programs. names : (K,) of the configurations."""
         return {
             "where": self.region.name,
             "left_out": self.left_out.document(names),
@@ -39,7 +39,7 @@ class HoldOut:
 
 
 def holdout_of(calibration: Calibration) -> HoldOut | None:
-    """What a calibration predicts of the configurations that it was asked to leave out."""
+    """Comparison on the configurations that a calibration held out; None if it held out none."""
     out = calibration.holdout
     if out is None:
         return None
@@ -50,10 +50,10 @@ def holdout_of(calibration: Calibration) -> HoldOut | None:
 def hold_out(
     drawing: Machine, measurements: Measurements, whole: Estimate, region: Neighbours
 ) -> HoldOut:
-    """Calibrate without a region's configurations, then predict them.
+    """Calibrate without a region's configurations and predict them.
 
-    whole : an estimate from all, where the search starts. Stations and boards are registered by all
-    photographs with the machine held; the machine knows those of the rest alone.
+    whole : estimate from all data, the starting point. Stations and boards are registered by all
+    images with the machine fixed; the machine depends only on the remaining configurations.
     """
     keep = np.ones(len(measurements.joints), dtype=bool)
     keep[region.rows] = False
@@ -64,7 +64,9 @@ def hold_out(
 def judged_without(
     drawing: Machine, measurements: Measurements, estimate: Estimate, region: Neighbours
 ) -> HoldOut:
-    """An estimate that did not see a region's configurations, on them and on those that it saw."""
+    """Comparison of an estimate on the configurations of a region that it did not use, and on those
+    that it used.
+    """
     measurements = estimate.stated_edge_noise(measurements)
     prediction = predict(estimate.machine, measurements, estimate.state)
     out = region.rows[prediction.observed[region.rows]]
@@ -79,6 +81,6 @@ def judged_without(
 def by_regions(
     drawing: Machine, measurements: Measurements, whole: Estimate, n: int
 ) -> tuple[HoldOut, ...]:
-    """Each of n regions of the workspace left out once."""
-    value = by_region(drawing, whole, measurements, n)
-    return tuple(hold_out(drawing, measurements, whole, region) for region in value)
+    """Holdouts of n regions of the workspace, one after the other."""
+    regions = by_region(drawing, whole, measurements, n)
+    return tuple(hold_out(drawing, measurements, whole, region) for region in regions)

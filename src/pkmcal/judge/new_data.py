@@ -1,7 +1,8 @@
-"""New data beside a calibration: are they the same machine's, what of them is new, and where it is.
+"""New data of a calibrated machine: configurations that are new, and a first estimate by these
+data.
 
-The calibrated machine, free within its drawing's tolerances, is the best guess of where to look in
-the photographs; only what was measured, and where poses and stations are, is kept of that.
+The calibrated machine, free within its prior sigmas, is the best start for measuring the images; of
+this estimate only the measurements and the poses of platform and stations are used.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from pkmcal.session.readings import same_pose
 
 
 def calibrated_rows(saved: SavedCalibration, session: Session) -> Booleans:
-    """(K,) configurations of a session that the calibration used.
+    """Mask (K,) of a session's configurations that the calibration used.
 
-    By their photographs; without any (a tracker's), or for a calibration that lists none, by the
-    readings: two measurements of a pose do not agree to the last digit.
+    They are identified by their images; without any (a tracker's), or for a calibration that lists
+    none, by the readings: two measurements of a pose do not agree to the last digit.
     """
     entries: list[dict[str, Any]] = saved.document["configurations"]
     used = [*compress(entries, saved.used)]
@@ -41,14 +42,18 @@ def calibrated_rows(saved: SavedCalibration, session: Session) -> Booleans:
 
 
 def repeated_rows(saved: SavedCalibration, session: Session) -> Booleans:
-    """(K,) configurations of a session at poses that the calibration used, by the readings."""
+    """Mask (K,) of a session's configurations at poses that the calibration used, by the
+    readings.
+    """
     used = saved.joints[saved.used]
     owner = same_pose(np.concatenate([used, session.joints]), session.joint_noise)
     return owner[len(used) :] < len(used)
 
 
 def check_new(valid: Booleans, visible: Booleans, what: str, expected: str, next_step: str) -> None:
-    """Raise `InputError`, in these words, where nothing that was seen is new to the calibration."""
+    """Raise `InputError`, in these words, if no observed configuration is new to the
+    calibration.
+    """
     if not np.any(visible & ~valid):
         used = int(np.sum(visible & valid))
         raise InputError(
@@ -66,23 +71,25 @@ def measured_new_data(
     progress: CalibrationProgress,
     share: float,
 ) -> Calibration:
-    """The session measured, and a first estimate of where everything is; see the module. Its own
-    session is without the photographs by hand that were not placed, and stations are numbered so.
+    """Measure a session and estimate all poses; see the module.
 
-    seed : of the search for the stations. progress : gets the first ``share`` of the progress.
+    The session of the result lacks hand-held images that were not localized, and numbers its
+    stations accordingly. seed : of the localization. progress : callback for the first ``share`` of
+    the progress.
     """
     return calibrate_session(
-        replace(session, machine=saved.machine, stations=_as_then(saved, session)),
+        replace(session, machine=saved.machine, stations=_stations_as_calibrated(saved, session)),
         seed=seed,
         progress=lambda text, part: progress(text, share * part),
     )
 
 
-def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
-    """The stations, their photographs taken to code light as the calibration found them to, where
-    the session does not say, and to be upside down where those were: a few new ones tell less.
+def _stations_as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
+    """Stations with the camera response and the half turn of images that the calibration found.
+
+    The session's own response has precedence. A few new images determine both worse.
     """
-    then = {row["name"]: row.get("response") for row in saved.document["stations"]}
+    responses = {row["name"]: row.get("response") for row in saved.document["stations"]}
     turned = {
         row["file"]: load_camera(saved.path.parent / written_camera(row["file"]))
         for row in saved.document.get("cameras", ())
@@ -90,23 +97,25 @@ def _as_then(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     }
     out: list[Station] = []
     for station in session.stations:
-        # a photograph by hand has its own name behind its entry's
+        # a hand-held image has its own name after that of its entry
         names = (
-            (name for name in then if name.startswith(f"{station.entry}-"))
+            (name for name in responses if name.startswith(f"{station.entry}-"))
             if station.handheld
             else iter([station.name])
         )
-        value = then.get(next(names, station.name))
-        reference_values = value is not None and not station.response_given
+        response = responses.get(next(names, station.name))
+        has_response = response is not None and not station.response_given
         camera = station.camera
-        own = turned.get(station.camera_file)
-        # else the file has been set right since, or is another
-        if own is not None and np.allclose(camera.turned_by_half().parameters, own.parameters):
-            camera = own
+        turned_camera = turned.get(station.camera_file)
+        # otherwise the file has been corrected since, or is another one
+        if turned_camera is not None and np.allclose(
+            camera.turned_by_half().parameters, turned_camera.parameters
+        ):
+            camera = turned_camera
         station_then = replace(station, camera=camera)
         out.append(
-            replace(station_then, response=value, response_given=True)
-            if reference_values
+            replace(station_then, response=response, response_given=True)
+            if has_response
             else station_then
         )
     return tuple(out)

@@ -1,4 +1,4 @@
-"""Straight paths that a session names: how straight its tool points are, [C] IV.D and Table 4."""
+"""Straightness of the tool's path for straight paths that a session names, [C] IV.D and Table 4."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from pkmcal.session.load import SHORTEST_PATH, Session
 
 @dataclass(frozen=True)
 class Straightness:
-    """Distances of points from the line that fits them best, m: root mean square ([C] Table 4) and
-    largest.
-    """
+    """Distances of points from their best line, m: root mean square ([C] Table 4) and largest."""
 
     rms: float
     largest: float
@@ -24,10 +22,10 @@ class Straightness:
 
 @dataclass(frozen=True)
 class LinePath:
-    """A straight path that the session names.
+    """Straight path that the session names.
 
-    seen : by the photographs; None where they show fewer than three. drawing, calibrated : by
-    forward kinematics of the readings; None where a machine cannot be closed. n : points.
+    n : number of points. seen : straightness in the images; None with fewer than three points.
+    drawing, calibrated : by forward kinematics of the readings; None if a machine does not close.
     """
 
     name: str
@@ -38,7 +36,7 @@ class LinePath:
 
 
 def straightness(points: Array) -> Straightness:
-    """Of points (n, 3), n >= 3; the line is the first principal axis."""
+    """Straightness of points (n, 3), n >= 3; the line is the first principal axis."""
     centred = points - points.mean(axis=0)
     along = np.linalg.svd(centred)[2][0]
     off = np.linalg.norm(centred - np.outer(centred @ along, along), axis=1)
@@ -46,7 +44,7 @@ def straightness(points: Array) -> Straightness:
 
 
 def paths_of(session: Session) -> dict[str, list[int]]:
-    """Rows of the straight paths' configurations, by the paths' names."""
+    """Rows of the configurations of each straight path, by its name."""
     paths: dict[str, list[str]] = session.document.get("paths") or {}
     return {
         name: [session.configurations.index(member) for member in members]
@@ -57,17 +55,19 @@ def paths_of(session: Session) -> dict[str, list[int]]:
 def line_path(
     name: str, rows: list[int], drawing: Machine, session: Session, prediction: Prediction
 ) -> LinePath:
-    """How straight the tool went through the configurations ``rows``, seen and computed."""
-    visible = prediction.T_base_platform[rows][prediction.observed[rows]]
+    """Straightness of the tool's path through the configurations ``rows``, observed and
+    computed.
+    """
+    observed = prediction.T_base_platform[rows][prediction.observed[rows]]
     by: list[Straightness | None] = []
     for machine in (drawing, prediction.machine):
-        result = machine.forward_result(session.joints[rows])
-        closes = bool(result.converged.all())
-        by.append(straightness(result.T_base_platform[:, :3, 3]) if closes else None)
+        fk = machine.forward_result(session.joints[rows])
+        closes = bool(fk.converged.all())
+        by.append(straightness(fk.T_base_platform[:, :3, 3]) if closes else None)
     return LinePath(
         name=name,
         n=len(rows),
-        seen=straightness(visible[:, :3, 3]) if len(visible) >= SHORTEST_PATH else None,
+        seen=straightness(observed[:, :3, 3]) if len(observed) >= SHORTEST_PATH else None,
         drawing=by[0],
         calibrated=by[1],
     )

@@ -1,17 +1,17 @@
-"""What a machine predicts of readings and tool points that photographs show.
+"""Prediction of readings and tool points that images observe, by a fixed machine.
 
-Stations, boards' mounts and the platform's poses are estimated from the photographs, the machine
-is held (:mod:`pkmcal.judge.fixed_machine`). Where photographs leave open where stations and boards
-are (a board tells a pose in a camera that stands anywhere), readings of *other* configurations
-tell: closures stand in the estimate with the soft deviation :data:`SOFT_READING_NOISE`, which gives
-way to anything seen, and each configuration's own readings are then taken out again exactly, by
+Stations, mounts and platform poses are estimated from the images with the machine fixed
+(:mod:`pkmcal.judge.fixed_machine`). Where images do not determine the poses of stations and boards
+(a board is observed by a camera of unknown pose), the readings of *other* configurations do:
+closures enter the estimate with the large standard deviation :data:`SOFT_READING_NOISE`, which
+gives way to any observation, and each configuration's own readings are then removed exactly, by
 their leverage (leave-one-out).
 
 With E the rows of readings and ``P = 1 - Q Q^T - q q^T`` the projector of
-:mod:`pkmcal.judge.fixed_machine`, Q and q orthonormal bases of what a configuration's own unknowns
-and the shared ones can explain, their residuals are ``E P y``. Of a reading's own error that leaves
-the part ``L``, a configuration's block of ``E P E^T``: residuals of fits without their own readings
-are ``L^-1 E P y``, to first order.
+:mod:`pkmcal.judge.fixed_machine`, where Q and q are orthonormal bases of the column spaces of a
+configuration's own unknowns and of the shared ones, their residuals are ``E P y``. The part of a
+reading's own error in them is ``L``, a configuration's block of ``E P E^T``: residuals of fits
+without the own readings are ``L^-1 E P y``, to first order.
 """
 
 from __future__ import annotations
@@ -36,24 +36,27 @@ from pkmcal.solver.elimination import Linear, Reduced, eliminate, rows_on_shared
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space, inverse_root
 
 SOFT_READING_NOISE = 0.01
-"""Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a
-photograph leaves open, so a seen pose hardly knows them."""
+"""Standard deviation (m, rad) of readings in the estimate of stations and poses: tens of times the
+uncertainty by an image, so that an observed pose hardly depends on them.
+"""
 LEAST_REDUNDANCY_SHARE = 1e-2
-"""Part of a reading's residual that its own fit leaves, below which hardly anything but the reading
-told where the platform was: what was seen left ten times SOFT_READING_NOISE open."""
+"""Minimum redundancy of a reading, the part of its error in its own residual; below it hardly
+anything but the reading determined the pose: the uncertainty by observations was ten times
+SOFT_READING_NOISE.
+"""
 FRAME_LAYING_STEPS = 20
 FRAMES_LAID_CHANGE = 1e-10
-"""Frame change (m, rad) below which the frames are laid."""
+"""Change of the frames (m, rad) below which their registration has converged."""
 UNREAD_FRAME_CHANGE_SHARE = 1e-9
-"""Share of the largest singular value below which a frame change moves no reading."""
+"""Relative size of singular values below which a change of the frames moves no reading."""
 
 
 @dataclass(frozen=True)
 class ReadingErrors:
-    """Errors of n configurations.
+    """Errors at n configurations.
 
-    residuals : (n, m) readings measured less predicted, m or rad. position, orientation : (n,) of
-    the tool point by the readings, m and rad; NaN where the machine cannot be closed.
+    residuals : (n, m) measured minus predicted readings, m or rad. position, orientation : (n,)
+    errors of the tool point by the readings, m and rad; NaN if the machine does not close.
     """
 
     residuals: Array
@@ -61,19 +64,19 @@ class ReadingErrors:
     orientation: Array
 
     def of(self, rows: Integers) -> ReadingErrors:
-        """Those of some configurations."""
+        """Errors of selected configurations."""
         return ReadingErrors(self.residuals[rows], self.position[rows], self.orientation[rows])
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a machine predicts of a session; values of configurations that were not seen are NaN.
+    """Prediction of a session by a machine; values are NaN for configurations without observations.
 
-    machine : as held, with the session's tube radii. observed : (K,) configurations whose pose was
-    seen. T_base_platform : (K, 4, 4) seen, without the configuration's own readings. errors : (K,)
-    of the readings that are predicted from it, and of the tool point.
-    noise : (n, n) covariance of the residuals of the n = K' m seen readings by the photographs'
-    and the readings' noise. by_machine : (n, P) their derivatives by the machine's parameters.
+    machine : fixed, with the session's tube radii. observed : (K,) configurations with an observed
+    pose. T_base_platform : (K, 4, 4) observed, without the configuration's own readings. errors :
+    (K,) of the readings predicted from it, and of the tool point. noise : (n, n) covariance by the
+    noise of images and readings of the residuals of the n = K' m observed readings. by_machine :
+    (n, P) their derivatives by the machine's parameters.
     """
 
     machine: Machine
@@ -85,10 +88,10 @@ class Prediction:
 
 
 def predict(machine: Machine, measurements: Measurements, start: State) -> Prediction:
-    """What a machine predicts of readings and tool points, seen by measurements.
+    """Predict readings and tool points of the measured configurations.
 
-    start : stations, mounts and poses in frames near the machine's. Raises ResultError where they
-    are not found, or where nothing but a configuration's own readings tells its pose.
+    start : stations, mounts and poses in frames near those of the machine. Raises ResultError if
+    they are not found, or if a pose depends on nothing but the configuration's own readings.
     """
     if not measurements.n_stations:
         raise ResultError(
@@ -96,32 +99,36 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
             expected="a session with photographs, or with a table of poses",
             next_step="To see whether the machine is as it was, use pkmcal watch with new readings",
         )
-    # links tell the difference of two poses, not the pose at either's readings
+    # links determine the difference of two poses, not the pose at either's readings
     soft = replace(measurements, joint_noise=SOFT_READING_NOISE, links=())
     held = hold(machine, soft, start)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear)
     own, shared = reduced.q[0], column_space(rows_on_shared(linear, reduced)[0][0])
-    picks = _picks(held, linear.value.shape[-1])
+    picks = _reading_selector(held, linear.value.shape[-1])
     n, m, n_rows = picks.shape
 
+    # L = E P E^T, the redundancy of each configuration's readings.
     along = picks @ own
     along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
-    residual = np.eye(m) - along - beside @ beside.mT  # L
-    if float(np.linalg.eigvalsh(residual).min(initial=1.0)) < LEAST_REDUNDANCY_SHARE:
+    redundancy = np.eye(m) - along - beside @ beside.mT  # L
+    if float(np.linalg.eigvalsh(redundancy).min(initial=1.0)) < LEAST_REDUNDANCY_SHARE:
         raise too_little(machine, measurements)
-    alone = np.linalg.inv(residual)
-    units = _size(held)[..., None] * alone
+    alone = np.linalg.inv(redundancy)
+    units = _reading_per_sigma(held)[..., None] * alone
 
-    value = _without_own(held, linear, reduced, picks.mT @ alone @ picks)
+    # Leave-one-out poses, the errors at these, and the derivatives by the fixed machine.
+    leave_one_out = _leave_one_out(held, linear, reduced, picks.mT @ alone @ picks)
     by = _by_machine(held, own, shared[: n * n_rows]).reshape(n, n_rows, -1)
     joints = measurements.joints[held.observed]
-    errors = _errors(held.machine, joints, value.T_base_platform[0], value.internal[0])
+    errors = _errors(
+        held.machine, joints, leave_one_out.T_base_platform[0], leave_one_out.internal[0]
+    )
     return Prediction(
         machine=held.machine,
         observed=held.observed,
-        T_base_platform=_among_all(value.T_base_platform[0], held.observed),
+        T_base_platform=_among_all(leave_one_out.T_base_platform[0], held.observed),
         errors=ReadingErrors(
             _among_all(errors.residuals, held.observed),
             _among_all(errors.position, held.observed),
@@ -134,8 +141,8 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     )
 
 
-def _picks(held: Held, n_rows: int) -> Array:
-    """E (K', m, r): the rows of readings, one each, out of a configuration's."""
+def _reading_selector(held: Held, n_rows: int) -> Array:
+    """E (K', m, r): selects the rows of readings among those of a configuration."""
     problem, state = held.problem, held.state
     n_poses, n_equations = state.T_base_platform.shape[1], problem.layout.n_equations
     columns = [
@@ -147,8 +154,10 @@ def _picks(held: Held, n_rows: int) -> Array:
     return out
 
 
-def _size(held: Held) -> Array:
-    """Reading (K', m) that one standard deviation of its row is, m or rad, with its sign."""
+def _reading_per_sigma(held: Held) -> Array:
+    """Reading (K', m) that corresponds to one standard deviation of its row, m or rad, with its
+    sign.
+    """
     layout, c = held.problem.layout, held.problem.closure(held.state)
     by_reading = c.by_reading[0]
     slope = np.sqrt(by_reading**2 @ layout.of_motor)
@@ -156,24 +165,25 @@ def _size(held: Held) -> Array:
     return sign * np.hypot(PERFECT_CLOSURE_SIGMA, SOFT_READING_NOISE * slope) / slope
 
 
-def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> BatchState:
-    """The poses of fits without each configuration's own readings.
+def _leave_one_out(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> BatchState:
+    """Poses of leave-one-out fits, each without the configuration's own readings.
 
-    alone : E^T L^-1 E (K', r, r). ``R^-1 Q^T (1 - A N^+ S^T) alone y`` is the answer to readings
-    moved to where the others predict them; S, the rows A of the shared unknowns with own ones taken
-    out, and N their normal matrix, in which open directions count as exact.
+    alone : E^T L^-1 E (K', r, r). ``R^-1 Q^T (1 - A N^+ S^T) alone y`` is the change of the own
+    unknowns when the readings are moved to the values that the others predict; S are the rows A of
+    the shared unknowns with own ones eliminated, and N their normal matrix, in which unidentifiable
+    directions count as exact.
     """
     half = inverse_root(rows_on_shared(linear, reduced)[0][0], RANK_TOLERANCE, loose=False)
-    shifted = alone @ linear.value[0, ..., None]
-    others = half @ (half.T @ (reduced.rows[0].mT @ shifted))
-    own = reduced.q[0].mT @ (shifted - linear.by_shared[0] @ others)
+    moved = alone @ linear.value[0, ..., None]
+    others = half @ (half.T @ (reduced.rows[0].mT @ moved))
+    own = reduced.q[0].mT @ (moved - linear.by_shared[0] @ others)
     own = np.linalg.solve(reduced.r[0], own)[..., 0]
     shared = np.zeros((1, held.problem.unknowns.count))
     return held.problem.retract(held.state, shared, own[None])
 
 
 def _by_machine(held: Held, own: Array, shared: Array) -> Array:
-    """P A (K' r, P) by all parameters that are held; own : Q (K', r, d), shared : q (K' r, a)."""
+    """P A (K' r, P) for all fixed parameters; own : Q (K', r, d), shared : q (K' r, a)."""
     wide, there = held.problem.opened(held.state)
     by = wide.linearize(there).by_shared[0, ..., wide.unknowns.machine]
     by = np.where(np.any(held.problem.free != 0, axis=1), 0.0, by)
@@ -184,10 +194,10 @@ def _by_machine(held: Held, own: Array, shared: Array) -> Array:
 def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
     """Covariance (K' m, K' m) of the residuals ``units E P y`` by noise.
 
-    along : D (K', m, m), the readings' rows along their own unknowns; beside : F (K', m, a), along
-    those of all: ``H = E P E^T = 1 - D - F F^T``. Rows have unit variance, but readings are sharper
-    than SOFT_READING_NOISE by the share ``less`` of it: the covariance of E P y is ``H - less H
-    H``, written without a difference of numbers that are nearly the same.
+    along : D (K', m, m), projection of the readings' rows onto their own unknowns. beside : F (K',
+    m, a), onto the shared ones: ``H = E P E^T = 1 - D - F F^T``. Rows have unit variance, but
+    readings have less than SOFT_READING_NOISE, by the share ``less`` of its variance: the
+    covariance of E P y is ``H - less H H``, in a form without differences of nearly equal numbers.
     """
     n, m = along.shape[:2]
     block = (np.eye(m) - along) @ ((1 - less) * np.eye(m) + less * along)
@@ -202,7 +212,7 @@ def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
 
 
 def _errors(machine: Machine, joints: Array, poses: Array, internal: Array) -> ReadingErrors:
-    """Of a machine on seen poses T_base_platform (n, 4, 4) in its own frames."""
+    """Errors of a machine at observed poses T_base_platform (n, 4, 4) in its own frames."""
     fk = forward(machine.layout, machine.values, joints, poses, internal)
     off = np.full((len(poses), 6), np.nan)
     ok = fk.converged
@@ -215,18 +225,18 @@ def _errors(machine: Machine, joints: Array, poses: Array, internal: Array) -> R
 
 
 def _among_all(values: Array, visible: Booleans) -> Array:
-    """Values (K', ...) of the seen configurations among all, NaN elsewhere."""
+    """Values (K', ...) of the observed configurations among all (K, ...), NaN elsewhere."""
     out = np.full((len(visible), *values.shape[1:]), np.nan)
     out[visible] = values
     return out
 
 
 def errors_on(machine: Machine, joints: Array, poses: Array) -> ReadingErrors:
-    """Errors of a machine on seen poses T_base_platform (n, 4, 4) in another machine's frames.
+    """Errors of a machine at observed poses T_base_platform (n, 4, 4) in another machine's frames.
 
-    joints : (n, m). The frames of base and platform, which are a convention, are laid so that the
-    readings agree best. What that takes up is given back by the degrees of freedom, so few
-    configurations flatter nobody.
+    joints : (n, m). The frames of base and platform, which are conventions, are registered for the
+    best agreement of the readings. The errors are corrected for the degrees of freedom of this
+    registration, so that few configurations do not make a machine look better.
     """
     e, f, used = closing_frame_changes(machine, joints, poses)
     own = e @ poses @ inverse(f)
@@ -247,10 +257,10 @@ def closing_frame_changes(
     machine: Machine, joints: Array, poses: Array
 ) -> tuple[Array, Array, int]:
     """Frame changes E, F (4, 4) after which E X F^-1 closes the machine best at the readings, and
-    how many numbers of them the readings fix.
+    the number of their components that the readings determine.
 
-    Gauss-Newton on the closure, rows that hinges move left out; changes that it does not see are
-    left alone.
+    Gauss-Newton on the closure, with the directions of hinges eliminated; unobservable components
+    are zero.
     """
     e, f = np.eye(4), np.eye(4)
     used = 0

@@ -1,5 +1,6 @@
-"""What judgements say: is the calibrated machine better than its drawing, by how much, and how sure
-(validate); is it still so, has it changed and where, or do the data tell too little (watch).
+"""Verdicts in words: whether the calibrated machine is better than the nominal one, by how much and
+how surely (validate); whether it is unchanged, has changed and where, or the data are insufficient
+(watch).
 """
 
 from __future__ import annotations
@@ -40,21 +41,21 @@ from pkmcal.wording import (
 )
 
 MOSTLY_NOISE = 2**0.5
-"""Factor on the photographs' noise within which that is more than half of the mean square."""
+"""Factor on the noise of images within which noise is more than half of the mean square."""
 POOR_REGION_FACTOR = 2.0
-"""Factor by which a region's errors must exceed those of the configurations in use to be told."""
+"""Ratio of a region's errors to those of the used configurations from which it is reported."""
 NOISIER_PHOTOGRAPHS_FACTOR = 1.5
-"""Times the calibration's noise from which on the photographs are no longer the same kind."""
+"""Ratio to the calibration's noise from which images are no longer of the same kind."""
 STEEL_EXPANSION = 12e-6
-"""Expansion of steel, 1/K, for a picture of what a common scale means."""
+"""Thermal expansion of steel, 1/K, to illustrate a common scale."""
 UNEXPLAINED_CHANCE = 1e-3
-"""Chance below which what the findings leave is said to be more than noise."""
+"""p-value of the unexplained rest below which it is reported."""
 MOST_OTHERS = 4
-"""Causes named beside the best; more are a table's."""
+"""Maximum number of rival causes that are named."""
 
 
 def factor(value: float) -> str:
-    """A factor with the digits that it deserves."""
+    """A factor with its significant digits."""
     if not np.isfinite(value):
         return "–"
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
@@ -72,10 +73,10 @@ def validation_verdict(
     measurements: Measurements,
     repeated: Booleans | None = None,
 ) -> Verdict:
-    """The verdict on new data, or, without any, on the regions held out, pooled.
+    """Verdict on new data, or, without any, on all held-out regions together.
 
-    measurements : of all configurations. repeated : (K,) those that the session has at poses that
-    the calibration used; None for nowhere.
+    measurements : of all configurations. repeated : (K,) configurations at poses that the
+    calibration used; None for none.
     """
     units = machine.joint_units
     unit = units[0] if len(set(units)) == 1 else None
@@ -85,19 +86,21 @@ def validation_verdict(
     )
     floor = finite_rms(np.concatenate([np.full(len(g.rows), g.floor) for g in groups]))
     gain = improvement_ratio(before, after)
-    reasons = [*_not_better(gain), *_broken(groups, units)]
+    reasons = [*_not_better(gain), *_promise_findings(groups, units)]
     again = int(repeated[judged.rows].sum()) if judged and repeated is not None else 0
     every = judged is not None and again == len(judged.rows)
     where = " of regions that it did not see" if judged is None else ""
     if every:
         where = " at the poses that it was calibrated from"
     headline = _validation_headline(gain, before, after, unit, where)
-    warnings = _regions(holdouts, unit)
+    warnings = _region_findings(holdouts, unit)
     if judged and again:
         warnings.insert(0, doubtful("validation.same_poses", number=again, of=len(judged.rows)))
     if judged and gain.better:
-        warnings += _weak_words(judged, units)
-    noise = _noise(after, floor, unit, measurements, np.concatenate([g.rows for g in groups]))
+        warnings += _unweighted_findings(judged, units)
+    noise = _noise_findings(
+        after, floor, unit, measurements, np.concatenate([g.rows for g in groups])
+    )
     return Verdict(not reasons, headline, (*reasons, *warnings, *noise))
 
 
@@ -140,17 +143,17 @@ def _not_better(gain: Ratio) -> list[Finding]:
     return [wrong("validation.not_better", **facts, **words)]
 
 
-def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
-    """Residuals that the deviations do not promise: the first group's that has such."""
+def _promise_findings(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
+    """Finding on residuals larger than their standard deviations, of the first group with such."""
     for group in groups:
         if not group.promise.usual:
-            return [_too_large(group, units)]
+            return [_residual_finding(group, units)]
         if not group.promise.steady:
-            return [_in_common(group, units)]
+            return [_offset_finding(group, units)]
     return []
 
 
-def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+def _residual_finding(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     one = len(set(units)) == 1
     return wrong(
         "validation.residuals_too_large",
@@ -162,8 +165,10 @@ def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     )
 
 
-def _weak_words(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
-    """Where plain root mean squares contradict the verdict, which weighs what was seen better."""
+def _unweighted_findings(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
+    """Finding if unweighted root mean squares contradict the verdict, which weights by
+    observability.
+    """
     by_drawing, by_calibrated = (group.figures(e) for e in (group.drawing, group.calibrated))
     worse = by_calibrated.joint_rms > by_drawing.joint_rms
     if not worse.any() and by_calibrated.position <= by_drawing.position:
@@ -176,7 +181,7 @@ def _weak_words(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
     return [doubtful("validation.hardly_seen", **facts)]
 
 
-def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+def _offset_finding(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     test = group.promise
     worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
     return wrong(
@@ -189,19 +194,19 @@ def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     )
 
 
-def _noise(
+def _noise_findings(
     after: Array, floor: float, unit: str | None, measurements: Measurements, rows: Integers
 ) -> tuple[Finding, ...]:
-    """That what is left of configurations ``rows`` is noise, and what would lessen it."""
+    """Finding if the residuals of configurations ``rows`` are mostly noise, with the remedy."""
     if unit is None or finite_rms(after) > MOSTLY_NOISE * floor:
         return ()
-    visible = np.zeros((len(measurements.joints), measurements.n_stations), dtype=bool)
+    observed = np.zeros((len(measurements.joints), measurements.n_stations), dtype=bool)
     edges, poses = measurements.edges, measurements.poses
     poses = poses.select(measurements.on_platform[poses.mount])
     for one in (edges, poses):
-        visible[one.configuration, one.station] = True
-    stations = int(visible[rows].any(axis=0).sum())
-    once = int(np.sum(visible[rows].sum(axis=1) == 1))
+        observed[one.configuration, one.station] = True
+    stations = int(observed[rows].any(axis=0).sum())
+    once = int(np.sum(observed[rows].sum(axis=1) == 1))
     facts = {"noise": floor, "unit": unit, "stations": stations, "number": once, "of": len(rows)}
     if stations == 1:
         return (note("validation.noise_one_station", **facts),)
@@ -212,17 +217,17 @@ def _noise(
     return (note("validation.noise_several", **facts),)
 
 
-def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
-    """Regions in which a calibration of the rest is poor."""
+def _region_findings(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
+    """Findings on regions in which a calibration by the others is poor."""
     out: list[Finding] = []
-    for item in holdouts:
-        off, usual = finite_rms(item.left_out.after), finite_rms(item.used.after)
+    for holdout in holdouts:
+        off, usual = finite_rms(holdout.left_out.after), finite_rms(holdout.used.after)
         if off >= POOR_REGION_FACTOR * usual:
             out.append(
                 doubtful(
                     "validation.extrapolation",
-                    item.region.name,
-                    number=len(item.left_out.rows),
+                    holdout.region.name,
+                    number=len(holdout.left_out.rows),
                     rms=off,
                     rms_used=usual,
                     unit=unit,
@@ -233,7 +238,7 @@ def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[Finding]:
 
 @dataclass(frozen=True)
 class Names:
-    """What cameras and stations are called, by their numbers."""
+    """Names of cameras and stations by their indices."""
 
     cameras: tuple[str, ...] = ()
     stations: tuple[str, ...] = ()
@@ -241,11 +246,11 @@ class Names:
 
 @dataclass(frozen=True)
 class ComparedSession:
-    """What a verdict says besides the tests.
+    """Facts of a session for a verdict, besides the tests.
 
-    configurations : K names. calibrated, observed : (K,) used by the calibration, and looked at.
-    noisier : times the calibration's factor on the stated noise of edges. stations_moved : cameras
-    that were said to have been left in place.
+    configurations : (K,) names. calibrated, observed : (K,) used by the calibration, and observed.
+    noisier : ratio to the calibration's factor on the stated noise of edges. stations_moved :
+    cameras that were assumed to be unmoved.
     """
 
     configurations: tuple[str, ...]
@@ -257,59 +262,62 @@ class ComparedSession:
 
 
 def watch_verdict(judged: ChangeTests, around: ComparedSession) -> Verdict:
-    """The verdict; usable means still as calibrated."""
+    """Verdict on a change; usable means unchanged."""
     warnings = _warnings(around)
     if judged.changed:
-        return _changed(judged, around, warnings)
+        return _change_verdict(judged, around, warnings)
     blind = [leg for leg in judged.legs if is_blind(leg)]
     if blind:
         return Verdict(
             False,
             "These data are too few to tell whether the machine is still as calibrated.",
-            (*_blind(blind), *warnings, note("watch.more_configurations")),
+            (*_blindness_findings(blind), *warnings, note("watch.more_configurations")),
         )
     new = int(np.sum(around.observed & ~around.calibrated))
     headline = (
         f"Still as calibrated, as far as {count(new, 'new configuration')} can tell:"
-        f" {_would_have(judged)}."
+        f" {_detectable_clause(judged)}."
     )
     silent = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
-    advice = [note("watch.no_reading", _of(silent), legs=_of(silent))] if silent else []
+    advice = (
+        [note("watch.no_reading", _leg_names(silent), legs=_leg_names(silent))] if silent else []
+    )
     return Verdict(True, headline, (*warnings, *advice))
 
 
 def is_blind(leg: LegTest) -> bool:
-    """Whether not even a change as large as the drawing's tolerance would have been found."""
+    """Whether even a change as large as the prior sigma would not have been detected."""
     if leg.zero is None:
         return leg.whole.dof == 0
     return not leg.detects_zero <= leg.tolerance
 
 
 def cause_words(suspect: Suspect, names: Names = Names(), short: bool = False) -> str:
-    """A cause with the change it would have made, as a part of a sentence.
+    """A cause with its estimated change, as a part of a sentence.
 
-    short : how far a joint moved, but not along what.
+    short : only the size of a joint's motion, without its direction.
     """
     cause, value, sigma = suspect.cause, suspect.change.value, suspect.change.sigma
     who = named(cause.legs) if cause.legs else ""
     if cause.part == "scale":
         return f"all lengths against the readings by {_ratio(value[0], sigma[0])}"
     if cause.part == "camera":
-        above_limit = cause.camera < len(names.cameras)
-        name = names.cameras[cause.camera] if above_limit else "a camera"
+        has_name = cause.camera < len(names.cameras)
+        name = names.cameras[cause.camera] if has_name else "a camera"
         return f"the focal length of {name} by {_ratio(value[0], sigma[0])}"
     if cause.part == "station":
-        return f"the place of the camera {names.stations[cause.station]}{_place(suspect.change)}"
+        motion = _camera_motion(suspect.change)
+        return f"the place of the camera {names.stations[cause.station]}{motion}"
     if cause.part in ("base", "platform"):
         joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
         together = " together" if len(cause.legs) > 1 else ""
-        return f"{joint}{together}{_vector(suspect, short)}"
+        return f"{joint}{together}{_joint_motion(suspect, short)}"
     if cause.part == "lead":
         return f"the scale of {who}'s reading by {_ratio(value[0], sigma[0])}"
     parts = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
     what = parts.get(cause.part, f"the {cause.part} of {who}")
     if len(value) > 1:
-        return f"{what}{_vector(suspect, short)}"
+        return f"{what}{_joint_motion(suspect, short)}"
     return f"{what} by {signed(value[0], sigma[0], cause.unit)}"
 
 
@@ -329,8 +337,8 @@ def _ratio(value: float, sigma: float) -> str:
     return f"{number(value * 1e6, places, signed=True)} µm/m (±{number(sigma * 1e6, places)})"
 
 
-def _vector(suspect: Suspect, short: bool) -> str:
-    """How far a joint moved, if the data tell that, and along what."""
+def _joint_motion(suspect: Suspect, short: bool) -> str:
+    """Size and direction of a joint's motion, if the data determine it."""
     cause, change = suspect.cause, suspect.change
     size = float(np.linalg.norm(change.value[:3]))
     if len(change.value) != 3 or size == 0 or not np.isfinite(change.sigma).all():
@@ -345,8 +353,8 @@ def _vector(suspect: Suspect, short: bool) -> str:
     return f"{text}, ({parts}) mm in the {cause.part} frame"
 
 
-def _place(change: Change) -> str:
-    """How far a camera moved and turned, as far as that is told."""
+def _camera_motion(change: Change) -> str:
+    """Motion and rotation of a camera, as far as the data determine them."""
     out: list[str] = []
     for part, unit, factor in ((slice(3, 6), "mm", 1e3), (slice(0, 3), "°", 180 / np.pi)):
         value, covariance = change.value[part], change.covariance[part, part]
@@ -360,14 +368,14 @@ def _place(change: Change) -> str:
     return f" by {' and '.join(out)}" if out else ""
 
 
-def _changed(
+def _change_verdict(
     judged: ChangeTests, around: ComparedSession, warnings: tuple[Finding, ...]
 ) -> Verdict:
     names = around.names
     findings = judged.findings
     if not findings:
         headline = "The machine is not as calibrated."
-        return Verdict(False, headline, (_unnamed(judged), *warnings))
+        return Verdict(False, headline, (_unidentified_finding(judged), *warnings))
     lens = all(f.suspect.cause.part == "camera" for f in findings)
     if lens:
         headline = (
@@ -376,15 +384,15 @@ def _changed(
         )
     else:
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
-    reasons = [_reason(f, k, names) for k, f in enumerate(findings)]
+    reasons = [_cause_finding(f, k, names) for k, f in enumerate(findings)]
     if judged.rest.dof and judged.rest.chance < UNEXPLAINED_CHANCE:
         remainder = {"chi2": judged.rest.chi2, "dof": judged.rest.dof, "chance": judged.rest.chance}
         reasons.append(wrong("watch.unexplained", **remainder))
-    return Verdict(False, headline, (*reasons, *warnings, _next(findings)))
+    return Verdict(False, headline, (*reasons, *warnings, _next_step(findings)))
 
 
 def _changes_headline(findings: Sequence[Explanation]) -> str:
-    """What changed, in short."""
+    """Summary of the changes."""
     causes = [f.suspect.cause for f in findings if f.suspect.cause.part not in ("scale", "camera")]
     if not causes:
         return "all its lengths have another scale"
@@ -394,8 +402,8 @@ def _changes_headline(findings: Sequence[Explanation]) -> str:
     return f"{named(legs)} {verb} changed" + (", or another that looks the same" if rivals else "")
 
 
-def _reason(value: Explanation, place: int, names: Names) -> Finding:
-    """One finding: what, how much, as after what, and what it may be instead."""
+def _cause_finding(value: Explanation, place: int, names: Names) -> Finding:
+    """Finding of one cause: its change and its rivals."""
     cause, change = value.suspect.cause, value.suspect.change
     alternatives = [cause_words(other, names, short=True) for other in value.others[:MOST_OTHERS]]
     if more := len(value.others) - len(alternatives):
@@ -420,15 +428,15 @@ def _reason(value: Explanation, place: int, names: Names) -> Finding:
     return wrong("watch.part", subject, **facts)
 
 
-def _unnamed(judged: ChangeTests) -> Finding:
-    """Something changed, and no single cause stands out."""
+def _unidentified_finding(judged: ChangeTests) -> Finding:
+    """Finding of a change without an identified cause."""
     legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
     if legs:
-        return wrong("watch.leg_test_fails", _of(legs), legs=_of(legs))
+        return wrong("watch.leg_test_fails", _leg_names(legs), legs=_leg_names(legs))
     return wrong("watch.machine_test_fails", chi2=judged.machine.chi2, dof=judged.machine.dof)
 
 
-def _next(findings: Sequence[Explanation]) -> Finding:
+def _next_step(findings: Sequence[Explanation]) -> Finding:
     parts = {f.suspect.cause.part for f in findings}
     if parts == {"camera"}:
         return note("watch.next_camera")
@@ -439,8 +447,8 @@ def _next(findings: Sequence[Explanation]) -> Finding:
     return note("watch.next_part")
 
 
-def _would_have(judged: ChangeTests) -> str:
-    """What would have been found, in words."""
+def _detectable_clause(judged: ChangeTests) -> str:
+    """Changes that would have been detected, in words."""
     zeros = [leg for leg in judged.legs if leg.zero is not None and leg.zero.dof]
     if not zeros:
         return "no test of a leg fails"
@@ -452,22 +460,24 @@ def _would_have(judged: ChangeTests) -> str:
 
 
 def least_size(legs: Sequence[LegTest]) -> tuple[str, str]:
-    """Smallest changes of the legs' zeros that would be found, such as ``0.3 to 0.5``, and unit."""
+    """Smallest detectable changes of the legs' zeros, such as ``0.3 to 0.5``, and their unit."""
     scale, name = DISPLAY_UNITS[legs[0].unit]
     sizes = [brief(f(leg.detects_zero for leg in legs) * scale) for f in (min, max)]
     return " to ".join(dict.fromkeys(sizes)), name
 
 
-def _blind(legs: Sequence[LegTest]) -> tuple[Finding, ...]:
-    """Why these data are too few, of legs about which they say too little."""
+def _blindness_findings(legs: Sequence[LegTest]) -> tuple[Finding, ...]:
+    """Findings on legs for which these data are insufficient."""
     nothing = [leg for leg in legs if not np.isfinite(leg.detects_zero)]
     little = [leg for leg in legs if np.isfinite(leg.detects_zero)]
     out: list[Finding] = []
     if nothing:
-        out.append(wrong("watch.leg_blind", _of(nothing), legs=_of(nothing)))
+        out.append(wrong("watch.leg_blind", _leg_names(nothing), legs=_leg_names(nothing)))
     if little:
         least = with_unit(*least_size(little))
-        out.append(wrong("watch.leg_weak", _of(little), legs=_of(little), least=least))
+        out.append(
+            wrong("watch.leg_weak", _leg_names(little), legs=_leg_names(little), least=least)
+        )
     return tuple(out)
 
 
@@ -475,7 +485,7 @@ def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
     out: list[Finding] = []
     for s in around.stations_moved:
         name = around.names.stations[s.station]
-        facts = {"station": name, "by": _place(s.change), "value": s.change.value}
+        facts = {"station": name, "by": _camera_motion(s.change), "value": s.change.value}
         out.append(doubtful("watch.station_moved", name, **facts))
     both = around.calibrated & around.observed
     if both.any():
@@ -486,6 +496,6 @@ def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
     return tuple(out)
 
 
-def _of(tests: Sequence[LegTest]) -> str:
-    """The legs that tests are of."""
+def _leg_names(tests: Sequence[LegTest]) -> str:
+    """Names of the legs of tests."""
     return named(j for test in tests for j in test.legs)

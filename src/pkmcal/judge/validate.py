@@ -1,7 +1,7 @@
-"""A calibration on data that it did not see: ``pkmcal validate``.
+"""Validation of a calibration on independent data: ``pkmcal validate``.
 
-The session's photographs are measured as for a calibration. Then the calibrated machine is held,
-the platform's poses are seen without their readings, and the readings become predictions.
+The session's images are measured as for a calibration. Then the calibrated machine is fixed, the
+platform's poses are estimated without their readings, and the readings are predicted.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ NOT_INDEPENDENT = (
 
 @dataclass(frozen=True)
 class Validation:
-    """Everything that a validation found.
+    """Results of a validation.
 
-    calibration : as read back. judged : on configurations that it did not see; None where there are
-    none, and only regions were held out. calibrated : (K,) configurations that it had seen.
-    repeated : (K,) those that are new measurements of poses that it used. regions : hold-outs
-    within the session. paths : the straight ones.
+    calibration : as loaded. judged : comparison on configurations that it did not use; None without
+    any, when only regions were held out. calibrated : (K,) configurations that it used. repeated :
+    (K,) new measurements at poses that it used. regions : holdouts within the session. paths :
+    straight paths.
     """
 
     calibration: SavedCalibration
@@ -91,77 +91,78 @@ def validate_calibration(
     seed: int = 0,
     progress: CalibrationProgress | None = None,
 ) -> Validation:
-    """Errors of a calibration on a session that it did not see; nothing is written.
+    """Errors of a calibration on a session that it did not use, without writing files.
 
-    calibration : its folder, or as read back. session : a loaded session, or its folder.
-    regions : besides, hold out so many regions of the session's workspace, one after the other, and
-    calibrate on the rest; the session may then be the calibration's own. seed : of the search.
-    Raises InputError where the two do not belong together.
+    calibration : its folder, or as loaded. session : a loaded session, or its folder. regions :
+    number of regions of the session's workspace that are held out in addition, one after the other,
+    from a calibration on the rest; the session may then be that of the calibration. seed : of the
+    localization. Raises InputError if the two do not belong together.
     """
     from threadpoolctl import threadpool_limits
 
     check_number("validate", "regions", regions)
     check_number("validate", "seed", seed)
-    values = progress or (lambda _text, _share: None)
+    report = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
-        lines, reference_values = paths_of(session), calibrated_rows(saved, session)
+        lines, calibrated = paths_of(session), calibrated_rows(saved, session)
         if not regions:
-            check_new(reference_values, _photographed(session), *NOT_INDEPENDENT)
-        remeasured = measured_new_data(saved, session, seed, values, 0.8)
+            check_new(calibrated, _has_image(session), *NOT_INDEPENDENT)
+        remeasured = measured_new_data(saved, session, seed, report, 0.8)
         session = replace(remeasured.session, machine=session.machine)
         estimate = remeasured.estimate
         data = estimate.stated_edge_noise(remeasured.measurements)
 
-        values("Predicting the readings", 0.8)
-        drawing = drawing_of(saved)
+        report("Predicting the readings", 0.8)
+        nominal = drawing_of(saved)
         prediction = predict(saved.machine, data, estimate.state)
         if not regions:
-            check_new(reference_values, prediction.observed, *NOT_INDEPENDENT)
+            check_new(calibrated, prediction.observed, *NOT_INDEPENDENT)
         judged, failed = None, tuple[Finding, ...]()
-        repeated = ~reference_values & repeated_rows(saved, session)
-        new = np.flatnonzero(prediction.observed & ~reference_values)
+        repeated = ~calibrated & repeated_rows(saved, session)
+        new = np.flatnonzero(prediction.observed & ~calibrated)
         if new.size:
             try:
-                by_drawing = predict(drawing, data, estimate.state)
-            except PkmcalError as error:  # so far off that its poses are not found
+                by_drawing = predict(nominal, data, estimate.state)
+            except PkmcalError as error:
+                # the nominal machine is too far off for its poses to be found
                 by_drawing = None
                 why = str(error).rstrip(".")
                 failed = (note("validation.nominal_fails", why=why),)
             judged = compare_with_drawing(
-                drawing, saved.covariance, data, prediction, by_drawing, new
+                nominal, saved.covariance, data, prediction, by_drawing, new
             )
 
-        values("Holding out regions", 0.9)
-        held_out = by_regions(drawing, data, estimate, regions) if regions else ()
+        report("Holding out regions", 0.9)
+        held_out = by_regions(nominal, data, estimate, regions) if regions else ()
         verdict = validation_verdict(judged, held_out, saved.machine, data, repeated)
         return Validation(
             calibration=saved,
             session=session,
             verdict=replace(verdict, findings=(*verdict.findings, *failed)),
             judged=judged,
-            calibrated=reference_values,
+            calibrated=calibrated,
             repeated=repeated,
             regions=held_out,
-            paths=tuple(line_path(*line, drawing, session, prediction) for line in lines.items()),
+            paths=tuple(line_path(*line, nominal, session, prediction) for line in lines.items()),
             timings={**remeasured.timings, "all": time.perf_counter() - began},
         )
 
 
 def drawing_of(saved: SavedCalibration) -> Machine:
-    """The machine as drawn: its values, and where the drawing holds an estimate.
+    """Nominal machine of a calibration.
 
-    A calibration read back has its own values for a drawing; regions would be held out of an
-    estimate that is held to what they told.
+    The machine of a loaded calibration has the calibrated values as its nominal ones; holdouts of
+    regions must not use them as priors, because they depend on the held-out data.
     """
     table = replace(saved.machine.parameters, drawing=saved.drawing.copy())
     return replace(saved.machine, parameters=table, values=saved.drawing.copy())
 
 
-def _photographed(session: Session) -> Booleans:
-    """(K,) configurations with a photograph; all where a tracker may have seen them, or where
-    readings alone were taken.
+def _has_image(session: Session) -> Booleans:
+    """Mask (K,) of configurations with an image; all if there is a tracker, or for readings without
+    stations.
     """
     out = np.full(len(session.configurations), bool(session.trackers or not session.stations))
     for station in session.stations:

@@ -1,8 +1,8 @@
-"""Is a machine still as its calibration says: ``pkmcal watch``.
+"""Test of whether a machine has changed since its calibration: ``pkmcal watch``.
 
-New photographs, boards or poses with their readings are measured as for a calibration. Then the
-calibrated machine is held, the platform's poses and the stations are found, and what is left over
-is tested for a change of each leg. Nothing is calibrated anew.
+New images, boards or poses with their readings are measured as for a calibration. Then the
+calibrated machine is fixed, the poses of platform and stations are estimated, and the residuals are
+tested for a change of each leg. The machine is not calibrated anew.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pkmcal.wording import listed
 
 WATCH_FORMAT = 1
 WATCH_ALPHA = 0.01
-"""Share of machines that did not change that are flagged all the same."""
+"""False-alarm rate: share of unchanged machines that are flagged."""
 NOTHING_NEW = (
     "there is nothing new in this session: the calibration was made from it",
     "photographs, or poses, that were taken after the calibration",
@@ -47,14 +47,13 @@ NOTHING_NEW = (
 
 @dataclass(frozen=True)
 class Watch:
-    """Everything that a look at a calibrated machine found.
+    """Results of the tests of a calibrated machine.
 
-    calibration : as read back. judged : the tests. residuals : (K,) root mean squares of each
-    configuration's residuals with the machine held, in standard deviations. calibrated : (K,)
-    configurations that the calibration had used, left out. observed : (K,) those that were looked
-    at. noise_scale, pose_scale : factors on the stated noise that were used. same_place : stations
-    that were taken to stand where the calibration had them. stations_moved : those that were said
-    to, and do not.
+    calibration : as loaded. judged : the tests. residuals : (K,) root mean squares of each
+    configuration's residuals with the fixed machine, in standard deviations. calibrated : (K,)
+    configurations used by the calibration, which are excluded. observed : (K,) those that are
+    tested. noise_scale, pose_scale : factors on the stated noise. same_place : stations with the
+    poses of the calibration. stations_moved : stations that should have them, and do not.
     """
 
     calibration: SavedCalibration
@@ -109,67 +108,67 @@ def watch_machine(
     same_place: Sequence[str] = (),
     progress: CalibrationProgress | None = None,
 ) -> Watch:
-    """Test a calibrated machine on new data; nothing is written.
+    """Test a calibrated machine on new data, without writing files.
 
-    calibration : its folder, or as read back. session : a loaded session, or its folder; a few
-    configurations are enough. alpha : share of unchanged machines that may be flagged. seed : of
-    the search for the stations. same_place : names of stations whose camera was not touched since
-    the calibration; one that evidently was is found anew, and told. Raises InputError where the two
-    do not belong together.
+    calibration : its folder, or as loaded. session : a loaded session, or its folder; a few
+    configurations are enough. alpha : false-alarm rate. seed : of the localization. same_place :
+    names of stations whose camera was not touched since the calibration; a station that has
+    evidently moved is localized anew and reported. Raises InputError if the two do not belong
+    together.
     """
     from threadpoolctl import threadpool_limits
 
     check_number("watch", "alpha", alpha)
     check_number("watch", "seed", seed)
-    values = progress or (lambda _text, _share: None)
+    report = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
         _check_usable(saved)
-        session = _placed(saved, session, same_place)
-        reference_values = calibrated_rows(saved, session)
-        check_new(reference_values, np.ones_like(reference_values), *NOTHING_NEW)
-        remeasured = measured_new_data(saved, session, seed, values, 0.9)
+        session = _with_fixed_poses(saved, session, same_place)
+        calibrated = calibrated_rows(saved, session)
+        check_new(calibrated, np.ones_like(calibrated), *NOTHING_NEW)
+        remeasured = measured_new_data(saved, session, seed, report, 0.9)
         session = replace(remeasured.session, machine=session.machine)
         observed = observed_configurations(remeasured.measurements)
-        check_new(reference_values, observed, *NOTHING_NEW)
+        check_new(calibrated, observed, *NOTHING_NEW)
 
-        values("Testing for changes", 0.9)
+        report("Testing for changes", 0.9)
         old = saved.document.get("statistics") or {}
         factors = ("noise_scale", "pose_scale", "link_scale")
         before = Kinds(*(float(old.get(name, 1.0)) for name in factors))
-        irls_weight = Trust.of(remeasured.estimate, before, _readings(saved, session))
-        noise = remeasured.estimate.statistics.noise_scale * irls_weight.scale.edges
-        held = _hold_new(saved, session, remeasured, irls_weight, ~reference_values)
+        data_weights = Trust.of(remeasured.estimate, before, _reading_scale(saved, session))
+        noise = remeasured.estimate.statistics.noise_scale * data_weights.scale.edges
+        held = _hold_new(saved, session, remeasured, data_weights, ~calibrated)
         prior = saved.prior(same_place, session.station_names)
-        judged, prior, shifted = tests_with_fixed_stations(held, prior, alpha)
-        around = ComparedSession(
+        judged, prior, stations_moved = tests_with_fixed_stations(held, prior, alpha)
+        compared = ComparedSession(
             session.configurations,
-            reference_values,
+            calibrated,
             observed,
             noise / before.edges,
             names_of(session),
-            shifted,
+            stations_moved,
         )
         return Watch(
             calibration=saved,
             session=session,
-            verdict=watch_verdict(judged, around),
+            verdict=watch_verdict(judged, compared),
             judged=judged,
             residuals=held.residuals(),
-            calibrated=reference_values,
-            observed=observed & ~reference_values,
+            calibrated=calibrated,
+            observed=observed & ~calibrated,
             noise_scale=noise,
-            pose_scale=irls_weight.scale.poses,
+            pose_scale=data_weights.scale.poses,
             same_place=tuple(session.station_names[k] for k in prior.stations),
-            stations_moved=shifted,
+            stations_moved=stations_moved,
             timings={**remeasured.timings, "all": time.perf_counter() - began},
         )
 
 
-def _readings(saved: SavedCalibration, session: Session) -> float:
-    """The factor on the readings' stated noise that the calibration found, where the session states
-    the same.
+def _reading_scale(saved: SavedCalibration, session: Session) -> float:
+    """Factor on the stated noise of readings found by the calibration, if the session states the
+    same noise; else 1.
     """
     joints = (saved.document.get("session") or {}).get("joints") or {}
     statistics = saved.document.get("statistics") or {}
@@ -178,13 +177,15 @@ def _readings(saved: SavedCalibration, session: Session) -> float:
 
 
 def names_of(session: Session) -> Names:
-    """Names of a session's cameras and stations, in the order of their numbers."""
+    """Names of a session's cameras and stations, in the order of their indices."""
     cameras = dict.fromkeys(station.camera_file for station in session.stations)
     return Names(tuple(cameras), session.station_names)
 
 
-def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> Session:
-    """The session with the kept stations' poses as the calibration has them.
+def _with_fixed_poses(
+    saved: SavedCalibration, session: Session, same_place: Sequence[str]
+) -> Session:
+    """Session with the calibration's poses of the kept stations.
 
     Raises `InputError` for a station that the session, or the calibration, does not have.
     """
@@ -209,17 +210,18 @@ def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]
 def tests_with_fixed_stations(
     held: Held, prior: CalibrationPrior, alpha: float
 ) -> tuple[ChangeTests, CalibrationPrior, tuple[StationTest, ...]]:
-    """All tests, the stations that were kept for them, and those that evidently were moved.
+    """All tests, the prior with the stations that were kept for them, and the stations that have
+    moved.
 
-    Where moved cameras explain the data better than any change of the machine, these are found anew
-    and the tests made once more; so no more unchanged machines are flagged than alpha.
+    If moved cameras explain the data better than any change of the machine, they are freed and the
+    tests repeated; so the false-alarm rate remains alpha.
     """
-    shifted: list[StationTest] = []
+    moved: list[StationTest] = []
     while True:
         judged = detect_changes(change_evidence(held, prior), held.machine, alpha)
         if not judged.moved:
-            return judged, prior, tuple(shifted)
-        shifted += [s for s in judged.stations if s.station in judged.moved]
+            return judged, prior, tuple(moved)
+        moved += [s for s in judged.stations if s.station in judged.moved]
         prior = prior.only([s for s in prior.stations if s not in judged.moved])
 
 
@@ -227,31 +229,31 @@ def _hold_new(
     saved: SavedCalibration,
     session: Session,
     remeasured: Calibration,
-    irls_weight: Trust,
+    data_weights: Trust,
     keep: Booleans,
 ) -> Held:
-    """The calibrated machine held on the configurations to keep, (K,)."""
+    """Fit of the new configurations, mask (K,) ``keep``, with the calibrated machine fixed."""
     data = remeasured.estimate.stated_edge_noise(remeasured.measurements)
     cameras = [station.camera for station in session.stations]
-    wide = magnified(data, remeasured.observation, cameras) if cameras else None
-    retained = Kinds(
-        irls_weight.robust.edges[keep[data.edges.configuration]],
-        irls_weight.robust.poses[
+    magnified_data = magnified(data, remeasured.observation, cameras) if cameras else None
+    weights = Kinds(
+        data_weights.robust.edges[keep[data.edges.configuration]],
+        data_weights.robust.poses[
             keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]
         ],
-        irls_weight.robust.links[data.links_among(keep)],
+        data_weights.robust.links[data.links_among(keep)],
     )
     return hold(
         saved.machine,
         select(data, keep),
         remeasured.estimate.state,
-        replace(irls_weight, robust=retained),
-        select(wide, keep) if wide else None,
+        replace(data_weights, robust=weights),
+        select(magnified_data, keep) if magnified_data else None,
     )
 
 
 def _check_usable(saved: SavedCalibration) -> None:
-    """Raise `InputError` for a calibration that says of itself not to be used."""
+    """Raise `InputError` for a calibration with the verdict not to use it."""
     if saved.verdict.usable:
         return
     raise InputError(

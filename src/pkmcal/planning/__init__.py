@@ -1,1 +1,1 @@
-"""What to measure next: what photographs would tell before they are taken, and the best choice."""
+"""Optimal design of the next measurements: predicted information of configurations and stations."""

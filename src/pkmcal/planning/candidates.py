@@ -1,4 +1,6 @@
-"""Where machine and cameras could stand: configurations and places among which a plan chooses."""
+"""Candidate configurations of the machine and candidate poses of a camera, from which a plan
+chooses.
+"""
 
 from __future__ import annotations
 
@@ -25,30 +27,34 @@ from pkmcal.simulation.placement import (
 )
 
 CAMERA_PLACES_A_RING = 12
-"""Places of a camera on a ring round the machine."""
+"""Number of camera poses on a ring around the machine."""
 CAMERA_RING_HEIGHTS = np.deg2rad([5.0, 22.0, 40.0, 60.0])
-"""Heights of the rings, of the line of sight above the ground."""
+"""Elevations of the rings: angles of the line of sight above the ground, rad."""
 NEIGHBOUR_RANGE_SHARE = 0.12
-"""Part of a motor's range by which a configuration is moved when it is bettered."""
+"""Maximum change of a reading, relative to the motor's range, by which a configuration is
+varied.
+"""
 NEIGHBOURS_TRIED_EACH = 6
-"""Configurations that are tried about each chosen one."""
+"""Number of variations of each chosen configuration."""
 DRAWN_FOR_EACH_WANTED = 3
-"""Configurations drawn for each one wanted: others are singular, folded, or legs touch."""
+"""Number of configurations drawn for each wanted one: some are singular, folded, or have legs that
+touch.
+"""
 
 
 class Configurations(NamedTuple):
-    """joints : (K, m) readings. T_base_platform : (K, 4, 4)."""
+    """Configurations of a machine: readings joints (K, m), poses T_base_platform (K, 4, 4)."""
 
     joints: Array
     T_base_platform: Array
 
 
 def configurations(machine: Machine, count: int, rng: np.random.Generator) -> Configurations:
-    """About ``count`` configurations that the machine can take, spread over its joints' ranges.
+    """Draw about ``count`` feasible configurations, spread over the ranges of the joints.
 
-    Half of them have every motor near an end of its range, where offsets and centres tell most;
-    the others lie between. All are in range, closed, in home's assembly, away from singular poses,
-    their legs clear of each other. Raises InputError where there are too few.
+    Half of them have every motor near an end of its range, where offsets and centres are determined
+    best; the others lie between. All are in range, closed, in the assembly mode of the home pose,
+    away from singular poses, and their legs do not touch. Raises InputError if there are too few.
     """
     parts = [
         draw_configurations(machine, max(count // 2, 1), extreme, rng)[0][: max(count // 2, 1)]
@@ -61,7 +67,11 @@ def configurations(machine: Machine, count: int, rng: np.random.Generator) -> Co
 def neighbours(
     machine: Machine, chosen: Configurations, rng: np.random.Generator
 ) -> Configurations:
-    """Configurations about chosen ones, as many as the machine can take of some about each."""
+    """Feasible variations of the chosen configurations.
+
+    Readings are varied if all motors have finite ranges, else poses are varied within the machine's
+    motion; as many of NEIGHBOURS_TRIED_EACH variations as are feasible remain.
+    """
     joints = np.repeat(chosen.joints, NEIGHBOURS_TRIED_EACH, axis=0)
     poses = np.repeat(chosen.T_base_platform, NEIGHBOURS_TRIED_EACH, axis=0)
     low, high = machine.joint_ranges.T
@@ -76,8 +86,8 @@ def neighbours(
         unit = np.array([NEIGHBOUR_RANGE_SHARE] * 3 + [NEIGHBOUR_RANGE_SHARE * size] * 3)
         motion = machine.layout.motion
         delta = rng.uniform(-1, 1, (len(poses), 6)) * unit @ motion @ motion.T
-        shifted = on_manifold(machine.layout, machine.values, perturb(poses, delta))
-        poses = shifted.T_base_platform[shifted.converged]
+        projected = on_manifold(machine.layout, machine.values, perturb(poses, delta))
+        poses = projected.T_base_platform[projected.converged]
     joints = machine.inverse(poses)
     finite = np.isfinite(joints).all(axis=-1)
     poses, joints = poses[finite], joints[finite]
@@ -88,10 +98,11 @@ def neighbours(
 def camera_ring_places(
     machine: Machine, camera: Camera, board: BoardBody | None = None
 ) -> tuple[StationPlace, ...]:
-    """Places of a camera on a sphere about the machine, from which it just fills the picture.
+    """Poses of a camera on a sphere around the machine, at the distance at which it fills the
+    image.
 
-    board : whether there has to be room for one. Raises InputError for a camera that looks all
-    round: it sees the legs best from their middle.
+    board : body that carries a board, for which there must be room; None without a board. Raises
+    InputError for a panoramic camera, whose best pose is between the legs.
     """
     if view_angle(camera) > PANORAMIC_HALF_VIEW:
         raise InputError(

@@ -1,13 +1,13 @@
-"""The best choice among many measurements: greedily, then by exchange.
+"""Selection of measurements by a greedy start and an exchange algorithm.
 
-Measurements are taken in turn, each time the one that lowers an index most; then each chosen one is
-put back and the best taken in its place, until nothing changes (Fedorov 1972; Mitchell 1974 for
-the form with a fixed count). The covariance follows each step by the matrix inversion lemma.
+Measurements are added in turn, each time the one that lowers an index most; then each chosen one is
+removed and replaced by the best, until nothing changes (Fedorov 1972; Mitchell 1974 for a fixed
+number). The covariance is updated in each step by the matrix inversion lemma.
 
-Indices, all of them better the smaller (directions of the machine in tolerances of its drawing):
+Indices, all of them minimized (directions of the machine are in prior sigmas):
 
-- **tool** : variance of the platform's position over the workspace (V- or I-optimality, which the
-  robot literature calls the goal-oriented criterion).
+- **tool** : variance of the platform's position over the workspace (V- or I-optimality;
+  "goal-oriented criterion" in the robot literature).
 - **D** : logarithm of the determinant of the machine's covariance.
 - **E** : its largest eigenvalue.
 - **O1** : minus the logarithm of the noise amplification index of Borm and Menq (1991), the
@@ -26,32 +26,35 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.planning.information import CandidateRows
 
 CANDIDATES_TRIED_EXACTLY = 24
-"""Candidates that are tried exactly; the others are farther by what the index' slope promises."""
+"""Number of candidates whose index is computed exactly: the best by the slope of the index."""
 EXCHANGE_ROUNDS = 12
-"""Rounds of exchanges; they end before, as a rule after three."""
+"""Maximum number of exchange rounds; three are usually enough."""
 LEAST_READING_DIFFERENCE = 0.1
-"""Part of its range by which some motor's reading differs at least between two configurations that
-one group measures. A photograph taken twice shows the same shading before the same background: its
-errors are the same, however often it is counted.
+"""Minimum difference of some motor's reading, relative to its range, between two configurations of
+one group. A repeated image shows the same shading in front of the same background: its errors are
+the same, however often it is counted.
 """
 EXCHANGE_GAIN_ROUNDING = 1e-6
 """Relative gain below which an exchange is rounding."""
 LEAST_DIRECTION_INFORMATION = 1e-6
-"""Information, in tolerances^-2, that a direction has at least for the logarithm of O1: a drawing
-knows it a million times better."""
+"""Minimum information, in prior sigmas^-2, of a direction in the logarithm of O1: the nominal model
+has a million times more.
+"""
 
 ShareProgress = Callable[[float], None]
 
 
 class Index(Protocol):
-    """What is to be small, of covariances (..., p, p) of the machine's directions."""
+    """Criterion to be minimized, a function of covariances (..., p, p) of the machine's
+    directions.
+    """
 
     def value(self, covariance: Array) -> Array:
-        """(...)."""
+        """Values (...) of the index."""
         ...
 
     def size(self, value: float, p: int, /) -> float:
-        """A value as what goes like a standard deviation of p directions."""
+        """Value converted to the scale of a standard deviation of p directions."""
         ...
 
     def slope(self, covariance: Array, /) -> Array:
@@ -61,7 +64,7 @@ class Index(Protocol):
 
 @dataclass(frozen=True)
 class ToolIndex:
-    """Variance of the platform's position (m^2), mean over the workspace; weight (p, p)."""
+    """Mean variance of the platform's position over the workspace (m^2); weight (p, p)."""
 
     weight: Array
 
@@ -70,51 +73,53 @@ class ToolIndex:
         return np.einsum("ij,...ij->...", self.weight, covariance)
 
     def size(self, value: float, _p: int, /) -> float:
-        """Metres."""
+        """Standard deviation in m."""
         return float(np.sqrt(value))
 
     def slope(self, _covariance: Array, /) -> Array:
-        """W's root."""
+        """Root of W."""
         return _root(self.weight)
 
 
 @dataclass(frozen=True)
 class DIndex:
-    """D."""
+    """Index D."""
 
     def value(self, covariance: Array) -> Array:
         """Log det C."""
         return np.linalg.slogdet(covariance)[1]
 
     def size(self, value: float, p: int, /) -> float:
-        """In tolerances, of a direction."""
+        """Standard deviation of a direction in prior sigmas, geometric mean."""
         return float(np.exp(value / (2 * p)))
 
     def slope(self, covariance: Array) -> Array:
-        """The root of C^-1."""
+        """Root of C^-1."""
         return _root(np.linalg.inv(covariance))
 
 
 @dataclass(frozen=True)
 class EIndex:
-    """E."""
+    """Index E."""
 
     def value(self, covariance: Array) -> Array:
-        """The largest eigenvalue of C."""
+        """Largest eigenvalue of C."""
         return np.linalg.eigvalsh(covariance)[..., -1]
 
     def size(self, value: float, _p: int, /) -> float:
-        """In tolerances, of the worst direction."""
+        """Standard deviation of the worst direction in prior sigmas."""
         return float(np.sqrt(value))
 
     def slope(self, covariance: Array) -> Array:
-        """Its eigenvector."""
+        """Eigenvector of the largest eigenvalue."""
         return np.linalg.eigh(covariance)[1][:, -1:]
 
 
 @dataclass(frozen=True)
 class O1Index:
-    """O1: the data's own information is what the drawing, one in each direction, did not know."""
+    """Index O1: the information of the data is that of C^-1 less the prior's, which is 1 in each
+    direction.
+    """
 
     def value(self, covariance: Array) -> Array:
         """-log of the geometric mean of the singular values."""
@@ -122,14 +127,14 @@ class O1Index:
         return -0.5 * np.log(np.maximum(eigenvalues, LEAST_DIRECTION_INFORMATION)).mean(axis=-1)
 
     def size(self, value: float, _p: int, /) -> float:
-        """In tolerances."""
+        """Standard deviation of a direction in prior sigmas, geometric mean."""
         return float(np.exp(value))
 
     def slope(self, covariance: Array) -> Array:
-        """By C, through its inverse."""
-        values, vectors = np.linalg.eigh(np.linalg.inv(covariance))
-        excess = np.maximum(values - 1.0, LEAST_DIRECTION_INFORMATION)
-        return vectors * (values / np.sqrt(2 * len(values) * excess))
+        """Slope by C, through its inverse."""
+        eigenvalues, eigenvectors = np.linalg.eigh(np.linalg.inv(covariance))
+        excess = np.maximum(eigenvalues - 1.0, LEAST_DIRECTION_INFORMATION)
+        return eigenvectors * (eigenvalues / np.sqrt(2 * len(eigenvalues) * excess))
 
 
 def _tool(info: CandidateRows) -> Index:
@@ -146,15 +151,16 @@ PLAN_INDICES: Mapping[str, Callable[[CandidateRows], Index]] = {
 
 
 def _root(matrix: Array) -> Array:
-    """F (p, k) with F F^T = matrix."""
-    values, vectors = np.linalg.eigh(matrix)
-    retained_rows = values > 1e-12 * values[-1]
-    return vectors[:, retained_rows] * np.sqrt(values[retained_rows])
+    """F (p, k) with F F^T = matrix, without directions of negligible eigenvalues."""
+    eigenvalues, eigenvectors = np.linalg.eigh(matrix)
+    significant = eigenvalues > 1e-12 * eigenvalues[-1]
+    return eigenvectors[:, significant] * np.sqrt(eigenvalues[significant])
 
 
 class Greedy(NamedTuple):
-    """chosen : (n,) candidates in their order. path : (n, p, p) the machine's covariance after
-    each.
+    """Greedy selection.
+
+    chosen : (n,) candidates in their order. path : (n, p, p) covariance of the machine after each.
     """
 
     chosen: Integers
@@ -164,9 +170,9 @@ class Greedy(NamedTuple):
 def greedy(
     info: CandidateRows, count: int, index: Index, progress: ShareProgress | None = None
 ) -> Greedy:
-    """``count`` candidates of each group, the best next one of each group in turn.
+    """Select ``count`` candidates for each group, the best next one of each group in turn.
 
-    Each group has ``count`` candidates or more. progress : called with the share done.
+    Each group must have at least ``count`` candidates. progress : callback with the share done.
     """
     work, groups = _Work(info, index), int(info.group.max()) + 1
     chosen, path = list[int](), list[Array]()
@@ -182,7 +188,7 @@ def greedy(
 
 
 def exchanged(info: CandidateRows, chosen: Integers, index: Index) -> Integers:
-    """A choice (n,) bettered: each is put back for the best of its group, until none gains."""
+    """Improve a selection (n,) by exchanges within each group, until none gains."""
     work, now = _Work(info, index), [int(c) for c in chosen]
     work.begin(now)
     value = float(index.value(work.machine))
@@ -191,7 +197,7 @@ def exchanged(info: CandidateRows, chosen: Integers, index: Index) -> Integers:
             work.add(old, -1.0)
             now[k] = work.best(int(info.group[old]), now[:k] + now[k + 1 :])
             work.add(now[k], 1.0)
-        work.begin(now)  # without the rounding of so many steps
+        work.begin(now)  # removes the rounding of many updates
         before, value = value, float(index.value(work.machine))
         if before - value <= EXCHANGE_GAIN_ROUNDING * abs(value):
             break
@@ -199,8 +205,9 @@ def exchanged(info: CandidateRows, chosen: Integers, index: Index) -> Integers:
 
 
 class _Work:
-    """The covariance of all unknowns while candidates come and go; unknowns in units of what all
-    candidates together tell.
+    """Covariance of all unknowns while candidates are added and removed.
+
+    Unknowns are scaled by the information of all candidates together.
     """
 
     def __init__(self, info: CandidateRows, index: Index) -> None:
@@ -214,7 +221,7 @@ class _Work:
         self._covariance = np.zeros_like(self._information)
 
     def begin(self, chosen: list[int]) -> None:
-        """The covariance with these candidates."""
+        """Compute the covariance with the given candidates."""
         rows = self._rows[np.array(chosen, dtype=int)].reshape(-1, len(self._unit))
         half = np.linalg.cholesky(self._information + rows.T @ rows)
         inverse = np.linalg.solve(half, np.eye(len(half)))
@@ -222,20 +229,23 @@ class _Work:
 
     @property
     def machine(self) -> Array:
-        """(p, p) of the machine's directions."""
+        """Covariance (p, p) of the machine's directions."""
         return self._directions @ self._covariance @ self._directions.T
 
     def add(self, candidate: int, sign: float) -> None:
-        """A candidate comes (1) or goes (-1)."""
+        """Add (sign 1) or remove (sign -1) a candidate by the matrix inversion lemma."""
         rows = self._rows[candidate]
         across = rows @ self._covariance
         inner = np.eye(len(rows)) + sign * across @ rows.T
         self._covariance = self._covariance - sign * across.T @ np.linalg.solve(inner, across)
 
     def best(self, group: int, taken: list[int]) -> int:
-        """The candidate of a group, none of those taken nor the same as one of them, whose coming
-        makes the index smallest; of those with which it is equal, the one of the least variance.
+        """Candidate of a group that minimizes the index.
+
+        Excluded are the candidates taken and those too close to one of the group's; among equal
+        ones the candidate with the least total variance is returned.
         """
+        # Decrease of the index by each candidate to first order.
         now = self.machine
         to_slope = self._covariance @ (self._directions.T @ self._index.slope(now))
         begin, end = np.searchsorted(self._group, [group, group + 1])
@@ -245,17 +255,19 @@ class _Work:
         apart = np.abs(self._where[begin:end, None] - self._where[own]).max(axis=-1)
         new = free & (apart >= LEAST_READING_DIFFERENCE).all(axis=1)
         free = new if new.any() else free
-        rows = self._rows[begin:end]  # a view: copies of all would cost more than the sums
+        rows = self._rows[begin:end]  # a view: copies would cost more than the sums
         first = (rows.reshape(-1, rows.shape[-1]) @ to_slope).reshape(len(rows), -1)
         gain = np.where(free, np.einsum("nk,nk->n", first, first), -1.0)
+        # Exact index of the best of them.
         top = np.argsort(-gain, kind="stable")[: min(CANDIDATES_TRIED_EXACTLY, int(free.sum()))]
         rows = rows[top]
         across = rows @ self._covariance
         inner = np.eye(rows.shape[1]) + across @ rows.mT
-        shifted = across @ self._directions.T
-        after = now - shifted.mT @ np.linalg.solve(inner, shifted)
-        value = self._index.value(after)
-        # while some direction is told nothing, the largest eigenvalue is the same whatever comes
-        same = value <= value.min() + EXCHANGE_GAIN_ROUNDING * np.abs(value.min())
+        on_machine = across @ self._directions.T
+        after = now - on_machine.mT @ np.linalg.solve(inner, on_machine)
+        index = self._index.value(after)
+        # While some direction has no information, the largest eigenvalue is the same for all
+        # candidates.
+        same = index <= index.min() + EXCHANGE_GAIN_ROUNDING * np.abs(index.min())
         spread = np.where(same, after.trace(axis1=1, axis2=2), np.inf)
         return int(begin + top[np.argmin(spread)])

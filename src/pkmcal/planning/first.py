@@ -1,7 +1,9 @@
-"""What the first photographs tell of the edges in all that follow.
+"""Information of edges, estimated from a session's first images, for the prediction of all further
+ones.
 
-A station's first photographs are measured as `calibrate` measures them. How much each edge tells
-there, in pixels, and lost edges nothing, is what such edges will tell elsewhere.
+A station's first images are measured as `calibrate` measures them. The distribution of the
+information of their edges, in pixels and with lost edges as zero, predicts that of edges in further
+images.
 """
 
 from __future__ import annotations
@@ -27,27 +29,35 @@ from pkmcal.session.load import Session
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 
 FIRST_PHOTOGRAPHS_A_STATION = 3
-"""Photographs of a station that are looked at closely: what people take before the long capture."""
+"""Number of first images of a station that are measured, as users take them before the main
+capture.
+"""
 FIRST_PHOTOGRAPHS_MEASURED = 6
-"""Photographs of all stations together whose edges are measured: a hexapod shows forty edges of
-each kind in them, enough for their scatter to be known to a tenth."""
+"""Number of measured images of all stations together: those of a hexapod show forty edges of each
+kind, enough to know their scatter to a tenth.
+"""
 FEWEST_FIRST_EDGES = 24
-"""Edges without which nothing is told: one photograph of a hexapod shows as many."""
+"""Minimum number of edges; a single image of a hexapod has as many."""
 SHARED_EDGES_WEIGHT = 2.0
-"""Edges that all of a kind at a station count for beside the leg's own, so that chance among three
-photographs does not make a leg."""
+"""Weight of all edges of a kind at a station, in numbers of edges, relative to the leg's own: it
+limits the influence of chance in three images.
+"""
 EXPECTED_EDGE_FREE_SHARE = 0.5
-"""Part of an edge that has to be free for it to be expected: its place is fitted to as much."""
+"""Minimum visible part of an edge from which it is expected: edges are fitted to as much."""
 EXACT_EDGE_NOISE = EdgeNoise(1e-3, 1e-3)
-"""px; errors of edges that are simulated for where they lie, and how they turn by a pixel."""
+"""Negligible noise (px) of edges that are simulated for their position and their turn by a
+pixel.
+"""
 SAME_LENGTH = 0.01
-"""Part of its length by which an edge may differ, and be as long: where all are."""
+"""Minimum bandwidth of the logarithm of edge lengths, for edges of equal length."""
 FIRST_EDGES_SEED = 7
 
 
 class EdgePool(NamedTuple):
-    """What one edge may tell: informations (n, 2, 2), px^-2 of shift and tilt, weights (n,), and
-    lengths (n,) in px of the edges that told it. shading : px, its own.
+    """Samples of the information of an edge.
+
+    information : (n, 2, 2), px^-2 of shift and tilt. weight : (n,). length : (n,) of the sampled
+    edges, px. shading : px, individual.
     """
 
     information: Array
@@ -56,10 +66,10 @@ class EdgePool(NamedTuple):
     shading: float = OWN_SHADING
 
     def chances(self, length: Array) -> Array:
-        """(m, n) chance of each, for edges of m lengths in px.
+        """Probabilities (m, n) of each sample, for edges of m lengths in px.
 
-        Long edges are found more often and tell more: those of about the same length count most,
-        by a Gaussian of the width that serves the density of the lengths best (Scott's rule).
+        Long edges are found more often and have more information, so samples are weighted by a
+        Gaussian kernel over the logarithm of the length (bandwidth by Scott's rule).
         """
         at = np.log(self.length)
         mean = np.average(at, weights=self.weight)
@@ -67,21 +77,21 @@ class EdgePool(NamedTuple):
         effective = self.weight.sum() ** 2 / np.sum(self.weight**2)
         width = max(spread * effective**-0.2, SAME_LENGTH)
         far = ((np.log(length)[:, None] - at) / width) ** 2 / 2
-        # beyond the longest and the shortest it is these that are asked
+        # subtracting far.min() assigns lengths outside the sampled range to the nearest samples
         chance = self.weight * np.exp(far.min(axis=1, keepdims=True) - far)
         return chance / chance.sum(axis=1, keepdims=True)
 
 
 Pools = tuple[EdgePool, ...]
-"""Of a station's edges, in the order of :func:`~pkmcal.observe.predict.tubes_of`."""
+"""Pools of a station's edges, in the order of :func:`~pkmcal.observe.predict.tubes_of`."""
 
 
 @dataclass(frozen=True)
 class EdgesOf:
-    """Edges (k, E) of a station's first photographs, in the order of ``tubes_of``.
+    """Edges (k, E) of a station's first images, in the order of ``tubes_of``.
 
-    photographs : (k,) their numbers. expected : of which nothing hides the most. valid : that were
-    measured and agree with all others.
+    photographs : (k,) numbers of the images. expected : edges whose larger part is visible. valid :
+    expected edges that were measured and are inliers.
     """
 
     photographs: Integers
@@ -91,9 +101,10 @@ class EdgesOf:
 
 @dataclass(frozen=True)
 class FirstEdges:
-    """What the first photographs gave.
+    """Estimate by the first images.
 
-    estimate : from them alone. pools, edges : by station. sigma : (S, L) px across, median.
+    estimate : by these images only. pools, edges : by station. sigma : (S, L) median standard
+    deviation of a leg's edges, px across.
     """
 
     estimate: Estimate
@@ -105,9 +116,12 @@ class FirstEdges:
 def spread_over(
     configuration: Integers, n_stations: int = 1, most: int = FIRST_PHOTOGRAPHS_A_STATION
 ) -> Integers:
-    """Numbers of the few of a station's photographs that are measured, of different configurations
-    and spread over all. configuration : (n,) of its photographs. most : of each station, and of all
-    together as many times more as FIRST_PHOTOGRAPHS_MEASURED is of FIRST_PHOTOGRAPHS_A_STATION.
+    """Indices of a station's images to be measured: of different configurations, spread over all of
+    them.
+
+    configuration : (n,) of the images. most : maximum for each station; the maximum for all
+    stations together is in the ratio of FIRST_PHOTOGRAPHS_MEASURED to FIRST_PHOTOGRAPHS_A_STATION
+    to it.
     """
     most = min(
         most, -(-most * FIRST_PHOTOGRAPHS_MEASURED // (FIRST_PHOTOGRAPHS_A_STATION * n_stations))
@@ -123,15 +137,15 @@ def first_edges(
     T_camera_base: Array,
     poses: Array,
 ) -> FirstEdges:
-    """The first photographs' edges, by a look for the legs and one at the edges.
+    """Measure the edges of the first images, by a search and one measurement pass.
 
-    photographs : of S stations. rows : numbers of those to be measured, by station. T_camera_base :
-    (S, 4, 4) where the stations were found. poses : T_base_platform (K, 4, 4) by the drawing.
-    Raises PkmcalError where they do not carry an estimate.
+    photographs : of S stations. rows : indices of the images to be measured, by station.
+    T_camera_base : (S, 4, 4) localized poses. poses : T_base_platform (K, 4, 4) by the nominal
+    model. Raises PkmcalError if there are too few edges for an estimate.
     """
     machine = session.machine
     numbers = numbered(session.camera_of_station[[p.station for p in photographs]])
-    few = [
+    images = [
         replace(p.select(own), station=number)
         for number, (p, own) in enumerate(zip(photographs, rows, strict=True))
     ]
@@ -140,59 +154,61 @@ def first_edges(
         if len(edges) < FEWEST_FIRST_EDGES:
             raise ResultError("too few edges to tell what others will give", found=len(edges))
         return Measurements(
-            edges, session.joints, session.joint_noise, len(few), numbers, shaded=True
+            edges, session.joints, session.joint_noise, len(images), numbers, shaded=True
         )
 
-    passes = legs.search_stations(placed_at(few, T_camera_base, poses), machine)
+    passes = legs.search_stations(placed_at(images, T_camera_base, poses), machine)
     coarse = replace(measurements(concatenate([one.edges for one in passes])), shaded=False)
-    # a pixel is what the search is good to, so there is no noise to be estimated
+    # The accuracy of the search is a pixel, so its noise is not estimated.
     start = start_state(machine, coarse, T_camera_base)
     estimate = bundle(machine, coarse, start, scale_noise=False)
     state = estimate.state
-    placed = placed_at(few, state.T_camera_base, state.T_base_platform)
+    placed = placed_at(images, state.T_camera_base, state.T_base_platform)
     passes = legs.measure_stations(placed, estimate.machine, {})
     fine = measurements(concatenate([one.edges for one in passes]))
     held = refinement_of(session, refine=False)
     fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
     start = replace(state, intrinsics=np.zeros_like(held.at))
     estimate = bundle(machine, fine, start)
-    return _edge_information(few, rows, estimate, fine.edges)
+    return _edge_information(images, rows, estimate, fine.edges)
 
 
 def _edge_information(
-    few: Sequence[Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
+    images: Sequence[Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
 ) -> FirstEdges:
-    """What an edge that ought to be seen tells on average, lost ones with nothing."""
+    """Information of each expected edge; lost edges have none."""
     machine, state = estimate.machine, estimate.state
     tubes = tubes_of(machine)
     n_edges, n_legs = len(tubes), machine.n_legs
     number = np.full((n_legs, int(tubes.tube.max()) + 1, 2), -1)
     number[tubes.leg, tubes.tube, tubes.side] = np.arange(n_edges)
-    pairs = np.array([(p.station, k) for p in few for k in p.configuration])
+    pairs = np.array([(p.station, k) for p in images for k in p.configuration])
     ideal, _ = simulate_edges(
         machine,
         state.T_camera_base,
-        tuple(p.camera.binned(p.binning) for p in few),
+        tuple(p.camera.binned(p.binning) for p in images),
         state.T_base_platform,
         EXACT_EDGE_NOISE,
         np.random.default_rng(FIRST_EDGES_SEED),
         photographs=pairs,
     )
 
-    shape = (len(few), len(state.T_base_platform), n_edges)
+    shape = (len(images), len(state.T_base_platform), n_edges)
 
     def place(some: EdgeSet) -> tuple[Integers, Integers, Integers]:
         return some.station, some.configuration, number[some.leg, some.tube, some.side]
 
-    expected, retained_rows, whole = (np.zeros(shape, dtype=bool) for _ in range(3))
+    # Expected edges by station, configuration and edge, and the inliers among them.
+    expected, inlier, whole = (np.zeros(shape, dtype=bool) for _ in range(3))
     expected[place(ideal)] = True
-    # of a tube that is hidden for the most part nobody asks why its edges are lost
+    # Edges that are hidden for the most part are not expected, so their loss does not count.
     length = np.ptp(ideal.span, axis=1)
     longest = np.zeros(n_edges)
     np.maximum.at(longest, place(ideal)[2], length)
     whole[place(ideal)] = length > EXPECTED_EDGE_FREE_SHARE * longest[place(ideal)[2]]
-    retained_rows[place(edges.select(estimate.edge_weights > 0.5))] = True
-    retained_rows &= expected
+    inlier[place(edges.select(estimate.edge_weights > 0.5))] = True
+    inlier &= expected
+    # Information of each edge in px^-2 of shift and tilt.
     unit = np.zeros((*shape, 2, 2))
     unit[place(ideal)] = pixel_turns(ideal)
     scale = estimate.edge_noise.scale[edges.tube]
@@ -207,19 +223,20 @@ def _edge_information(
     long[place(ideal)] = pixel_lengths(ideal)
     own_shading = estimate.edge_noise.shading[tubes.tube]
     pools = tuple(
-        _pools(information[s], long[s], expected[s], kind, own_shading) for s in range(len(few))
+        _pools(information[s], long[s], expected[s], kind, own_shading) for s in range(len(images))
     )
-    sigma = np.full((len(few), n_legs), np.nan)
+    # Standard deviation of the shift of each leg's edges, px: noise and individual shading.
+    sigma = np.full((len(images), n_legs), np.nan)
     pixel = np.linalg.norm(edges.shift, axis=-1)
     across = np.hypot(
         scale * np.sqrt(edges.covariance[:, 0, 0]) / pixel, estimate.edge_noise.shading[edges.tube]
     )
-    for s, j in np.ndindex(len(few), n_legs):
+    for s, j in np.ndindex(len(images), n_legs):
         mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)
         sigma[s, j] = np.median(across[mine]) if mine.any() else np.nan
     by_station = tuple(
-        EdgesOf(own, whole[s, p.configuration], (retained_rows & whole)[s, p.configuration])
-        for s, (own, p) in enumerate(zip(rows, few, strict=True))
+        EdgesOf(own, whole[s, p.configuration], (inlier & whole)[s, p.configuration])
+        for s, (own, p) in enumerate(zip(rows, images, strict=True))
     )
     return FirstEdges(estimate, pools, sigma, by_station)
 
@@ -227,11 +244,11 @@ def _edge_information(
 def _pools(
     values: Array, length: Array, expected: Booleans, kind: Integers, shading: Array
 ) -> Pools:
-    """What edges of a station may tell, by edge (E,): its tube's own, and that of all of its kind.
+    """Pools of a station's edges (E,): samples of the tube's own edge and of all edges of its kind.
 
-    values : (K, E, 2, 2), zero where lost; length : (K, E), px; expected : (K, E). kind : (E, 2)
-    tube and side. shading : (E,) px. Edges differ: a mean would promise more than edges of which
-    some tell much and others nothing.
+    values : (K, E, 2, 2) information, zero if lost. length : (K, E), px. expected : (K, E). kind :
+    (E, 2) tube and side. shading : (E,) px. Samples are kept, because a mean would predict more
+    than edges of which some have much information and others none.
     """
     out: list[EdgePool] = []
     for e in range(values.shape[1]):
@@ -254,9 +271,11 @@ def _pools(
 def drawn_edges(
     machine: Machine, edges: EdgeSet, pools: Sequence[Pools], rng: np.random.Generator | None
 ) -> EdgeSet:
-    """Edges with :data:`EXACT_EDGE_NOISE` errors that tell as much as such edges did, drawn at
-    random; those that tell nothing go. Without ``rng`` each tells what such an edge does on
-    average.
+    """Edges with :data:`EXACT_EDGE_NOISE` noise, given an information drawn at random from the
+    pools.
+
+    Edges with no information are removed. Without ``rng`` each edge has the mean information of its
+    pool.
     """
     tubes = tubes_of(machine)
     own, length = np.zeros((len(edges), 2, 2)), pixel_lengths(edges)
@@ -273,9 +292,9 @@ def drawn_edges(
             if rng is None:
                 own[mine] = np.tensordot(chance, pool.information, axes=1)
             else:
-                drawn = rng.random((len(mine), 1)) > np.cumsum(chance, axis=1)
+                below = rng.random((len(mine), 1)) > np.cumsum(chance, axis=1)
                 own[mine] = pool.information[
-                    np.minimum(drawn.sum(axis=1), len(pool.information) - 1)
+                    np.minimum(below.sum(axis=1), len(pool.information) - 1)
                 ]
     informative = np.linalg.eigvalsh(own)[:, 0] > 0
     edges, own = replace(edges, shading=shading).select(informative), own[informative]
@@ -284,13 +303,13 @@ def drawn_edges(
 
 
 def pixel_turns(edges: EdgeSet) -> Array:
-    """Turns (N, 2, 2) of simulated edges' normals by a pixel of shift and of tilt, in columns.
+    """Turns (N, 2, 2) of simulated edges' normals by one pixel of shift and of tilt, in columns.
 
-    The Cholesky factor of their covariance: their bases have the shift first.
+    This is the Cholesky factor of their covariance, as their bases have the shift first.
     """
     return np.linalg.cholesky(edges.covariance) / EXACT_EDGE_NOISE.shift
 
 
 def pixel_lengths(edges: EdgeSet) -> Array:
-    """Lengths (N,) in px of simulated edges, by how little they turn when an end moves by one."""
+    """Lengths (N,) in px of simulated edges, from their turn by one pixel of tilt."""
     return 2 / np.linalg.norm(pixel_turns(edges)[:, :, 1], axis=1)

@@ -1,13 +1,18 @@
-"""What each measurement that could be made tells of the machine, before it is made.
+"""Predicted information of candidate measurements on the machine.
 
-With the joint estimate's own Jacobian at the machine as it is known, each candidate's rows on the
-shared unknowns are worked out once, the platform's pose of that configuration eliminated (the
-estimate's own Schur complement). The information of any choice of candidates is then the sum of
-``R^T R`` over the chosen and of what is known beforehand; nuisances (stations, edge shifts,
-shading, boards' places) stay unknowns, so a choice promises what the estimate then states.
+The rows of each candidate on the shared unknowns are computed once, by the Jacobian of the joint
+estimate at the current machine, with the platform's pose of that configuration eliminated (Schur
+complement). The information of any selection is the prior information plus the sum of ``R^T R``
+over its candidates; nuisance parameters (stations, edge shifts, shading, mounts) remain unknowns,
+so the predicted covariance is that which the estimate will state.
 
-The machine is told in p directions that frames and conventions leave, in tolerances of its drawing,
-so that no frame is favoured.
+      machine  stations, shifts, ...
+    [   R_1 (candidate 1)        ]
+    [   R_2 (candidate 2)        ]      information = prior + sum_k R_k^T R_k
+    [   ...                      ]
+
+The machine is expressed by the p directions that gauge and conventions leave, in prior sigmas, so
+that no frame is preferred.
 """
 
 from __future__ import annotations
@@ -38,18 +43,21 @@ from pkmcal.solver.elimination import eliminate
 from pkmcal.wording import listed
 
 UNMEASURED_PLACE_SIGMA = 1.0
-"""m and rad; how well the place of a station, or a board, is known at least: before any
-measurement, so that every choice has a covariance. A photograph tells a thousand times more."""
+"""Prior sigma (m and rad) of the poses of stations and mounts, so that every selection has a
+covariance. An image has a thousand times more information.
+"""
 DIRECTION_VARIANCE_FLOOR = 1e-12
-"""Variance, in tolerances squared, of what a calibration holds exactly: an axis' own length."""
+"""Minimum variance, in prior sigmas squared, of a direction that a calibration holds exactly, such
+as the length of an axis.
+"""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """What could be measured: n configurations, each by one of G groups of stations.
+    """Candidate measurements: n configurations, each measured by one of G groups of stations.
 
-    groups : stations that all measure a configuration. group : (n,) by which of them, in increasing
-    order. joints : (n, m). T_base_platform : (n, 4, 4).
+    groups : stations that measure a configuration together. group : (n,) index of the group, in
+    increasing order. joints : (n, m). T_base_platform : (n, 4, 4).
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -61,27 +69,30 @@ class Candidates:
     def of_all(
         cls, groups: tuple[tuple[int, ...], ...], joints: Array, T_base_platform: Array
     ) -> Candidates:
-        """Each of K configurations by each of the groups."""
+        """Candidates with each of K configurations for each of the groups."""
         n = len(groups)
         group = np.repeat(np.arange(n), len(joints))
         poses = np.tile(T_base_platform, (n, 1, 1))
         return cls(groups, group, np.tile(joints, (n, 1)), poses)
 
     def only(self, chosen: Integers) -> Candidates:
-        """Some of them; their groups in increasing order."""
+        """Selected candidates, which must be in increasing order of their groups."""
         parts = self.group[chosen], self.joints[chosen], self.T_base_platform[chosen]
         return Candidates(self.groups, *parts)
 
     @property
     def pairs(self) -> Integers:
-        """(M, 2) stations and the candidates that they measure."""
+        """Pairs (M, 2) of stations and the candidates that they measure."""
         rows = [np.flatnonzero(self.group == g) for g in range(len(self.groups))]
         return np.concatenate([all_pairs(s, k) for s, k in zip(self.groups, rows, strict=True)])
 
 
 class Directions(NamedTuple):
-    """Directions (nz, p) of the machine's free parameters z that frames and conventions leave, each
-    a tolerance large, and back from z, (p, nz); span : (nz, g) what those do to z.
+    """Directions of the machine's free parameters z that gauge and conventions leave, in prior
+    sigmas.
+
+    to_z : (nz, p). of_z : (p, nz) the inverse map. span : (nz, g) changes of z by gauge and
+    conventions.
     """
 
     to_z: Array
@@ -91,13 +102,13 @@ class Directions(NamedTuple):
 
 @dataclass(frozen=True)
 class CandidateRows:
-    """Rows of all candidates, and what they are for.
+    """Rows of all candidates, with the prior information.
 
-    rows : (n, r, na) on the shared unknowns in their own units. group : (n,) in increasing order,
-    which group of stations measures each. where : (n, m) its readings, in parts of the motors'
-    ranges. information : (na, na) information beforehand, with the drawing's. machine : (p, na) the
-    machine's directions, of which the drawing alone knows each to one. work : (M, 6, p) turn and
-    shift of the platform at M poses of the workspace by each direction, rad and m.
+    rows : (n, r, na) on the shared unknowns in their own units. group : (n,) index of the group of
+    stations, in increasing order. where : (n, m) readings relative to the motors' ranges.
+    information : (na, na) prior information, with that of the nominal model. machine : (p, na)
+    directions of the machine; the nominal model alone gives each a variance of one. work : (M, 6,
+    p) turn and shift of the platform at M poses of the workspace by each direction, rad and m.
     """
 
     rows: Array
@@ -108,20 +119,24 @@ class CandidateRows:
     work: Array
 
     def of(self, chosen: Integers, times: float = 1.0) -> Array:
-        """(na, na) information of a choice of candidates, each measured ``times`` over."""
+        """Information (na, na) of a selection of candidates, each measured ``times`` times."""
         rows = self.rows[chosen].reshape(-1, self.rows.shape[-1])
         return self.information + times * (rows.T @ rows)
 
     def covariance(self, information: Array) -> Array:
-        """(p, p) of the machine's directions, in tolerances, by an information (na, na)."""
+        """Covariance (p, p) of the machine's directions, in prior sigmas, for an information (na,
+        na).
+        """
         scale = np.sqrt(np.diag(information))
         half = np.linalg.cholesky(information / np.outer(scale, scale))
-        residual = np.linalg.solve(half, (self.machine / scale).T)
-        return residual.T @ residual
+        whitened = np.linalg.solve(half, (self.machine / scale).T)
+        return whitened.T @ whitened
 
     def tool(self, covariance: Array) -> tuple[float, float]:
-        """Standard deviations of the platform's position (m) and turn (rad) by a covariance (p, p),
-        mean over the workspace: as `calibrate` states them.
+        """Standard deviations of the platform's position (m) and turn (rad) for a covariance (p,
+        p).
+
+        Means over the workspace, as `calibrate` reports them.
         """
         variance = np.einsum("kap,pq,kaq->ka", self.work, covariance, self.work, optimize=True)
         shift, turn = variance[:, 3:].sum(axis=1), variance[:, :3].sum(axis=1)
@@ -132,17 +147,17 @@ def information_of(
     rig: Rig,
     candidates: Candidates,
     work: Array,
-    reference_values: CalibrationPrior | None = None,
+    calibration_prior: CalibrationPrior | None = None,
     rng: np.random.Generator | None = None,
     wanted: int | None = None,
 ) -> CandidateRows:
-    """Rows of all candidates; see the module.
+    """Rows of all candidates.
 
-    work : T_base_platform (M, 4, 4) where the tool counts. reference_values : what an earlier
-    calibration knows of the machine, in place of its drawing. rng : as for
-    :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : how many of each group are to be
-    measured in the end, all by default: edges that are shaded alike count together. Raises
-    InputError where a group of stations measures nothing at any configuration.
+    work : T_base_platform (M, 4, 4) of the workspace. calibration_prior : prior of an earlier
+    calibration, in place of the nominal model. rng : as for
+    :meth:`~pkmcal.planning.rig.LegsFrom.measure`. wanted : number of each group that will be
+    measured, by default all: it determines the correlation of edges with common shading. Raises
+    InputError if a group of stations measures nothing in any configuration.
     """
     machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
     measurements = rig.measured(joints, poses, candidates.pairs, rng)
@@ -151,38 +166,38 @@ def information_of(
     share = 1.0 if wanted is None or each < 2 else min((wanted - 1) / (each - 1), 1.0)
     assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
-    direction, u = machine_directions(machine, problem), problem.unknowns
+    directions, u = machine_directions(machine, problem), problem.unknowns
     reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
-    rows[assembled.observed] = reduced  # of what shows nothing, nothing is told
+    rows[assembled.observed] = reduced  # candidates that show nothing have no information
     prior = problem.prior
-    if reference_values is not None:  # the drawing speaks in it already
+    if calibration_prior is not None:  # it includes the nominal model's priors
         prior = prior[~prior[:, u.machine].any(axis=1)]
     total = prior.T @ prior
     for part in (u.stations, u.mounts):
         total[part, part] += np.eye(part.stop - part.start) / UNMEASURED_PLACE_SIGMA**2
-    if reference_values is not None:
-        at, values = _prior_information(
-            reference_values, machine, problem, rig.T_station_base, direction
+    if calibration_prior is not None:
+        at, added = _prior_information(
+            calibration_prior, machine, problem, rig.T_station_base, directions
         )
-        total[np.ix_(at, at)] += values
-    directed = np.zeros((len(direction.of_z), u.count))
-    directed[:, u.machine] = direction.of_z
+        total[np.ix_(at, at)] += added
+    directed = np.zeros((len(directions.of_z), u.count))
+    directed[:, u.machine] = directions.of_z
     return CandidateRows(
         rows=rows,
         group=candidates.group,
         where=joints / motor_spans(joints, machine.joint_ranges),
         information=total,
         machine=directed,
-        work=tool_by_free(rig, problem, machine.inverse(work), work) @ direction.to_z,
+        work=tool_by_free(rig, problem, machine.inverse(work), work) @ directions.to_z,
     )
 
 
 def _check_observed(rig: Rig, candidates: Candidates, measurements: Measurements) -> None:
-    """Raise `InputError` where a group of stations measures nothing anywhere."""
+    """Raise `InputError` if a group of stations measures nothing in any configuration."""
     edges, poses = measurements.edges.configuration, measurements.poses.configuration
-    in_view = np.unique(candidates.group[np.concatenate([edges, poses])])
-    lost = np.setdiff1d(candidates.group, in_view)
+    measured = np.unique(candidates.group[np.concatenate([edges, poses])])
+    lost = np.setdiff1d(candidates.group, measured)
     if not lost.size:
         return
     names = [rig.names[s] for s in candidates.groups[lost[0]]]
@@ -196,12 +211,13 @@ def _check_observed(rig: Rig, candidates: Candidates, measurements: Measurements
 
 
 def machine_directions(machine: Machine, problem: Problem) -> Directions:
-    """The machine's directions at its present values."""
+    """Directions of the machine at its present values."""
     tolerance = machine.parameters.tolerances_free()
     moves = move_generators(machine.layout, machine.values) @ conventions(machine)
-    shifted = np.linalg.lstsq(problem.free, moves, rcond=None)[0]
-    basis = np.linalg.qr(shifted / tolerance[:, None], mode="complete")[0][:, shifted.shape[1] :]
-    return Directions(tolerance[:, None] * basis, basis.T / tolerance, shifted)
+    frame_changes = np.linalg.lstsq(problem.free, moves, rcond=None)[0]
+    basis = np.linalg.qr(frame_changes / tolerance[:, None], mode="complete")[0]
+    basis = basis[:, frame_changes.shape[1] :]
+    return Directions(tolerance[:, None] * basis, basis.T / tolerance, frame_changes)
 
 
 def _prior_information(
@@ -209,38 +225,39 @@ def _prior_information(
     machine: Machine,
     problem: Problem,
     T_station_base: Array,
-    sense: Directions,
+    directions: Directions,
 ) -> tuple[Integers, Array]:
-    """Where in the shared unknowns, and with which information, an earlier calibration speaks.
+    """Columns of the shared unknowns and the information (k, k) of an earlier calibration on them.
 
-    Its covariance stands in its own frames. Any frames would do, so changes of frames are given a
-    tolerance's variance: they move the kept stations with the machine, and no measurement minds.
+    Its covariance refers to its own gauge. Any gauge is valid, so changes of frames get the
+    variance of a prior sigma: they move the kept stations with the machine and are not observable.
     """
     u, n = problem.unknowns, len(machine.values)
-    retained_rows = np.array(prior.stations, dtype=int)
-    to_free = np.zeros((u.n_free + 6 * len(retained_rows), n + 6 * len(retained_rows)))
+    fixed_stations = np.array(prior.stations, dtype=int)
+    to_free = np.zeros((u.n_free + 6 * len(fixed_stations), n + 6 * len(fixed_stations)))
     to_free[: u.n_free, :n] = problem.structure.to_free
-    to_free[u.n_free :, n:] = np.eye(6 * len(retained_rows))
+    to_free[u.n_free :, n:] = np.eye(6 * len(fixed_stations))
     frames = conventions(machine)
-    shifted = [sense.span]
-    if len(retained_rows):
-        stations = station_generators(T_station_base[retained_rows]) @ frames[:12]
-        shifted.append(stations.reshape(-1, frames.shape[1]))
-    shifted = np.concatenate(shifted)
-    size = np.append(machine.parameters.tolerances_free(), np.ones(6 * len(retained_rows)))
-    share = shifted / size[:, None]
-    shifted = shifted / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
-    spread = to_free @ prior.covariance @ to_free.T + shifted @ shifted.T
-    values, vectors = np.linalg.eigh(spread / np.outer(size, size))
-    half = vectors / np.sqrt(np.maximum(values, DIRECTION_VARIANCE_FLOOR)) / size[:, None]
-    columns = u.stations.start + 6 * retained_rows[:, None] + np.arange(6)
+    frame_changes = [directions.span]
+    if len(fixed_stations):
+        stations = station_generators(T_station_base[fixed_stations]) @ frames[:12]
+        frame_changes.append(stations.reshape(-1, frames.shape[1]))
+    frame_changes = np.concatenate(frame_changes)
+    size = np.append(machine.parameters.tolerances_free(), np.ones(6 * len(fixed_stations)))
+    share = frame_changes / size[:, None]
+    frame_changes = frame_changes / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
+    spread = to_free @ prior.covariance @ to_free.T + frame_changes @ frame_changes.T
+    eigenvalues, eigenvectors = np.linalg.eigh(spread / np.outer(size, size))
+    half = eigenvectors / np.sqrt(np.maximum(eigenvalues, DIRECTION_VARIANCE_FLOOR)) / size[:, None]
+    columns = u.stations.start + 6 * fixed_stations[:, None] + np.arange(6)
     at = np.concatenate([np.arange(u.n_free), columns.ravel()])
     return at, half @ half.T
 
 
 def tool_by_free(rig: Rig, problem: Problem, joints: Array, poses: Array) -> Array:
-    """Turn and shift (M, 6, nz) of the platform at poses (M, 4, 4) by the machine's free
-    parameters at given readings (M, m), frames laid over each other as for a result.
+    """Derivatives (M, 6, nz) of turn and shift of the platform by the machine's free parameters.
+
+    At poses (M, 4, 4) and given readings (M, m), with the frames registered as for a result.
     """
     machine, n = rig.machine, len(rig.machine.values)
     state = State(machine.values, rig.T_station_base, poses, np.zeros(1))

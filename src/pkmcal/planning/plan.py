@@ -1,8 +1,8 @@
-"""The next configurations worth measuring, and where to put the camera: ``pkmcal plan``.
+"""Plan of the next measurements and of the stations: ``pkmcal plan``.
 
-Configurations are chosen among many that the machine can take, then bettered about where they are;
-places of a camera among those on a sphere, or among a session's stations. What the plan promises is
-the covariance that the joint estimate would state of it.
+Configurations are chosen among many feasible ones and then improved locally; stations among poses
+on a sphere, or among those of a session. The predicted accuracy is the covariance that the joint
+estimate would state.
 """
 
 from __future__ import annotations
@@ -35,37 +35,38 @@ from pkmcal.ranges import check_number
 from pkmcal.simulation.placement import StationPlace, usable
 
 PLAN_CANDIDATES = 400
-"""Configurations among which is chosen."""
+"""Minimum number of candidate configurations."""
 CANDIDATES_FOR_EACH_WANTED = 4
-"""Of these for each one wanted, at least."""
+"""Minimum number of candidates for each wanted configuration."""
 AT_WORK = 60
-"""Poses of the workspace at which the tool counts."""
+"""Number of poses of the workspace at which the tool's accuracy is evaluated."""
 BETTERING_ROUNDS = 8
-"""Rounds, at most, in which the chosen configurations are moved."""
+"""Maximum number of rounds of local improvement."""
 LEAST_ROUND_GAIN = 0.01
-"""Part of the deviation that a round has to gain for another one."""
+"""Minimum relative gain of a round for another one to follow."""
 FOR_PLACES = 24
-"""Configurations by which places of a camera are compared."""
+"""Number of configurations for the comparison of stations."""
 RANDOM_PLANS_COMPARED = 10
-"""Choices by chance that a plan is compared with."""
+"""Number of random selections with which a plan is compared."""
 CAPTURE_MULTIPLES = (2, 4)
-"""How many times as many photographs are told as well."""
+"""Multiples of the planned number of images for which the accuracy is predicted as well."""
 WORTHWHILE_ACCURACY_GAIN = 0.01
-"""Part of its standard deviation by which one more configuration from each place has to better the
-tool to be worth it: the hundredth that a hundred others would add up to."""
+"""Minimum relative gain of the tool's standard deviation by one more configuration at each station
+that makes it worthwhile.
+"""
 POSES_BETWEEN_CONFIGURATIONS = 8
-"""Poses looked at on the way from one configuration to the next."""
+"""Number of poses that are checked on the path between two configurations."""
 REROUTING_ATTEMPTS = 5
-"""Times that another way is looked for where one is blocked."""
+"""Maximum number of reroutings around blocked steps."""
 CONFIGURATION_NAME_LETTERS = "abcdefghijklmnopqrstuvwxyz"
-"""First letters of new configurations' names, one a group of stations."""
+"""First letters of new configurations' names, one for each group of stations."""
 PLAN_SEED = 0
 
 
 @dataclass(frozen=True)
 class Accuracy:
     """Standard deviations of the platform's position (m) and turn (rad), mean over the workspace,
-    with ``count`` configurations from each place.
+    with ``count`` configurations at each station.
     """
 
     count: float
@@ -75,8 +76,10 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class TriedPlace:
-    """A camera's place that was tried. alone : m, the platform's position with all configurations
-    from there. chosen : whether it is part of the plan.
+    """Candidate pose of a camera.
+
+    alone : standard deviation (m) of the platform's position with all configurations observed from
+    there. chosen : whether it is part of the plan.
     """
 
     place: StationPlace
@@ -86,17 +89,18 @@ class TriedPlace:
 
 @dataclass(frozen=True)
 class MeasurementPlan:
-    """What to measure next, in this order.
+    """Planned measurements, in the order of the path through them.
 
-    subject : what it is for; with the chosen places where these were free. stations : names that
-    measure each configuration, (n,) tuples. names, joints (n, m), T_base_platform (n, 4, 4) : the
-    configurations, of which those of ``rank`` up to k are the best k from each place. index : what
-    was made small. value : its value, and at_random : that of configurations drawn evenly over the
-    joints' ranges, mean. now, promised, by_chance : accuracy
-    before, with the plan, with such configurations. curve : with fewer and with more. region : the
-    workspace. blocked : (n,) True where the straight way to a configuration leaves what the machine
-    can take, or its legs touch. travel : how long the slowest motor moves in all, in parts of its
-    range, and by chance. tried : places of a camera.
+    subject : subject of the plan, with the chosen stations if these were free. stations : (n,)
+    tuples of names of the stations that measure each configuration. names, joints (n, m),
+    T_base_platform (n, 4, 4) : the configurations; those of ``rank`` up to k are the best k at each
+    station. index : name of the minimized index. value : its value; at_random : its mean for
+    configurations that are drawn uniformly over the joints' ranges. now, promised, by_chance :
+    accuracy before the plan, with it, and with random configurations. curve : accuracy with fewer
+    and with more configurations. region : the workspace, work : its poses. blocked : (n,) True if
+    the machine cannot take the straight path to a configuration, or its legs touch on it. travel :
+    total motion of the slowest motor, relative to its range, on the planned and on a random path.
+    tried : candidate stations. together : whether all stations measure each configuration.
     """
 
     subject: Subject
@@ -123,8 +127,8 @@ class MeasurementPlan:
 
     @property
     def pays_until(self) -> float | None:
-        """Configurations from each place after which one more betters the tool by less than
-        :data:`WORTHWHILE_ACCURACY_GAIN`; None where all of those planned pay.
+        """Number of configurations at each station after which one more improves the tool by less
+        than :data:`WORTHWHILE_ACCURACY_GAIN`; None if all planned ones are worthwhile.
         """
         for before, after in pairwise(self.curve):
             each = 1 - (after.position / before.position) ** (1 / (after.count - before.count))
@@ -145,14 +149,14 @@ def plan_measurements(
     seed: int = PLAN_SEED,
     progress: ShareProgress | None = None,
 ) -> MeasurementPlan:
-    """The plan.
+    """Plan measurements for a subject.
 
-    count : configurations from each place; of all stations, where these measure together. index :
-    one of :data:`~pkmcal.planning.exchange.PLAN_INDICES`. region : where the tool counts; the whole
-    reach if absent. together : whether all stations measure every configuration; by default where
-    they have cameras or trackers of their own. free_places : how many places of the camera to
-    choose on a sphere about the machine. best_of : how many of the rig's stations to choose.
-    seed : of what is drawn. progress : called with the share done.
+    count : configurations at each station; in total, if all stations measure together. index : one
+    of :data:`~pkmcal.planning.exchange.PLAN_INDICES`. region : workspace in which the tool's
+    accuracy counts; by default all reachable poses. together : whether all stations measure every
+    configuration; by default if they have cameras of their own or there is a tracker. free_places :
+    number of stations to choose on a sphere around the machine. best_of : number of the rig's
+    stations to choose. seed : of all random numbers. progress : callback with the share done.
     Raises InputError for what cannot be planned.
     """
     progress = progress or (lambda _share: None)
@@ -160,25 +164,28 @@ def plan_measurements(
     _check(rig, count, index, free_places, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
-    drawn = configurations(
+    candidates = configurations(
         rig.machine, max(PLAN_CANDIDATES, CANDIDATES_FOR_EACH_WANTED * count), rng
     )
     progress(0.1)
     tried: tuple[TriedPlace, ...] = ()
     if free_places or best_of:
-        rig, reference_values, tried = _with_places(
-            subject, work, drawn, count, index, free_places, best_of
+        rig, prior, tried = _with_stations(
+            subject, work, candidates, count, index, free_places, best_of
         )
-        subject = replace(subject, rig=rig, prior=reference_values)
+        subject = replace(subject, rig=rig, prior=prior)
     progress(0.3)
-    joined = _together(rig) if together is None else together
+    if together is None:  # one camera is carried; several, or a tracker, measure at once
+        tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
+        several = tracked or len(np.unique(rig.camera_of_station)) > 1
+        together = len(rig.names) > 1 and several
     stations = range(len(rig.names))
-    groups = (tuple(stations),) if joined else tuple((s,) for s in stations)
-    made = _Making(rig, subject.prior, groups, count, index, work)
-    pool = made.pool(Candidates.of_all(groups, *drawn))
-    item = made.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
+    groups = (tuple(stations),) if together else tuple((s,) for s in stations)
+    selection = _Selection(rig, subject.prior, groups, count, index, work)
+    pool = selection.pool(Candidates.of_all(groups, *candidates))
+    chosen = selection.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
     progress(0.9)
-    return _ordered(subject, made, item, pool, region, joined, tried, rng)
+    return _routed_plan(subject, selection, chosen, pool, region, together, tried, rng)
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
@@ -212,22 +219,16 @@ def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: i
         )
 
 
-def _together(rig: Rig) -> bool:
-    """One camera is carried from place to place; several, or a tracker, measure at once."""
-    tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
-    return len(rig.names) > 1 and (tracked or len(np.unique(rig.camera_of_station)) > 1)
-
-
 class _Pool(NamedTuple):
-    """Candidates, and what each tells."""
+    """Candidates with their rows."""
 
     candidates: Candidates
     info: CandidateRows
 
 
 @dataclass(frozen=True)
-class _Making:
-    """What is chosen, and by what."""
+class _Selection:
+    """Selection of configurations for a rig, with its options."""
 
     rig: Rig
     prior: CalibrationPrior | None
@@ -237,19 +238,19 @@ class _Making:
     work: Array
 
     def pool(self, candidates: Candidates, rng: np.random.Generator | None = None) -> _Pool:
-        """Candidates with what they tell; rng : as of :func:`information_of`."""
+        """Candidates with their rows. rng : as in :func:`information_of`."""
         rig, work, prior = self.rig, self.work, self.prior
         return _Pool(candidates, information_of(rig, candidates, work, prior, rng, self.count))
 
     def chosen(self, pool: _Pool, rng: np.random.Generator, progress: ShareProgress) -> Candidates:
-        """The best of a pool, bettered about where they are."""
+        """Best candidates of a pool, improved locally."""
         index = PLAN_INDICES[self.index](pool.info)
         first = greedy(pool.info, self.count, index, lambda x: progress(0.4 * x)).chosen
         best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
         size = np.inf
         for k in range(BETTERING_ROUNDS):
             progress(0.5 + 0.5 * k / BETTERING_ROUNDS)
-            pool, start = self._about(best, rng)
+            pool, start = self._with_neighbours(best, rng)
             chosen = np.sort(exchanged(pool.info, start, index))
             best = pool.candidates.only(chosen)
             covariance = pool.info.covariance(pool.info.of(chosen))
@@ -258,8 +259,12 @@ class _Making:
                 break
         return best
 
-    def _about(self, best: Candidates, rng: np.random.Generator) -> tuple[_Pool, Integers]:
-        """Chosen candidates and others about each, by the same group; and where those stand."""
+    def _with_neighbours(
+        self, best: Candidates, rng: np.random.Generator
+    ) -> tuple[_Pool, Integers]:
+        """Pool of the chosen candidates and their variations for the same group, and the indices of
+        the chosen ones.
+        """
         parts: list[Configurations] = []
         group: list[Integers] = []
         start: list[Integers] = []
@@ -279,38 +284,40 @@ def _accuracy(info: CandidateRows, covariance: Array, count: float) -> Accuracy:
     return Accuracy(count, *info.tool(covariance))
 
 
-def _ordered(
+def _routed_plan(
     subject: Subject,
-    made: _Making,
-    value: Candidates,
-    drawn: _Pool,
+    selection: _Selection,
+    chosen: Candidates,
+    pool: _Pool,
     region: Region,
     together: bool,
     tried: tuple[TriedPlace, ...],
     rng: np.random.Generator,
 ) -> MeasurementPlan:
-    """The plan of what was chosen: in the order of the shortest way, with what it promises."""
-    machine, count, groups = subject.rig.machine, made.count, made.groups
-    # as good as such photographs turn out, one by one, not as they are on average
-    own = made.pool(value, np.random.default_rng(PLAN_SEED)).info
-    index, every = PLAN_INDICES[made.index](own), np.arange(len(value.group))
+    """Plan of the chosen configurations, in the order of the shortest path, with its predicted
+    accuracy.
+    """
+    machine, count, groups = subject.rig.machine, selection.count, selection.groups
+    # edges with drawn rather than mean information, as real images have
+    own = selection.pool(chosen, np.random.default_rng(PLAN_SEED)).info
+    index, every = PLAN_INDICES[selection.index](own), np.arange(len(chosen.group))
     nested = greedy(own, count, index)
     curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
     covariance = own.covariance(own.of(every))
     promised = _accuracy(own, covariance, count)
     more = [_accuracy(own, own.covariance(own.of(every, t)), t * count) for t in CAPTURE_MULTIPLES]
-    by_chance, at_random = _by_chance(made, drawn, rng)
+    by_chance, at_random = _random_accuracy(selection, pool, rng)
     rank = np.empty(len(every), dtype=int)
     rank[nested.chosen] = every // len(groups) + 1
-    order, blocked, travel = _route(machine, value, rng)
+    order, blocked, travel = _route(machine, chosen, rng)
     return MeasurementPlan(
         subject=subject,
-        stations=tuple(tuple(subject.rig.names[s] for s in groups[value.group[k]]) for k in order),
-        names=_new_names(value.group[order], subject.names),
-        joints=value.joints[order],
-        T_base_platform=value.T_base_platform[order],
+        stations=tuple(tuple(subject.rig.names[s] for s in groups[chosen.group[k]]) for k in order),
+        names=_new_names(chosen.group[order], subject.names),
+        joints=chosen.joints[order],
+        T_base_platform=chosen.T_base_platform[order],
         rank=rank[order],
-        index=made.index,
+        index=selection.index,
         value=float(index.value(covariance)),
         at_random=at_random,
         now=_accuracy(own, own.covariance(own.information), 0),
@@ -318,7 +325,7 @@ def _ordered(
         by_chance=by_chance,
         curve=(*curve, promised, *more),
         region=region,
-        work=made.work,
+        work=selection.work,
         blocked=blocked,
         travel=travel,
         tried=tried,
@@ -327,7 +334,7 @@ def _ordered(
 
 
 def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of configurations, a letter a group and a number, that none has yet."""
+    """New names of configurations, a letter for each group and a number."""
     out: list[str] = []
     used = set(taken)
     for g in group.tolist():
@@ -340,37 +347,41 @@ def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[Accuracy, float]:
-    """What configurations drawn evenly over the joints' ranges would give, mean of a few draws."""
-    index, n_groups = PLAN_INDICES[made.index](drawn.info), len(made.groups)
-    n = len(drawn.info.group) // n_groups
-    evenly = np.arange(n // 2, n)  # the first half are at the ends of the ranges
-    count = min(made.count, len(evenly))
-    results: list[tuple[float, float, float]] = []
+def _random_accuracy(
+    selection: _Selection, pool: _Pool, rng: np.random.Generator
+) -> tuple[Accuracy, float]:
+    """Accuracy and index with configurations drawn uniformly over the joints' ranges, mean of
+    several draws.
+    """
+    index, n_groups = PLAN_INDICES[selection.index](pool.info), len(selection.groups)
+    n = len(pool.info.group) // n_groups
+    evenly = np.arange(n // 2, n)  # the first half is at the ends of the ranges
+    count = min(selection.count, len(evenly))
+    figures: list[tuple[float, float, float]] = []
     for _ in range(RANDOM_PLANS_COMPARED):
         rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
-        covariance = drawn.info.covariance(drawn.info.of(np.concatenate(rows)))
-        results.append((*drawn.info.tool(covariance), float(index.value(covariance))))
-    position, orientation, value = np.mean(results, axis=0).tolist()
-    return Accuracy(made.count, position, orientation), value
+        covariance = pool.info.covariance(pool.info.of(np.concatenate(rows)))
+        figures.append((*pool.info.tool(covariance), float(index.value(covariance))))
+    position, orientation, value = np.mean(figures, axis=0).tolist()
+    return Accuracy(selection.count, position, orientation), value
 
 
 # ------------------------------------------------------------------ the way between them
 
 
 def _route(
-    machine: Machine, value: Candidates, rng: np.random.Generator
+    machine: Machine, chosen: Candidates, rng: np.random.Generator
 ) -> tuple[Integers, Booleans, tuple[float, float]]:
-    """The order (n,), group by group; which steps are blocked (n,); and how long the way is, and
-    one by chance.
+    """Order (n,) of the configurations, group by group, blocked steps (n,), and the lengths of this
+    path and of a random one.
     """
     home = machine.inverse(machine.home()[None])[0]
     order: list[Integers] = []
     barred: list[Booleans] = []
     own, chance = 0.0, 0.0
-    for g in range(len(value.groups)):
-        rows = np.flatnonzero(value.group == g)
-        joints, poses = value.joints[rows], value.T_base_platform[rows]
+    for g in range(len(chosen.groups)):
+        rows = np.flatnonzero(chosen.group == g)
+        joints, poses = chosen.joints[rows], chosen.T_base_platform[rows]
         apart = motor_distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
         path, blocked = _free_path(machine, joints, poses, home, apart)
         order.append(rows[path])
@@ -383,13 +394,11 @@ def _route(
 def _free_path(
     machine: Machine, joints: Array, poses: Array, home: Array, apart: Array
 ) -> tuple[Integers, Booleans]:
-    """A short way that avoids steps on which legs touch or the machine is lost, where that can be;
-    and which of its steps are such.
-    """
+    """Short path that avoids blocked steps where possible, and its blocked steps."""
     bars = np.zeros((len(joints), len(joints)), dtype=bool)
     first = apart[-1, :-1].copy()
     path = shortest_path(apart[:-1, :-1], first, bars)
-    blocked = _blocked(machine, joints[path], poses[path], home)
+    blocked = _blocked_steps(machine, joints[path], poses[path], home)
     for _ in range(REROUTING_ATTEMPTS):
         steps = np.flatnonzero(blocked[1:])
         if not len(steps) and not blocked[0]:
@@ -398,12 +407,14 @@ def _free_path(
         if blocked[0]:
             first[path[0]] += len(joints) * apart.max()
         path = shortest_path(apart[:-1, :-1], first, bars)
-        blocked = _blocked(machine, joints[path], poses[path], home)
+        blocked = _blocked_steps(machine, joints[path], poses[path], home)
     return path, blocked
 
 
-def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
-    """(n,) whether on the way to each, motors moving evenly, the machine is lost or legs touch."""
+def _blocked_steps(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
+    """Whether the step to each configuration (n,) is blocked: with all motors moving uniformly, the
+    closure fails or legs touch.
+    """
     before = np.concatenate([home[None], joints[:-1]])
     n = POSES_BETWEEN_CONFIGURATIONS
     share = (np.arange(n) + 0.5)[:, None, None] / n
@@ -418,32 +429,30 @@ def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Bool
 # ------------------------------------------------------------------ places of the camera
 
 
-def _with_places(
+def _with_stations(
     subject: Subject,
     work: Array,
-    drawn: Configurations,
+    candidates: Configurations,
     count: int,
     index: str,
     free_places: int | None,
     best_of: int | None,
 ) -> tuple[Rig, CalibrationPrior | None, tuple[TriedPlace, ...]]:
-    """The rig with the best places: free ones on a sphere, or some of its own.
+    """Rig with the best stations, on a sphere or among its own.
 
-    Each place is an information of its own on the machine, its station's place and shading
-    eliminated, from configurations spread over all; the best set of them is chosen as
-    configurations are.
+    The information of each station on the machine, with the station's pose and shading eliminated,
+    comes from configurations spread over all; stations are then chosen as configurations are.
     """
     rig = subject.rig
     if free_places:
-        wide, spots = _around(rig)
+        wide, poses = _on_sphere(rig)
     else:
-        wide, spots = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
-    few = np.unique(np.linspace(0, len(drawn.joints) - 1, FOR_PLACES).astype(int))
-    part = Configurations(*(x[few] for x in drawn))
-    reference_values = subject.prior and subject.prior.only(())
+        wide, poses = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
+    few = np.unique(np.linspace(0, len(candidates.joints) - 1, FOR_PLACES).astype(int))
+    part = Configurations(*(x[few] for x in candidates))
+    machine_prior = subject.prior and subject.prior.only(())
     infos = [
-        _view_information(wide.only([s]), part, work, reference_values)
-        for s in range(len(wide.names))
+        _view_information(wide.only([s]), part, work, machine_prior) for s in range(len(wide.names))
     ]
     first = next((info for info in infos if info is not None), None)
     if first is None:
@@ -452,30 +461,34 @@ def _with_places(
             where="--places",
             expected="a camera that sees the legs, or a board that faces some place",
         )
+    # Information of each station on the machine, beyond the prior's.
     start = np.linalg.inv(first.covariance(first.information))
-    covariances, alone = np.zeros((len(infos), *start.shape)), np.zeros(len(infos))
+    information, alone = np.zeros((len(infos), *start.shape)), np.zeros(len(infos))
     for s, info in enumerate(infos):
-        after = np.linalg.inv(start)
+        covariance = np.linalg.inv(start)
         if info is not None:
-            after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
-            covariances[s] = np.linalg.inv(after) - start
-        alone[s] = first.tool(after)[0]
-    roots = np.stack([_padded_root(covariances[s]) for s in range(len(covariances))])
-    same = np.zeros(len(roots), dtype=int)
-    number = np.arange(len(roots), dtype=float)[:, None]  # no two places are the same
-    whole = CandidateRows(roots, same, number, start, np.eye(len(start)), first.work)
+            covariance = info.covariance(info.of(np.arange(len(few)), count / len(few)))
+            information[s] = np.linalg.inv(covariance) - start
+        alone[s] = first.tool(covariance)[0]
+    # Rows R with R^T R = information, whose smallest eigenvalues may be rounding.
+    eigenvalues, vectors = np.linalg.eigh(information)
+    rows = np.sqrt(np.maximum(eigenvalues, 0.0))[..., None] * vectors.mT
+    # The best set of stations; distinct numbers, so that none counts as a repetition of another.
+    same = np.zeros(len(rows), dtype=int)
+    number = np.arange(len(rows), dtype=float)[:, None]
+    whole = CandidateRows(rows, same, number, start, np.eye(len(start)), first.work)
     rule = PLAN_INDICES[index](whole)
     wanted = free_places or best_of or 1
     best = np.sort(exchanged(whole, greedy(whole, wanted, rule).chosen, rule))
     tried = tuple(
-        TriedPlace(place, float(alone[k]), bool(k in best)) for k, place in enumerate(spots)
+        TriedPlace(place, float(alone[k]), bool(k in best)) for k, place in enumerate(poses)
     )
     chosen = wide.only(best.tolist())
     if free_places:
         names = tuple(f"place{n + 1}" for n in range(len(best)))
-        return replace(chosen, names=names), reference_values, tried
+        return replace(chosen, names=names), machine_prior, tried
     prior = subject.prior and subject.prior.only(best.tolist())
-    if prior is not None:  # by their new numbers
+    if prior is not None:  # renumber the stations of the prior
         prior = replace(prior, stations=tuple(np.searchsorted(best, prior.stations).tolist()))
     return chosen, prior, tried
 
@@ -483,21 +496,15 @@ def _with_places(
 def _view_information(
     rig: Rig, part: Configurations, work: Array, prior: CalibrationPrior | None
 ) -> CandidateRows | None:
-    """What configurations tell from one place; None where nothing is seen from there."""
+    """Rows of configurations observed from one station; None if nothing is visible from there."""
     try:
         return information_of(rig, Candidates.of_all(((0,),), *part), work, prior)
     except InputError:
         return None
 
 
-def _padded_root(information: Array) -> Array:
-    """(p, p) rows R with R^T R = information, whose smallest eigenvalues may be rounding."""
-    values, vectors = np.linalg.eigh(information)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-
-
-def _around(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:
-    """The rig's first camera at every place of a sphere, with what it sees there."""
+def _on_sphere(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:
+    """Rig with its first camera at every pose on a sphere, with the instruments of that camera."""
     one = next(one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom))
     board = "platform" if isinstance(one, BoardFrom) else None
     spots = camera_ring_places(rig.machine, one.camera, board)

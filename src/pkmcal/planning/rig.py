@@ -1,8 +1,8 @@
-"""What measures: cameras that see legs or a board, and trackers, each at its place.
+"""Instruments of a plan: cameras that observe legs or a board, and trackers, each at its station.
 
-An instrument tells what it would measure of the machine at given poses, without errors but with
-their covariance: the same measurements as photographs and tables give. Nothing is seen beyond a
-picture's border, behind a leg, or on a board's back.
+An instrument predicts its measurements of the machine at given poses, without errors but with their
+covariance, in the form that images and tables give. Nothing is measured outside the image, behind a
+leg, or on the back of a board.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from pkmcal.planning.first import EXACT_EDGE_NOISE, FIRST_EDGES_SEED, EdgePool, 
 from pkmcal.simulation.edges import hidden, pixel_angle, simulate_edges
 
 FLATTEST_BOARD_COSINE = np.cos(np.deg2rad(70))
-"""Cosine of the angle between a board's normal and the line of sight below which it is not read."""
+"""Minimum cosine of the angle between a board's normal and the line of sight."""
 
 
 class At(NamedTuple):
-    """A machine at K configurations: joints (K, m), T_base_platform (K, 4, 4)."""
+    """Machine at K configurations: joints (K, m), T_base_platform (K, 4, 4)."""
 
     machine: Machine
     joints: Array
@@ -48,15 +48,17 @@ class At(NamedTuple):
 
 
 def nominal_pools(machine: Machine, sigma: float = NOMINAL_EDGE_SIGMA) -> Pools:
-    """Edges that are all found, sigma (px) off across and as much by turning."""
+    """Pools of edges that are all found, with standard deviation sigma (px) of shift and tilt."""
     one = EdgePool(np.eye(2)[None] / sigma**2, np.ones(1), np.ones(1))
     return (one,) * len(tubes_of(machine))
 
 
 @dataclass(frozen=True)
 class LegsFrom:
-    """The legs seen by a camera at T_camera_base (4, 4). pools : what its edges tell. binning : how
-    many pixels across, and down, are one where these are looked for.
+    """Legs observed by a camera at T_camera_base (4, 4).
+
+    pools : information of its edges. binning : pixels that are averaged, in each direction, in the
+    search for edges.
     """
 
     station: int
@@ -66,8 +68,8 @@ class LegsFrom:
     binning: int = 1
 
     def measure(self, at: At, rows: Integers, rng: np.random.Generator | None, /) -> EdgeSet:
-        """Edges of the legs. rng : draws how good each turns out; without it each is as good as
-        such a one is on average.
+        """Edges of the legs. rng : for drawing the information of each edge; its mean without
+        it.
         """
         pairs = np.stack([np.zeros_like(rows), rows], axis=-1)
         edges, _ = simulate_edges(
@@ -85,10 +87,10 @@ class LegsFrom:
 
 @dataclass(frozen=True)
 class BoardFrom:
-    """A board on the platform, seen by a camera at T_camera_base (4, 4).
+    """Board on the platform, observed by a camera at T_camera_base (4, 4).
 
-    points : (N, 3) its corners, board frame, m. T_platform_board : (4, 4). sigma : px, of a
-    corner. mount : its number.
+    points : (N, 3) corners, board frame, m. T_platform_board : (4, 4). sigma : of a corner, px.
+    mount : its index.
     """
 
     station: int
@@ -100,25 +102,25 @@ class BoardFrom:
     mount: int = 0
 
     def measure(self, at: At, rows: Integers, _rng: np.random.Generator | None, /) -> PoseSet:
-        """The board's pose wherever enough corners are seen."""
+        """Poses of the board where enough corners are visible."""
         T = self.T_camera_base @ at.T_base_platform[rows] @ self.T_platform_board
         there = apply(T[:, None], self.points)
-        prediction = self._visible_corners(
+        visible = self._visible_corners(
             At(at.machine, at.joints[rows], at.T_base_platform[rows]), T, there
         )
         by_point = self.camera.project_jacobians(there)[0]
         by_pose = np.concatenate([-by_point @ skew(there - T[:, None, :3, 3]), by_point], axis=-1)
-        by_pose = np.where(prediction[..., None, None], by_pose, 0.0) / self.sigma
+        by_pose = np.where(visible[..., None, None], by_pose, 0.0) / self.sigma
         normal = np.einsum("knip,kniq->kpq", by_pose, by_pose)
-        enough = prediction.sum(axis=1) >= LEAST_CORNERS_WEIGHED
+        enough = visible.sum(axis=1) >= LEAST_CORNERS_WEIGHED
         covariance = np.linalg.inv(normal[enough])
         return pose_set(self.station, rows[enough], self.mount, T[enough], covariance)
 
     def _visible_corners(self, at: At, T: Array, there: Array) -> Booleans:
-        """(K, N) corners in the picture, on the board's face, and not behind a leg."""
+        """Corners (K, N) in the image, on the board's face, and not behind a leg."""
         with np.errstate(invalid="ignore"):
             visible = np.asarray(self.camera.in_image(self.camera.project(there)))
-        # the print is on the side of the board's -z
+        # the print is on the side of the board's -z axis
         eye = inverse(T)[:, :3, 3] - self.points.mean(axis=0)
         visible &= (-eye[:, 2] / np.linalg.norm(eye, axis=-1) > FLATTEST_BOARD_COSINE)[:, None]
         machine, tubes = at.machine, tubes_of(at.machine)
@@ -134,9 +136,9 @@ class BoardFrom:
 
 @dataclass(frozen=True)
 class TargetFrom:
-    """A target on the platform, measured by a tracker or a probe at T_tracker_base (4, 4).
+    """Target on the platform, measured by a tracker or a probe at T_tracker_base (4, 4).
 
-    T_platform_target : (4, 4). whiten : (6, 6) as of :class:`~pkmcal.measurements.PoseSet`.
+    T_platform_target : (4, 4). whiten : (6, 6) as in :class:`~pkmcal.measurements.PoseSet`.
     """
 
     station: int
@@ -146,7 +148,7 @@ class TargetFrom:
     mount: int = 0
 
     def measure(self, at: At, rows: Integers, _rng: np.random.Generator | None, /) -> PoseSet:
-        """The target's pose at every configuration."""
+        """Poses of the target at every configuration."""
         T = self.T_tracker_base @ at.T_base_platform[rows] @ self.T_platform_target
         n = len(rows)
         whiten = np.broadcast_to(self.whiten, (n, 6, 6)).copy()
@@ -154,18 +156,17 @@ class TargetFrom:
 
 
 Instrument = LegsFrom | BoardFrom | TargetFrom
-"""One way in which the station of a number measures configurations ``rows`` of a machine."""
+"""Instrument of one station; ``measure`` predicts its measurements of configurations ``rows``."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A machine and what measures it.
+    """Machine with its instruments.
 
     names : of S stations. T_station_base : (S, 4, 4) of cameras and trackers. camera_of_station :
-    (S,) number of each one's camera. joint_noise : of a reading. instruments : what they measure.
-    mounts : what boards and targets are fixed to, with their places T_mount (M, 4, 4). shading :
-    px, standard deviation of what the edges of one side of a tube at one station have in common.
-    where : what precedes a station's name in messages about it; None where no file names it.
+    (S,) index of the camera. joint_noise : of a reading. mounts : of boards and targets, with poses
+    T_mount (M, 4, 4). shading : px, standard deviation of the shift that edges of one side of a
+    tube at one station share. where : prefix of a station's name in messages; None without a file.
     """
 
     machine: Machine
@@ -182,7 +183,7 @@ class Rig:
     __repr__ = short_repr
 
     def only(self, stations: Sequence[int]) -> Rig:
-        """With some of its stations, in this order; mounts stay."""
+        """Rig with selected stations, in this order, and all mounts."""
         number = {s: k for k, s in enumerate(stations)}
         cameras = self.camera_of_station[list(stations)]
         return replace(
@@ -201,20 +202,19 @@ class Rig:
         self, joints: Array, T_base_platform: Array, pairs: Integers,
         rng: np.random.Generator | None = None,
     ) -> Measurements:  # fmt: skip
-        """What is measured at joints (K, m), T_base_platform (K, 4, 4).
+        """Predicted measurements at joints (K, m), T_base_platform (K, 4, 4).
 
-        pairs : (M, 2) stations and configurations that they measure. rng : as for
-        :meth:`LegsFrom.measure`.
+        pairs : (M, 2) stations and configurations. rng : as in :meth:`LegsFrom.measure`.
         """
         edges, poses = [EdgeSet.empty()], [PoseSet.empty()]
         at = At(self.machine, joints, T_base_platform)
         for one in self.instruments:
             rows = pairs[pairs[:, 0] == one.station, 1]
-            value = one.measure(at, rows, rng)
-            if isinstance(value, EdgeSet):
-                edges.append(value)
+            predicted = one.measure(at, rows, rng)
+            if isinstance(predicted, EdgeSet):
+                edges.append(predicted)
             else:
-                poses.append(value)
+                poses.append(predicted)
         edges = concatenate(edges)
         return Measurements(
             edges=edges,
@@ -230,7 +230,7 @@ class Rig:
     def assembled(
         self, measurements: Measurements, T_base_platform: Array, share: float = 1.0
     ) -> tuple[Assembled, BatchState]:
-        """The joint estimate's problem of these measurements, at the true state. share : as of
+        """Problem of the joint estimate for the measurements, and the true state. share : as in
         :func:`~pkmcal.identify.assembly.assemble`.
         """
         machine, shading = self.machine, self.shading
@@ -248,5 +248,5 @@ class Rig:
 
 
 def all_pairs(stations: Sequence[int], configurations: Integers) -> Integers:
-    """(M, 2) every station at every configuration."""
+    """Pairs (M, 2) of every station with every configuration."""
     return np.array([(s, k) for s in stations for k in configurations], dtype=int).reshape(-1, 2)

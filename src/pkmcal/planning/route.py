@@ -1,4 +1,4 @@
-"""The shortest way through configurations, by readings."""
+"""Shortest open path through configurations, by readings."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 
 ROUTE_CHANGES_A_POINT = 50
-"""Changes a point at most; they end before, when none shortens the way."""
+"""Maximum number of improvements for each point; usually none is left before."""
 ROUTE_GAIN_ROUNDING = 1e-12
 MOST_POINTS_MOVED_TOGETHER = 3
-"""Points that are moved together."""
+"""Maximum length of a stretch that is moved (Or-opt)."""
 
 
 def motor_distances(joints: Array, ranges: Array) -> Array:
-    """(n, n) how long the slowest motor needs from each of the readings (n, m) to each, in parts of
-    its range (m, 2).
+    """Distances (n, n) between readings (n, m): the largest motion of a motor relative to its range
+    (m, 2).
     """
     return np.abs((joints[:, None] - joints) / motor_spans(joints, ranges)).max(axis=-1)
 
 
 def motor_spans(joints: Array, ranges: Array) -> Array:
-    """(m,) lengths of the motors' ranges (m, 2), or of what the readings (n, m) span where the file
-    gives none.
+    """Lengths (m,) of the motors' ranges (m, 2), or the span of the readings (n, m) for a motor
+    without a range.
     """
     span, own = ranges[:, 1] - ranges[:, 0], np.ptp(joints, axis=0)
     return np.where(np.isfinite(span) & (span > 0), span, np.where(own > 0, own, 1.0))
@@ -31,16 +31,16 @@ def motor_spans(joints: Array, ranges: Array) -> Array:
 def shortest_path(
     apart: Array, first: Array | None = None, barred: Booleans | None = None
 ) -> Integers:
-    """An order (n,) that makes the way through all n points short, open at its end.
+    """Order (n,) of points that makes an open path through all of them short.
 
-    apart : (n, n) distances. first : (n,) distances from where the way begins; anywhere if absent.
-    barred : (n, n) steps to be avoided where others serve.
+    apart : (n, n) distances. first : (n,) distances from the start of the path; None for any start.
+    barred : (n, n) steps to be avoided if possible.
 
-    The nearest point next, then stretches turned round (2-opt, Croes 1958) and moved elsewhere
-    (Or 1976), each time what shortens the way most, until neither does.
+    Nearest neighbour, then reversed stretches (2-opt, Croes 1958) and moved stretches (Or 1976),
+    each time the largest gain, until neither gains.
     """
     n = len(apart)
-    # one more point stands for the beginning and the open end
+    # one more point represents the start and the open end
     cost = np.zeros((n + 1, n + 1))
     cost[:n, :n] = apart + (0.0 if barred is None else barred * (apart.max() * n + 1.0))
     cost[n, :n] = 0.0 if first is None else first
@@ -49,25 +49,25 @@ def shortest_path(
         rest = np.flatnonzero(remaining)
         order.append(int(rest[np.argmin(cost[order[-1], rest])]))
         remaining[order[-1]] = False
-    direction = np.array([*order, n])
+    path = np.array([*order, n])
     for _ in range(ROUTE_CHANGES_A_POINT * n):
         gain, better = max(
-            (_turned(direction, cost), _best_move(direction, cost)), key=lambda item: item[0]
+            (_best_reversal(path, cost), _best_move(path, cost)), key=lambda item: item[0]
         )
         if gain < ROUTE_GAIN_ROUNDING * cost.max():
             break
-        direction = better
-    return direction[1:-1]
+        path = better
+    return path[1:-1]
 
 
 def length(path: Integers, apart: Array, first: Array | None = None) -> float:
-    """Of a way, with that to its beginning."""
+    """Length of a path, including the distance to its start."""
     begin = 0.0 if first is None else float(first[path[0]])
     return begin + float(apart[path[:-1], path[1:]].sum())
 
 
-def _turned(path: Integers, cost: Array) -> tuple[float, Integers]:
-    """The best gain by turning round the stretch from i to j, and the way after it."""
+def _best_reversal(path: Integers, cost: Array) -> tuple[float, Integers]:
+    """Best gain by reversing a stretch i to j (2-opt), and the path after it."""
     before, here, after = path[:-2], path[1:-1], path[2:]
     now = cost[before, here][:, None] + cost[here, after]
     gain = now - cost[before[:, None], here] - cost[here[:, None], after]
@@ -78,8 +78,10 @@ def _turned(path: Integers, cost: Array) -> tuple[float, Integers]:
 
 
 def _best_move(path: Integers, cost: Array) -> tuple[float, Integers]:
-    """The best gain by moving a stretch of up to three points between two others."""
-    results: list[tuple[float, int, int, int]] = []
+    """Best gain by moving a stretch of up to three points between two others, and the path after
+    it.
+    """
+    moves: list[tuple[float, int, int, int]] = []
     step = cost[path[:-1], path[1:]]
     for size in range(1, min(MOST_POINTS_MOVED_TOGETHER, len(path) - 3) + 1):
         i = np.arange(1, len(path) - size)
@@ -90,10 +92,10 @@ def _best_move(path: Integers, cost: Array) -> tuple[float, Integers]:
         gain = without[:, None] - with_
         gain[(j >= i[:, None] - 1) & (j <= i[:, None] + size - 1)] = -np.inf
         a, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        results.append((float(gain[a, b]), int(i[a]), size, int(b)))
-    if not results:
+        moves.append((float(gain[a, b]), int(i[a]), size, int(b)))
+    if not moves:
         return -np.inf, path
-    gain, i, size, j = max(results)
+    gain, i, size, j = max(moves)
     part, rest = path[i : i + size], np.delete(path, np.s_[i : i + size])
     j = j if j < i else j - size
     return gain, np.concatenate([rest[: j + 1], part, rest[j + 1 :]])

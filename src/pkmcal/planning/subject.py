@@ -1,4 +1,6 @@
-"""Rigs: of a session as it stands, or of a machine and a camera that somebody thinks of."""
+"""Subjects of a plan: the rig of a session, or of a machine with a hypothetical camera or
+tracker.
+"""
 
 from __future__ import annotations
 
@@ -50,20 +52,21 @@ from pkmcal.simulation.placement import default_stations, draw_configurations
 from pkmcal.wording import brief, listed
 
 PLAN_PHOTOGRAPHS_A_STATION = 12
-"""Of a station, whose edges are measured, and twice as many of all together: a plan is made once,
-and a few edges tell shading badly."""
+"""Maximum number of a station's images whose edges are measured; twice as many of all stations
+together. A plan is made once, and few edges determine the shading badly.
+"""
 BOARD_MOUNT_NAME = "board"
 LAST_CALIBRATION_FOLDER = "calibration"
-"""Where calibrate writes, inside a session."""
+"""Output folder of `calibrate` inside a session."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """What a plan is made for.
+    """Subject of a plan.
 
-    rig : what measures. prior : what an earlier calibration knows. columns : of joints.csv.
-    names : of the configurations that there are already. words : where its numbers come from, in
-    sentences. board : fields of the board's file, if one is seen.
+    rig : machine and instruments. prior : of an earlier calibration. columns : of joints.csv. names
+    : of existing configurations. words : sentences on the sources of its numbers. board : fields of
+    the board's file, if a board is observed.
     """
 
     rig: Rig
@@ -87,10 +90,12 @@ def as_it_stands(
     corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
-    """A session to be planned for, as far as it was measured.
+    """Subject of a session with its existing measurements.
 
-    after : what is known already, the usable calibration in its folder unless given or
-    ``from_drawing``. The rest as for :func:`~pkmcal.planning.subject.subject_of_session`.
+    after : earlier calibration; by default the usable one in the session's folder, none with
+    ``from_drawing``. Others as for :func:`~pkmcal.planning.subject.subject_of_session`. Raises
+    InputError if the given calibration is not usable, or if ``same_place`` is set without a
+    calibration.
     """
     saved: SavedCalibration | None = None
     if (
@@ -99,7 +104,7 @@ def as_it_stands(
         and (session.folder / LAST_CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
     ):
         after = load(session.folder / LAST_CALIBRATION_FOLDER)
-        if not after.verdict.usable:  # it says of itself not to be used
+        if not after.verdict.usable:  # a default must not be an unusable calibration
             after = None
     if after is not None:
         saved, session = read_same_machine(after, session)
@@ -139,16 +144,16 @@ def of_machine(
     corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
-    """Of a machine and the camera, or tracker, that somebody thinks of.
+    """Subject with a machine and a hypothetical camera or tracker.
 
-    cameras : one a place. board : on the platform, instead of the legs. tracker : standard
-    deviations of its positions (m) and turns (rad; None where it measures points), instead of
-    cameras. edge, corner : px, how far edges and corners are off.
+    cameras : one for each station. board : on the platform, observed instead of the legs. tracker :
+    standard deviations of its positions (m) and turns (rad; None if it measures points), instead of
+    cameras. edge, corner : standard deviations, px.
     """
     rng = np.random.default_rng(seed)
     noise = f"Readings are taken to be good to {brief(joint_noise * 1e6)} µm (or µrad)"
     if tracker is not None:
-        rig = _tracked(machine, tracker, joint_noise)
+        rig = _tracker_rig(machine, tracker, joint_noise)
         return Subject(rig, None, tuple(columns), (), (noise + ", as told.",))
     cameras = tuple(cameras)
     stations = default_stations(machine, cameras, rng, "platform" if board else None)
@@ -165,7 +170,7 @@ def of_machine(
         mounts, T_mount = (), None
         what = f"edges of legs to {edge:g} px"
     else:
-        place = _bracket(machine, board, cameras, T_camera_base, rng)
+        place = _best_board_pose(machine, board, cameras, T_camera_base, rng)
         instruments = tuple(
             BoardFrom(s, camera, T, board.points, place, corner) for s, (camera, T) in placed
         )
@@ -187,16 +192,16 @@ def of_machine(
     return Subject(rig, None, tuple(columns), (), words, fields)
 
 
-def _bracket(
+def _best_board_pose(
     machine: Machine, board: Board, cameras: tuple[Camera, ...], T: Array, rng: np.random.Generator
 ) -> Array:
-    """Where a board on the platform is seen best."""
+    """T_platform_board (4, 4) at which a board on the platform is visible best."""
     poses, joints = draw_configurations(machine, 12, 0.5, rng)
     return place_board(machine, board, "platform", cameras, T, poses, joints, rng)
 
 
 def check_tubes(machine: Machine, where: str) -> None:
-    """Raise `InputError` for a machine whose legs have no edges; where : their place in a file."""
+    """Raise `InputError` for a machine whose legs have no edges. where : their place in a file."""
     if len(tubes_of(machine)):
         return
     raise InputError(
@@ -207,8 +212,8 @@ def check_tubes(machine: Machine, where: str) -> None:
     )
 
 
-def _tracked(machine: Machine, noise: tuple[float, float | None], joint_noise: float) -> Rig:
-    """A tracker in the base frame, with its target at the platform's origin."""
+def _tracker_rig(machine: Machine, noise: tuple[float, float | None], joint_noise: float) -> Rig:
+    """Rig of a tracker in the base frame, with its target at the platform's origin."""
     position, turn = noise
     whiten = np.diag([0.0 if turn is None else 1 / turn] * 3 + [1 / position] * 3)
     target = TargetFrom(0, np.eye(4), np.eye(4), whiten)
@@ -230,16 +235,16 @@ def subject_of_session(
     corner: float = NOMINAL_CORNER_SIGMA,
     seed: int = 0,
 ) -> Subject:
-    """Of a session: from its drawing, its first photographs, or an earlier calibration.
+    """Subject of a session, by its nominal model, its first images, or an earlier calibration.
 
-    saved : of this machine; its values, its stations' places and what it knows are used.
-    same_place : whether its cameras still stand where they stood. anywhere : that places of its
-    first camera are to be chosen, so that nobody has to say where any stands. edge, corner : px,
-    where no photograph tells how good edges and corners are.
-    Raises InputError where nothing tells where a station stands.
+    saved : calibration of this machine, the source of its values, stations and prior. same_place :
+    whether cameras still have the poses of that calibration. anywhere : whether poses of its first
+    camera are to be chosen, so that none must be given. edge, corner : px, standard deviations for
+    a session without images. Raises InputError if the pose of a station is not known, or for
+    hand-held cameras.
     """
     if anywhere:
-        session = _one_camera(session)
+        session = _first_camera_session(session)
     by_hand = [station.name for station in session.stations if station.handheld]
     if by_hand:
         raise InputError(
@@ -252,42 +257,46 @@ def subject_of_session(
     if saved is not None:
         session = replace(session, machine=saved.machine)
         words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
-    in_view = _Photographed.of(session, saved, np.random.default_rng(seed))
-    T_camera_base = _places(session, saved, in_view, anywhere, seed)
-    rig, board, corner_source = _rig(session, saved, in_view, T_camera_base, edge, corner, seed)
-    reference_values = None
+    images = _SessionImages.of(session, saved, np.random.default_rng(seed))
+    T_camera_base = _station_poses(session, saved, images, anywhere, seed)
+    rig, board, corner_source = _rig(session, saved, images, T_camera_base, edge, corner, seed)
+    prior = None
     if saved is not None:
-        prior = [name for name in session.station_names if same_place and name in saved.placed]
-        reference_values = saved.prior(prior, session.station_names)
+        fixed_stations = [
+            name for name in session.station_names if same_place and name in saved.placed
+        ]
+        prior = saved.prior(fixed_stations, session.station_names)
     columns = tuple(session.document["joints"]["columns"])
     names = session.configurations
     fields = board.document if board else None
-    return Subject(rig, reference_values, columns, names, (*words, *corner_source), fields)
+    return Subject(rig, prior, columns, names, (*words, *corner_source), fields)
 
 
 def _rig(
     session: Session,
     saved: SavedCalibration | None,
-    in_view: _Photographed,
+    images: _SessionImages,
     T_camera_base: Array,
     edge: float,
     corner: float,
     seed: int,
 ) -> tuple[Rig, Board | None, list[str]]:
-    """What a session's stations and trackers measure with, the board on the platform, and where the
-    noise is known from, in words. As :func:`subject_of_session`; T_camera_base : (S, 4, 4).
+    """Rig of a session, the board on its platform, and sentences on the sources of the noise.
+
+    Arguments as for :func:`subject_of_session`; T_camera_base : (S, 4, 4).
     """
     words: list[str] = []
     instruments: list[Instrument] = []
     mounts: list[Mount] = []
     T_mount: list[Array] = []
+    # The board on the platform.
     has_board = any("board" in s.observe for s in session.stations)
     board: Board | None = None
     if has_board and session.board is not None and session.board_body == "platform":
         board = load_board(session.board)
         mounts.append(Mount(BOARD_MOUNT_NAME, "platform", board.tolerance))
-        T_mount.append(_board_place(session, board, saved, in_view, T_camera_base, seed))
-        sigma, corner_source = _corner_noise(in_view.boards, corner)
+        T_mount.append(_board_pose(session, board, saved, images, T_camera_base, seed))
+        sigma, corner_source = _corner_noise(images.boards, corner)
         words.append(corner_source)
         for s, station in enumerate(session.stations):
             if "board" in station.observe:
@@ -295,17 +304,19 @@ def _rig(
                 instruments.append(
                     BoardFrom(s, station.camera, T_camera_base[s], board.points, place, sigma)
                 )
+    # The legs.
     shading = SHADING_SIGMA
     legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
     if legs:
         check_tubes(session.machine, f"{session.document['mechanism']}, legs")
         pixels, pools, shading, corner_source = _edge_noise(
-            session, legs, in_view, T_camera_base, edge
+            session, legs, images, T_camera_base, edge
         )
         words.append(corner_source)
         for s, binning, pool in zip(legs, pixels, pools, strict=True):
             camera = session.stations[s].camera
             instruments.append(LegsFrom(s, camera, T_camera_base[s], pool, binning))
+    # The trackers' targets.
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         place = _saved_target(saved, table.name)
         mounts.append(Mount(table.name, "platform"))
@@ -326,8 +337,10 @@ def _rig(
     return rig, board, words
 
 
-def _one_camera(session: Session) -> Session:
-    """The session with its first camera alone, on a tripod; a hand's photographs tell no place."""
+def _first_camera_session(session: Session) -> Session:
+    """Session with its first camera only, on a tripod; hand-held images do not determine a
+    station.
+    """
     if not session.stations:
         raise InputError(
             "there is no camera whose place could be chosen",
@@ -340,9 +353,10 @@ def _one_camera(session: Session) -> Session:
     return replace(session, stations=(first,), trackers=())
 
 
-class _Photographed(NamedTuple):
-    """What photographs a session has: of legs, and the boards in them; where stations were found
-    (S, 4, 4), None where nothing was.
+class _SessionImages(NamedTuple):
+    """Images of legs of a session, the boards in them, and the localized stations (S, 4, 4).
+
+    T_camera_base : None without images, or with a calibration that has the stations.
     """
 
     photographs: list[Any]
@@ -352,40 +366,41 @@ class _Photographed(NamedTuple):
     @classmethod
     def of(
         cls, session: Session, saved: SavedCalibration | None, rng: np.random.Generator
-    ) -> _Photographed:
+    ) -> _SessionImages:
         if not any(station.photographs for station in session.stations):
             return cls([], Boards(), None)
         photographs = read_photographs(session)
         boards = boards_of(session, photographs)
-        if saved is not None and _saved_places(session, saved) is not None:
+        if saved is not None and _saved_station_poses(session, saved) is not None:
             return cls(photographs, boards, None)
         return cls(photographs, boards, localize_stations(session, photographs, boards, rng))
 
 
-def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
-    """(S, 4, 4) of all stations in a calibration; None where one is not in it."""
+def _saved_station_poses(session: Session, saved: SavedCalibration) -> Array | None:
+    """Poses (S, 4, 4) of all stations in a calibration; None if one is missing."""
     there = {station.name: inverse(station.T_base_camera) for station in saved.stations}
     if not all(name in there for name in session.station_names):
         return None
     return np.stack([there[name] for name in session.station_names])
 
 
-def _places(
+def _station_poses(
     session: Session,
     saved: SavedCalibration | None,
-    in_view: _Photographed,
+    images: _SessionImages,
     anywhere: bool,
     seed: int,
 ) -> Array:
-    """Where all stations stand, (S, 4, 4), by the first that tells: the calibration, the
-    photographs, a pose by hand; a tracker in the base frame. anywhere : where nothing tells, any
-    usual place serves.
+    """Poses (S, 4, 4) of all stations by the first source: calibration, localization, pose in
+    session.yaml; trackers are in the base frame.
+
+    anywhere : use a default pose for a station without a source, instead of raising InputError.
     """
-    reference_values = None if saved is None else _saved_places(session, saved)
-    if reference_values is None:
-        reference_values = in_view.T_camera_base
-    if reference_values is not None:
-        return reference_values
+    poses = None if saved is None else _saved_station_poses(session, saved)
+    if poses is None:
+        poses = images.T_camera_base
+    if poses is not None:
+        return poses
     out: list[Array] = []
     for station in session.stations:
         if station.T_camera_base is None and anywhere:
@@ -407,36 +422,34 @@ def _places(
 
 
 def _edge_noise(
-    session: Session, legs: list[int], in_view: _Photographed, T_camera_base: Array, edge: float
+    session: Session, legs: list[int], images: _SessionImages, T_camera_base: Array, edge: float
 ) -> tuple[tuple[int, ...], tuple[Pools, ...], float, str]:
-    """How many pixels are one where each station's edges are looked for, what these tell, the
-    shading, and where that comes from.
-    """
+    """Binning and pools of each station with legs, the shading, and a sentence on their source."""
     why = "no photograph tells it yet"
-    if len(in_view.photographs) == len(legs):
+    if len(images.photographs) == len(legs):
         rows = [
             spread_over(p.configuration, len(legs), PLAN_PHOTOGRAPHS_A_STATION)
-            for p in in_view.photographs
+            for p in images.photographs
         ]
         try:
             poses = platform_poses(session)
-            first = first_edges(session, in_view.photographs, rows, T_camera_base[legs], poses)
+            first = first_edges(session, images.photographs, rows, T_camera_base[legs], poses)
         except (PkmcalError, np.linalg.LinAlgError):
-            # `check` and `calibrate` tell what is wrong with them; here they serve nothing
+            # `check` and `calibrate` report what is wrong with these images; the plan uses defaults
             why = "the photographs that there are do not tell it; pkmcal check says why"
         else:
             count = sum(len(row) for row in rows)
             words = f"How good edges are is told by {count} of the photographs that there are."
-            pixels = tuple(p.binning for p in in_view.photographs)
+            pixels = tuple(p.binning for p in images.photographs)
             return pixels, first.pools, first.estimate.statistics.shading, words
-    # how sharp they will be nobody has seen
+    # without images their sharpness is not known
     pixels = tuple(first_binning(session.stations[s].camera.image_size) for s in legs)
     pools = (nominal_pools(session.machine, edge),) * len(legs)
     return pixels, pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
 
 
 def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
-    """Px of a board's corner, and where that comes from."""
+    """Standard deviation of a board's corner in px, and a sentence on its source."""
     sigma = [
         float(np.hypot(np.median(s.views.views.sigma[s.views.views.visible]), s.views.poses.noise))
         for s in boards.stations.values()
@@ -444,12 +457,12 @@ def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
     ]
     if not sigma:
         return corner, f"Corners are taken to be good to {corner:g} px: no photograph tells it yet."
-    values = float(np.median(sigma))
-    return values, f"Corners of the board are good to {brief(values)} px in the photographs."
+    median = float(np.median(sigma))
+    return median, f"Corners of the board are good to {brief(median)} px in the photographs."
 
 
 def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
-    """T_platform_target (4, 4) of a calibration."""
+    """T_platform_target (4, 4) in a calibration; None if there is none."""
     targets: list[dict[str, Any]] = [] if saved is None else saved.document.get("targets", [])
     for target in targets:
         if target["name"] == name and target.get("T_platform_target"):
@@ -457,25 +470,25 @@ def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
     return None
 
 
-def _board_place(
+def _board_pose(
     session: Session,
     board: Board,
     saved: SavedCalibration | None,
-    in_view: _Photographed,
+    images: _SessionImages,
     T_camera_base: Array,
     seed: int,
 ) -> Array:
-    """T_platform_board (4, 4): as calibrated, as photographed, or where it would be seen best."""
-    reference_values = _saved_target(saved, BOARD_MOUNT_NAME)
-    if reference_values is not None:
-        return reference_values
-    if in_view.boards.stations:
-        measurements = measurements_of(session, in_view.boards)
+    """T_platform_board (4, 4): as calibrated, from images, or where the board is visible best."""
+    calibrated = _saved_target(saved, BOARD_MOUNT_NAME)
+    if calibrated is not None:
+        return calibrated
+    if images.boards.stations:
+        measurements = measurements_of(session, images.boards)
         return start_mounts(measurements, T_camera_base, platform_poses(session, most=True))[0]
     users = [s for s, station in enumerate(session.stations) if "board" in station.observe]
     cameras = tuple(session.stations[s].camera for s in users)
     rng = np.random.default_rng(seed)
     try:
-        return _bracket(session.machine, board, cameras, T_camera_base[users], rng)
+        return _best_board_pose(session.machine, board, cameras, T_camera_base[users], rng)
     except GeometryError as error:
         raise error.as_input("session.yaml, stations") from None

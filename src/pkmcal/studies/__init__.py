@@ -1,1 +1,1 @@
-"""Monte-Carlo studies: one engine, and the papers' own simulations as settings of it."""
+"""Monte-Carlo studies: one engine, and the papers' simulations as settings of the engine."""

@@ -1,10 +1,10 @@
-"""Simulated calibrations of many machines by the joint estimate, and how far their results are off.
+"""Simulated calibrations of many machines by the joint estimate, and their errors.
 
-True machines are drawn from the drawing's tolerances, cameras' edge shifts and tubes' shading from
-what the estimate takes them for: so its stated deviations, which use all of these as knowledge,
-should hold. Measurements are edges and boards' poses with the noise that they state. The estimate
-is that of ``calibrate``: robust, with the noise's scale and the shading found from the data, from
-the drawing on; stations start as the search in photographs leaves them.
+True machines are drawn from the prior sigmas of the nominal model, cameras' edge shifts and tubes'
+shading from the priors of the estimate, so the stated standard deviations, which use all of these
+priors, should hold. Measurements are edges and board poses with their stated noise. The estimate is
+that of ``calibrate``: robust, with the scale of the noise and the shading estimated from the data,
+started from the nominal model; stations start with the errors that localization leaves.
 
 Axes: B runs, K configurations, N edges, V views of a board, W poses of the workspace.
 """
@@ -61,19 +61,21 @@ from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 JOINT_ESTIMATE_KEY: Key = ("joint",)
 CALIBRATIONS_A_BATCH = 10
-"""Runs that are solved at once, and that share a plan of photographs."""
+"""Number of runs that are solved together and share one capture plan."""
 UNSHARED_SHADING_VARIANCE = 1e-9
-"""Of a variance, what two edges with the same normal are shaded by each for itself; a covariance of
-equal rows has no root."""
+"""Part of the unit variance of the shading that is independent for each edge: the correlation
+matrix of edges with equal normals would have no Cholesky factor without it.
+"""
 STATION_START_SIGMAS = np.repeat([np.deg2rad(1.0), 0.01], 3)
-"""rad and m, standard deviations by which stations start off: so far is what a search for the drawn
-machine in photographs leaves, as the drawing's own errors do."""
+"""Standard deviations (rad, rad, rad, m, m, m) of the stations' starting poses: the errors that
+localization leaves, which come from those of the nominal model.
+"""
 TOOL_ERROR_POSES = 20
-"""Poses at which the tool's error is told."""
+"""Number of poses at which the tool's error is evaluated."""
 TIMES_MACHINES_REDRAWN = 20
-"""Times that a machine is drawn again which cannot take the plan's readings."""
+"""Number of attempts to draw a machine that can take the readings of the plan."""
 PHOTOGRAPH_PLAN_STREAM, TOOL_POSES_STREAM = 1, 2
-"""Uses of a batch's draws, besides the simulation."""
+"""Random streams of a batch, besides 0 of the simulation."""
 CALIBRATED_QUANTITIES: Mapping[str, Quantity] = {
     "position": Quantity("rms", 1e3, "mm"),
     "orientation": Quantity("rms", 1e3, "mrad"),
@@ -87,10 +89,10 @@ CALIBRATED_QUANTITIES: Mapping[str, Quantity] = {
 
 @dataclass(frozen=True)
 class SimulatedSessions:
-    """One batch of simulated sessions, ready to be calibrated.
+    """Batch of simulated sessions, ready to be calibrated.
 
-    capture : their plan. theta (B, P), poses (B, K, 4, 4), internal (B, K, n) : the truth.
-    assembled : the least-squares problem of all runs. start : where it begins.
+    capture : their common plan. theta (B, P), poses T_base_platform (B, K, 4, 4), internal (B, K,
+    n) hinges : the truth. assembled : least-squares problem of all runs. start : initial state.
     """
 
     capture: Capture
@@ -103,7 +105,7 @@ class SimulatedSessions:
 
 @dataclass(frozen=True)
 class SimulatedCalibrations:
-    """Calibrations of machines by one design. batch : runs that share a plan."""
+    """Study of calibrations of machines by one design. batch : number of runs that share a plan."""
 
     design: Design
     batch: int = CALIBRATIONS_A_BATCH
@@ -113,81 +115,83 @@ class SimulatedCalibrations:
 
     @cached_property
     def gauge(self) -> Gauge:
-        """Frames of the result, as a calibration chooses them."""
+        """Gauge of the result, the default of a calibration."""
         return default_gauge(self.design.machine_with_cylinders)
 
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
-        """Names and units of the parameters that errors are told of, (P,)."""
+        """Names and units of the parameters whose errors are reported, (P,)."""
         table = self.design.machine_with_cylinders.parameters
         return tuple(zip(table.names, table.units, strict=True))
 
     def populations(self, runs: int) -> list[Population]:
-        """All runs alike."""
+        """A single population with all runs."""
         return [Population("machine", runs, self.batch)]
 
     def draw(self, batch: Batch) -> SimulatedSessions:
-        """True machines, their poses at the plan's readings, and what is measured of them."""
+        """Draw true machines, compute their poses at the plan's readings, and simulate the
+        measurements.
+        """
         design, rng = self.design, batch.generator(0)
         capture = captured(design, batch.generator(PHOTOGRAPH_PLAN_STREAM))
         theta, poses, internal = _machines(design, capture, batch.runs, rng)
         readings = capture.joints + design.reading_noise * rng.standard_normal(
             (batch.runs, *capture.joints.shape)
         )
-        one = assemble(capture.machine, capture.measurements(design.reading_noise), self.gauge)
-        problem = one.problem
-        data = replace(problem.data, joints=readings[:, one.observed])
+        template = assemble(capture.machine, capture.measurements(design.reading_noise), self.gauge)
+        problem = template.problem
+        data = replace(problem.data, joints=readings[:, template.observed])
         if len(capture.edges):
-            data = _measured_edges(design, capture, one, theta, poses, internal, rng)
-            data = replace(data, joints=readings[:, one.observed])
+            data = _measured_edges(design, capture, template, theta, poses, internal, rng)
+            data = replace(data, joints=readings[:, template.observed])
         pose_data = problem.pose_data
         if len(capture.views):
-            pose_data = _measured_boards(design, capture, one, poses, rng)
+            pose_data = _measured_boards(design, capture, template, poses, rng)
         off = STATION_START_SIGMAS * rng.standard_normal((batch.runs, len(capture.cameras), 6))
         stations = perturb(capture.T_camera_base, off)
         problem = replace(problem, data=data, pose_data=pose_data)
-        assembled = replace(one, problem=problem)
+        assembled = replace(template, problem=problem)
         start = _start(capture, assembled, stations, readings)
-        mounts = np.array(one.priors) == "mount"
-        there = problem.prior_values(start).mean(axis=0)  # a metre's knowledge: one for all runs
+        mounts = np.array(template.priors) == "mount"
+        # the prior is a metre wide: the same for all runs
+        there = problem.prior_values(start).mean(axis=0)
         target = np.where(mounts, there, problem.prior_target)
-        assembled = replace(one, problem=replace(problem, prior_target=target))
+        assembled = replace(template, problem=replace(problem, prior_target=target))
         return SimulatedSessions(capture, theta, poses, internal, assembled, start)
 
     def solve(self, batch: Batch, data: SimulatedSessions) -> dict[Key, Fitted]:
-        """The joint estimate, told in the result's frames."""
+        """Joint estimate of all runs, in the gauge of the result."""
         problem = data.assembled.problem
-        value = solve_batch(problem, data.start)
+        fit = solve_batch(problem, data.start)
         n, own = batch.runs, problem.layout.own_motion.shape[1]
-        used = sum(counts(problem, value.weight))
+        # Degrees of freedom: inliers, closures and priors, less own and shared unknowns.
+        used = sum(counts(problem, fit.weight))
         k = int(data.assembled.observed.sum())
         dof = used + k * (problem.layout.n_equations - own) + len(problem.prior)
         dof = dof - problem.unknowns.count
-        scale = np.maximum(value.noise_scale, value.scale.poses)
-        good = np.array([stop is Stop.CONVERGED for stop in value.solution.stop])
-        parameters = [self._in_gauge(data, value, run) for run in range(n)]
+        scale = np.maximum(fit.noise_scale, fit.scale.poses)
+        good = np.array([stop is Stop.CONVERGED for stop in fit.solution.stop])
+        parameters = [self._in_gauge(data, fit, run) for run in range(n)]
         return {
             JOINT_ESTIMATE_KEY: Fitted(
                 np.array([theta for theta, _ in parameters]),
                 extra={
-                    "chi2": value.solution.cost / dof,
+                    "chi2": fit.solution.cost / dof,
                     "scale": scale,
-                    "steps": value.solution.steps.astype(float),
+                    "steps": fit.solution.steps.astype(float),
                     "failed": 1.0 - (good & (scale <= TOO_NOISY)),
                 },
                 covariance=np.array([covariance for _, covariance in parameters]),
             )
         }
 
-    def _in_gauge(
-        self, data: SimulatedSessions, value: BatchResult, run: int
-    ) -> tuple[Array, Array]:
-        """Parameters (P,) in the result's frames, and their covariance (P, P)."""
+    def _in_gauge(self, data: SimulatedSessions, fit: BatchResult, run: int) -> tuple[Array, Array]:
+        """Parameters (P,) in the result's gauge and their covariance (P, P)."""
         machine, p = data.capture.machine, data.theta.shape[1]
         state = state_of(
-            data.assembled, take(value.solution.state, np.array([run])), _truth(data, run)
+            data.assembled, take(fit.solution.state, np.array([run])), _truth(data, run)
         )
-        shared = value.covariance[run]
+        shared = fit.covariance[run]
         full = machine_covariance(data.assembled.problem, machine, state, shared, self.gauge)
         theta = machine.parameters.unit_axes(in_gauge(machine, state, self.gauge).theta)
         return theta, full[:p, :p]
@@ -195,7 +199,7 @@ class SimulatedCalibrations:
     def judge(
         self, batch: Batch, data: SimulatedSessions, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
-        """Errors of parameters and tool, and what is stated of them."""
+        """Errors of the parameters and of the tool, with their stated standard deviations."""
         machine, fit = data.capture.machine, fits[JOINT_ESTIMATE_KEY]
         by_board = "legs" not in self.design.observe
         joints = draw_configurations(
@@ -209,35 +213,40 @@ class SimulatedCalibrations:
     def _judged(
         self, data: SimulatedSessions, fit: Fitted, run: int, joints: Array, *, every: bool
     ) -> tuple[Array, Array]:
-        """One run's errors and their stated deviations, of the parameters (2, P) and of the tool
+        """Errors and stated standard deviations of one run: of the parameters (2, P) and the tool
         (2, W, 6).
         """
         machine, true = data.capture.machine, _truth(data, run)
         theta = fit.theta[run]
         covariance = np.zeros((len(theta),) * 2) if fit.covariance is None else fit.covariance[run]
-        values = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
+        true_theta = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         sigma = np.where(sigma > ROUNDING_SIGMA, sigma, np.nan)
-        sigma[_along_axes(machine)] = np.nan
+        # An axis is a unit vector: its largest component follows from the other two, and changes
+        # only to second order when the axis turns.
+        axes = machine.parameters.axes
+        largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
+        sigma[axes[np.arange(len(axes)), largest]] = np.nan
         off = tool_error_and_sigma(machine, theta, covariance, true, joints, every=every)
-        return np.stack([theta - values, sigma]), np.stack(off)
+        return np.stack([theta - true_theta, sigma]), np.stack(off)
 
 
 def judged(parameters: Array, tool: Array, fit: Fitted) -> Sample:
-    """A sample of calibrations, each with all that a study tells of it.
+    """Sample of calibrations with all their figures.
 
-    parameters : (2, B, n) errors and stated deviations in m or rad, NaN of what is no unknown of
-    its own. tool : (2, B, W, 6) the same of the tool's pose (omega, tau).
+    parameters : (2, B, n) errors and stated standard deviations in m or rad; NaN for parameters
+    that are not unknowns of their own. tool : (2, B, W, 6) the same for the tool's pose (omega,
+    tau).
     """
     size, stated = _sizes(tool[0]), _sizes(tool[1])
-    values = {
+    figures = {
         "parameters": parameters[0],
         "tool": tool[0],
         "position": size[1], "orientation": size[0],
         "position_sigma": stated[1], "orientation_sigma": stated[0],
         "covered": covered(*parameters), "covered_tool": covered(*tool),
     }  # fmt: skip
-    return Sample(values | fit.extra, {"parameters": parameters[1], "tool": tool[1]})
+    return Sample(figures | fit.extra, {"parameters": parameters[1], "tool": tool[1]})
 
 
 def tool_error_and_sigma(
@@ -249,47 +258,53 @@ def tool_error_and_sigma(
     *,
     every: bool,
 ) -> tuple[Array, Array]:
-    """By how much a calibrated machine's poses differ from the true one's at the same readings, and
-    the standard deviations that the calibration states of that: (W, 6) each, (omega, tau).
+    """Errors of a calibrated machine's poses at given readings, and their stated standard
+    deviations.
 
-    theta (P,), covariance (P, P) : of the result. joints (W, m). Frames of the truth are laid over
-    the result's as :func:`pkmcal.identify.tool.tool_error` has it; every : as where no legs were
-    seen. NaN where a machine cannot take the readings.
+    theta (P,), covariance (P, P) : of the result. joints : (W, m) readings. The frames of the truth
+    are registered to those of the result as in :func:`pkmcal.identify.tool.tool_error`; every : as
+    if no legs were observed. Returns two arrays (W, 6) of (omega, tau); NaN where a machine cannot
+    take the readings.
     """
     n = len(theta)
-    # the best fit is that of the truth on the result, not on the drawing
-    value = replace(machine, parameters=replace(machine.parameters, drawing=theta), values=theta)
-    over = changed_frames(machine.layout, true, *alignment(value, true, BestFit()))
+    # register the truth to the result rather than to the nominal model
+    calibrated = replace(
+        machine, parameters=replace(machine.parameters, drawing=theta), values=theta
+    )
+    registered = changed_frames(machine.layout, true, *alignment(calibrated, true, BestFit()))
     there = replace(true, theta=theta)
-    keep = transformation(value, there, BestFit())[:n, :n]
+    keep = transformation(calibrated, there, BestFit())[:n, :n]
+    # Forward kinematics of the result and of the truth at the same readings.
     home = np.broadcast_to(machine.home(), (len(joints), 4, 4))
-    drawn = forward(machine.layout, machine.parameters.drawing, joints, home)
-    one = forward(machine.layout, theta, joints, drawn.T_base_platform, drawn.internal)
-    other = forward(machine.layout, over.theta, joints, one.T_base_platform, one.internal)
-    good = one.converged & other.converged
-    poses = one.T_base_platform[good]
-    by = pose_by_parameters(value, joints[good], poses) @ keep
-    by = without_frames(value, poses, by, every=every)
-    off = pose_difference(poses, other.T_base_platform[good])[..., None]
-    off = without_frames(value, poses, off, every=every)[..., 0]
-    variance = np.einsum("kip,pq,kiq->ki", by, covariance, by)
+    nominal_fk = forward(machine.layout, machine.parameters.drawing, joints, home)
+    calibrated_fk = forward(
+        machine.layout, theta, joints, nominal_fk.T_base_platform, nominal_fk.internal
+    )
+    true_fk = forward(
+        machine.layout,
+        registered.theta,
+        joints,
+        calibrated_fk.T_base_platform,
+        calibrated_fk.internal,
+    )
+    good = calibrated_fk.converged & true_fk.converged
+    # Error and its covariance, both without the components that are changes of frames.
+    poses = calibrated_fk.T_base_platform[good]
+    by_parameters = pose_by_parameters(calibrated, joints[good], poses) @ keep
+    by_parameters = without_frames(calibrated, poses, by_parameters, every=every)
+    error = pose_difference(poses, true_fk.T_base_platform[good])[..., None]
+    error = without_frames(calibrated, poses, error, every=every)[..., 0]
+    variance = np.einsum("kip,pq,kiq->ki", by_parameters, covariance, by_parameters)
     out = np.full((2, len(joints), 6), np.nan)
-    out[0, good], out[1, good] = off, np.sqrt(np.maximum(variance, 0.0))
-    out[:, out[1] < ROUNDING_SIGMA] = np.nan  # no motion in this direction
+    out[0, good], out[1, good] = error, np.sqrt(np.maximum(variance, 0.0))
+    out[:, out[1] < ROUNDING_SIGMA] = np.nan  # the machine cannot move in this direction
     return out[0], out[1]
 
 
-def _along_axes(machine: Machine) -> Integers:
-    """Positions of each axis's largest component, which follows from the other two: an axis is a
-    direction, and what turns it moves that component by the turn's square alone.
-    """
-    axes = machine.parameters.axes
-    largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
-    return axes[np.arange(len(axes)), largest]
-
-
 def _sizes(tool: Array) -> tuple[Array, Array]:
-    """Root mean squares (B,) over the workspace of turns (rad) and displacements (m)."""
+    """Root mean square (B,) rotations (rad) and displacements (m) of the tool over the
+    workspace.
+    """
     squares = np.nansum(tool.reshape(*tool.shape[:2], 2, 3) ** 2, axis=-1)
     there = np.asarray(np.isfinite(tool).any(axis=-1))
     squares = np.where(there[..., None], squares, np.nan)
@@ -298,7 +313,7 @@ def _sizes(tool: Array) -> tuple[Array, Array]:
 
 
 def _truth(data: SimulatedSessions, run: int) -> State:
-    """What is true of a run."""
+    """True state of a run."""
     capture = data.capture
     return State(
         data.theta[run],
@@ -315,8 +330,11 @@ def _truth(data: SimulatedSessions, run: int) -> State:
 def _machines(
     design: Design, capture: Capture, runs: int, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """True machines (B, P) as they might be built, their poses (B, K, 4, 4) and hinges at the
-    plan's readings.
+    """Draw true machines (B, P) by the prior sigmas, with their poses (B, K, 4, 4) and hinges at
+    the plan's readings.
+
+    A machine that cannot take the readings is drawn again; ResultError after TIMES_MACHINES_REDRAWN
+    attempts.
     """
     machine, table = capture.machine, capture.machine.parameters
     tolerance, free = design.tolerance * table.tolerances_free(), table.free_matrix()
@@ -349,15 +367,15 @@ def _machines(
 def _measured_edges(
     design: Design,
     capture: Capture,
-    one: Assembled,
+    template: Assembled,
     theta: Array,
     poses: Array,
     internal: Array,
     rng: np.random.Generator,
 ) -> EdgeData:
-    """The edges of all runs at their places in the problem."""
-    machine, edges, at = capture.machine, capture.edges, one.places.edges
-    blocks, runs, n = one.problem.blocks, len(theta), len(capture.edges)
+    """Edge measurements of all runs, at their places in the problem."""
+    machine, edges, at = capture.machine, capture.edges, template.places.edges
+    blocks, runs, n = template.problem.blocks, len(theta), len(capture.edges)
     ends = limb_ends(machine.layout, theta[:, None], capture.joints, poses, internal)
     radius = theta[:, blocks.radius[at.row, at.place]]
     normal, basis, first = np.empty((runs, n, 3)), np.empty((runs, n, 3, 2)), np.empty((runs, n, 3))
@@ -370,6 +388,7 @@ def _measured_edges(
             for e in (ends.a, ends.b)
         )
         u, m = line_through(a, b)
+        # Exact edge normals, and their rotations by a shift and a tilt of one pixel.
         exact = edge_normal(u, m, radius[:, own], SIDE_SIGNS[edges.side[own]])
         span = edges.span[own]
         along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, EDGE_TURN_PLACES)
@@ -385,18 +404,22 @@ def _measured_edges(
         normal[:, own], basis[:, own], first[:, own] = exact, frame, middle
         by_shift[:, own] = shift.reshape(runs, -1, 2)
         by_tilt[:, own] = tilt.reshape(runs, -1, 2)
+    # Errors in px: independent noise, the camera's edge shift, and the shading of the tube's side.
     error = design.edge_noise * rng.standard_normal((2, runs, n))
     camera = blocks.camera[at.row, at.place]
-    outward = SHIFT_SIGMA * rng.standard_normal((runs, one.problem.unknowns.n_cameras))[:, camera]
+    outward = (
+        SHIFT_SIGMA * rng.standard_normal((runs, template.problem.unknowns.n_cameras))[:, camera]
+    )
     line = blocks.line[at.row, at.place]
     lines = rng.standard_normal((runs, int(line.max(initial=0)) + 1))
     alone = rng.standard_normal((runs, n))
-    own = OWN_SHADING / SHADING_SIGMA * _own(line, normal[0], rng, runs)
+    own = OWN_SHADING / SHADING_SIGMA * _own_shading(line, normal[0], rng, runs)
     shaded = design.shading * (np.where(line < 0, alone, lines[:, line]) + own)
     turn = by_shift * (error[0] + outward + shaded)[..., None] + by_tilt * error[1][..., None]
     normal = normal + (basis @ turn[..., None])[..., 0]
     normal = normal / np.sqrt(dot(normal, normal))[..., None]
     basis = tangent_basis(normal, first)
+    # Whitening by the noise that the estimate assumes.
     parts = design.edge_noise * np.stack([by_shift, by_tilt], axis=-1)
     whiten = np.linalg.inv(np.linalg.cholesky(parts @ parts.mT))
 
@@ -404,16 +427,17 @@ def _measured_edges(
         return np.moveaxis(at.filled(np.moveaxis(values, 0, 1)), 2, 0)
 
     return replace(
-        one.problem.data,
+        template.problem.data,
         basis=placed(basis)[:, :, :, None],
         white=placed(whiten),
         optics=placed(by_shift[..., None]),
     )
 
 
-def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> Array:
-    """What edges (n,) are shaded by one by one, of unit variance, (runs, n): alike where normals
-    (n, 3) of the same line are near.
+def _own_shading(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> Array:
+    """Individual shading of edges (n,), (runs, n) of unit variance.
+
+    It is correlated between edges of the same line by the angle between their normals (n, 3).
     """
     out = rng.standard_normal((runs, len(line)))
     for number in range(int(line.max(initial=-1)) + 1):
@@ -430,12 +454,12 @@ def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> 
 
 
 def _measured_boards(
-    design: Design, capture: Capture, one: Assembled, poses: Array, rng: np.random.Generator
+    design: Design, capture: Capture, template: Assembled, poses: Array, rng: np.random.Generator
 ) -> PoseData:
-    """The board's poses of all runs, with the covariance that their corners' noise gives."""
+    """Board poses of all runs, with the covariance that follows from the noise of the corners."""
     if capture.board is None or capture.T_platform_board is None:
-        return one.problem.pose_data
-    at, (station, row) = one.places.poses, capture.views.T
+        return template.problem.pose_data
+    at, (station, row) = template.places.poses, capture.views.T
     true = capture.T_camera_base[station] @ poses[:, row] @ capture.T_platform_board
     information = np.empty((*true.shape[:2], 6, 6))
     for number, camera in enumerate(capture.cameras):
@@ -450,15 +474,15 @@ def _measured_boards(
     covariance = np.linalg.inv(information)
     covariance = 0.5 * (covariance + covariance.mT)
     root = np.linalg.cholesky(covariance)
-    in_view = perturb(true, (root @ rng.standard_normal((*true.shape[:2], 6, 1)))[..., 0])
+    measured = perturb(true, (root @ rng.standard_normal((*true.shape[:2], 6, 1)))[..., 0])
 
     def placed(values: Array, empty: Array) -> Array:
         out = np.moveaxis(at.filled(np.moveaxis(values, 0, 1)), 2, 0)
         return np.where(at.present[..., None, None], out, empty)
 
     return replace(
-        one.problem.pose_data,
-        T_station_target=placed(in_view, np.eye(4)),
+        template.problem.pose_data,
+        T_station_target=placed(measured, np.eye(4)),
         whiten=placed(np.linalg.inv(root), np.zeros((6, 6))),
     )
 
@@ -466,7 +490,9 @@ def _measured_boards(
 def _start(
     capture: Capture, assembled: Assembled, T_camera_base: Array, readings: Array
 ) -> BatchState:
-    """Where all runs begin: the drawing, poses by its forward kinematics, boards from the poses."""
+    """Initial state of all runs: nominal parameters, platform poses by forward kinematics, mounts
+    from the platform poses.
+    """
     machine, problem = capture.machine, assembled.problem
     runs, u = len(readings), problem.unknowns
     reached = machine.forward_result(capture.joints, capture.T_base_platform)

@@ -1,9 +1,10 @@
-"""What a session would photograph, told by the drawing: stations, configurations, what is seen.
+"""Plan of a session by the nominal model: stations, configurations, and the visible edges and
+boards.
 
-Axes: S stations, K configurations, N edges, V views of a board with n corners each. A plan is made
-with the drawing, as people make it; the true machines of a study, which differ from it by its
-tolerances, then take the same readings. What is seen of them is what the plan sees: an edge that
-a true machine shows by a millimetre less counts as long as planned.
+Axes: S stations, K configurations, N edges, V views of a board with n corners each. The plan is
+made with the nominal model, as a user makes it; the true machines of a study, which differ by their
+prior sigmas, then take the same readings. Visibility is that of the plan: an edge of a true machine
+that is shorter by a millimetre counts with its planned length.
 """
 
 from __future__ import annotations
@@ -27,28 +28,29 @@ from pkmcal.simulation.placement import default_stations, draw_configurations, i
 from pkmcal.simulation.truth import Settings
 
 LEAST_BOARD_SHARE_IN_IMAGE = 0.5
-"""Share of a board's corners that a photograph has to show."""
+"""Share of a board's corners that an image must show."""
 LEAST_FACING = 0.2
-"""Cosine of the angle between a board's normal and the line of sight below which it shows nothing:
-detectors give up at some eighty degrees."""
+"""Cosine of the angle between board normal and line of sight below which no corner is visible:
+detectors fail at about 80 degrees.
+"""
 CORNER_BORDER_MARGIN = 10.0
-"""px between a corner and the image's border."""
+"""Distance in px of a corner from the image border."""
 SPARE_CONFIGURATIONS_DRAWN = 10
-"""Configurations drawn beyond those wanted, of which a station takes what it sees."""
+"""Number of configurations drawn beyond twice those wanted; stations select those in view."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """What is to be built and bought; lengths in m, angles in rad.
+    """Design of a machine with its measuring set-up; lengths in m, angles in rad.
 
-    machine : the drawing. cameras : one for all stations, or one each. stations : how many.
-    T_camera_base : (S, 4, 4) where they stand, None for places of their own in every batch.
+    machine : the nominal model. cameras : one for all stations, or one for each. stations : their
+    number. T_camera_base : (S, 4, 4) poses of the stations; None to choose them in every batch.
     observe : legs, board or both; the board is on the platform. board : None for one in proportion
-    to the machine. configurations : photographed by each station, its own or, ``shared``, the same
-    by all. distance, elevation : of the cameras, None for the usual. reading_noise : m or rad.
-    edge_noise : px, of an edge's place and of its ends. corner_noise : px, of a coordinate.
-    shading : px, of the shift that all edges of a tube's side have at a station. tolerance : true
-    machines differ from the drawing by so many of its tolerances. extreme : share of
+    to the machine. configurations : number for each station; ``shared`` if all stations observe the
+    same ones. distance, elevation : of the cameras; None for the defaults. reading_noise : m or
+    rad. edge_noise : px, of an edge's shift and of its ends by tilt. corner_noise : px, of a
+    coordinate. shading : px, of the shift that all edges of a tube's side share at a station.
+    tolerance : standard deviation of true machines, in prior sigmas. extreme : share of
     configurations with legs near the ends of their ranges.
     """
 
@@ -71,23 +73,26 @@ class Design:
 
     @property
     def machine_with_cylinders(self) -> Machine:
-        """The drawing with a cylinder a rod where legs are observed and it gives them none."""
+        """The nominal model, with a cylinder for each rod if legs are observed and the model has
+        none.
+        """
         return with_forearms(self.machine) if "legs" in self.observe else self.machine
 
     @property
     def camera_of_station(self) -> tuple[Camera, ...]:
-        """One a station."""
+        """Camera of each station."""
         return self.cameras if len(self.cameras) > 1 else self.cameras * self.stations
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A plan of photographs.
+    """Plan of images by a design.
 
-    machine : the drawing. cameras : one a station. T_camera_base : (S, 4, 4). T_base_platform
-    (K, 4, 4), joints (K, m) : by the drawing, exact. edges : exact, by the drawing; empty where
-    legs are not observed. views : (V, 2) station and configuration of the photographs that show
-    the board; corners : (V, n) which of its corners. board, T_platform_board : None without one.
+    machine : the nominal model. cameras : one for each station. T_camera_base : (S, 4, 4).
+    T_base_platform (K, 4, 4), joints (K, m) : nominal and exact. edges : nominal and exact; empty
+    if legs are not observed. views : (V, 2) station and configuration of the images that show the
+    board. corners : (V, n) visibility of its corners. board, T_platform_board : None without a
+    board.
     """
 
     machine: Machine
@@ -102,7 +107,9 @@ class Capture:
     T_platform_board: Array | None = None
 
     def measurements(self, joint_noise: float) -> Measurements:
-        """The plan as measurements: where each stands; numbers by the drawing, of boards none."""
+        """The plan as measurements, for their structure: edges are nominal, board poses are
+        identity.
+        """
         n = len(self.views)
         none = np.zeros(n, dtype=int)
         unit = np.broadcast_to(np.eye(4), (n, 4, 4))
@@ -121,9 +128,9 @@ class Capture:
 
 
 def captured(design: Design, rng: np.random.Generator) -> Capture:
-    """A plan: stations and board where people put them, configurations drawn until all are seen.
+    """Choose stations, mount the board, and draw configurations until enough are in view.
 
-    Raises InputError where a station does not see enough.
+    Raises InputError if a station does not see enough configurations.
     """
     machine, cameras = design.machine_with_cylinders, design.camera_of_station
     by_board = "board" in design.observe
@@ -134,11 +141,13 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
             distance=design.distance, elevation=design.elevation,
         )  # fmt: skip
         T_camera_base = np.stack([place.T_camera_base() for place in places])
+    # Candidate configurations, more than needed.
     n = design.configurations
     wanted = n if design.shared else n * design.stations
     poses, joints = draw_configurations(
         machine, 2 * wanted + SPARE_CONFIGURATIONS_DRAWN, design.extreme, rng
     )
+    # Visibility of board and legs at each station.
     board = T_platform_board = None
     visible = np.ones((design.stations, len(joints)), dtype=bool)
     if by_board:
@@ -147,8 +156,8 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
         T_platform_board = place_board(
             whole, board, "platform", cameras, T_camera_base, poses, whole.inverse(poses), rng
         )
-        display = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        visible &= display.mean(axis=-1) >= LEAST_BOARD_SHARE_IN_IMAGE
+        corner_visible = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        visible &= corner_visible.mean(axis=-1) >= LEAST_BOARD_SHARE_IN_IMAGE
     if "legs" in design.observe:
         visible &= np.stack(
             [
@@ -156,16 +165,17 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
                 for camera, T in zip(cameras, T_camera_base, strict=True)
             ]
         )
-    rows, photographs = _chosen(visible, n, shared=design.shared)
+    # The first configurations that are in view.
+    rows, pairs = _chosen(visible, n, shared=design.shared)
     poses, joints = poses[rows], joints[rows]
     edges = EdgeSet.empty()
     if "legs" in design.observe:
-        edges = _edges(machine, cameras, T_camera_base, poses, joints, photographs)
+        edges = _edges(machine, cameras, T_camera_base, poses, joints, pairs)
     views, corners = np.zeros((0, 2), dtype=int), np.zeros((0, 0), dtype=bool)
     if board is not None and T_platform_board is not None:
-        views = photographs
-        display = _corners(board, T_platform_board, cameras, T_camera_base, poses)
-        corners = display[views[:, 0], views[:, 1]]
+        views = pairs
+        corner_visible = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        corners = corner_visible[views[:, 0], views[:, 1]]
     return Capture(
         machine, cameras, T_camera_base, poses, joints, edges, views, corners, board,
         T_platform_board,
@@ -173,7 +183,7 @@ def captured(design: Design, rng: np.random.Generator) -> Capture:
 
 
 def _chosen(visible: Booleans, n: int, *, shared: bool) -> tuple[Integers, Integers]:
-    """Candidates (K,) that are taken, and pairs (M, 2) of station and configuration.
+    """Selected candidates (K,), and the pairs (M, 2) of station and configuration.
 
     visible : (S, candidates).
     """
@@ -202,12 +212,12 @@ def _edges(
     T_camera_base: Array,
     poses: Array,
     joints: Array,
-    photographs: Integers,
+    pairs: Integers,
 ) -> EdgeSet:
-    """All edges that the photographs show, exact."""
+    """Exact edges that are visible in the images (M, 2) of station and configuration."""
     tubes, sets = tubes_of(machine), list[EdgeSet]()
     for station, (camera, T) in enumerate(zip(cameras, T_camera_base, strict=True)):
-        rows = photographs[photographs[:, 0] == station, 1]
+        rows = pairs[pairs[:, 0] == station, 1]
         ends = machine.ends_at(joints[rows], poses[rows])
         radius = machine.values[tubes.radius]
         exact, _ = visible_edges(camera, tubes, radius, apply(T, ends.a), apply(T, ends.b))
@@ -223,7 +233,9 @@ def _corners(
     T_camera_base: Array,
     poses: Array,
 ) -> Booleans:
-    """(S, K, n) which corners each station sees; the machine's own parts hide none."""
+    """Visibility (S, K, n) of the corners at each station; occlusion by the machine is
+    neglected.
+    """
     out: list[Booleans] = []
     for camera, T in zip(cameras, T_camera_base, strict=True):
         there = T @ poses @ T_platform_board

@@ -1,4 +1,4 @@
-"""A study's batches on a Dask cluster: the same tasks, so the same numbers."""
+"""Runner of a study's batches on a Dask cluster; the tasks, and so the numbers, are the same."""
 
 from __future__ import annotations
 
@@ -14,28 +14,30 @@ from pkmcal.studies.tasks import Finished, Job, Runner, SolvedBatch, work
 from pkmcal.wording import install_step
 
 SCHEDULER_TIMEOUT = 20
-"""Seconds for a scheduler to answer, and for its first worker to be there."""
+"""Seconds to wait for the scheduler's answer, and for its first worker."""
 SCHEDULER_SCHEMES = ("tcp", "tls", "ws", "wss")
 EXPECTED_SCHEDULER_ADDRESS = "the address that dask scheduler prints, such as tcp://10.0.0.1:8786"
 
 
 def _is_address(text: str) -> bool:
-    """Whether a text names a host and a port, and how to speak with it."""
+    """Whether a text is an address with a known scheme, a host and a port."""
     try:
         parts = urlsplit(text if "://" in text else f"tcp://{text}")
         return parts.scheme in SCHEDULER_SCHEMES and bool(parts.hostname) and bool(parts.port)
-    except ValueError:  # a port that is no number
+    except ValueError:  # the port is not a number
         return False
 
 
-def _version() -> str:
-    """The program's version, here or on a worker."""
+def _pkmcal_version() -> str:
+    """Version of pkmcal, here or on a worker."""
     return version("pkmcal")
 
 
-def _worked(task: Job) -> SolvedBatch:
-    """On a worker, which keeps to one thread in its linear algebra from then on: its tasks may
-    overlap, and each would give the others' threads back when it ends.
+def _work_on_one_thread(task: Job) -> SolvedBatch:
+    """Result of a task, computed on a worker.
+
+    The worker's linear algebra is limited to one thread for good: tasks may overlap, and a limit
+    for each task would restore the other's threads when the task ends.
     """
     from threadpoolctl import threadpool_limits
 
@@ -44,10 +46,11 @@ def _worked(task: Job) -> SolvedBatch:
 
 
 def on_cluster(address: str) -> Runner:
-    """A runner on the cluster whose scheduler is at an address such as ``tcp://10.0.0.1:8786``.
+    """Runner on the cluster with the scheduler's address, such as ``tcp://10.0.0.1:8786``.
 
-    Raises InputError where dask.distributed is not installed; running it does where the cluster
-    does not answer, has no worker, or other workers than this program's.
+    Raises InputError if dask.distributed is not installed or the address is malformed; the runner
+    raises InputError if the cluster does not answer, has no worker, or has workers with another
+    version of pkmcal.
     """
     if find_spec("distributed") is None:
         raise InputError(
@@ -55,7 +58,7 @@ def on_cluster(address: str) -> Runner:
             where="--scheduler",
             next_step=install_step("cluster"),
         )
-    if not _is_address(address):  # which Dask's client only tells after it has begun, and late
+    if not _is_address(address):  # Dask's client reports a malformed address only late
         raise InputError(
             "this is no address of a Dask scheduler",
             where="--scheduler", found=f"'{address}'", expected=EXPECTED_SCHEDULER_ADDRESS,
@@ -75,10 +78,10 @@ def on_cluster(address: str) -> Runner:
             ) from None
         log = logging.getLogger("distributed.client")
         level = log.level
-        log.setLevel(logging.CRITICAL)  # what a lost scheduler means is told by the error here
+        log.setLevel(logging.CRITICAL)  # _run_tasks reports a lost scheduler
         try:
-            workers = _checked(client, address)
-            _done(client, tasks, finished)
+            workers = _count_threads(client, address)
+            _run_tasks(client, tasks, finished)
         finally:
             client.close()
             log.setLevel(level)
@@ -87,8 +90,8 @@ def on_cluster(address: str) -> Runner:
     return runner
 
 
-def _checked(client: Any, address: str) -> int:
-    """The number of the cluster's workers, all of which have this program."""
+def _count_threads(client: Any, address: str) -> int:
+    """Number of the cluster's threads; raises InputError if any worker has another version."""
     try:
         client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
     except TimeoutError:
@@ -99,25 +102,27 @@ def _checked(client: Any, address: str) -> int:
             next_step=f"Start one with: dask worker {address}",
         ) from None
     try:
-        versions = set(client.run(_version).values())
+        versions = set(client.run(_pkmcal_version).values())
     except (ImportError, AttributeError) as error:
         versions = {str(error)}
-    if versions != {_version()}:
+    if versions != {_pkmcal_version()}:
         raise InputError(
             "the cluster's workers have another pkmcal, so they would not give the same numbers",
             where="--scheduler",
             found=", ".join(sorted(versions)),
-            expected=_version(),
-            next_step=f"Install pkmcal {_version()} where the workers run",
+            expected=_pkmcal_version(),
+            next_step=f"Install pkmcal {_pkmcal_version()} where the workers run",
         )
     return sum(client.nthreads().values())
 
 
-def _done(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
-    """All tasks; what a worker had in hand when it died is done again by another."""
+def _run_tasks(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
+    """Run all tasks; Dask repeats the tasks of a worker that has died on another one."""
     from distributed import CancelledError, KilledWorker, as_completed
 
-    futures = {client.submit(_worked, task, pure=False): k for k, task in enumerate(tasks)}
+    futures = {
+        client.submit(_work_on_one_thread, task, pure=False): k for k, task in enumerate(tasks)
+    }
     try:
         for future in as_completed(list(futures), loop=client.loop):
             number = futures.pop(future)
@@ -129,7 +134,7 @@ def _done(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
             found=str(error),
             next_step="Look whether they have enough memory; what is finished is kept",
         ) from None
-    except CancelledError:  # of all that waited, where the client lost its scheduler
+    except CancelledError:  # the client has lost its scheduler, which cancels all pending tasks
         raise ResultError(
             "the scheduler of the cluster is gone",
             next_step="Start it again; what is finished is kept, and the same command goes on",

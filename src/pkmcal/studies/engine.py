@@ -1,8 +1,8 @@
-"""One engine of Monte-Carlo studies: batches of simulated runs, drawn, solved and judged.
+"""Engine of Monte-Carlo studies: batches of simulated runs are drawn, solved and judged.
 
-Runs are worked on in batches, vectorised, on all cores (:mod:`pkmcal.studies.tasks`). A batch
-depends on its own seeds alone: so results do not depend on the number of workers nor on their
-order, and finished batches can be kept and taken up again.
+Runs are vectorised in batches and batches are distributed over all cores
+(:mod:`pkmcal.studies.tasks`). A batch depends on its own seed alone, so results depend neither on
+the number of workers nor on their order, and finished batches can be stored and reused.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ S = TypeVar("S", bound=StudySetting)
 
 @dataclass(frozen=True)
 class StudyResult(Generic[S]):
-    """What the runs came to.
+    """Results of all runs of one setting.
 
-    samples : of every run, by what was estimated how. accuracy : its quantities summed up, each
-    with its Monte-Carlo error. wall : seconds of it all. solving : seconds of the estimators alone,
-    on so many ``workers``. cpu : their processor time.
+    samples : of all runs, by key. accuracy : summaries of the quantities, each with its Monte-Carlo
+    error. wall : seconds of the whole study. solving : seconds of the estimators alone, divided by
+    the number of ``workers``. cpu : processor seconds of the estimators.
     """
 
     setting: S
@@ -46,16 +46,16 @@ class StudyResult(Generic[S]):
     workers: int
 
     def of(self, *key: str) -> Mapping[str, Summary]:
-        """The quantities of one method, summed up."""
+        """Summaries of one method's quantities."""
         return self.accuracy[key]
 
     def values(self, quantity: str, *key: str) -> Array:
-        """A quantity of one method, every run's, (B,) or (B, n)."""
+        """Values of one quantity of a method for every run, (B,) or (B, n)."""
         return self.samples[key].values[quantity]
 
 
 def run(setting: S, runs: int, seed: int, progress: StudyProgress | None = None) -> StudyResult[S]:
-    """The whole study of one setting. progress : called with what is done and the share of it."""
+    """Study of one setting. progress : callback with a text and the share done."""
     return run_all([setting], runs, seed, progress)[0]
 
 
@@ -68,11 +68,11 @@ def run_all(
     store: Store | None = None,
     names: Sequence[str] = (),
 ) -> list[StudyResult[S]]:
-    """Several settings with the same seeds: what they differ by is theirs, and not the draws'.
+    """Studies of several settings with the same seeds, so that they differ only by their settings.
 
-    runner : all cores of this machine unless given. store : batches that are finished already are
-    taken from there, and new ones put there at once. names : of the settings, for errors.
-    Raises what a setting raises, with its name.
+    runner : all cores of this machine by default. store : source of finished batches, and
+    destination of new ones as soon as they are done. names : of the settings, for error messages.
+    Raises errors of the settings, with the setting's name.
     """
     began = time.perf_counter()
     parts = [
@@ -80,19 +80,20 @@ def run_all(
         for cell, setting in enumerate(settings)
         for number, batch in enumerate(batches(setting, runs, seed))
     ]
-    # The first batch of every setting first: one that cannot be simulated is told at once.
+    # Run the first batch of every setting first, so that a setting that cannot be simulated fails
+    # at once.
     parts.sort(key=lambda part: (part[1], part[0]))
     done: dict[int, SolvedBatch] = {}
     for k, part in enumerate(parts):
-        value = store.load(*part) if store else None
-        if value is not None:
-            done[k] = value
-    remainder = [k for k in range(len(parts)) if k not in done]
+        stored = store.load(*part) if store else None
+        if stored is not None:
+            done[k] = stored
+    pending = [k for k in range(len(parts)) if k not in done]
     if progress and done:
         progress(settings[0].doing, len(done) / len(parts))
 
     def finished(task: int, result: SolvedBatch) -> None:
-        k = remainder[task]
+        k = pending[task]
         cell, number, _ = parts[k]
         if store:
             store.save(cell, number, result)
@@ -101,7 +102,7 @@ def run_all(
             progress(settings[cell].doing, len(done) / len(parts))
 
     jobs = [Job(settings[cell], batch, names[cell] if names else "")
-            for cell, _, batch in (parts[k] for k in remainder)]  # fmt: skip
+            for cell, _, batch in (parts[k] for k in pending)]  # fmt: skip
     workers = (runner or on_cores)(jobs, finished) if jobs else 1
     wall = time.perf_counter() - began
     out: list[StudyResult[S]] = []
@@ -116,7 +117,7 @@ def run_all(
 
 
 def batches(setting: StudySetting, runs: int, seed: int) -> list[Batch]:
-    """All that is to be done, the same for any number of workers."""
+    """All batches of a study with their seeds, independent of the number of workers."""
     parts = [
         (population.name, min(population.batch, population.runs - first))
         for population in setting.populations(runs)
@@ -127,7 +128,7 @@ def batches(setting: StudySetting, runs: int, seed: int) -> list[Batch]:
 
 
 def collected(parts: Sequence[Mapping[Key, Sample]]) -> dict[Key, Sample]:
-    """Batches' samples as the study's, in the batches' order."""
+    """Samples of all batches, concatenated in the order of the batches."""
 
     def joined(arrays: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
         return {name: np.concatenate([a[name] for a in arrays]) for name in arrays[0]}
@@ -140,7 +141,7 @@ def collected(parts: Sequence[Mapping[Key, Sample]]) -> dict[Key, Sample]:
 
 
 def summed_up(setting: StudySetting, sample: Sample) -> dict[str, Summary]:
-    """A sample's quantities over its runs, in SI units."""
+    """Summaries of a sample's quantities over its runs, in SI units."""
     return {
         name: SUMMARIES_BY_STATISTIC[quantity.statistic](sample.values[name])
         for name, quantity in setting.quantities.items()

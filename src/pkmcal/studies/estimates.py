@@ -1,6 +1,6 @@
-"""Estimators on simulated runs, the bound that none can pass, and the tool's errors by a result.
+"""Estimators for simulated runs, the Cramér-Rao bound, and the tool's errors.
 
-All are batched over runs B. The papers' own methods are in the papers' studies.
+All functions are batched over B runs. The papers' own methods are in the papers' studies.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ from pkmcal.solver.search import minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 UNTOLD_SINGULAR_SHARE = 1e-9
-"""Singular values of scaled rows below this share of the largest are of what nothing tells."""
+"""Relative size of singular values of scaled rows below which a direction is unidentifiable."""
 FREE_TOOL_FRAME_SIGMA = 1e3
-"""Standard deviation (m) of the tool frame in a registration: free."""
+"""Prior sigma (m) of the tool frame in a registration: effectively free."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """An estimate of B runs. theta : (B, P). T_camera_base, T_mount : (B, 4, 4) of the only ones.
-    extra : what the method says of itself, (B,) or (B, n) by name, such as chi2 per degree of
-    freedom. sigma : the standard deviations that it states, by quantity. covariance : (B, P, P)
-    that it states of theta, where it does.
+    """Estimate of B runs.
+
+    theta : (B, P). T_camera_base, T_mount : (B, 4, 4) of the only station and the only mount. extra
+    : figures reported by the method, (B,) or (B, n) by name, such as chi2 per degree of freedom.
+    sigma : stated standard deviations, by quantity. covariance : (B, P, P) stated covariance of
+    theta, None if the method has none.
     """
 
     theta: Array
@@ -46,48 +48,54 @@ class Fitted:
 
 
 def nominal_estimate(machine: Machine, runs: int) -> Fitted:
-    """The drawing's values as an estimate."""
-    values = machine.parameters.drawing
-    return Fitted(np.broadcast_to(values, (runs, len(values))))
+    """Nominal parameters as an estimate."""
+    nominal = machine.parameters.drawing
+    return Fitted(np.broadcast_to(nominal, (runs, len(nominal))))
 
 
 def joint(problem: Problem, start: BatchState) -> BatchResult:
-    """The joint maximum-likelihood estimate with the noise as it is, which a simulation knows."""
+    """Joint maximum-likelihood estimate with the true noise, which a simulation knows."""
     return solve_batch(problem, start, robust=False, scale_noise=False)
 
 
-def freedom(data: SimulatedRuns, layout: LimbLayout, reference_values: int) -> int:
-    """Degrees of freedom of the joint problem. reference_values : the rank of what all
-    configurations share, less what is known of it beforehand.
+def freedom(data: SimulatedRuns, layout: LimbLayout, shared_rank: int) -> int:
+    """Degrees of freedom of the joint problem.
+
+    shared_rank : rank of the unknowns shared by all configurations, less the number of their
+    priors.
     """
     boards = 0 if data.view.T_platform_board is None else 6
     rows = 4 * data.axis.shape[2] + boards + layout.n_equations
-    return data.count * (rows - layout.own_motion.shape[1]) - reference_values
+    return data.count * (rows - layout.own_motion.shape[1]) - shared_rank
 
 
 def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generator) -> Array:
-    """Errors (B, na) of the shared unknowns, drawn with the Cramér-Rao bound's covariance at a
-    state; none along what nothing tells.
+    """Errors (B, na) of the shared unknowns, drawn with the covariance of the Cramér-Rao bound at a
+    state.
+
+    The components along unidentifiable directions are zero.
     """
     reduced = eliminate(problem.linearize(state))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
     s, vt, scale = scaled_directions(rows)
-    above_limit = s > UNTOLD_SINGULAR_SHARE * s[:, :1]
-    spread = np.where(above_limit, 1 / np.where(above_limit, s, 1.0), 0.0)
-    # the symmetric root, as singular vectors' signs are rounding's
+    identifiable = s > UNTOLD_SINGULAR_SHARE * s[:, :1]
+    spread = np.where(identifiable, 1 / np.where(identifiable, s, 1.0), 0.0)
+    # The symmetric root is unique, whereas the signs of singular vectors depend on rounding.
     draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
     return (vt.mT @ draw)[..., 0] / scale
 
 
 class ToolPlaces(NamedTuple):
-    """Where machines are held against the truth: poses (B, n, 4, 4) and readings (B, n, m)."""
+    """Poses at which machines are compared with the truth: (B, n, 4, 4), with readings (B, n,
+    m).
+    """
 
     poses: Array
     readings: Array
 
 
 def tool_places(data: SimulatedRuns, wanted: Array) -> ToolPlaces:
-    """Those near the wanted poses (n, 4, 4) that each true machine can take, and its readings."""
+    """Poses near the wanted ones (n, 4, 4) that each true machine can reach, and its readings."""
     layout, theta = data.machine.layout, data.theta[:, None]
     poses = on_manifold(layout, theta, wanted).T_base_platform if layout.n_internal else wanted
     readings = readings_at_poses(layout, theta, poses)
@@ -95,7 +103,7 @@ def tool_places(data: SimulatedRuns, wanted: Array) -> ToolPlaces:
 
 
 class ToolErrors(NamedTuple):
-    """Root mean square over places, (B,) m and rad."""
+    """Root mean square errors over poses: (B,) m and rad."""
 
     shift: Array
     turn: Array
@@ -104,10 +112,10 @@ class ToolErrors(NamedTuple):
 def tool_errors(
     layout: LimbLayout, theta: Array, at: ToolPlaces, turn: float, shift: float
 ) -> ToolErrors:
-    """How far machines (B, P) are from the truth at the same readings.
+    """Errors of machines (B, P) with respect to the truth at the same readings.
 
-    Base and tool frames are those that fit best, since a calibration gives them too. turn, shift :
-    rad and m that count alike in that.
+    Base and tool frames are registered for the best fit, since a calibration determines them too.
+    turn, shift : rad and m that have equal weight in the registration.
     """
     fk = forward(layout, theta[..., None, :], at.readings, at.poses).T_base_platform
     still = np.broadcast_to(np.eye(4), (len(fk), 4, 4))

@@ -1,8 +1,8 @@
-"""What a study's runs come to, combination by combination, and what was varied with most gain.
+"""Results of a study for each combination, and the gain by each varied name.
 
-Runs of a batch share a plan of photographs, so standard errors are those of a mean over batches
-that differ: the squares of the batches' sums of deviations, not of each run's alone. Runs that
-failed are counted, and left out of all else.
+Runs of a batch share a capture plan, so standard errors are clustered by batch: they use the
+squares of the batches' sums of deviations rather than of single runs. Failed runs are counted and
+excluded from all other figures.
 """
 
 from __future__ import annotations
@@ -37,23 +37,25 @@ from pkmcal.wording import brief, count, number
 
 PROMISED_COVERAGE = 0.95
 COVERAGE_TOLERANCE = 0.02
-"""Coverage may be off its promise by this, as asked of a calibration: 93 to 97 %."""
+"""Accepted deviation of the coverage of 95 % intervals: 93 to 97 %, as required of a
+calibration.
+"""
 COVERAGE_INTERVALS = np.array([0.5, 0.68, 0.8, 0.9, 0.95, 0.99])
-"""Intervals of which it is told how often they hold."""
+"""Nominal coverages for which the actual coverage is reported."""
 
 
 @dataclass(frozen=True)
 class CellFindings:
-    """One combination.
+    """Summary of the runs of one combination.
 
-    runs, failed : how many, and the share that did not converge, or had to be refused. freedom : of
-    what standard errors are told from, less than one where fewer than two runs can be used.
-    position (m) and orientation (rad) : the tool's errors over the workspace, root mean square;
-    ``_95`` : that 95 % of them stay below; ``_sigma`` : what calibrations state, their mean.
-    covered, covered_tool : share of 95 % intervals that hold the truth, of all parameters and of
-    the tool's pose. held, held_tool : (n,) the same of the intervals of COVERAGE_INTERVALS. chi2 :
-    per degree of freedom. parameters : (P,) names. by_parameter : (P,) share of each parameter's 95
-    % intervals, NaN of what has none.
+    runs : their number. freedom : degrees of freedom of the standard errors; less than one if fewer
+    than two runs are usable. failed : share of runs that did not converge or had to be refused.
+    position (m) and orientation (rad) : root mean square of the tool's error over the workspace;
+    ``_95`` : its 95th percentile; ``_sigma`` : mean of the stated standard deviation. covered,
+    covered_tool : share of 95 % intervals that contain the truth, for the parameters and for the
+    tool's pose. held, held_tool : (n,) the same for the intervals of COVERAGE_INTERVALS. chi2 : per
+    degree of freedom. parameters : (P,) names. by_parameter : (P,) coverage of each parameter's 95
+    % intervals; NaN for those without a standard deviation.
     """
 
     values: Mapping[str, Value]
@@ -78,8 +80,8 @@ class CellFindings:
 
     @property
     def honest(self) -> bool | None:
-        """Whether 95 % intervals hold often enough, chance aside (Student's, both ways); None where
-        fewer than two runs can be used.
+        """Whether the coverage of 95 % intervals is at least 93 %, within Student's two-sided 95 %
+        limit of its Monte-Carlo error; None if fewer than two runs are usable.
         """
         from scipy.special import stdtrit
 
@@ -93,9 +95,10 @@ class CellFindings:
 
 
 class Gain(NamedTuple):
-    """What a varied name does to the tool's position: from its worst to its best value, root mean
-    squares over all else that was varied (m), how many times that is, and whether chance could do
-    it.
+    """Effect of a varied name on the tool's position error, from its worst to its best value.
+
+    before, after : root mean squares (m) over all combinations with the worst and the best value.
+    sure : whether the difference exceeds chance.
     """
 
     name: str
@@ -107,16 +110,16 @@ class Gain(NamedTuple):
 
     @property
     def times(self) -> float:
-        """Before over after."""
+        """Ratio of ``before`` to ``after``."""
         return self.before / self.after
 
 
 @dataclass(frozen=True)
 class SweepResult:
-    """A whole study.
+    """Result of a study.
 
-    subject, varied : what was asked. cells, results : combinations and all their runs. found : what
-    they come to. runs, seed : of each. wall : seconds. workers : how many worked.
+    subject : what was studied. varied : names with their values. cells, results : combinations and
+    their runs. found : their summaries. runs : number for each combination.
     """
 
     subject: StudySubject
@@ -130,14 +133,17 @@ class SweepResult:
     __repr__ = short_repr
 
     def summary(self) -> str:
-        """As the command tells it, a line a combination: the tool's error over the workspace with
-        its standard error, what calibrations state of it, and how many 95 % intervals hold.
+        """Text that the command prints, one line for each combination: the tool's error over the
+        workspace with its standard error, the stated standard deviation, the coverage of 95 %
+        intervals, and the share of failed runs.
         """
         lines = [f"{self.subject.name}, {count(self.runs, 'calibration')} a combination"]
         for cell in self.found:
-            result, error, stated = (1e3 * value for value in (*cell.position, cell.position_sigma))
+            position, error, stated = (
+                1e3 * value for value in (*cell.position, cell.position_sigma)
+            )
             lines.append(
-                f"  {in_words(cell.values) or 'as it is'}: tool {brief(result)} ±"
+                f"  {in_words(cell.values) or 'as it is'}: tool {brief(position)} ±"
                 f" {brief(error)} mm,"
                 f" stated {brief(stated)} mm, {number(100 * cell.covered.value, 1)} % of the 95 %"
                 f" intervals hold, {number(100 * cell.failed.value, 1)} % failed"
@@ -146,24 +152,22 @@ class SweepResult:
 
     @property
     def wall(self) -> float:
-        """Seconds that this took."""
+        """Duration of the study in seconds."""
         return self.results[0].wall
 
     @property
     def workers(self) -> int:
-        """How many worked."""
+        """Number of workers."""
         return self.results[0].workers
 
     @property
     def gains(self) -> list[Gain]:
-        """Names of which two values or more have calibrations that can be used, the one with most
-        gain first.
-        """
-        item = (self._gain(name) for name in self.varied)
-        return sorted((gain for gain in item if gain), key=lambda g: -g.times)
+        """Gains of the names with two usable values or more, largest first."""
+        gains = (self._gain(name) for name in self.varied)
+        return sorted((gain for gain in gains if gain), key=lambda g: -g.times)
 
     def _gain(self, name: str) -> Gain | None:
-        """Of one name."""
+        """Gain by one name; None with fewer than two usable values."""
         means = {value: self.at(name, value) for value in self.varied[name]}
         means = {value: mean for value, mean in means.items() if np.isfinite(mean.value)}
         if len(means) < 2:
@@ -172,11 +176,15 @@ class SweepResult:
         before, after = means[worst], means[best]
         freedom = min(cell.freedom for cell in self.found if np.isfinite(cell.position.value))
         pairs = len(means) * (len(means) - 1) // 2
-        sure = before.value - after.value > _by_chance(before.error, after.error, freedom, pairs)
+        sure = before.value - after.value > _chance_difference(
+            before.error, after.error, freedom, pairs
+        )
         return Gain(name, worst, best, before.value, after.value, sure)
 
     def at(self, name: str, value: Value) -> Summary:
-        """The tool's position error where a name has a value, root mean square over all else."""
+        """Tool's position error with one value of a name, root mean square over all other
+        combinations.
+        """
         own = [cell.position for cell in self.found if cell.values[name] == value]
         square = float(np.mean([s.value**2 for s in own]))
         error = np.sqrt(np.sum([(s.value * s.error) ** 2 for s in own])) / len(own)
@@ -193,7 +201,7 @@ def study(
     scheduler: str | None = None,
     progress: StudyProgress | None = None,
 ) -> SweepResult:
-    """Accuracy of simulated calibrations; what ``pkmcal study`` computes.
+    """Study the accuracy of simulated calibrations; what ``pkmcal study`` computes.
 
     Parameters
     ----------
@@ -206,16 +214,16 @@ def study(
     seed :
         Seed for all random numbers.
     out :
-        A folder in which finished batches are kept, and from which an interrupted study continues.
+        A folder for finished batches, from which an interrupted study continues.
     scheduler :
         The address of a Dask cluster; the local cores are used without one.
     progress :
-        Called with what is done and the share of it, 0 to 1.
+        Called with a text and the share done, 0 to 1.
 
     Returns
     -------
     SweepResult
-        ``value``, one entry a combination; ``summary()``.
+        ``found``, one entry for each combination; ``summary()``.
 
     Raises
     ------
@@ -231,21 +239,21 @@ def study(
     check_number("study", "runs", runs)
     check_number("study", "seed", seed)
     runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
-    begun = subject_of(subject)
-    varied = parsed(begun, vary)
-    cells = cells_of(begun, varied)
+    studied = subject_of(subject)
+    varied = parsed(studied, vary)
+    cells = cells_of(studied, varied)
     settings = [cell.setting for cell in cells]
     title = " ".join([subject, *vary])
     names = [in_words(cell.values) for cell in cells]
     opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
     with opened as store:
         results = run_all(settings, runs, seed, progress, runner, store, names)
-    value = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
-    return SweepResult(begun, varied, tuple(cells), tuple(results), value, runs, seed)
+    found = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
+    return SweepResult(studied, varied, tuple(cells), tuple(results), found, runs, seed)
 
 
 def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
-    """One combination's runs summed up; NaN where all of them failed."""
+    """Summary of the runs of one combination; NaN where all of them failed."""
     sample = result.samples[JOINT_ESTIMATE_KEY]
     values, sigma = sample.values, sample.sigma
     sizes = [batch.runs for batch in batches(result.setting, result.runs, result.seed)]
@@ -287,8 +295,10 @@ def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
 
 
 def clustered(values: Array, batch: Integers) -> Summary:
-    """Mean of values (B,) and its standard error where runs of a batch (B,) go together; of one
-    batch alone, that of its runs; NaN of a single run, which tells no scatter, and of none.
+    """Mean of values (B,) and its standard error, clustered by batch (B,).
+
+    With a single batch the standard error is that of independent runs. It is NaN for a single run,
+    and the mean is NaN without any.
     """
     if len(values) < 2:
         return Summary(float(values[0]) if len(values) else np.nan, np.nan)
@@ -300,14 +310,16 @@ def clustered(values: Array, batch: Integers) -> Summary:
     return Summary(mean, spread * float(np.sqrt(groups / (groups - 1))))
 
 
-def _by_chance(one: float, other: float, freedom: int, pairs: int) -> float:
-    """By how much two means of these standard errors, told from ``freedom`` each, may differ by
-    chance: 95 % of the largest differences of so many pairs are less (Welch 1947; Bonferroni).
+def _chance_difference(one: float, other: float, freedom: int, pairs: int) -> float:
+    """Difference of two means with these standard errors that chance exceeds in 5 % of the cases.
+
+    freedom : degrees of freedom of each standard error. pairs : number of compared pairs, of which
+    the largest difference counts (Welch 1947; Bonferroni).
     """
     from scipy.special import stdtrit
 
     variance = one**2 + other**2
-    if not variance > 0:  # NaN where a single run tells no scatter
+    if not variance > 0:  # NaN if a standard error is that of a single run
         return 0.0 if variance == 0 else np.inf
     dof = freedom * variance**2 / (one**4 + other**4)
     return float(stdtrit(dof, 1 - 0.025 / pairs) * np.sqrt(variance))

@@ -1,9 +1,9 @@
-"""[A] 4.3 as a study: a hexapod, three stations that see four legs each, the legs' axes measured.
+"""Study of [A] 4.3: a hexapod and three stations that each measure the axes of four legs.
 
-A Gough-Stewart platform in fifteen configurations a station with extreme leg lengths; axes measured
-with the noise of Table 1 in degrees, three images averaged; drawing errors uniform. Compared are
-the paper's four steps as printed and corrected, the joint estimate, and the Cramér-Rao bound; or
-the joint estimate alone, which ``pkmcal study`` varies.
+A Gough-Stewart platform in fifteen configurations per station with extreme leg lengths; axes
+measured with the noise of Table 1 in degrees, averaged over three images; uniform errors of the
+nominal model. Compared are the paper's four steps as printed and corrected, the joint estimate, and
+the Cramér-Rao bound. A second setting has the joint estimate alone, which ``pkmcal study`` varies.
 """
 
 from __future__ import annotations
@@ -70,18 +70,21 @@ FOUR_STEP_FORMS: dict[str, FourStepForm] = {
 
 PAPER_A_STATIONS = 3
 PHOTOGRAPHS_SOLVED_AT_ONCE = 25 * 45
-"""Photographs of all runs that are solved at once; more only leaves the processor's cache."""
+"""Maximum number of images of all runs in a batch; larger batches exceed the processor's cache."""
 END_EFFECTOR_POSES = 10
-"""Poses a run at which the end-effector is compared, [A] 4.3."""
+"""Number of poses in each run at which the end-effector is compared, [A] 4.3."""
 DRAWS_FROM_BOUND = 4
-"""Draws from each run's bound, so that the bound's end-effector is known twice as well."""
+"""Number of draws from each run's bound: four halve the standard error of the bound's end-effector
+errors.
+"""
 RIGHT_MINIMUM_CHI2 = 1.5
-"""A run whose chi2 per degree of freedom is below has found its minimum; a false one has far
-more than a hundred."""
+"""Limit of chi2 per degree of freedom of a run in the right minimum; a false one has more than a
+hundred.
+"""
 STATION_GUESS_OFFSET = np.array([0.03, -0.02, 0.03, 0.01, -0.01, 0.02])
-"""rad and m by which stations are off where nothing but the drawing is known."""
+"""Offset (rad and m) of stations that start from the nominal model only."""
 END_EFFECTOR_STREAM, START_ERROR_STREAM, PAPER_A_BOUND_STREAM = 1, 2, 3
-"""Uses of a batch's draws, besides the simulation."""
+"""Random streams of a batch, besides 0 of the simulation."""
 
 RADIAN_IN_DEGREES = float(np.degrees(1.0))
 PAPER_A_PARAMETER_GROUPS = ("base_xy", "base_z", "platform_xy", "platform_z", "offset")
@@ -92,8 +95,9 @@ END_EFFECTOR_QUANTITIES = (
     "orientation_registered",
 )
 """Mean error of the end-effector at random poses, [A] eq. 20, in frames by the centres 1, 3 and 5;
-then with frames registered on all centres, so that the error of the frames' own definition by three
-joints is left out."""
+then in frames registered on all centres, which excludes the error of frames that are defined by
+three joints.
+"""
 PAPER_A_QUANTITIES: Mapping[str, Quantity] = {
     **{name: Quantity("rms", 1e3, "mm") for name in (*PAPER_A_PARAMETER_GROUPS, "parameters")},
     **{
@@ -105,20 +109,25 @@ PAPER_A_QUANTITIES: Mapping[str, Quantity] = {
     "chi2": Quantity("mean"),
     "steps": Quantity("mean"),
 }
-"""PAPER_A_PARAMETER_GROUPS and all thirty parameters; the end-effector; of the joint estimate chi2
-per degree of freedom and the solver's steps."""
+"""PAPER_A_PARAMETER_GROUPS and all thirty parameters; the end-effector; chi2 per degree of freedom
+and the solver's steps of the joint estimate.
+"""
 
 
 @dataclass(frozen=True)
 class HexapodByAxes:
-    """[A] 4.3. poses : per station. drawing_error, joint_noise : m, standard deviations of uniform
-    errors ("variance equal to 2 mm"). distance, height : of the cameras, which look level, m.
-    start_error : start the joint estimate this far off the drawing (m, uniform) instead of from the
-    four steps. batch : runs that are solved at once.
+    """Setting of [A] 4.3.
 
-    The paper does not say where the cameras stand. The distance has no influence, since Table 1 is
-    in the camera's frame. The height has: the axis's point with y = 0 lies there, and errors of
-    direction grow away from it. So it is the middle of the legs.
+    poses : number at each station. drawing_error, joint_noise : m, standard deviations of uniform
+    errors ("variance equal to 2 mm"). distance, height : of the cameras, which look horizontally,
+    m. start_error : half width (m) of a uniform error of the nominal model from which the joint
+    estimate starts; None to start from the four steps. batch : number of runs that are solved
+    together.
+
+    The paper does not give the poses of the cameras. Their distance has no influence, because Table
+    1 refers to the camera's frame. Their height has: the point of an axis is that with y = 0, and
+    errors of the direction grow with the distance from it. So the height is that of the middle of
+    the legs.
     """
 
     poses: int = 15
@@ -136,12 +145,12 @@ class HexapodByAxes:
     quantities = PAPER_A_QUANTITIES
 
     def populations(self, runs: int) -> list[Population]:
-        """One hexapod after another."""
+        """A single population of hexapods."""
         most = max(1, PHOTOGRAPHS_SOLVED_AT_ONCE // (PAPER_A_STATIONS * self.poses))
         return [Population("hexapod", runs, self.batch or most)]
 
     def draw(self, batch: Batch) -> SimulatedRuns:
-        """True machines, told in the study's frames; poses by their readings."""
+        """Draw true machines in the study's gauge, with poses by their readings."""
         machine, rng = hexapod_with_held_radii(), batch.generator(0)
         table = machine.parameters
         error = spread_evenly(rng, (batch.runs, len(table)), self.drawing_error)
@@ -157,7 +166,7 @@ class HexapodByAxes:
         return simulate_runs(machine, theta, readings, poses, self.view(machine), noise, rng)
 
     def _readings(self, machine: Machine, runs: int, rng: np.random.Generator) -> Array:
-        """Readings (B, K, 6): distinct corners of the legs' ranges per station, or uniform."""
+        """Readings (B, K, 6): distinct corners of the legs' ranges at each station, or uniform."""
         low, high = machine.joint_ranges.T
         if not self.extreme:
             return rng.uniform(low, high, (runs, PAPER_A_STATIONS * self.poses, 6))
@@ -168,7 +177,9 @@ class HexapodByAxes:
         return corners[pick].reshape(runs, -1, 6)
 
     def view(self, machine: Machine) -> Viewpoints:
-        """Cameras on a circle, each between two pairs of base joints, that see the nearest legs."""
+        """Cameras on a circle, each between two pairs of base joints, that observe the nearest
+        legs.
+        """
         angles = np.radians([60.0, 180.0, 300.0])
         up = np.array([0.0, 0.0, self.height])
         T_camera_base = np.stack(
@@ -185,7 +196,7 @@ class HexapodByAxes:
         return Viewpoints(T_camera_base, station, legs[station])
 
     def solve(self, batch: Batch, data: SimulatedRuns) -> dict[Key, Fitted]:
-        """The four steps in both forms, and the joint estimate from the corrected ones."""
+        """Four steps in both forms, and the joint estimate started from the corrected form."""
         machine = data.machine
         axes = measured_axes(data)
         a_camera, centres = centres_from_axes(axes, PAPER_A_STATIONS)
@@ -205,8 +216,10 @@ class HexapodByAxes:
     def judge(
         self, batch: Batch, data: SimulatedRuns, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
-        """Errors of every method, at the same poses; of the bound its standard deviations, and the
-        end-effector's errors by draws from it.
+        """Errors of every method at the same poses.
+
+        For the bound these are its standard deviations, and the end-effector's errors by draws from
+        it.
         """
         machine, rows = data.machine, thirty(data.machine).rows
 
@@ -221,27 +234,31 @@ class HexapodByAxes:
         draws = batch.generator(PAPER_A_BOUND_STREAM).normal(
             size=(DRAWS_FROM_BOUND, batch.runs, root.shape[-1], 1)
         )
-        shifted = np.mean(
+        effector_by_bound = np.mean(
             [effector(theta) for theta in data.theta + (root @ draws)[..., 0]], axis=0
         )
-        out[PAPER_A_BOUND,] = _sample(machine, np.linalg.norm(rows @ root, axis=-1), shifted)
+        out[PAPER_A_BOUND,] = _sample(
+            machine, np.linalg.norm(rows @ root, axis=-1), effector_by_bound
+        )
         return out
 
 
 def _sample(
     machine: Machine, errors: Array, effector: Array, fit: Fitted | None = None
 ) -> Sample:  # fmt: skip
-    """Errors (B, 30) of the parameters, also by group, and (B, 4) of the end-effector."""
-    values = {name: errors[:, at] for name, at in parameters_by_group(machine).items()}
-    values |= {"parameters": errors}
-    values |= {name: effector[:, k] for k, name in enumerate(END_EFFECTOR_QUANTITIES)}
-    return Sample(values | (fit.extra if fit else {}), fit.sigma if fit else {})
+    """Sample with errors (B, 30) of the parameters, also by group, and (B, 4) of the
+    end-effector.
+    """
+    figures = {name: errors[:, at] for name, at in parameters_by_group(machine).items()}
+    figures |= {"parameters": errors}
+    figures |= {name: effector[:, k] for k, name in enumerate(END_EFFECTOR_QUANTITIES)}
+    return Sample(figures | (fit.extra if fit else {}), fit.sigma if fit else {})
 
 
 @dataclass(frozen=True)
 class JointByAxes(HexapodByAxes):
-    """The joint estimate of the same machines from the corrected four steps, judged as all
-    simulated calibrations are.
+    """Joint estimate of the same machines from the corrected four steps, with the figures of all
+    simulated calibrations.
     """
 
     doing = "Joint calibrations of [A] 4.3"
@@ -254,10 +271,10 @@ class JointByAxes(HexapodByAxes):
 
     def solve(
         self,
-        batch: Batch,  # noqa: ARG002 - as the protocol has it
+        batch: Batch,  # noqa: ARG002 - required by the protocol
         data: SimulatedRuns,
     ) -> dict[Key, Fitted]:
-        """The four steps, and the joint estimate from there."""
+        """Joint estimate, started from the corrected four steps."""
         measured = measured_axes(data)
         steps = solve_from_centres(
             data.machine, measured, *centres_from_axes(measured, PAPER_A_STATIONS), "corrected"
@@ -268,33 +285,35 @@ class JointByAxes(HexapodByAxes):
     def judge(
         self, batch: Batch, data: SimulatedRuns, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
-        """Errors of the thirty parameters, and of the platform at random poses of the workspace,
-        in frames by three centres.
+        """Errors of the thirty parameters and of the platform at random poses of the workspace, in
+        the gauge of three centres.
         """
         fit, machine = fits[JOINT_ESTIMATE_KEY], data.machine
         errors = (fit.theta - data.theta) @ thirty(machine).rows.T
         parameters = np.stack([errors, fit.sigma["parameters"]])
         tool = _tool(machine, data.theta, fit, batch.generator(END_EFFECTOR_STREAM))
-        values = fit.extra | {"failed": (fit.extra["chi2"] > RIGHT_MINIMUM_CHI2).astype(float)}
-        values["scale"] = np.ones(batch.runs)
-        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, Fitted(fit.theta, extra=values))}
+        figures = fit.extra | {"failed": (fit.extra["chi2"] > RIGHT_MINIMUM_CHI2).astype(float)}
+        figures["scale"] = np.ones(batch.runs)
+        return {JOINT_ESTIMATE_KEY: judged(parameters, tool, Fitted(fit.theta, extra=figures))}
 
 
 def converged(study: StudyResult[HexapodByAxes]) -> int:
-    """Runs whose joint estimate ended at the right answer."""
+    """Number of runs whose joint estimate is in the right minimum."""
     return int(np.sum(study.values("chi2", PAPER_A_JOINT) < RIGHT_MINIMUM_CHI2))
 
 
 def mean_error(study: StudyResult[HexapodByAxes], method: str) -> Array:
-    """Mean |error| (30,), m; of the bound's standard deviations, that of a normal distribution."""
+    """Mean |error| (30,), m; for the bound, that of a normal distribution with its standard
+    deviations.
+    """
     errors = np.abs(study.values("parameters", method)).mean(axis=0)
     return errors * (np.sqrt(2 / np.pi) if method == PAPER_A_BOUND else 1.0)
 
 
 @cache
 def hexapod_with_held_radii() -> Machine:
-    """The catalogue's Gough-Stewart platform with its radii held: axes do not need them. Its
-    readings are what they say, as in the paper.
+    """The catalogue's Gough-Stewart platform with fixed radii, which axes do not need, and, as in
+    the paper, with exact scales of the readings.
     """
     machine = machine_from_document(with_exact_scales(load_mechanism("gough-stewart").document))
     table = machine.parameters
@@ -303,8 +322,10 @@ def hexapod_with_held_radii() -> Machine:
 
 
 class Thirty(NamedTuple):
-    """The thirty parameters of [A] Fig. 4: names such as ``A2 x``, rows (30, P) that give them
-    from a machine's parameters, the drawing's values (30,), m.
+    """The thirty parameters of [A] Fig. 4.
+
+    names : such as ``A2 x``. rows : (30, P) linear map from a machine's parameters. drawing : (30,)
+    nominal values, m.
     """
 
     names: tuple[str, ...]
@@ -313,35 +334,37 @@ class Thirty(NamedTuple):
 
 
 def thirty(machine: Machine) -> Thirty:
-    """Frames by the centres 1, 3 and 5: origin in the first, x to the third, the fifth in the x-y
-    plane. Six coordinates of each body vanish by that; twelve each are left, then the offsets.
+    """Thirty parameters in frames by the centres 1, 3 and 5.
+
+    The origin is in the first centre, x points to the third, and the fifth is in the x-y plane. Six
+    coordinates of each body vanish in these frames; twelve each remain, followed by the offsets.
     """
-    values = machine.parameters.drawing
+    theta = machine.parameters.drawing
     held = {(0, 0), (0, 1), (0, 2), (2, 1), (2, 2), (4, 2)}
     names: list[str] = []
     rows: list[Array] = []
-    drawn: list[float] = []
+    nominal: list[float] = []
     for letter, index in zip("AB", centre_index(machine.layout), strict=True):
-        points = values[index]
+        points = theta[index]
         x = points[2] - points[0]
         x = x / np.linalg.norm(x)
         z = np.cross(x, points[4] - points[0])
         z = z / np.linalg.norm(z)
         frame = np.stack([x, np.cross(z, x), z])
         for leg, axis in sorted(set(np.ndindex(6, 3)) - held):
-            row = np.zeros(len(values))
+            row = np.zeros(len(theta))
             row[index[leg]] = frame[axis]
             names.append(f"{letter}{leg + 1} {'xyz'[axis]}")
             rows.append(row)
-            drawn.append(float(frame[axis] @ (points[leg] - points[0])))
+            nominal.append(float(frame[axis] @ (points[leg] - points[0])))
     names += [f"q{leg + 1}" for leg in range(6)]
-    rows += list(np.eye(len(values))[machine.layout.rod])
-    drawn += values[machine.layout.rod].tolist()
-    return Thirty(tuple(names), np.array(rows), np.array(drawn))
+    rows += list(np.eye(len(theta))[machine.layout.rod])
+    nominal += theta[machine.layout.rod].tolist()
+    return Thirty(tuple(names), np.array(rows), np.array(nominal))
 
 
 def parameters_by_group(machine: Machine) -> dict[str, Integers]:
-    """Which of the thirty parameters belong to each of PAPER_A_PARAMETER_GROUPS."""
+    """Indices of the thirty parameters by PAPER_A_PARAMETER_GROUPS."""
     names = thirty(machine).names
     out: dict[str, Integers] = {}
     for body, letter in (("base", "A"), ("platform", "B")):
@@ -353,7 +376,7 @@ def parameters_by_group(machine: Machine) -> dict[str, Integers]:
 
 
 def measured_axes(data: SimulatedRuns) -> Axes:
-    """The measured axes as [A]'s steps want them."""
+    """Measured axes in the form of [A]'s steps."""
     station, legs = data.view.station, data.view.legs
     u, point, _, _ = from_coordinates(data.axis)
     n_runs, n_photos, n_legs = data.joints.shape
@@ -366,15 +389,17 @@ def measured_axes(data: SimulatedRuns) -> Axes:
 
 
 class Start(NamedTuple):
-    """Where the joint estimate begins: theta (B, P), T_camera_base (B, S, 4, 4)."""
+    """Start of the joint estimate: theta (B, P), T_camera_base (B, S, 4, 4)."""
 
     theta: Array
     T_camera_base: Array
 
 
 def start_off_drawing(data: SimulatedRuns, error: Array) -> Start:
-    """A start without the four steps: free parameters error (B, P) off the drawing, stations off
-    by a few degrees and centimetres.
+    """Start of the joint estimate without the four steps.
+
+    error : (B, P) offset of the free parameters from the nominal model. Stations are off by a few
+    degrees and centimetres.
     """
     table = data.machine.parameters
     free = np.any(table.free_matrix() != 0, axis=1)
@@ -386,7 +411,7 @@ def start_off_drawing(data: SimulatedRuns, error: Array) -> Start:
 
 
 def joint_from_readings(data: SimulatedRuns, start: Start) -> Fitted:
-    """The joint estimate; poses start by forward kinematics from the readings."""
+    """Joint estimate; platform poses start by forward kinematics from the readings."""
     machine = data.machine
     problem = joint_problem(machine, data, ThreeCentres())
     home = np.broadcast_to(machine.home(), (1, 1, 4, 4))
@@ -395,9 +420,8 @@ def joint_from_readings(data: SimulatedRuns, start: Start) -> Fitted:
     state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
     solution = joint(problem, state)
     theta, nz = problem.theta(solution.solution.state), z.shape[1]
-    dof = freedom(
-        data, machine.layout, reference_values=nz - 12 + 6 * PAPER_A_STATIONS
-    )  # the gauge fixes twelve
+    # The gauge fixes 12 of the nz free parameters; each station has 6 unknowns.
+    dof = freedom(data, machine.layout, shared_rank=nz - 12 + 6 * PAPER_A_STATIONS)
     spread = in_frames(machine, problem, theta)
     stated = spread @ solution.info.covariance[:, :nz, :nz] @ spread.mT
     rows = thirty(machine).rows
@@ -415,31 +439,32 @@ def joint_from_readings(data: SimulatedRuns, start: Start) -> Fitted:
 
 
 def in_frames(machine: Machine, problem: Problem, theta: Array) -> Array:
-    """Errors of all parameters, in frames by three centres, by those of the free ones at theta
-    (B, P): (B, P, nz).
+    """Derivatives (B, P, nz) of all parameters in the gauge of three centres by the free
+    parameters, at theta (B, P).
     """
     change = projector(machine, theta, ThreeCentres())
     return problem.free - generators(machine.layout, theta) @ change @ problem.free
 
 
 def root_of_bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Array:
-    """Square root (B, P, nz) of the Cramér-Rao covariance, frames by three centres, at the truth.
+    """Square root (B, P, nz) of the Cramér-Rao covariance at the truth, in the gauge of three
+    centres.
 
-    An efficient estimate's errors are this matrix times independent unit normals.
+    The errors of an efficient estimate are this matrix times independent standard normal variables.
     """
     z = machine.parameters.to_free(data.theta)
     n, nz = z.shape
     T = np.broadcast_to(data.view.T_camera_base, (n, PAPER_A_STATIONS, 4, 4))
     state = BatchState(z, T, data.T_base_platform, np.zeros((n, 1, 1)))
     covariance = Information(problem, state).covariance[:, :nz, :nz]
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-    root = root @ vectors.mT  # the symmetric root is unique
+    eigenvalues, eigenvectors = np.linalg.eigh(covariance)
+    root = eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None]
+    root = root @ eigenvectors.mT  # the symmetric root is unique
     return in_frames(machine, problem, data.theta) @ root
 
 
 def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator) -> Array:
-    """Errors (B, 4) of the end-effector by machines (B, P), END_EFFECTOR_QUANTITIES, m and rad."""
+    """Errors (B, 4) of the end-effector of machines (B, P), END_EFFECTOR_QUANTITIES, m and rad."""
     machine = data.machine
     low, high = machine.joint_ranges.T
     readings = rng.uniform(low, high, (len(theta), END_EFFECTOR_POSES, len(low)))
@@ -451,18 +476,20 @@ def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator)
     base, platform = centre_index(machine.layout)
     e = register(theta[:, base], data.theta[:, base])[:, None]
     f = register(theta[:, platform], data.theta[:, platform])[:, None]
-    b1 = data.theta[:, None, platform[0]]  # the frames hold A1 and B1 at the drawing's values
+    b1 = data.theta[:, None, platform[0]]  # the gauge holds A1 and B1 at their nominal values
     columns: list[Array] = []
-    for shifted in (T, e @ T @ inverse(f)):
-        columns.append(np.linalg.norm(apply(shifted, b1) - apply(T_true, b1), axis=-1).mean(axis=1))
-        turn = shifted[..., :3, :3] @ T_true[..., :3, :3].mT
+    for estimated in (T, e @ T @ inverse(f)):
+        columns.append(
+            np.linalg.norm(apply(estimated, b1) - apply(T_true, b1), axis=-1).mean(axis=1)
+        )
+        turn = estimated[..., :3, :3] @ T_true[..., :3, :3].mT
         columns.append(np.linalg.norm(rotation_vector(turn), axis=-1).mean(axis=1))
     return np.stack(columns, axis=-1)
 
 
 def _tool(machine: Machine, true: Array, fit: Fitted, rng: np.random.Generator) -> Array:
-    """Errors (2, B, END_EFFECTOR_POSES, 6) of the platform's pose (omega, tau), and their stated
-    deviations.
+    """Errors of the platform's pose (omega, tau) at random readings, and their stated standard
+    deviations, (2, B, END_EFFECTOR_POSES, 6).
     """
     layout, (low, high) = machine.layout, machine.joint_ranges.T
     readings = rng.uniform(low, high, (len(true), END_EFFECTOR_POSES, len(low)))

@@ -1,4 +1,4 @@
-"""What [A] reports, what an independent prototype of it gave, and how ours is held against it."""
+"""Figures that [A] reports, those of an independent prototype, and the checks against both."""
 
 from __future__ import annotations
 
@@ -29,15 +29,18 @@ from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
 TABLE_1 = AxisNoise(images=1)
-"""[A] Table 1, a single image. Printed in rad; degrees are meant (errata): in rad the end-effector
-would be off by centimetres."""
+"""[A] Table 1, a single image. It is printed in rad, but degrees are meant (errata): in rad the
+end-effector would have errors of centimetres.
+"""
 MEAN_ERRORS = (0.04e-3, 1e-3)
-"""[A] 4.3: mean errors of the thirty parameters lie between, m."""
+"""Range of the mean errors of the thirty parameters, [A] 4.3, m."""
 PAPER_A_ERRORS_BEFORE, PAPER_A_ERRORS_AFTER = (
     (1e-3, float(np.radians(0.12))),
     (0.08e-3, float(np.radians(0.018))),
 )
-"""[A] 4.3: end-effector with the drawing and calibrated, m and rad; printed in rad, as above."""
+"""Errors of the end-effector with the nominal model and calibrated, [A] 4.3, m and rad; angles are
+printed in rad, but degrees are meant, as in Table 1.
+"""
 
 _GROUPS = {
     FOUR_STEPS_PRINTED: ("0.077", "1.79", "0.100", "1.62", "0.198"),
@@ -57,40 +60,44 @@ PAPER_A_PROTOTYPE: dict[Key, dict[str, str]] = {
     }
     for method, figures in _GROUPS.items()
 }
-"""RMSE (mm) of PAPER_A_PARAMETER_GROUPS, and errors of the end-effector (mm and degrees), by an
-independent prototype that shares no code with this program: 3 stations x 15 poses x 4 legs. Where
-its cameras stood and how large its drawing errors were is not known."""
+"""RMSE (mm) of PAPER_A_PARAMETER_GROUPS and errors of the end-effector (mm and degrees) by an
+independent prototype that shares no code with this program: 3 stations x 15 poses x 4 legs. The
+poses of its cameras and the size of its nominal errors are not known.
+"""
 PROTOTYPE_POSES = {5: 0.169, 15: 0.091, 30: 0.060, 120: 0.029}
-"""End-effector (mm) of the joint estimate by poses a station."""
+"""Prototype's end-effector error (mm) of the joint estimate by number of poses at a station."""
 MOST_DISPLACEMENT, MOST_ORIENTATION = 0.095, 0.015
-"""mm and degrees that the joint estimate must not exceed."""
+"""Maximum errors of the joint estimate's end-effector, mm and degrees."""
 
 FOLLOWS_DRAWING = {
     ((FOUR_STEPS_PRINTED,), name)
     for name in ("base_z", "platform_z", "displacement", "orientation")
 }
-"""What the four steps as printed leave at the drawing's own error."""
+"""Figures for which the four steps as printed leave the error of the nominal model."""
 PAPER_A_TOLERANCE, PAPER_A_OPEN_TOLERANCE = 0.25, 0.35
-"""Relative difference from the prototype that fails: its cameras stood elsewhere, which moves the
-bound by a tenth; for FOLLOWS_DRAWING the size of the drawing's errors is open as well."""
+"""Accepted relative differences from the prototype: its cameras had other poses, which changes the
+bound by a tenth; for FOLLOWS_DRAWING the size of the nominal errors is open as well.
+"""
 BOUND_TOLERANCE = 1.05
 CHI2_TOLERANCE = 0.02
-"""The noise of directions is not linear, 1e-3 rad, and moves chi2 by less."""
+"""Accepted deviation of chi2 from 1: the noise of directions, 1e-3 rad, is not linear and changes
+chi2 by less.
+"""
 
 
 def tolerance(key: Key, quantity: str) -> float:
-    """Of one of the prototype's figures."""
+    """Accepted relative difference from one of the prototype's figures."""
     return PAPER_A_OPEN_TOLERANCE if (key, quantity) in FOLLOWS_DRAWING else PAPER_A_TOLERANCE
 
 
 def paper_a_figures(study: StudyResult[HexapodByAxes]) -> list[Compared]:
-    """Every figure that the prototype gives, the end-effector's last."""
+    """All figures of the prototype, those of the end-effector last."""
     figures = compared(study, PAPER_A_PROTOTYPE, tolerance)
     return sorted(figures, key=lambda figure: figure.quantity not in PAPER_A_PARAMETER_GROUPS)
 
 
 def paper_a_checks(study: StudyResult[HexapodByAxes]) -> tuple[Check, ...]:
-    """What must hold, or the reproduction has failed."""
+    """Checks that must pass for the reproduction to succeed."""
     joint, right = study.of(PAPER_A_JOINT), converged(study)
     over = ratio_of_figures(joint["parameters"], study.of(PAPER_A_BOUND)["parameters"]).value
     chi2 = joint["chi2"].value

@@ -1,4 +1,4 @@
-"""[A] Table 1 on rendered photographs: six configurations, each taken five times."""
+"""Noise of [A] Table 1 on rendered images: six configurations with five images each."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import DEMO_MECHANISM, camera_of_size
 
 PAPER_A_PICTURE_SIZE = (1024, 768)
-"""[A] 4.2: pixels; the lens of 6 mm is the demonstration's too."""
+"""[A] 4.2: pixels; its lens of 6 mm is also that of the demonstration."""
 PAPER_A_SESSION_SETTINGS = Settings(stations=3, configurations=6, repeats=5)
-"""Six orientations of the legs, [A] 4.2. Three stations, so that the session can be calibrated."""
+"""Six orientations of the legs, [A] 4.2, at three stations, so that the session can be
+calibrated.
+"""
 RENDERING_PROGRESS_SHARE = 0.8
 
 
 class MeasuredNoise(NamedTuple):
-    """Standard deviations of one photograph of a leg: median and largest over the legs.
+    """Standard deviations in a single image of a leg: median and largest over the legs.
 
-    edge : of an edge as a whole, px, median.
+    edge : of the shift of an edge, px, median.
     """
 
     middle: AxisNoise
@@ -32,7 +34,7 @@ class MeasuredNoise(NamedTuple):
 
 
 def measured_noise(seed: int, progress: Callable[[str, float], None]) -> MeasuredNoise:
-    """Render the photographs, calibrate them, and see how they scatter."""
+    """Render the images, calibrate the session, and compute the scatter of the axes."""
 
     def rendered(done: int, total: int) -> None:
         progress(f"Photograph {done} of {total}", RENDERING_PROGRESS_SHARE * done / total)
@@ -48,14 +50,14 @@ def measured_noise(seed: int, progress: Callable[[str, float], None]) -> Measure
             seed=seed,
             progress=rendered,
         )
-        value = study_repeats(
+        repeats = study_repeats(
             folder,
             seed=seed,
             progress=lambda text, share: progress(
                 text, RENDERING_PROGRESS_SHARE + (1 - RENDERING_PROGRESS_SHARE) * share
             ),
         )
-    return MeasuredNoise(_noise(value.middle), _noise(value.bound), value.middle.shift)
+    return MeasuredNoise(_noise(repeats.middle), _noise(repeats.bound), repeats.middle.shift)
 
 
 def _noise(row: LegScatter) -> AxisNoise:

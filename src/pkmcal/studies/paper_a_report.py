@@ -1,4 +1,4 @@
-"""[A] 4 computed again: Table 1, Fig. 4, the end-effector's errors, beside the paper's figures."""
+"""Report on [A] 4: Table 1, Fig. 4 and the end-effector's errors, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -64,8 +64,9 @@ if TYPE_CHECKING:
     from pkmcal.studies.paper_a_images import MeasuredNoise
 
 NARROW_DRAWING_ERROR = 0.002 / 3**0.5
-"""Standard deviation (m) of drawing errors spread evenly within 2 mm, the other reading of "uniform
-noise with variance equal to 2 mm"."""
+"""Standard deviation (m) of errors that are uniform within ± 2 mm, the other reading of "uniform
+noise with variance equal to 2 mm".
+"""
 PAPER_A_METHOD_LABELS = {
     PAPER_A_DRAWING: "the drawing, before",
     FOUR_STEPS_PRINTED: "four steps as printed",
@@ -83,17 +84,17 @@ PAPER_A_QUANTITY_LABELS = {
     "orientation": "orientation",
 }
 PAPER_A_REMARKS = ("printed", "before", "agree", "of_drawing", "others")
-"""The last two where there is something to tell."""
+"""Remarks of the report; the last two only if there are such differences."""
 ERROR_AXIS_TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3]
-"""mm that logarithmic axes tell."""
+"""Ticks of logarithmic axes, mm."""
 FIGURE_4_ERROR_RANGE = (0.005, 5.0)
-"""mm that Fig. 4's logarithmic axis of errors holds."""
+"""Range of the logarithmic error axis of Fig. 4, mm."""
 
 HexapodByAxesStudy = StudyResult[HexapodByAxes]
 
 
 def reproduce(options: Options) -> Outcome:
-    """The whole reproduction."""
+    """Reproduce [A] 4."""
     began = perf_counter()
     measured, done = None, 0.0
     if options.photographs:
@@ -102,7 +103,7 @@ def reproduce(options: Options) -> Outcome:
         done = 0.6
         measured = measured_noise(options.seed, options.within(0.0, done))
     share = (1 - done) * (0.1 if options.long else 0.5)
-    value, narrow = (
+    study, narrow = (
         run(setting, options.runs, options.seed, options.within(begin, begin + share))
         for setting, begin in (
             (HexapodByAxes(), done),
@@ -110,43 +111,43 @@ def reproduce(options: Options) -> Outcome:
         )
     )
     done += 2 * share
-    by_poses: dict[int, HexapodByAxesStudy] = {}  # with other numbers of poses a station
+    by_poses: dict[int, HexapodByAxesStudy] = {}  # by number of poses at a station
     for poses in PROTOTYPE_POSES if options.long else ():
         upto = done + (1 - done) * poses / sum(PROTOTYPE_POSES)
-        values = options.within(done, upto)
-        same = poses == value.setting.poses
-        setting = replace(value.setting, poses=poses)
-        by_poses[poses] = value if same else run(setting, options.runs, options.seed, values)
+        progress = options.within(done, upto)
+        same = poses == study.setting.poses
+        setting = replace(study.setting, poses=poses)
+        by_poses[poses] = study if same else run(setting, options.runs, options.seed, progress)
         done = upto
-    figures = paper_a_figures(value)
+    figures = paper_a_figures(study)
     elapsed = perf_counter() - began
-    words = _words(value, narrow, figures, measured, elapsed)
+    words = _words(study, narrow, figures, measured, elapsed)
     return words.reproduction(
         (
             words.part("noise", table_1(measured), more=["measured"] if measured else []),
-            _figure_part(words, value),
-            words.part("effector", _effector_table(value), _readings_table(value, narrow)),
+            _figure_part(words, study),
+            words.part("effector", _effector_table(study), _readings_table(study, narrow)),
             words.part(
                 "groups",
                 Table(
                     "RMSE, mm",
                     ("", *(PAPER_A_QUANTITY_LABELS[g] for g in PAPER_A_PARAMETER_GROUPS)),
                     tuple(
-                        _by_method(value, [Column(name, 3, 4) for name in PAPER_A_PARAMETER_GROUPS])
+                        _by_method(study, [Column(name, 3, 4) for name in PAPER_A_PARAMETER_GROUPS])
                     ),
                 ),
             ),
             *([_poses_part(words, by_poses)] if by_poses else []),
             words.part("how"),
         ),
-        checks=paper_a_checks(value),
+        checks=paper_a_checks(study),
         remarks=[name for name in PAPER_A_REMARKS if words.values.get(name, True)],
-        numbers={**_numbers(value, narrow, figures, by_poses, elapsed), **_noise(measured)},
+        numbers={**_numbers(study, narrow, figures, by_poses, elapsed), **_noise(measured)},
     )
 
 
 def _by_method(s: HexapodByAxesStudy, columns: Sequence[Column]) -> list[Row]:
-    """Every method's accuracy, beside the prototype's."""
+    """Rows with the accuracy of every method, beside the prototype's."""
     return [
         row
         for m in PAPER_A_METHODS
@@ -160,7 +161,7 @@ def _name(method: str) -> str:
 
 
 def _figures_text(figures: list[Compared]) -> str:
-    """Figures in words, by method: ``Joint estimate: base z 0.06 for 0.063``."""
+    """Text with figures by method: ``Joint estimate, base z 0.06 for 0.063``."""
     texts: list[str] = []
     for (method,) in dict.fromkeys(f.key for f in figures):
         items = [
@@ -186,7 +187,7 @@ def _words(
     measured: MeasuredNoise | None,
     elapsed: float,
 ) -> Words:
-    """All that is said, with the figures that it names; differences from the prototype too."""
+    """Text of the report with its values, and with the differences from the prototype."""
 
     def over(method: str, other: str) -> float:
         return ratio_of_figures(s.of(method)["parameters"], s.of(other)["parameters"]).value
@@ -226,7 +227,9 @@ def _words(
 
 
 def table_1(measured: MeasuredNoise | None = None) -> Table:
-    """[A] Table 1 and what the simulation takes; measured : the same on repeated photographs."""
+    """[A] Table 1 and the noise of the simulation. measured : noise on rendered images, if
+    measured.
+    """
 
     def cells(noise: AxisNoise, places: int) -> tuple[str, ...]:
         psi, theta, x, z = noise.sigma().tolist()
@@ -248,7 +251,7 @@ def table_1(measured: MeasuredNoise | None = None) -> Table:
 
 
 def _figure_part(words: Words, s: HexapodByAxesStudy) -> Part:
-    """[A] Fig. 4."""
+    """Section on [A] Fig. 4."""
     params = thirty(hexapod_with_held_radii())
     errors = {method: mean_error(s, method) for method in PAPER_A_METHODS}
     low, high = (mm(v, 2) for v in MEAN_ERRORS)
@@ -281,7 +284,9 @@ def _figure_part(words: Words, s: HexapodByAxesStudy) -> Part:
 
 
 def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) -> dict[str, Any]:
-    """True values (30,) as a line, mean errors (30,) of each method as bars below; m."""
+    """Plot of true values (30,) as a line above the mean errors (30,) of each method as bars; in
+    m.
+    """
     in_mm = {method: 1e3 * error for method, error in errors.items()}
     colours = {
         FOUR_STEPS_PRINTED: "--quiet",
@@ -295,7 +300,7 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
         ),
         bars(
             PAPER_A_METHOD_LABELS[PAPER_A_BOUND], names, in_mm[PAPER_A_BOUND],
-            color=TRANSPARENT_COLOUR,  # no estimate, so not filled
+            color=TRANSPARENT_COLOUR,  # the bound is not an estimate, so it is not filled
             line={"color": "--ink", "width": 1.2},
         ),
         trace(
@@ -341,7 +346,7 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
 
 
 def _effector_table(s: HexapodByAxesStudy) -> Table:
-    """[A] eq. 20."""
+    """Table of [A] eq. 20."""
     columns = (
         Column("displacement", 3, 3),
         Column("orientation", 4, 4),
@@ -366,7 +371,7 @@ def _effector_table(s: HexapodByAxesStudy) -> Table:
 
 
 def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Table:
-    """What the drawing's errors do, by the two readings of the paper."""
+    """Table of the influence of the nominal errors, for the two readings of the paper."""
 
     def row(name: str, s: HexapodByAxesStudy) -> Row:
         before, printed, joint = (
@@ -393,38 +398,42 @@ def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Tab
 
 
 def _poses_part(words: Words, studies: dict[int, HexapodByAxesStudy]) -> Part:
-    """Accuracy by the number of poses a station."""
+    """Section on the accuracy by number of poses at a station."""
     poses = sorted(studies)
-    results = {n: studies[n].of(PAPER_A_JOINT)["displacement"].times(1e3) for n in poses}
+    displacements = {n: studies[n].of(PAPER_A_JOINT)["displacement"].times(1e3) for n in poses}
     least = [1e3 * studies[n].of(PAPER_A_BOUND)["displacement"].value for n in poses]
     rows = [
         Row(
             str(n),
-            (number(results[n].value, 4), number(results[n].error, 4), number(bound, 4),
+            (number(displacements[n].value, 4), number(displacements[n].error, 4), number(bound, 4),
              number(PROTOTYPE_POSES[n], 3)),
         )
         for n, bound in zip(poses, least, strict=True)
     ]  # fmt: skip
     heads = ("poses a station", "found", "± Monte-Carlo", "bound", "prototype")
     title = "Displacement of the end-effector, joint estimate, mm"
-    drawn = _falling(poses, [results[n] for n in poses], least)
+    figure = _poses_plot(poses, [displacements[n] for n in poses], least)
     return words.part(
         "poses",
         Table(title, heads, tuple(rows)),
-        plots={"poses": {"figure": drawn, "height": 380}},
+        plots={"poses": {"figure": figure, "height": 380}},
     )
 
 
-def _falling(poses: list[int], results: list[Summary], least: list[float]) -> dict[str, Any]:
-    """End-effector (mm) by poses a station, on logarithmic axes."""
+def _poses_plot(
+    poses: list[int], displacements: list[Summary], least: list[float]
+) -> dict[str, Any]:
+    """Plot of the end-effector's error (mm) by number of poses at a station, on logarithmic
+    axes.
+    """
     as_root = [least[-1] * (poses[-1] / n) ** 0.5 for n in poses]
-    two_sigma = [2 * s.error for s in results]
+    two_sigma = [2 * s.error for s in displacements]
     data = [
         trace("Cramér-Rao bound", poses, least, "--ink", "lines",
                line={"color": "--ink", "dash": "dot", "width": 1.5}),
         trace("as N to the power of −½", poses, as_root, "--quiet", "lines",
                line={"color": "--quiet", "dash": "dash", "width": 1.5}),
-        trace("joint estimate", poses, [s.value for s in results], "--calibrated",
+        trace("joint estimate", poses, [s.value for s in displacements], "--calibrated",
                error_y={"array": two_sigma, "color": "--calibrated"}),
         trace("independent prototype", PROTOTYPE_POSES, PROTOTYPE_POSES.values(),
                "--drawing", "markers",
@@ -451,7 +460,7 @@ def _numbers(
     by_poses: dict[int, HexapodByAxesStudy],
     elapsed: float,
 ) -> dict[str, Any]:
-    """Everything for programs, m and rad."""
+    """Figures for programs, m and rad."""
     names = thirty(hexapod_with_held_radii()).names
     return {
         "runs": s.runs,
@@ -490,17 +499,17 @@ def _numbers(
 
 
 def _accuracy(s: HexapodByAxesStudy, method: str) -> dict[str, Any]:
-    results = {
+    summaries = {
         name: s.of(method)[name] for name in (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
     }
     return {
-        "found": {name: summary.value for name, summary in results.items()},
-        "standard_error": {name: summary.error for name, summary in results.items()},
+        "found": {name: summary.value for name, summary in summaries.items()},
+        "standard_error": {name: summary.error for name, summary in summaries.items()},
     }
 
 
 def _noise(measured: MeasuredNoise | None) -> dict[str, Any]:
-    """[A] Table 1 of one image and, where it was measured, ours."""
+    """[A] Table 1 for one image and, if measured, the noise on rendered images."""
 
     def report(noise: AxisNoise) -> dict[str, float]:
         return dict(zip(("psi", "theta", "x", "z"), noise.sigma().tolist(), strict=True))

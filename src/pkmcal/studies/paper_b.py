@@ -1,9 +1,10 @@
-"""[B] V as a study: a hexapod's legs seen by a mirror between them, and by a camera before it.
+"""Study of [B] V: a hexapod's legs observed by a catadioptric camera between them, and by a pinhole
+camera in front.
 
-Sixty configurations at the workspace's limits; every edge is what a fit to a hundred points with
-0.2 px of noise gives. Compared are the linear system of [B] 14 by several regressions, and the
-joint estimate, on right edges and on wrong ones, with a shift of all edges that lenses and light
-make, and with a wrong radius.
+Sixty configurations at the limits of the workspace; every edge has the noise of a fit to a hundred
+points with 0.2 px each. Compared are the linear system of [B] eq. 14 with several regressions and
+the joint estimate, on right and on wrong edges, with a common shift of all edges as lenses and
+lighting cause it, and with a wrong radius.
 """
 
 from __future__ import annotations
@@ -32,20 +33,23 @@ from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 PAPER_B_LEG_RADIUS, PAPER_B_LEG_REACH = 0.014, (0.02, 0.6)
-"""m, of a leg, which is one cylinder from joint to joint, as in the paper."""
+"""Radius of a leg and the range of its cylinder along the leg, m; as in the paper, each leg is one
+cylinder.
+"""
 PAPER_B_CONFIGURATIONS = 60
 POINTS_FITTED_AN_EDGE, POINT_NOISE = 100, 0.2
-"""Points an edge is fitted to, and px of each."""
+"""Number of points to which an edge is fitted, and standard deviation of each in px."""
 PAPER_B_READING_NOISE = 3e-6
-"""m, noise of a reading."""
+"""Standard deviation of a reading, m."""
 PAPER_B_BATCH_RUNS = 5
 RUNS_A_CASE = 4
-"""One run of a case for so many that are asked for: there are twelve, and most end in a joint
-estimate."""
+"""Divisor of the number of runs for each of the twelve cases, most of which end in a joint
+estimate.
+"""
 MOST_CONTROLLED_RUNS = 20
-"""Most runs of the machine that is controlled."""
+"""Maximum number of runs of the controlled machine."""
 CONTROLLED_MACHINE_SEED = 2006
-"""Seed of that machine."""
+"""Seed of the controlled machine."""
 
 MIRROR_VIEW, PERSPECTIVE_VIEW = "mirror", "perspective"
 PLAIN_REGRESSION, HUBER_REGRESSION, TUKEY_REGRESSION = "plain", "huber", "tukey"
@@ -62,17 +66,17 @@ PAPER_B_REGRESSIONS: tuple[linear.RegressionMethod, ...] = (
 
 
 class View(NamedTuple):
-    """A camera and where it stands, (4, 4)."""
+    """Camera and its pose T_camera_base (4, 4)."""
 
     camera: Camera
     T_camera_base: Array
 
 
 class Case(NamedTuple):
-    """What is wrong with the edges, and what is tried on them.
+    """Errors of the edges, and the methods that are applied.
 
-    wrong : share of edges that are another leg's. outward : px by which all lie outside. radius :
-    relative error of the radius that is believed.
+    wrong : share of edges that belong to another leg. outward : shift of all edges, px. radius :
+    relative error of the assumed radius.
     """
 
     methods: tuple[str, ...]
@@ -92,7 +96,7 @@ PAPER_B_CASES = {
     ),
 }
 CONTROLLED_POPULATION = "controlled"
-"""The population of one machine that is measured again and again, to be controlled."""
+"""Population of one machine that is measured repeatedly, for the control by its images."""
 PAPER_B_VIEW_NAMES = (MIRROR_VIEW, PERSPECTIVE_VIEW)
 PAPER_B_QUANTITIES = {
     "centre": Quantity("rms", 1e3, "mm"),
@@ -100,19 +104,20 @@ PAPER_B_QUANTITIES = {
     "cad": Quantity("mean", 1e3, "mm"),
     "pixel": Quantity("rms", 1.0, "px"),
 }
-"""Errors of the base centres in the camera's frame: their length; along the camera's axis;
-[B] V.A's square root of the median square from the drawing, after [B] 15; in the picture."""
+"""Errors of the base centres in the camera's frame: their length; along the camera's axis; the
+square root of the median square from the nominal model of [B] V.A, after [B] eq. 15; in the image.
+"""
 
 
 @dataclass(frozen=True)
 class HexapodByLegs:
-    """[B] V.A and V.B."""
+    """Setting of [B] V.A and V.B."""
 
     doing = "Edges of the legs"
     quantities = PAPER_B_QUANTITIES
 
     def populations(self, runs: int) -> list[Population]:
-        """Each camera with each case; and one machine that is controlled."""
+        """Populations of each camera with each case, and of the controlled machine."""
         each = max(2, runs // RUNS_A_CASE)
         out = [
             Population(f"{view}, {case}", each, PAPER_B_BATCH_RUNS)
@@ -124,7 +129,7 @@ class HexapodByLegs:
         ]
 
     def draw(self, batch: Batch) -> list[MeasuredHexapod]:
-        """A true machine a run, its configurations, and the edges that are seen."""
+        """Draw a true machine for each run, with its configurations and visible edges."""
         rng = batch.generator(0)
         if batch.population == CONTROLLED_POPULATION:
             truth, view = controlled_machine(), views_by_name()[PERSPECTIVE_VIEW]
@@ -135,16 +140,16 @@ class HexapodByLegs:
         return [measured_hexapod(drawn_machine(rng), view, case, rng) for _ in range(batch.runs)]
 
     def solve(self, batch: Batch, data: list[MeasuredHexapod]) -> dict[Key, Fitted]:
-        """Every method's base centres in the camera's frame, (B, L, 3)."""
+        """Base centres (B, L, 3) in the camera's frame by every method."""
         where, _, name = batch.population.partition(", ")
         methods = PAPER_B_CASES[name].methods if name else (ROBUST_REGRESSION,)
         rng = batch.generator(1)
-        results = [solved(one, methods, rng) for one in data]
-        values = hexapod_with_cylinder_legs().parameters.drawing
-        theta = np.broadcast_to(values, (batch.runs, len(values)))
+        centres = [solved(one, methods, rng) for one in data]
+        nominal = hexapod_with_cylinder_legs().parameters.drawing
+        theta = np.broadcast_to(nominal, (batch.runs, len(nominal)))
         return {
             (where, name or CONTROLLED_POPULATION, method): Fitted(
-                theta, extra={"centres": np.stack([f[method] for f in results])}
+                theta, extra={"centres": np.stack([f[method] for f in centres])}
             )
             for method in methods
         }
@@ -155,14 +160,14 @@ class HexapodByLegs:
         """Errors of the base centres."""
         del batch
         truth = np.stack([one.centres for one in data])
-        camera, drawing = data[0].view.camera, hexapod_with_cylinder_legs().base_centers()
+        camera, nominal = data[0].view.camera, hexapod_with_cylinder_legs().base_centers()
         pixel = camera.project(truth)
         out: dict[Key, Sample] = {}
         for key, fit in fits.items():
             centres = fit.extra["centres"]
             off = centres - truth
-            T = register(np.broadcast_to(drawing, centres.shape), centres)
-            laid = apply(T[:, None], drawing)
+            T = register(np.broadcast_to(nominal, centres.shape), centres)
+            laid = apply(T[:, None], nominal)
             square = np.sum((centres - laid) ** 2, axis=-1)
             out[key] = Sample(
                 {
@@ -179,8 +184,10 @@ class HexapodByLegs:
 
 @dataclass(frozen=True)
 class MeasuredHexapod:
-    """One run: the true base centres (L, 3) in the camera's frame, and what is measured and
-    believed.
+    """One run.
+
+    view : the camera. centres : (L, 3) true base centres in its frame. machine : the assumed model.
+    measurements : edges and readings.
     """
 
     view: View
@@ -191,7 +198,7 @@ class MeasuredHexapod:
 
 @cache
 def hexapod_with_cylinder_legs() -> Machine:
-    """The catalogue's Gough-Stewart platform with one cylinder a leg, readings as they are."""
+    """The catalogue's Gough-Stewart platform with one cylinder for each leg and exact scales."""
     document = with_exact_scales(load_mechanism("gough-stewart").document)
     kind = type(document.legs[0].tubes[0])
     tube = kind.model_validate(
@@ -202,26 +209,27 @@ def hexapod_with_cylinder_legs() -> Machine:
 
 
 def drawn_machine(rng: np.random.Generator) -> Machine:
-    """A machine built within the drawing's tolerances, its radii as drawn: what a wrong radius does
-    is a case of its own.
+    """Machine drawn by the prior sigmas; radii are nominal, since a wrong radius is a case of its
+    own.
     """
-    drawing = hexapod_with_cylinder_legs()
-    values = true_machine(drawing, 1.0, rng).values.copy()
-    radii = np.array(drawing.parameters.kinds) == "radius"
-    values[radii] = drawing.values[radii]
-    return drawing.with_values(values)
+    nominal = hexapod_with_cylinder_legs()
+    values = true_machine(nominal, 1.0, rng).values.copy()
+    radii = np.array(nominal.parameters.kinds) == "radius"
+    values[radii] = nominal.values[radii]
+    return nominal.with_values(values)
 
 
 @cache
 def controlled_machine() -> Machine:
-    """The one machine that is controlled, [B] V.B."""
+    """The controlled machine of [B] V.B."""
     return drawn_machine(np.random.default_rng(CONTROLLED_MACHINE_SEED))
 
 
 @cache
 def views_by_name() -> dict[str, View]:
-    """[B] V.A: a mirror between the legs, its 640 x 480 pixels parallel to the base, and a camera
-    of 1024 x 780 that looks level from in front.
+    """Cameras of [B] V.A: a catadioptric camera of 640 x 480 px between the legs, its image
+    parallel to the base, and a pinhole camera of 1024 x 780 px that looks horizontally from the
+    front.
     """
     mirror = Unified((640, 480), np.array([173.6, 173.3, 319.8, 240.2, 1.0, 0, 0, 0, 0]))
     up = np.array([0.01, -0.02, 0.06])
@@ -237,14 +245,14 @@ def views_by_name() -> dict[str, View]:
 def measured_hexapod(
     truth: Machine, view: View, case: Case, rng: np.random.Generator
 ) -> MeasuredHexapod:
-    """What a camera sees of a machine at the limits of its workspace."""
+    """Measurements of a machine at the limits of its workspace by a camera."""
     corners = np.array(list(product(*truth.joint_ranges)))
     readings = corners[rng.permutation(len(corners))[:PAPER_B_CONFIGURATIONS]]
     poses = truth.forward(readings)
     noise = EdgeNoise(
         shift=POINT_NOISE / np.sqrt(POINTS_FITTED_AN_EDGE),
-        tilt=POINT_NOISE
-        * np.sqrt(3 / POINTS_FITTED_AN_EDGE),  # of a line's ends, by points all along it
+        # at the ends of a line that is fitted to points all along it
+        tilt=POINT_NOISE * np.sqrt(3 / POINTS_FITTED_AN_EDGE),
         outward=case.outward,
         wrong=case.wrong,
     )
@@ -265,24 +273,25 @@ def solved(
     one: MeasuredHexapod, methods: tuple[str, ...], rng: np.random.Generator
 ) -> dict[str, Array]:
     """Base centres (L, 3), camera frame, by each of the methods."""
-    drawing = hexapod_with_cylinder_legs().base_centers()
+    nominal = hexapod_with_cylinder_legs().base_centers()
     out: dict[str, Array] = {}
     for method in PAPER_B_REGRESSIONS:
         if method in methods or method == ROBUST_REGRESSION:
-            value = linear.centres(one.machine, one.measurements, method, rng)
-            out[method] = value.centres[0]
+            estimate = linear.centres(one.machine, one.measurements, method, rng)
+            out[method] = estimate.centres[0]
     start = out[ROBUST_REGRESSION]
     if SCALED_BY_RATIO in methods:
-        out[SCALED_BY_RATIO] = start / linear.scale_ratio(start, drawing)
-        out[SCALED_BY_SIMILARITY] = start / linear.procrustes_scale(start, drawing)
+        out[SCALED_BY_RATIO] = start / linear.scale_ratio(start, nominal)
+        out[SCALED_BY_SIMILARITY] = start / linear.procrustes_scale(start, nominal)
     if PAPER_B_JOINT in methods:
         out[PAPER_B_JOINT] = jointly_estimated_centres(one, start)
     return {method: out[method] for method in methods}
 
 
 def jointly_estimated_centres(one: MeasuredHexapod, start: Array) -> Array:
-    """The joint estimate's base centres (L, 3), camera frame, begun where the linear ones lay the
-    drawing.
+    """Base centres (L, 3), camera frame, by the joint estimate.
+
+    The nominal model, registered to the linear estimate's centres ``start``, is the starting point.
     """
     machine, measured = one.machine, one.measurements
     T = register(machine.base_centers(), start)

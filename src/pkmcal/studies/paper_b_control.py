@@ -1,4 +1,6 @@
-"""[B] V.B: the hexapod led by its legs' edges, with what may be believed of its base; Fig. 10."""
+"""Simulation of [B] V.B, Fig. 10: a hexapod controlled by the edges of its legs, with several
+assumptions on its base.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +28,20 @@ PAPER_B_LOOP_SETTINGS = LoopSettings(law="edges", gain=1.0, rate=12.5, delay=1, 
                     noise=EdgeNoise(shift=0.02, tilt=0.02))  # fmt: skip
 CONTROL_START_READINGS = np.array([0.385, 0.445, 0.405, 0.455, 0.375, 0.425])
 CONTROL_GOAL_READINGS = np.array([0.445, 0.395, 0.440, 0.385, 0.445, 0.400])
-"""m, readings of [B] Fig. 9's configurations, which the paper shows and does not tell."""
+"""Readings (m) for the configurations of [B] Fig. 9, which the paper shows without numbers."""
 CAMERA_BY_HAND_ERRORS = {"hand": (0.03, 3.0), "coarse": (0.1, 10.0)}
-"""m and degrees by which a camera's place by hand is off: with ruler and eye, and at a guess."""
+"""Errors of a camera pose that is measured by hand, m and degrees: with a ruler, and estimated by
+eye.
+"""
 E1, E2 = "cad", "linear"
 
 
 class ControlledHexapod(NamedTuple):
-    """[B] Fig. 10. eye : the camera before the true machine. trials : by what is believed, the
-    ``true`` geometry, E1 ``cad``, E2 ``linear``, E3 by ``hand``, and ``coarse``. centres :
-    (R, L, 3) m, camera frame, as each of them has the base's joints.
+    """Simulation of [B] Fig. 10.
+
+    eye : the camera in front of the true machine. trials : by assumption: the ``true`` geometry, E1
+    ``cad``, E2 ``linear``, E3 by ``hand``, and ``coarse``. centres : (R, L, 3) base joints by each
+    of them, m, camera frame.
     """
 
     eye: Eye
@@ -44,8 +50,10 @@ class ControlledHexapod(NamedTuple):
 
 
 def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
-    """The same way with every estimate. centres : (R, L, 3) of [B] 14, camera frame, a run each."""
-    machine, drawing = controlled_machine(), hexapod_with_cylinder_legs()
+    """Run the same motion with every estimate. centres : (R, L, 3) by [B] eq. 14, camera frame, for
+    each run.
+    """
+    machine, nominal = controlled_machine(), hexapod_with_cylinder_legs()
     view = views_by_name()[PERSPECTIVE_VIEW]
     true = machine_view(machine, view.T_camera_base)
     eye = Eye.of(true, view.camera)
@@ -54,24 +62,24 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     exact = Uncertainty(np.zeros((len(machine.values),) * 2), np.zeros(3), np.zeros(3))
     beliefs: dict[str, Belief] = {}
     for name, (position, degrees) in CAMERA_BY_HAND_ERRORS.items():
-        value = estimates(
-            true, drawing.values, exact, runs, rng, position, float(np.radians(degrees))
+        drawn_beliefs = estimates(
+            true, nominal.values, exact, runs, rng, position, float(np.radians(degrees))
         )
-        beliefs.setdefault("true", value[0])
-        beliefs[name] = replace(value[3], name=name)
+        beliefs.setdefault("true", drawn_beliefs[0])
+        beliefs[name] = replace(drawn_beliefs[3], name=name)
     T = np.broadcast_to(view.T_camera_base, (runs, 4, 4))
-    values = np.tile(drawing.values, (runs, 1))
-    values[:, centre_index(machine.layout)[0]] = apply(inverse(T)[:, None], centres)
-    beliefs[E2] = _belief(E2, "Linear", true, values, T)
-    fitted = register(np.broadcast_to(drawing.base_centers(), centres.shape), centres)
-    as_drawn = np.broadcast_to(drawing.values, values.shape)
+    theta = np.tile(nominal.values, (runs, 1))
+    theta[:, centre_index(machine.layout)[0]] = apply(inverse(T)[:, None], centres)
+    beliefs[E2] = _belief(E2, "Linear", true, theta, T)
+    fitted = register(np.broadcast_to(nominal.base_centers(), centres.shape), centres)
+    as_drawn = np.broadcast_to(nominal.values, theta.shape)
     beliefs[E1] = _belief(E1, "Drawing, fitted", true, as_drawn, fitted)
     start, goal = (
         np.broadcast_to(machine.forward(q), (runs, 4, 4))
         for q in (CONTROL_START_READINGS, CONTROL_GOAL_READINGS)
     )
     ran: dict[str, ServoRuns] = {
-        # the same noise for all, so that differences are the estimates'
+        # the same noise for all, so that they differ only by their estimates
         name: simulate_servo_runs(
             eye, belief.view, start, goal, PAPER_B_LOOP_SETTINGS, np.random.default_rng(seed)
         )

@@ -1,4 +1,4 @@
-"""What [B] reports, what an independent prototype of it gave, and how ours is held against it."""
+"""Figures that [B] reports, those of an independent prototype, and the checks against both."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
 CAD_MEDIAN_ERROR = {MIRROR_VIEW: 12e-3, PERSPECTIVE_VIEW: 8e-3}
-"""[B] V.A: square root of the median square error from the drawing, m."""
+"""[B] V.A: square root of the median square error from the nominal model, m."""
 PAPER_B_PROTOTYPE: dict[Key, dict[str, str]] = {
     (MIRROR_VIEW, "right", ROBUST_REGRESSION): {"centre": "0.29"},
     (MIRROR_VIEW, "right", PAPER_B_JOINT): {"centre": "0.08"},
@@ -35,24 +35,28 @@ PAPER_B_PROTOTYPE: dict[Key, dict[str, str]] = {
     (MIRROR_VIEW, "radius", ROBUST_REGRESSION): {"centre": "3"},
     (PERSPECTIVE_VIEW, "radius", ROBUST_REGRESSION): {"centre": "10"},
 }
-"""Errors of the base joints, mm, by an independent prototype (errata; of ranges the middle)."""
+"""Errors of the base joints, mm, by an independent prototype (errata; middle of ranges)."""
 PAPER_B_TOLERANCE = 0.15
-"""Relative difference from the prototype that fails, where the setting leaves them comparable."""
+"""Accepted relative difference from the prototype where the settings are comparable."""
 MOST_ROBUST_ERROR_GROWTH = 1.5
-"""Times its error on right edges that the robust method may have with 35 % of wrong ones; fewer
-edges alone make 1.24 of it."""
+"""Maximum ratio of the robust method's error with 35 % of wrong edges to that on right edges; the
+smaller number of edges alone makes it 1.24.
+"""
 COLLAPSED_REGRESSION_ERROR = 0.05
-"""m beyond which a regression has collapsed."""
+"""Error (m) beyond which a regression has collapsed."""
 MOST_JOINT_OVER_LINEAR = {MIRROR_VIEW: 0.7, PERSPECTIVE_VIEW: 0.3}
-"""Part of the linear error that the joint estimate may have, whatever is wrong with the edges: the
-readings tell lengths, which the camera before the machine sees worst."""
+"""Maximum ratio of the joint estimate's error, in any case, to the linear one's on right edges:
+readings determine lengths, which the camera in front of the machine determines worst.
+"""
 SIMILAR_ESTIMATES_FACTOR = 2.0
-"""Times by which E1 and E2 may differ and count as alike, beside the tenfold of E3."""
+"""Maximum ratio of E1 and E2 that still counts as similar, compared with the tenfold of E3."""
 
 
 def paper_b_figures(study: StudyResult[HexapodByLegs]) -> list[Compared]:
-    """Every figure that the prototype gives. Held are those of a wrong radius, which scales the
-    machine wherever the cameras stand; the others depend on that.
+    """All figures of the prototype.
+
+    Only those with a wrong radius are comparable, because it scales the machine for any pose of the
+    cameras; the others depend on that pose.
     """
     return compared(
         study,
@@ -63,7 +67,7 @@ def paper_b_figures(study: StudyResult[HexapodByLegs]) -> list[Compared]:
 
 
 def paper_b_checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) -> tuple[Check, ...]:
-    """What must hold, or the reproduction has failed."""
+    """Checks that must pass for the reproduction to succeed."""
     return (
         *_calibrated(study),
         *_controlled(ran),
@@ -74,7 +78,7 @@ def paper_b_checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) ->
 
 
 def _calibrated(study: StudyResult[HexapodByLegs]) -> tuple[Check, ...]:
-    """Of the calibrations from legs' edges."""
+    """Checks of the calibrations by legs' edges."""
 
     def error(*key: str) -> Summary:
         return study.of(*key)["centre"]
@@ -144,7 +148,7 @@ def _calibrated(study: StudyResult[HexapodByLegs]) -> tuple[Check, ...]:
 
 
 def _controlled(ran: ControlledHexapod) -> tuple[Check, ...]:
-    """Of the platform that is controlled by its legs' images."""
+    """Checks of the platform that is controlled by images of its legs."""
     far = {name: float(np.median(trial.astray)) for name, trial in ran.trials.items()}
     reached = sum(trial.reached for trial in ran.trials.values())
     all_runs = sum(len(trial.runs.end) for trial in ran.trials.values())

@@ -1,4 +1,4 @@
-"""[B] V computed again: Figs. 6 to 10, 12 mm and 8 mm, beside the paper's figures."""
+"""Report on [B] V: Figs. 6 to 10, 12 mm and 8 mm, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ PAPER_B_COLUMNS = [
     Column("cad", 1, 1),
 ]
 DRAWN_EDGE_PLACES = 9
-"""Places along an edge that is drawn."""
+"""Number of points of a plotted edge."""
 DRAWN_ERROR_ENLARGEMENT = 10.0
-"""Times that errors are drawn enlarged."""
+"""Factor by which plotted errors are enlarged."""
 EXAMPLE_RUNS = 0
-"""The run whose joints are drawn: the first, not the best."""
+"""Index of the run whose joints are plotted: the first, not the best."""
 CONTROL_CURVE_STYLES = {
     "true": ("True geometry", "--quiet", "dot"),
     E1: ("E1: drawing, fitted", "--good", "dash"),
@@ -98,7 +98,7 @@ HexapodByLegsStudy = StudyResult[HexapodByLegs]
 
 
 def reproduce(options: Options) -> Outcome:
-    """The whole reproduction."""
+    """Reproduce [B] V."""
     began = perf_counter()
     study = run(HexapodByLegs(), options.runs, options.seed, options.within(0.0, 0.9))
     options.progress("Control by the edges", 0.9)
@@ -110,18 +110,20 @@ def reproduce(options: Options) -> Outcome:
 
 
 def paper_b_outcome(study: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Outcome:
-    """The reproduction that a study and the controlled runs give. elapsed : s, of both."""
+    """Outcome of a study and the controlled runs. elapsed : duration of both in s."""
     words = _words(study, ran, elapsed)
     return words.reproduction(
         (
-            words.part("accuracy", *_tables(study), plots={"shares": {"figure": _shares(study)}}),
-            words.part("figure-6", plots={"mirror": _picture(study, MIRROR_VIEW)}),
+            words.part(
+                "accuracy", *_tables(study), plots={"shares": {"figure": _share_plot(study)}}
+            ),
+            words.part("figure-6", plots={"mirror": _joints_plot(study, MIRROR_VIEW)}),
             _geometry_part(words, study),
-            words.part("figure-8", plots={"camera": _picture(study, PERSPECTIVE_VIEW, ran)}),
+            words.part("figure-8", plots={"camera": _joints_plot(study, PERSPECTIVE_VIEW, ran)}),
             words.part(
                 "figure-9",
                 plots={
-                    name: _configuration(ran, readings)
+                    name: _configuration_plot(ran, readings)
                     for name, readings in (
                         ("start", CONTROL_START_READINGS),
                         ("goal", CONTROL_GOAL_READINGS),
@@ -132,8 +134,8 @@ def paper_b_outcome(study: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: 
                 "figure-10",
                 _control_table(ran),
                 plots={
-                    "error": {"figure": _errors(ran), "height": 380},
-                    "beside": {"figure": _beside(ran), "height": 320},
+                    "error": {"figure": _error_plot(ran), "height": 380},
+                    "beside": {"figure": _distance_plot(ran), "height": 320},
                 },
             ),
             words.part("how"),
@@ -145,18 +147,20 @@ def paper_b_outcome(study: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: 
 
 
 def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Words:
-    """All that is said, with the figures that it names."""
+    """Text of the report with its values."""
     true, estimated = _joints(s, MIRROR_VIEW)
     project = views_by_name()[MIRROR_VIEW].camera.project
-    visible = ran.eye.camera.project
-    by_hand = np.linalg.norm(visible(ran.centres["hand"]) - visible(ran.centres["true"]), axis=-1)
+    project_controlled = ran.eye.camera.project
+    by_hand = np.linalg.norm(
+        project_controlled(ran.centres["hand"]) - project_controlled(ran.centres["true"]), axis=-1
+    )
     astray = {
         f"{name}_astray": 1e3 * float(np.median(trial.astray)) for name, trial in ran.trials.items()
     }
     start, goal = ran.eye.true.machine.forward(
         np.array([CONTROL_START_READINGS, CONTROL_GOAL_READINGS])
     )
-    sense = pose_difference(goal, start)
+    motion = pose_difference(goal, start)
     return Words.of(
         "b",
         s,
@@ -168,8 +172,8 @@ def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Wor
         mirror_pixel=float(np.linalg.norm(project(estimated) - project(true), axis=-1).max()),
         mirror_off=1e3 * float(np.linalg.norm(estimated - true, axis=-1).max()),
         hand_pixel=float(np.median(by_hand)),
-        way=1e3 * float(np.linalg.norm(sense[3:])),
-        way_tilt=float(np.degrees(np.linalg.norm(sense[:3]))),
+        way=1e3 * float(np.linalg.norm(motion[3:])),
+        way_tilt=float(np.degrees(np.linalg.norm(motion[:3]))),
         **astray,
     )
 
@@ -178,12 +182,12 @@ def _words(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> Wor
 
 
 def _tables(s: HexapodByLegsStudy) -> list[Table]:
-    """A table a camera."""
+    """Table for each camera."""
     out: list[Table] = []
     for view in PAPER_B_VIEW_NAMES:
         rows = [Row("The paper", ("", "", "", number(1e3 * CAD_MEDIAN_ERROR[view], 0)), "paper")]
-        for case, tried in PAPER_B_CASES.items():
-            for method in tried.methods:
+        for case, setting in PAPER_B_CASES.items():
+            for method in setting.methods:
                 key, name = (
                     (view, case, method),
                     f"{CASE_NAMES[case]}: {PAPER_B_METHOD_LABELS[method]}",
@@ -198,7 +202,7 @@ def _tables(s: HexapodByLegsStudy) -> list[Table]:
 
 
 def _control_table(ran: ControlledHexapod) -> Table:
-    """[B] Fig. 10 in figures."""
+    """Table of [B] Fig. 10."""
     rows = [
         Row(
             title,
@@ -225,13 +229,13 @@ def _control_table(ran: ControlledHexapod) -> Table:
 
 
 def _joints(s: HexapodByLegsStudy, view: str, case: str = "shifted") -> tuple[Array, Array]:
-    """True and linearly estimated base joints (L, 3) of the run that is drawn, camera frame, m."""
+    """True and linearly estimated base joints (L, 3) of the plotted run, camera frame, m."""
     key = (view, case, ROBUST_REGRESSION)
     return s.values("truth", *key)[EXAMPLE_RUNS], s.values("centres", *key)[EXAMPLE_RUNS]
 
 
-def _shares(s: HexapodByLegsStudy) -> dict[str, Any]:
-    """Error by the share of wrong edges, through the mirror."""
+def _share_plot(s: HexapodByLegsStudy) -> dict[str, Any]:
+    """Plot of the error by the share of wrong edges, for the catadioptric camera."""
     data: list[dict[str, Any]] = []
     for method, colour in PAPER_B_METHOD_COLOURS.items():
         cases = {
@@ -240,18 +244,19 @@ def _shares(s: HexapodByLegsStudy) -> dict[str, Any]:
                                 ("35 % wrong", 35))
             if method in PAPER_B_CASES[case].methods
         }  # fmt: skip
-        drawn = trace(PAPER_B_METHOD_LABELS[method], cases, cases.values(), colour)
-        data.append({**drawn, "hovertemplate": "%{y:.3g} mm with %{x} %"})
+        curve = trace(PAPER_B_METHOD_LABELS[method], cases, cases.values(), colour)
+        data.append({**curve, "hovertemplate": "%{y:.3g} mm with %{x} %"})
     layout = plane("wrong edges, %", "error of a joint, mm")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
     return {"data": data, "layout": layout}
 
 
-def _picture(
+def _joints_plot(
     s: HexapodByLegsStudy, view: str, ran: ControlledHexapod | None = None
 ) -> dict[str, Any]:
-    """[B] Figs. 6 and 8: joints in the picture, and the legs of the drawing at home; ran : where
-    joints by hand are drawn, too.
+    """Plots of [B] Figs. 6 and 8: joints in the image, and the nominal legs in the home pose.
+
+    ran : source of the joints by a camera pose measured by hand; not plotted without it.
     """
     camera, T = views_by_name()[view]
     machine = hexapod_with_cylinder_legs()
@@ -267,17 +272,17 @@ def _picture(
         data.append(_marks("true joints", true, "--ink", "x-thin", 11))
     else:
         data.append(_marks("true joints", true, "--ink", "circle", 4))
-        # of the machine that is controlled, laid where this run's is by its own true joints
+        # offset of the controlled machine's joints, applied to the true joints of this run
         off = camera.project(ran.centres["hand"][EXAMPLE_RUNS]) - camera.project(
             ran.centres["true"][EXAMPLE_RUNS]
         )
         data.append(_marks("by hand", true + off, "--calibrated", "x-thin", 11))
     data.append(_marks("estimated joints", estimated, "--drawing", "circle-open", 13))
-    return _photograph(camera.image_size, data)
+    return _image_axes(camera.image_size, data)
 
 
-def _photograph(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict[str, Any]:
-    """A plot whose axes are a picture's, framed, with y downwards."""
+def _image_axes(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict[str, Any]:
+    """Plot with the axes of an image: framed, with y downwards."""
     width, height = image_size
     layout = plane("x, pixels", "y, pixels")
     framed = {"showline": True, "mirror": True, "constrain": "domain"}
@@ -287,20 +292,21 @@ def _photograph(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict
 
 
 def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
-    """[B] Fig. 7."""
-    drawing = hexapod_with_cylinder_legs().base_centers()
-    sets: list[tuple[str, Array, str, str, float]] = [("drawing", drawing, "--ink", "square", 8)]
-    passes = (
+    """Section on [B] Fig. 7."""
+    nominal = hexapod_with_cylinder_legs().base_centers()
+    sets: list[tuple[str, Array, str, str, float]] = [("drawing", nominal, "--ink", "square", 8)]
+    styles = (
         (MIRROR_VIEW, "--calibrated", "circle-open"),
         (PERSPECTIVE_VIEW, "--drawing", "diamond-open"),
     )
-    for view, colour, symbol in passes:
+    for view, colour, symbol in styles:
         true, estimated = _joints(s, view)
-        # the run's own machine is the drawing's here, so that its errors are the method's alone
+        # the run's machine is replaced by the nominal one, so that only the method's errors are
+        # plotted
         fitted = register(true, estimated)
         off = apply(inverse(fitted), estimated) - true
         turned = views_by_name()[view].T_camera_base[:3, :3]
-        sets.append((view, drawing + DRAWN_ERROR_ENLARGEMENT * off @ turned, colour, symbol, 10))
+        sets.append((view, nominal + DRAWN_ERROR_ENLARGEMENT * off @ turned, colour, symbol, 10))
     plots: dict[str, dict[str, Any]] = {}
     for name, axes in (("lateral", (0, 2)), ("top", (0, 1))):
         data = [
@@ -314,8 +320,8 @@ def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
     return words.part("figure-7", plots=plots)
 
 
-def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
-    """[B] Fig. 9: the camera's picture at readings (m,); nearer legs before those behind them."""
+def _configuration_plot(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
+    """Plot of [B] Fig. 9: the camera's image at readings (m,), nearer legs in front of others."""
     machine, camera, T = ran.eye.true.machine, ran.eye.camera, ran.eye.true.T_camera_base
     pose = machine.forward(readings)
     edges = (
@@ -329,18 +335,22 @@ def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
     for leg in np.argsort(-(base + platform)[:, 2]):
         first, second = edges[ran.eye.true.legs.tolist().index(leg)]
         outline = np.concatenate([first, second[::-1], first[:1]])
-        drawn = trace(f"leg {leg + 1}", outline[:, 0], outline[:, 1], f"--leg{leg + 1}", "lines")
-        data.append({**drawn, "fill": "toself", "fillcolor": "--card", "legendrank": int(leg)})
+        outline_trace = trace(
+            f"leg {leg + 1}", outline[:, 0], outline[:, 1], f"--leg{leg + 1}", "lines"
+        )
+        data.append(
+            {**outline_trace, "fill": "toself", "fillcolor": "--card", "legendrank": int(leg)}
+        )
     x, y, _ = (machine.platform_centers() - machine.platform_centers().mean(axis=0)).T
     around = np.argsort(np.arctan2(y, x))
     ring = camera.project(platform)[[*around, around[0]]]
     data.append(trace("platform", ring[:, 0], ring[:, 1], "--ink", "lines"))
     data.append(_marks("base joints", camera.project(base), "--ink", "circle", 6))
-    return _photograph(camera.image_size, data)
+    return _image_axes(camera.image_size, data)
 
 
-def _errors(ran: ControlledHexapod) -> dict[str, Any]:
-    """[B] Fig. 10: the norm of e against time."""
+def _error_plot(ran: ControlledHexapod) -> dict[str, Any]:
+    """Plot of [B] Fig. 10: norm of e against time."""
     data: list[dict[str, Any]] = []
     for name, (title, colour, dash) in CONTROL_CURVE_STYLES.items():
         runs = ran.trials[name].runs
@@ -352,8 +362,8 @@ def _errors(ran: ControlledHexapod) -> dict[str, Any]:
     return {"data": data, "layout": layout}
 
 
-def _beside(ran: ControlledHexapod) -> dict[str, Any]:
-    """How far the platform is from where the true geometry has it, against time."""
+def _distance_plot(ran: ControlledHexapod) -> dict[str, Any]:
+    """Plot of the platform's distance from its path with the true geometry, against time."""
     ideal = ran.trials["true"].runs
     points = hexapod_with_cylinder_legs().platform_centers()
     there = apply(ideal.T_base_platform[:, :, None], points)
@@ -376,7 +386,7 @@ def _marks(name: str, points: Array, colour: str, symbol: str, size: float) -> d
 
 
 def _numbers(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> dict[str, Any]:
-    """Everything for programs, m, px and s."""
+    """Figures for programs, m, px and s."""
     return {
         "runs": s.runs,
         "seed": s.seed,
@@ -385,8 +395,11 @@ def _numbers(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> d
         "accuracy": [
             {
                 **dict(zip(("view", "case", "method"), key, strict=True)),
-                **{q: _caption(s.of(*key)[q].value) for q in ("centre", "depth", "cad", "pixel")},
-                "centre_error": _caption(s.of(*key)["centre"].error),
+                **{
+                    q: _finite_or_none(s.of(*key)[q].value)
+                    for q in ("centre", "depth", "cad", "pixel")
+                },
+                "centre_error": _finite_or_none(s.of(*key)["centre"].error),
                 "runs": len(s.values("centre", *key)),
                 "prototype": PAPER_B_PROTOTYPE.get(key, {}).get("centre"),
             }
@@ -403,12 +416,12 @@ def _numbers(s: HexapodByLegsStudy, ran: ControlledHexapod, elapsed: float) -> d
                 "astray": float(np.median(t.astray)),
                 "overshoot": float(t.overshoot.max()),
                 "error_rise": float(t.rise.max()),
-                "settling": _caption(float(np.nanmedian(t.settling))) if t.reached else None,
+                "settling": _finite_or_none(float(np.nanmedian(t.settling))) if t.reached else None,
             }
             for name, t in ran.trials.items()
         },
     }
 
 
-def _caption(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None

@@ -1,8 +1,9 @@
-"""[C] IV as a study: an H4, a board on its nacelle, a camera on its base.
+"""Study of [C] IV: an H4 with a board on its nacelle, and a camera on its base.
 
-81 poses, 71 drawn for the calibration and 10 for control; board poses with 0.2 mm and 0.03 degrees
-of noise a component. Compared are equations 3 and 5 as printed and whitened, the joint estimate and
-the Cramér-Rao bound, with models that are the truth's, richer or poorer.
+81 poses, of which 71 are drawn for the calibration and 10 for control; board poses with noise of
+0.2 mm and 0.03 degrees in each component. Compared are equations 3 and 5 as printed and whitened,
+the joint estimate and the Cramér-Rao bound, with models that are equal to the truth, richer or
+poorer.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ METHODS_BY_TRUTH: dict[H4ModelKind, dict[H4ModelKind, tuple[str, ...]]] = {
         "rods": (EQ5_WHITENED, PAPER_C_JOINT),
     },
 }
-"""For each truth the models that are fitted to it, and how."""
+"""For each truth, the fitted models and their methods."""
 H4_MODEL_KINDS: tuple[H4ModelKind, ...] = tuple(METHODS_BY_TRUTH)
 PRINTED_EQUATION_FORMS: dict[str, PoseFitForm] = {
     EQ3_AS_PRINTED: "joint",
@@ -88,14 +89,17 @@ PRINTED_EQUATION_FORMS: dict[str, PoseFitForm] = {
 
 PAPER_C_BATCH_RUNS = 20
 RODS_SHARE = 5
-"""One run with rods for so many others: it has 82 parameters and takes ten times as long."""
+"""Ratio of the number of runs to that with rods, which have 82 parameters and take ten times as
+long.
+"""
 LARGER_WORKSPACE_FACTOR = 1.25
-"""Half sizes of the workspace that errors are also told over, by those of the measured volume. The
-errata's prototype does not name its own; this one fits its figures."""
+"""Size of the second workspace for errors, relative to the measured volume. The errata's prototype
+does not name its own; this factor reproduces its figures.
+"""
 PAPER_C_COMPARED_POSES = 100
-"""Poses at which a run's machine is held against the truth."""
+"""Number of poses in each run at which machines are compared with the truth."""
 PAPER_C_BOUND_STREAM, COMPARED_POSES_STREAM, RULED_LINES_STREAM = 1, 2, 3
-"""Uses of a batch's draws, besides the simulation."""
+"""Random streams of a batch, besides 0 of the simulation."""
 PAPER_C_QUANTITIES = {
     "shift": Quantity("rms", 1e3, "mm"),
     "turn": Quantity("rms", 1e3, "mrad"),
@@ -103,15 +107,18 @@ PAPER_C_QUANTITIES = {
     "larger_turn": Quantity("rms", 1e3, "mrad"),
     "chi2": Quantity("mean"),
 }
-"""The tool's errors over the measured volume and over a larger workspace, and chi2 per degree of
-freedom, NaN where rows are not whitened."""
+"""Tool's errors over the measured volume and over a larger workspace, and chi2 per degree of
+freedom, which is NaN if rows are not whitened.
+"""
 
 
 @dataclass(frozen=True)
 class H4ByBoard:
-    """[C] IV. turn, shift : standard deviations of a board's pose, rad and m a component.
-    joint_noise : of a reading, rad. deviations : of the true machines from the drawing. control :
-    poses that are held back.
+    """Setting of [C] IV.
+
+    turn, shift : standard deviations of a board's pose in each component, rad and m. joint_noise :
+    of a reading, rad. deviations : of the true machines from the nominal model. control : number of
+    held-out poses.
     """
 
     turn: float = float(np.radians(0.03))
@@ -125,27 +132,29 @@ class H4ByBoard:
 
     @property
     def noise(self) -> Noise:
-        """Of boards and readings."""
+        """Noise of board poses and readings."""
         return Noise(self.joint_noise, pose=np.repeat([self.turn, self.shift], 3))
 
     def populations(self, runs: int) -> list[Population]:
-        """Each truth; fewer with rods."""
+        """Population of each truth; fewer runs with rods."""
         out = [
             Population(kind, runs, PAPER_C_BATCH_RUNS) for kind in H4_MODEL_KINDS if kind != "rods"
         ]
         return [*out, Population("rods", max(2, runs // RODS_SHARE), PAPER_C_BATCH_RUNS // 4)]
 
     def draw(self, batch: Batch) -> SimulatedRuns:
-        """True machines and their poses; calibration first, then control."""
+        """Draw true machines and their poses: those for the calibration first, then those for
+        control.
+        """
         return self.simulated(kind_of(batch.population), batch.runs, batch.generator(0))
 
     def simulated(self, kind: H4ModelKind, runs: int, rng: np.random.Generator) -> SimulatedRuns:
-        """The same of one kind of truth."""
+        """Simulated runs of one kind of truth."""
         machine = model(kind)
         theta = true_values(kind, self.deviations, runs, rng)
         order = np.argsort(rng.random((runs, len(measured_volume_grid()))), axis=1)
         poses = measured_volume_grid()[order]
-        if kind == "rods":  # two rods a forearm tilt the nacelle a little
+        if kind == "rods":  # forearms of two rods tilt the nacelle a little
             poses = on_manifold(machine.layout, theta[:, None], poses).T_base_platform
         readings = readings_at_poses(machine.layout, theta[:, None], poses)
         station = np.zeros(len(measured_volume_grid()), dtype=int)
@@ -153,7 +162,7 @@ class H4ByBoard:
         return simulate_runs(machine, theta, readings, poses, view, self.noise, rng, self.control)
 
     def solve(self, batch: Batch, data: SimulatedRuns) -> dict[Key, Fitted]:
-        """Every model that is fitted to this truth, by every method that is asked for."""
+        """Estimates with every model and method of METHODS_BY_TRUTH for this truth."""
         kind = kind_of(batch.population)
         return {
             (kind, name, method): fit
@@ -166,7 +175,7 @@ class H4ByBoard:
     def judge(
         self, batch: Batch, data: SimulatedRuns, fits: Mapping[Key, Fitted]
     ) -> dict[Key, Sample]:
-        """The tool's errors; where the truth is the paper's machine, its validation as well."""
+        """Errors of the tool; for the paper's machine as truth, also the paper's validation."""
         space, lines = batch.generator(COMPARED_POSES_STREAM), batch.generator(RULED_LINES_STREAM)
         near, far = (
             tool_places(data, workspace(PAPER_C_COMPARED_POSES, space, larger))
@@ -180,34 +189,36 @@ class H4ByBoard:
                 tool_errors(machine.layout, fit.theta, at, self.turn, self.shift)
                 for at in (near, far)
             )
-            values = {
+            figures = {
                 "chi2": np.full(batch.runs, np.nan),
                 "shift": one.shift, "turn": one.turn,
                 "larger_shift": other.shift, "larger_turn": other.turn,
             }  # fmt: skip
             if papers and method != PAPER_C_BOUND:
                 off = control_residuals(machine, fit, data)
-                values |= {
+                figures |= {
                     "control_mean": off.mean(axis=1),
                     "control_rms": np.sqrt(np.mean(off**2, axis=1)),
                     "straightness": straightness_along_rulers(machine, fit.theta, data, lines),
                     "square": square(machine, fit.theta, data),
                 }
             if papers and name == "design":
-                values["table_2"] = table_2_of(machine, fit.theta)
-            out[kind, name, method] = Sample(values | fit.extra)
+                figures["table_2"] = table_2_of(machine, fit.theta)
+            out[kind, name, method] = Sample(figures | fit.extra)
         return out | {("design", ROTATION_AXIS_METHOD): axis_of_rotation(data)} if papers else out
 
 
 def kind_of(name: str) -> H4ModelKind:
-    """A kind of truth or model by its name."""
+    """Kind of truth or model by its name."""
     return next(kind for kind in H4_MODEL_KINDS if kind == name)
 
 
 def _fits(
     data: SimulatedRuns, name: H4ModelKind, methods: tuple[str, ...], rng: np.random.Generator
 ) -> dict[str, Fitted]:
-    """Every asked method's estimate with one model. Only rods need the drawing as a prior."""
+    """Estimates with one model by the given methods. Only the model with rods needs priors from the
+    nominal model.
+    """
     machine, prior = model(name), name == "rods"
     begin = start(machine, data)
     out: dict[str, Fitted] = {}
@@ -226,12 +237,14 @@ def _fits(
 
 
 def start(machine: Machine, data: SimulatedRuns) -> State:
-    """Where every method begins: the drawing, camera and board by the closed form; B runs."""
-    n, values = data.count, machine.parameters.drawing
-    fk = forward(machine.layout, values, data.joints[:, :n], machine.home())
+    """Starting state of every method, B runs: nominal parameters, camera and board by the closed
+    form.
+    """
+    n, nominal = data.count, machine.parameters.drawing
+    fk = forward(machine.layout, nominal, data.joints[:, :n], machine.home())
     pair = solve_pairs(fk.T_base_platform, data.T_camera_board[:, :n], size_of(machine))
     return State(
-        values,
+        nominal,
         pair.T_camera_base[:, None],
         fk.T_base_platform,
         np.zeros(1),
@@ -245,10 +258,10 @@ def at_poses(
     machine: Machine, data: SimulatedRuns, begin: State, form: PoseFitForm, *,
     whitened: bool, use_drawing: bool = False,
 ) -> PoseFit:  # fmt: skip
-    """[C] eq. 3 or 5, as printed or whitened. begin : of :func:`start`."""
-    n, in_view = data.count, data.T_camera_board
+    """Fit by [C] eq. 3 or 5, as printed or whitened. begin : state by :func:`start`."""
+    n, measured = data.count, data.T_camera_board
     problem, state = pose_problem(
-        machine, measurements(data), in_view[:, :n], data.joints[:, :n], begin, form
+        machine, measurements(data), measured[:, :n], data.joints[:, :n], begin, form
     )
     noise = np.broadcast_to(np.diag(data.noise.pose**2), (n, 6, 6)) if whitened else None
     return fit_machine_to_poses(
@@ -257,7 +270,7 @@ def at_poses(
 
 
 def estimate_of_pose_fit(fit: PoseFit, *, whitened: bool = False) -> Fitted:
-    """A fit at measured poses as an estimate, with its rank and how many unknowns it estimates."""
+    """Estimate of a fit at measured poses, with its rank and its number of estimated unknowns."""
     problem, state = fit.problem, fit.solution.state
     runs, n = problem.readings.shape[:2]
     extra = {
@@ -273,7 +286,7 @@ def estimate_of_pose_fit(fit: PoseFit, *, whitened: bool = False) -> Fitted:
 def joint_from_pose_fit(
     machine: Machine, data: SimulatedRuns, begin: PoseFit, *, use_drawing: bool = False
 ) -> Fitted:
-    """The joint estimate, from a fit at measured poses."""
+    """Joint estimate, started from a fit at measured poses."""
     problem = joint_problem(machine, data, default_gauge(machine), use_drawing=use_drawing)
     state = begin.solution.state
     poses = begin.problem.platform_poses(state)
@@ -290,7 +303,9 @@ def joint_from_pose_fit(
 
 
 def estimate_at_bound(machine: Machine, data: SimulatedRuns, rng: np.random.Generator) -> Fitted:
-    """A draw from the Cramér-Rao bound at the truth, whose parameters are the machine's."""
+    """Draw from the Cramér-Rao bound at the truth; the truth's parameters must be those of the
+    machine.
+    """
     problem = joint_problem(machine, data, default_gauge(machine))
     z = (data.theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
     runs, n = len(z), data.count
@@ -307,27 +322,30 @@ def estimate_at_bound(machine: Machine, data: SimulatedRuns, rng: np.random.Gene
 
 
 def axis_of_rotation(data: SimulatedRuns) -> Sample:
-    """[C] IV.B of every run: spread of the axis over pairs of poses, found and by noise alone, and
-    of single poses, rad; chi2 per degree of freedom of one axis.
+    """Results of [C] IV.B for every run.
+
+    spread : of the axis over pairs of poses, rad. expected : the same by noise alone. tilt : root
+    mean square over single poses, rad. chi2 : per degree of freedom of a common axis.
     """
-    results = [
+    axes = [
         rotation_axis(measurements(data, run).poses, "schoenflies")
         for run in range(len(data.theta))
     ]
     return Sample(
         {
-            "spread": np.array([f.spread for f in results]),
-            "expected": np.array([f.expected_spread for f in results]),
-            "tilt": np.array([np.sqrt(np.mean(f.tilt**2)) for f in results]),
-            "chi2": np.array([f.chi2 / f.dof for f in results]),
-            "dof": np.array([f.dof for f in results]),
+            "spread": np.array([f.spread for f in axes]),
+            "expected": np.array([f.expected_spread for f in axes]),
+            "tilt": np.array([np.sqrt(np.mean(f.tilt**2)) for f in axes]),
+            "chi2": np.array([f.chi2 / f.dof for f in axes]),
+            "dof": np.array([f.dof for f in axes]),
         }
     )
 
 
 def ranks(study: StudyResult[H4ByBoard]) -> dict[tuple[H4ModelKind, str], tuple[int, int]]:
-    """Rank of the Jacobian with everything free, and how many unknowns are estimated, by model and
-    method, each on its own truth.
+    """Rank of the Jacobian with all unknowns free, and number of estimated unknowns.
+
+    By model and method, each with the truth of its own model.
     """
     out: dict[tuple[H4ModelKind, str], tuple[int, int]] = {}
     for kind in H4_MODEL_KINDS[:2]:

@@ -1,4 +1,4 @@
-"""What [C] reports, what an independent prototype of it gave, and how ours is held against it."""
+"""Figures that [C] reports, those of an independent prototype, and the checks against both."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TRUE_MACHINE_HEADINGS = {
     kind: where[0].upper() + where[1:] for kind, where in TRUE_MACHINE_CLAUSES.items()
 }
 NACELLE_ERROR_BEFORE = Before(26e-3, 0.022)
-"""[C] IV.C: the nacelle's mean error with the a priori parameters, m and rad."""
+"""[C] IV.C: mean error of the nacelle with the a priori parameters, m and rad."""
 TABLE_3 = {
     "before": ((9.0e-2, 3.5e-2, 7.3e-2, 8.3e-2), (9.0e-2, 3.7e-2, 7.4e-2, 8.3e-2)),
     "design": ((7.1e-5, 1.1e-4, -7.7e-4, -2.1e-4), (1.4e-3, 1.3e-3, 1.4e-3, 2.6e-3)),
@@ -58,11 +58,11 @@ TABLE_3 = {
 TABLE_4 = {"before": (1.3e-3, 2.3e-3), "design": (4.9e-4, 5.8e-4), "calibration": (5.9e-4, 1.1e-3)}
 """[C] Table 4: straightness in two directions, m."""
 SQUARE_BEFORE, SQUARE_AFTER = 5e-3, 0.5e-3
-"""[C] IV.D: error of the square's side, m; after, an upper limit."""
+"""[C] IV.D: error of the square's side before and, as an upper limit, after the calibration, m."""
 ROTATION_AXIS_SPREAD = float(np.radians(0.12))
-"""[C] IV.B: standard deviation of the angle between the axis and its mean."""
+"""[C] IV.B: standard deviation of the angle between the axis and its mean, rad."""
 JOINT_MEANS = (9.4e-2, 3.6e-2, 7.6e-2, 8.5e-2)
-"""What Table 2's two columns ask for as "before" in Table 3, rad (errata)."""
+"""Means of Table 3 "before" that follow from the two columns of Table 2, rad (errata)."""
 
 _PROTOTYPE: dict[Key, tuple[str, ...]] = {
     ("design", "design", PAPER_C_DRAWING): ("4.5", "9.6"),
@@ -84,31 +84,34 @@ PAPER_C_PROTOTYPE: dict[Key, dict[str, str]] = {
     for key, figures in _PROTOTYPE.items()
 }
 """RMSE over the workspace after registration, mm and mrad, by an independent prototype that shares
-no code with this program. Its workspace and its drawn machines are not known."""
+no code with this program. Its workspace and its drawn machines are not known.
+"""
 PAPER_C_TOLERANCE = 0.15
-"""Relative difference from the prototype that fails: its workspace's size is not known, and errors
-grow with it."""
+"""Accepted relative difference from the prototype: the size of its workspace is not known, and
+errors grow with it.
+"""
 FOLLOWS_MACHINE: tuple[tuple[H4ModelKind, H4ModelKind], ...] = (
     ("calibration", "design"), ("rods", "design"), ("rods", "calibration"),
 )  # fmt: skip
-"""Truth and model whose errors are those of what the model leaves out: they follow how the machine
-was drawn and, with rods, how far apart these stand, which the paper does not tell."""
+"""Truth and model whose errors are dominated by what the model leaves out: they depend on the drawn
+machines and, with rods, on the distance between them, which the paper does not give.
+"""
 PAPER_C_RANKS: dict[tuple[H4ModelKind, str], tuple[int, int]] = {
     ("design", EQ3_AS_PRINTED): (21, 19),
     ("design", EQ5_WHITENED): (23, 23),
     ("calibration", EQ5_AS_PRINTED): (38, 36),
     ("calibration", EQ5_WHITENED): (40, 40),
 }
-"""Rank of the Jacobian, and unknowns that are estimated (errata; 36 is the paper's)."""
+"""Rank of the Jacobian, and number of estimated unknowns (errata; 36 is the paper's)."""
 OVER_BOUND = 1.03
 MOST_RODS = 0.09
-"""mm that the model with rods must not exceed."""
+"""Maximum error of the model with rods, mm."""
 TOO_POOR = 1.5
 """chi2 per degree of freedom above which a model is too poor for its data."""
 
 
 def paper_c_figures(study: StudyResult[H4ByBoard]) -> list[Compared]:
-    """Every figure that the prototype gives; held where the setting leaves it comparable."""
+    """All figures of the prototype, marked by whether the settings are comparable."""
     return compared(
         study,
         PAPER_C_PROTOTYPE,
@@ -122,23 +125,23 @@ def paper_c_figures(study: StudyResult[H4ByBoard]) -> list[Compared]:
 
 
 def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
-    """What must hold, or the reproduction has failed."""
+    """Checks that must pass for the reproduction to succeed."""
     place, turn = start.shift, start.turn
     before = study.values("control_mean", "design", "design", PAPER_C_DRAWING).mean(axis=0)
     old = largest_side(study, ("design", PAPER_C_DRAWING))
     new = largest_side(study, ("design", EQ3_AS_PRINTED))
     every = ranks(study)
-    results = {key: every[key] for key in PAPER_C_RANKS}
+    measured_ranks = {key: every[key] for key in PAPER_C_RANKS}
     expected_ranks, wanted = (
         ", ".join(f"{rank} ({count})" for rank, count in values.values())
-        for values in (results, PAPER_C_RANKS)
+        for values in (measured_ranks, PAPER_C_RANKS)
     )
     axis = study.of("design", ROTATION_AXIS_METHOD)["chi2"].value
     dof = study.values("dof", "design", ROTATION_AXIS_METHOD)
     allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
-    compared = (PAPER_C_JOINT, PAPER_C_BOUND)
+    methods = (PAPER_C_JOINT, PAPER_C_BOUND)
     over = [
-        ratio_of_figures(*(study.of(kind, kind, method)["larger_shift"] for method in compared))
+        ratio_of_figures(*(study.of(kind, kind, method)["larger_shift"] for method in methods))
         for kind in H4_MODEL_KINDS[:2]
     ]
     right = [study.of(kind, kind, PAPER_C_JOINT)["chi2"].value for kind in H4_MODEL_KINDS]
@@ -167,7 +170,7 @@ def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check,
             "ranks, Models 12 and 31 (unknowns estimated)",
             expected_ranks,
             wanted,
-            results == PAPER_C_RANKS,
+            measured_ranks == PAPER_C_RANKS,
         ),
         Check(
             "χ² per degree of freedom of one axis of rotation, mean",

@@ -1,8 +1,8 @@
-"""[C] IV: the H4 that is simulated, its poses, and where camera and board are.
+"""The simulated H4 of [C] IV, its poses, and the poses of camera and board.
 
 81 poses on a grid of 200 x 200 x 150 mm and -20, 0, 20 degrees. Truths: the machine that the paper
-identified (Model 12), one with every arm its own (Model 31), one whose forearms are two rods of
-different length.
+identified (Model 12), a machine with individual arms (Model 31), and a machine whose forearms are
+two rods of different length.
 """
 
 from __future__ import annotations
@@ -20,22 +20,25 @@ from pkmcal.mechanisms import Machine, load_mechanism
 H4ModelKind = Literal["design", "calibration", "rods"]
 MEASURED_VOLUME_MIDDLE = np.array([0.0, 0.0, -0.45])
 MEASURED_VOLUME_HALF = np.array([0.1, 0.1, 0.075, np.radians(20.0)])
-"""Half of the measured volume ([C] IV.A), m and rad."""
+"""Half sizes of the measured volume ([C] IV.A), m and rad."""
 ROD_DRAWING = 1e-3, 0.035
-"""Tolerances of lengths (m) and angles (rad, 2 degrees) of the machine with rods, which needs a
-drawing: about 59 of its parameters are better known than by this one."""
+"""Prior sigmas of lengths (m) and angles (rad, 2 degrees) of the machine with rods, which needs
+priors: about 59 of its parameters are better known than by this nominal model.
+"""
 NACELLE_CORNER_SIGNS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 """(s, t) of the nacelle's four corners, errata [C]."""
 PAPER_C_CAMERA_POSE = look_at(
     np.array([0.03, -0.02, 0.15]), MEASURED_VOLUME_MIDDLE, np.array([1.0, 0.0, 0.0])
 )
-"""T_camera_base: about along the axis of rotation, [C] III.C."""
+"""T_camera_base; the camera looks roughly along the axis of rotation, [C] III.C."""
 PAPER_C_BOARD_POSE = pose(rotation(np.array([3.05, 0.05, 0.08])), np.array([0.04, -0.03, 0.03]))
 """T_platform_board."""
 
 
 class Table2(NamedTuple):
-    """[C] Table 2: h, the arm (0.26 m), R, the forearm (0.48 m), and four angles and offsets."""
+    """Column of [C] Table 2: h, arm (0.26 m), R, forearm (0.48 m), four angles alpha and four
+    offsets q0.
+    """
 
     h: float
     arm: float
@@ -53,8 +56,8 @@ IDENTIFIED_TABLE_2 = Table2(
 
 
 class Deviations(NamedTuple):
-    """Standard deviations of true machines from the drawing: of lengths (m), of axes' directions
-    (rad), and of the difference between two rods of a forearm (m).
+    """Standard deviations of true machines from the nominal model: of lengths (m), of axes'
+    directions (rad), and of the difference between the two rods of a forearm (m).
     """
 
     length: float = 1e-3
@@ -64,7 +67,9 @@ class Deviations(NamedTuple):
 
 @cache
 def model(kind: H4ModelKind) -> Machine:
-    """The catalogue's H4 with one of its models; of rods, drawn as well as ROD_DRAWING says."""
+    """The catalogue's H4 with one of its models; that with rods has the prior sigmas
+    ROD_DRAWING.
+    """
     machine = load_mechanism("h4", model=kind)
     if kind != "rods":
         return machine
@@ -75,7 +80,7 @@ def model(kind: H4ModelKind) -> Machine:
 
 
 def table_2_values(machine: Machine, table: Table2) -> Array:
-    """Parameters (P,) of the H4 with a column of Table 2; Q = q - q0, so ``angle`` is -q0."""
+    """Parameters (P,) of the H4 by a column of Table 2; Q = q - q0, so ``angle`` is -q0."""
     names = machine.parameters.index
     out = machine.parameters.drawing.copy()
     for j, (s, _) in enumerate(NACELLE_CORNER_SIGNS):
@@ -92,7 +97,7 @@ def table_2_values(machine: Machine, table: Table2) -> Array:
 
 
 def table_2_of(machine: Machine, theta: Array) -> Array:
-    """h, arm, R, rod, four alpha, four q0 (B, 12) of Model 12's parameters (B, P)."""
+    """h, arm, R, rod, four alpha, four q0 (B, 12) from the parameters (B, P) of Model 12."""
     index = machine.parameters.index
 
     def of(name: str) -> Array:
@@ -107,25 +112,29 @@ def table_2_of(machine: Machine, theta: Array) -> Array:
 
 
 def true_values(kind: H4ModelKind, off: Deviations, runs: int, rng: np.random.Generator) -> Array:
-    """True parameters (B, P) of the model of that kind."""
+    """True parameters (B, P) for a kind of model."""
     machine = model(kind)
     table = machine.parameters
     if kind == "design":
         return np.tile(table_2_values(machine, IDENTIFIED_TABLE_2), (runs, 1))
     kinds = np.array([table.kinds[k] for k in table.first_of_free()])
     sigma = np.select([kinds == "axis", kinds == "angle"], [off.axis, 0.0], off.length)
-    if kind == "rods":  # hinges and bars true: but for their rods, forearms are parallelograms
+    if kind == "rods":  # hinges and bars are exact: but for their rods, forearms are parallelograms
         names = table.free_names()
         still = [".platform." in n or ".along" in n or ".axis" in n for n in names]
         sigma = np.where(still, 0.0, sigma)
-    values = table.drawing + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
+    theta = table.drawing + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
     for leg, motor in enumerate(machine.layout.actuated, start=1):
-        values[:, table.index(f"legs[{leg}].base.angle")] = -IDENTIFIED_TABLE_2.q0[motor]
-    return _paired(machine, values, off.rods, rng) if kind == "rods" else values
+        theta[:, table.index(f"legs[{leg}].base.angle")] = -IDENTIFIED_TABLE_2.q0[motor]
+    return _with_paired_rods(machine, theta, off.rods, rng) if kind == "rods" else theta
 
 
-def _paired(machine: Machine, values: Array, rods: float, rng: np.random.Generator) -> Array:
-    """Both rods of a forearm and both arms of a motor alike, but for the rods' difference."""
+def _with_paired_rods(
+    machine: Machine, values: Array, rods: float, rng: np.random.Generator
+) -> Array:
+    """Equal rods of a forearm and equal arms of a motor, except for the difference between the
+    rods.
+    """
     out = values.copy()
     index = machine.parameters.index
     for first in range(1, machine.n_legs, 2):
@@ -139,7 +148,7 @@ def _paired(machine: Machine, values: Array, rods: float, rng: np.random.Generat
 
 
 def schoenflies(x: Array) -> Array:
-    """Poses (..., 4, 4) of (X, Y, Z, theta), (..., 4)."""
+    """Poses (..., 4, 4) from (X, Y, Z, theta), (..., 4)."""
     turn = x[..., 3:] * np.array([0.0, 0.0, 1.0])
     return pose(rotation(turn), x[..., :3])
 
@@ -152,6 +161,6 @@ def measured_volume_grid() -> Array:
 
 
 def workspace(count: int, rng: np.random.Generator, larger: float = 1.0) -> Array:
-    """Random poses (count, 4, 4) in the measured volume, or in a larger one about its middle."""
+    """Random poses (count, 4, 4) in the measured volume, enlarged by a factor about its middle."""
     x = larger * MEASURED_VOLUME_HALF * rng.uniform(-1, 1, (count, 4))
     return schoenflies(x + np.append(MEASURED_VOLUME_MIDDLE, 0.0))

@@ -1,4 +1,4 @@
-"""[C] IV computed again: Tables 2, 3 and 4, 26 mm and 5 mm, beside the paper's figures."""
+"""Report on [C] IV: Tables 2, 3 and 4, 26 mm and 5 mm, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -46,24 +46,24 @@ from pkmcal.wording import number
 
 TABLE_2_ANGLE_HEADS = ("α₁", "α₂", "α₃", "α₄", "q₀₁", "q₀₂", "q₀₃", "q₀₄")
 PAPER_C_REMARKS = ("models", "floor", "axis", "apart")
-"""The last where there is something to tell."""
+"""Remarks of the report; the last only if there are such differences."""
 VALIDATION_TABLE_ROWS = (
     ("Before", ("design", PAPER_C_DRAWING), "before"),
     ("Model 12, eq. 3", ("design", EQ3_AS_PRINTED), "design"),
     ("Model 31, eq. 5", ("calibration", EQ5_AS_PRINTED), "calibration"),
 )
-"""Rows of Tables 3 and 4: their name, model and method, and which of the paper's."""
+"""Rows of Tables 3 and 4: their label, model and method, and the key of the paper's row."""
 
 H4ByBoardStudy = StudyResult[H4ByBoard]
 
 
 def reproduce(options: Options) -> Outcome:
-    """The whole reproduction."""
+    """Reproduce [C] IV."""
     return paper_c_outcome(run(H4ByBoard(), options.runs, options.seed, options.progress))
 
 
 def paper_c_outcome(study: H4ByBoardStudy) -> Outcome:
-    """The reproduction that a study gives."""
+    """Outcome of a study."""
     start = before()
     words = _words(study, start)
     return words.reproduction(
@@ -107,7 +107,7 @@ def paper_c_outcome(study: H4ByBoardStudy) -> Outcome:
 
 
 def _words(s: H4ByBoardStudy, start: Before) -> Words:
-    """All that is said, with the figures that it names; what is apart from the prototype, too."""
+    """Text of the report with its values, and with the differences from the prototype."""
     apart = [f for f in paper_c_figures(s) if not f.held and not f.tolerable]
     right, setting = ("calibration", "calibration"), s.setting
     return Words.of(
@@ -138,7 +138,7 @@ def _words(s: H4ByBoardStudy, start: Before) -> Words:
 
 
 def _accuracy_tables(s: H4ByBoardStudy) -> list[Table]:
-    """Every estimator's error over the workspace, beside the prototype's."""
+    """Tables of every estimator's error over the workspace, beside the prototype's."""
     columns = [
         *(Column(name, 3, 3) for name in ("shift", "turn", "larger_shift", "larger_turn")),
         Column("chi2", 2, 2),
@@ -182,7 +182,7 @@ def _tables_2(s: H4ByBoardStudy) -> tuple[Table, Table]:
             out.append(Row("  its scatter", cells(values.std(axis=0)), "prototype"))
         return tuple(out)
 
-    # the paper has four decimals; the scatter of sizes needs five
+    # The paper has four decimals; the scatter of sizes needs five.
     sizes, angles = rows(slice(4), 5, equation, best), rows(slice(4, None), 4, equation)
     return (
         Table("Table 2: sizes, m", ("", "h", "arm", "R", "forearm"), sizes),
@@ -191,11 +191,12 @@ def _tables_2(s: H4ByBoardStudy) -> tuple[Table, Table]:
 
 
 def _control_mean(s: H4ByBoardStudy, model_and_method: tuple[str, str]) -> Array:
-    """Means (4,) of the motors' residuals; after a calibration they have no sign of their own, so
-    their root mean square over the runs.
+    """Means (4,) of the motors' residuals, rad.
+
+    After a calibration their signs are random, so these are root mean squares over the runs.
     """
-    value = s.values("control_mean", "design", *model_and_method)
-    return value.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(value)
+    means = s.values("control_mean", "design", *model_and_method)
+    return means.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(means)
 
 
 def _table_3(s: H4ByBoardStudy) -> Table:
@@ -207,9 +208,9 @@ def _table_3(s: H4ByBoardStudy) -> Table:
     rows: list[Row] = []
     for label, which, key in VALIDATION_TABLE_ROWS:
         ours = (_control_mean(s, which), each_rms(s.values("control_rms", "design", *which)))
-        for what, paper, item in zip(("mean", "rms"), TABLE_3[key], ours, strict=True):
+        for what, paper, figures in zip(("mean", "rms"), TABLE_3[key], ours, strict=True):
             rows.append(Row(f"{label}, {what}: the paper", two_digits(paper), "paper"))
-            rows.append(Row("  found", two_digits(item)))
+            rows.append(Row("  found", two_digits(figures)))
     heads = ("", "q₁", "q₂", "q₃", "q₄")
     return Table("Table 3: residuals of the motors, mrad", heads, tuple(rows))
 
@@ -224,9 +225,9 @@ def _table_4(s: H4ByBoardStudy) -> Table:
         if key:
             one, two = TABLE_4[key]
             rows.append(Row(f"{label}: the paper", (mm(one, 2), mm(two, 2), "", ""), "paper"))
-        value = each_rms(s.values("straightness", "design", *which))
+        straightness = each_rms(s.values("straightness", "design", *which))
         name = "  found" if key else f"  found, {label}"
-        rows.append(Row(name, tuple(mm(float(v)) for v in value)))
+        rows.append(Row(name, tuple(mm(float(v)) for v in straightness)))
     return Table(
         "Table 4: straightness, mm",
         ("", "200 mm, x", "200 mm, y", "400 mm, x", "400 mm, y"),
@@ -267,7 +268,7 @@ def _axis_table(s: H4ByBoardStudy) -> Table:
 
 
 def _ranks_table(s: H4ByBoardStudy) -> Table:
-    """[C] III.C: what can be identified."""
+    """[C] III.C: identifiable unknowns."""
     unknowns = {"design": 24, "calibration": 46}
     rows = [
         Row(
@@ -283,8 +284,8 @@ def _ranks_table(s: H4ByBoardStudy) -> Table:
 
 
 def _accuracy_plot(s: H4ByBoardStudy) -> dict[str, Any]:
-    """The tool's error over the larger workspace by truth, model and method, mm; the prototype's
-    beside it, whose workspace fits that one.
+    """Plot of the tool's error over the larger workspace by truth, model and method, mm, beside the
+    prototype's, whose workspace fits that size.
     """
     data: list[dict[str, Any]] = []
     places: list[int] = []
@@ -293,18 +294,17 @@ def _accuracy_plot(s: H4ByBoardStudy) -> dict[str, Any]:
     for kind, models in METHODS_BY_TRUTH.items():
         errors: dict[int, float] = {}
         for name, method in ((name, m) for name, methods in models.items() for m in methods):
-            place = len(labels) + len(data)  # a gap between machines
+            place = len(labels) + len(data)  # leaves a gap between machines
             labels.append(f"{PAPER_C_MODEL_LABELS[name]}, {PAPER_C_METHOD_LABELS[method]}")
             places.append(place)
             errors[place] = 1e3 * s.of(kind, name, method)["larger_shift"].value
-            reference_values = PAPER_C_PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
-            if reference_values:
-                printed[place] = float(reference_values)
+            prototype = PAPER_C_PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
+            if prototype:
+                printed[place] = float(prototype)
         colour = {"design": "--drawing", "calibration": "--calibrated", "rods": "--leg3"}[kind]
-        lying = bars(
-            TRUE_MACHINE_HEADINGS[kind], errors.values(), errors, color=colour
-        )  # so names can be read
-        data.append({**lying, "orientation": "h", "width": 0.8})
+        # horizontal bars, for the length of their names
+        horizontal = bars(TRUE_MACHINE_HEADINGS[kind], errors.values(), errors, color=colour)
+        data.append({**horizontal, "orientation": "h", "width": 0.8})
     marks = {"color": "--ink", "size": 9, "symbol": "diamond-open"}
     data.append(
         trace("independent prototype", printed.values(), printed, "--ink", "markers", marker=marks)
@@ -321,7 +321,7 @@ def _accuracy_plot(s: H4ByBoardStudy) -> dict[str, Any]:
 
 
 def _residual_plot(s: H4ByBoardStudy) -> dict[str, Any]:
-    """[C] Table 3 after the calibration: root mean square residuals of the motors, mrad."""
+    """Plot of [C] Table 3 after the calibration: root mean square residuals of the motors, mrad."""
     data: list[dict[str, Any]] = []
     colours = {"design": "--drawing", "calibration": "--calibrated"}
     motors = [f"q{sign}" for sign in "₁₂₃₄"]
@@ -341,7 +341,7 @@ def _residual_plot(s: H4ByBoardStudy) -> dict[str, Any]:
 
 
 def _numbers(s: H4ByBoardStudy, start: Before) -> dict[str, Any]:
-    """Everything for programs, m and rad."""
+    """Figures for programs, m and rad."""
     axis = s.samples["design", ROTATION_AXIS_METHOD].values
     validated = [
         (name, method)
@@ -392,14 +392,18 @@ def _numbers(s: H4ByBoardStudy, start: Before) -> dict[str, Any]:
 
 
 def _accuracy(s: H4ByBoardStudy, *key: str) -> dict[str, Any]:
-    """One method's figures, with the prototype's, mm and mrad, where it has any."""
-    value = s.of(*key)
-    chi2, printed = value["chi2"].value, PAPER_C_PROTOTYPE.get(key)
+    """Figures of one method for programs, with the prototype's, in mm and mrad, if there are
+    any.
+    """
+    summaries = s.of(*key)
+    chi2, printed = summaries["chi2"].value, PAPER_C_PROTOTYPE.get(key)
     figures = [printed.get(name) for name in ("larger_shift", "larger_turn")] if printed else None
     return {
         **dict(zip(("truth", "model", "method"), key, strict=True)),
-        **{name: value[name].value for name in ("shift", "turn", "larger_shift", "larger_turn")},
-        **{f"{name}_error": value[name].error for name in ("larger_shift", "larger_turn")},
+        **{
+            name: summaries[name].value for name in ("shift", "turn", "larger_shift", "larger_turn")
+        },
+        **{f"{name}_error": summaries[name].error for name in ("larger_shift", "larger_turn")},
         "chi2": None if np.isnan(chi2) else chi2,
         "runs": len(s.values("shift", *key)),
         "prototype": figures and [v and float(v) for v in figures],

@@ -1,6 +1,7 @@
-"""[C] IV.C and IV.D on simulated runs: Tables 3 and 4, the error before, and the square.
+"""Validation of [C] IV.C and IV.D on simulated runs: Tables 3 and 4, the error before the
+calibration, and the square.
 
-All with the machine that the paper identified (Table 2, Model 12) as the truth.
+The truth is always the machine that the paper identified (Table 2, Model 12).
 """
 
 from __future__ import annotations
@@ -27,38 +28,46 @@ from pkmcal.studies.paper_c_machine import (
 from pkmcal.studies.simulated import SimulatedRuns
 
 VALIDATION_SQUARE_SIDE = 0.1
-"""[C] IV.D: the square's side, m."""
+"""[C] IV.D: side of the square, m."""
 RULED_LINE_LENGTHS = (0.2, 0.4)
-"""The ruled line's length, m; the paper does not tell it, and errors grow as its square."""
+"""Lengths of the ruled line, m; the paper does not give its length, and errors grow as its
+square.
+"""
 RULED_LINE_DIRECTIONS = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
 RULED_LINE_POINTS = 21
 ERROR_BEFORE_POSES = 400
-"""Of the workspace, that the error before is the mean of."""
+"""Number of poses of the workspace over which the error before the calibration is averaged."""
 
 
 def control_residuals(machine: Machine, fit: Fitted, data: SimulatedRuns) -> Array:
-    """[C] Table 3: what the inverse kinematics wants at the control poses, less the readings,
-    (B, n, 4) rad. At the measured poses; for the drawing, which places neither camera nor board, at
-    the true ones: what a controller would be wrong by.
+    """[C] Table 3: readings by inverse kinematics at the control poses, less the measured ones, (B,
+    n, 4) rad.
+
+    Poses are the measured ones; for the nominal model, which has neither camera nor board poses,
+    the true ones, so that residuals are the errors of a controller.
     """
     n = data.count
     poses = data.T_base_platform[:, n:]
     if fit.T_camera_base is not None and fit.T_mount is not None:
-        in_view = data.T_camera_board[:, n:]
-        poses = inverted(fit.T_camera_base)[:, None] @ in_view @ inverted(fit.T_mount)[:, None]
+        T_camera_board = data.T_camera_board[:, n:]
+        poses = (
+            inverted(fit.T_camera_base)[:, None] @ T_camera_board @ inverted(fit.T_mount)[:, None]
+        )
         poses = taken(machine.layout.motion, poses).pose
     return readings_at_poses(machine.layout, fit.theta[:, None], poses) - data.joints[:, n:]
 
 
 class Before(NamedTuple):
-    """[C] IV.C: mean error of the nacelle with the drawing, m and rad."""
+    """[C] IV.C: mean error of the nacelle with the nominal model, m and rad."""
 
     shift: float
     turn: float
 
 
 def before() -> Before:
-    """The drawing's poses against the true ones at the same readings, in the machine's frame."""
+    """Mean error of the nominal poses with respect to the true ones at the same readings, in the
+    machine's frame.
+    """
     machine = model("design")
     poses = workspace(ERROR_BEFORE_POSES, np.random.default_rng(0))
     readings = readings_at_poses(machine.layout, table_2_values(machine, IDENTIFIED_TABLE_2), poses)
@@ -71,10 +80,10 @@ def before() -> Before:
 def straightness_along_rulers(
     machine: Machine, theta: Array, data: SimulatedRuns, rng: np.random.Generator
 ) -> Array:
-    """[C] Table 4: root mean square distance (B, 4) of poses along a ruler from their best line.
+    """[C] Table 4: root mean square distance (B, 4) of poses along a ruler from their best line, m.
 
-    Two directions of each of RULED_LINE_LENGTHS. The tool is led along the true line; poses come
-    from the readings by the machine (B, P).
+    Two directions for each of RULED_LINE_LENGTHS. The tool moves along the true line; poses are
+    computed from the readings by the machine (B, P).
     """
     out: list[Array] = []
     for direction in [
@@ -96,16 +105,17 @@ def straightness_along_rulers(
 
 
 def square(machine: Machine, theta: Array, data: SimulatedRuns) -> Array:
-    """[C] IV.D: error (B, 4) of a square's sides, m, where the controller has the machine (B, P).
+    """[C] IV.D: error (B, 4) of a square's sides, m, with the machine (B, P) in the controller.
 
-    It asks for the corners by its inverse kinematics; the true machine goes where that leads.
+    The controller computes the corners' readings by its inverse kinematics; the true machine goes
+    to the poses of these readings.
     """
     corners = MEASURED_VOLUME_MIDDLE + VALIDATION_SQUARE_SIDE / 2 * np.array(
         [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
     )
     poses = schoenflies(np.concatenate([corners, np.zeros((4, 1))], axis=1))
     readings = readings_at_poses(machine.layout, theta[..., None, :], poses)
-    went = forward(data.machine.layout, data.theta[:, None], readings, poses).T_base_platform
-    points = went[..., :3, 3]
+    reached = forward(data.machine.layout, data.theta[:, None], readings, poses).T_base_platform
+    points = reached[..., :3, 3]
     sides = np.linalg.norm(np.roll(points, -1, axis=-2) - points, axis=-1)
     return sides - VALIDATION_SQUARE_SIDE

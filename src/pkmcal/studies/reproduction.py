@@ -1,8 +1,8 @@
-"""A paper's figures computed again, as an outcome: what holds for every paper.
+"""Reproduction of a paper's figures as an outcome: what all papers have in common.
 
-A paper's words stand in ``paper_x.yaml``, with places for figures in braces, as ``str.format`` has
-them; its tables, checks and plots are code. Terminal, page and JSON show the same of them.
-Its figures are held against what the paper reports, or an independent prototype gave.
+The text of a paper's report is in ``paper_x.yaml``, with figures in braces as in ``str.format``;
+its tables, checks and plots are code. Terminal, page and JSON show the same content. Figures are
+compared with those that the paper reports, or with those of an independent prototype.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from pkmcal.wording import brief, count, number
 
 REPRODUCED_PAPERS = ("a", "b", "c")
 PrintedFigures = Mapping[Key, Mapping[str, str]]
-"""A prototype's figures as it prints them, by what was estimated how and by quantity."""
+"""Figures of a prototype as printed, by key and quantity."""
 MONTE_CARLO_NOTE = ", its Monte-Carlo error aside"
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a person may choose. runs : of the Monte-Carlo simulation. long : also what takes
-    minutes. photographs : also what is measured on rendered photographs. progress : called with
-    the step in words and the share done.
+    """Options of a reproduction.
+
+    runs : number of the Monte-Carlo simulation. long : include parts that take minutes. photographs
+    : include measurements on rendered images. progress : callback with a text and the share done.
     """
 
     runs: int = 100
@@ -42,12 +43,16 @@ class Options:
     progress: StudyProgress = lambda _text, _share: None
 
     def within(self, first: float, last: float) -> StudyProgress:
-        """The same telling, of a part of the work."""
+        """Progress callback for a part of the work, from ``first`` to ``last`` of its share."""
         return lambda text, share: self.progress(text, first + (last - first) * share)
 
 
 def reproduce_paper(paper: str, options: Options) -> Outcome:
-    """One paper's figures beside ours. paper : its letter, small."""
+    """Reproduce the figures of a paper. paper : its letter in lower case.
+
+    With fewer than the default number of runs, a missed expectation comes with a note on that
+    number.
+    """
     outcome: Outcome = import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
     if outcome.verdict.usable or options.runs >= Options.runs:
         return outcome
@@ -57,10 +62,10 @@ def reproduce_paper(paper: str, options: Options) -> Outcome:
 
 
 class DisplayNumber(float):
-    """A number in a text: ``{:3}`` with three decimals, ``{:~}`` with two digits."""
+    """Number with format specifications ``{:3}`` for three decimals and ``{:~}`` for two digits."""
 
     def __format__(self, spec: str) -> str:
-        """As people read it."""
+        """Format for display; other specifications are those of float."""
         if spec == "~":
             return brief(self)
         return number(self, int(spec)) if spec.isdigit() else super().__format__(spec)
@@ -68,7 +73,9 @@ class DisplayNumber(float):
 
 @dataclass(frozen=True)
 class Words:
-    """A paper's words. document : of its file. values : what its texts name."""
+    """Text of a paper's report. document : content of its file. values : by the names in the
+    text.
+    """
 
     letter: str
     document: Mapping[str, Any]
@@ -76,11 +83,13 @@ class Words:
 
     @classmethod
     def of(cls, letter: str, study: StudyResult[Any], **values: Any) -> Words:
-        """The words on a study: ``found`` and ``error`` hold each method's figures in their units;
-        values : what else the texts name.
+        """Text with the values of a study.
+
+        ``found`` and ``error`` hold each method's figures and standard errors in their units.
+        values : further values that the text names.
         """
         units = study.setting.quantities
-        display = {
+        figures = {
             ", ".join(key): {
                 name: summary.times(units[name].factor) for name, summary in accuracy.items()
             }
@@ -88,10 +97,10 @@ class Words:
         }
         numbers: dict[str, Any] = {
             "found": {
-                m: {q: DisplayNumber(s.value) for q, s in a.items()} for m, a in display.items()
+                m: {q: DisplayNumber(s.value) for q, s in a.items()} for m, a in figures.items()
             },
             "error": {
-                m: {q: DisplayNumber(s.error) for q, s in a.items()} for m, a in display.items()
+                m: {q: DisplayNumber(s.error) for q, s in a.items()} for m, a in figures.items()
             },
             "setting": study.setting,
             "runs": study.runs,
@@ -105,7 +114,7 @@ class Words:
         return cls(letter, document, numbers)
 
     def say(self, text: str) -> str:
-        """A text with its figures put in."""
+        """Text with its values filled in."""
         return text.format_map(self.values)
 
     def part(
@@ -115,14 +124,16 @@ class Words:
         plots: Mapping[str, Mapping[str, Any]] | None = None,
         more: Iterable[str] = (),
     ) -> Part:
-        """A section. plots : by name, the ``figure`` and sizes of each. more : names of paragraphs
-        that are there at times only.
+        """Section of the report. plots : by name, the ``figure`` and sizes of each. more : names of
+        optional paragraphs.
         """
         own = self.document["parts"][name]
         texts = [*own["text"], *(own[key] for key in more)]
-        drawn = tuple(Plot(key, **own["plots"][key], **plot) for key, plot in (plots or {}).items())
+        figures = tuple(
+            Plot(key, **own["plots"][key], **plot) for key, plot in (plots or {}).items()
+        )
         title, text = own["title"], tuple(self.say(t) for t in texts)
-        return Part(name, title, text, plots=drawn, tables=tables)
+        return Part(name, title, text, plots=figures, tables=tables)
 
     def reproduction(
         self,
@@ -131,7 +142,9 @@ class Words:
         remarks: Iterable[str],
         numbers: Mapping[str, Any],
     ) -> Outcome:
-        """The outcome. remarks : names of those that hold. numbers : all, for programs."""
+        """Outcome of the reproduction. remarks : names of those that apply. numbers : figures for
+        programs.
+        """
         passed = all(check.passed for check in checks)
         failed = tuple(
             wrong("study.missed", check.what, found=check.found, expected=check.expected)
@@ -139,7 +152,7 @@ class Words:
             if not check.passed
         )
         headline, cited = self.say(self.document["headline"]), self.document["cited"]
-        if failed:  # what the words call reproduced may be what is missed
+        if failed:  # the headline of the text may praise what is missed here
             headline = (
                 f"Not reproduced: this run misses {len(failed)} of the"
                 f" {count(len(checks), 'expectation')} that it is held against."
@@ -186,7 +199,7 @@ class Words:
 
 
 class Column(NamedTuple):
-    """A column of a table of accuracies: a quantity, its decimals, its error's."""
+    """Column of a table of accuracies: quantity, decimals of its value and of its error."""
 
     quantity: str
     places: int
@@ -202,32 +215,32 @@ def accuracy_rows(
     *,
     errors: bool = True,
 ) -> list[Row]:
-    """One method's figures in the quantities' units, their Monte-Carlo errors where asked for, and
-    what an independent prototype ``printed``.
+    """Rows of one method: figures in the quantities' units, Monte-Carlo errors if ``errors``, and
+    the figures ``printed`` by an independent prototype.
     """
     setting: StudySetting = study.setting
-    results = [
+    figures = [
         (column, study.accuracy[key][column.quantity].times(quantity.factor))
         for column in columns
         for quantity in [setting.quantities[column.quantity]]
     ]
-    cells = (number(s.value, c.places) if isfinite(s.value) else "" for c, s in results)
+    cells = (number(s.value, c.places) if isfinite(s.value) else "" for c, s in figures)
     rows = [Row(name, tuple(cells))]
     if errors:
-        cells = (number(s.error, c.error_places) for c, s in results)
+        cells = (number(s.error, c.error_places) for c, s in figures)
         rows.append(Row("  ± Monte-Carlo error", tuple(cells), "prototype"))
-    reference_values = tuple((printed or {}).get(c.quantity, "") for c in columns)
-    if any(reference_values):
-        rows.append(Row("  independent prototype", reference_values, "prototype"))
+    prototype = tuple((printed or {}).get(c.quantity, "") for c in columns)
+    if any(prototype):
+        rows.append(Row("  independent prototype", prototype, "prototype"))
     return rows
 
 
 class Compared(NamedTuple):
-    """One figure in its printed ``unit`` with its Monte-Carlo error, and the prototype's.
+    """Figure in its printed ``unit`` with its Monte-Carlo error, beside the prototype's.
 
-    rounding : half of the prototype's last digit. tolerance : relative difference that is one of
-    the setting, not of the method. held : whether the setting leaves it comparable. name : what it
-    is, in words.
+    rounding : half of the last digit of the prototype's figure. tolerance : relative difference
+    that settings can cause, so not a fault of the method. held : whether the settings are
+    comparable. name : description in words.
     """
 
     key: Key
@@ -242,7 +255,9 @@ class Compared(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """By more than two standard errors of the difference of two such simulations."""
+        """Whether the figures differ by more than two standard errors of the difference of two such
+        simulations, and the rounding.
+        """
         return (
             abs(self.measured.value - self.expected)
             > 2 * 2**0.5 * self.measured.error + self.rounding
@@ -250,7 +265,7 @@ class Compared(NamedTuple):
 
     @property
     def tolerable(self) -> bool:
-        """Whether the difference is one of the setting, Monte-Carlo error aside."""
+        """Whether the difference is within the tolerance and two Monte-Carlo errors."""
         allowed = self.tolerance * self.expected + 2 * self.measured.error
         return abs(self.measured.value - self.expected) <= allowed
 
@@ -262,27 +277,31 @@ def compared(
     held: Callable[[Key], bool] = lambda _: True,
     named: Callable[[Key, str], str] = lambda key, quantity: ", ".join((*key, quantity)),
 ) -> list[Compared]:
-    """Every figure that the prototype gives. named : one in words, by its method and quantity."""
+    """All figures of the prototype beside those of the study. named : description of a figure, by
+    key and quantity.
+    """
     out: list[Compared] = []
     for key, figures in prototype.items():
         for quantity, printed in figures.items():
-            display = study.setting.quantities[quantity]
-            count = study.of(*key)[quantity].times(display.factor)
+            definition = study.setting.quantities[quantity]
+            measured = study.of(*key)[quantity].times(definition.factor)
             rounding = 0.5 * 10.0 ** -len(printed.partition(".")[2])
             allowed = tolerance(key, quantity)
             name = named(key, quantity)
             out.append(
                 Compared(
-                    key, quantity, count, float(printed), rounding, allowed, held(key),
-                    name, display.unit,
+                    key, quantity, measured, float(printed), rounding, allowed, held(key),
+                    name, definition.unit,
                 )
             )  # fmt: skip
     return out
 
 
 def prototype_check(figures: list[Compared], within: str) -> Check:
-    """Whether all figures that are held against the prototype's agree, and how many of the others
-    do not, which depend on what the paper leaves open; within : in words.
+    """Check that all comparable figures agree with the prototype's.
+
+    The others, which depend on what the paper leaves open, are only counted. within : the tolerance
+    in words.
     """
     held = [f for f in figures if f.held]
     bad = [
@@ -299,7 +318,7 @@ def prototype_check(figures: list[Compared], within: str) -> Check:
 
 
 def at_most(what: str, unit: str, summary: Summary, most: float, places: int) -> Check:
-    """A figure that may exceed a limit by its Monte-Carlo error alone."""
+    """Check of an upper limit, within two Monte-Carlo errors. most : in the summary's unit."""
     space = "" if unit == "°" else " "
     return Check(
         what,
@@ -310,10 +329,10 @@ def at_most(what: str, unit: str, summary: Summary, most: float, places: int) ->
 
 
 def mm(value: float, places: int = 3) -> str:
-    """Metres as millimetres, radians as milliradians, without the unit."""
+    """Number in mm or mrad, from m or rad, without its unit."""
     return number(1e3 * value, places)
 
 
 def deg(value: float, places: int) -> str:
-    """Radians as degrees without the sign."""
+    """Number in degrees, from rad, without its unit."""
     return number(degrees(value), places)

@@ -1,8 +1,8 @@
-"""Simulated sessions of many runs: true machines, where they stand, and noisy measurements.
+"""Simulated sessions of many runs: true machines, their poses, and noisy measurements.
 
-Runs are batched: B of them, K configurations, m readings, S stations. A camera sees legs' axes, as
-[A] measures them, or a board on the platform, as [C] does. A run becomes the same measurements, and
-the same least-squares problem, as a session of photographs.
+Runs are batched: B runs, K configurations, m readings, S stations. A camera observes legs' axes, as
+[A] measures them, or a board on the platform, as [C] does. A run becomes the same measurements and
+the same least-squares problem as a session with images.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from pkmcal.papers.axis_measurements import as_edges, to_coordinates
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """What is seen of K configurations, the same in all runs.
+    """Stations and what they observe of K configurations, the same in all runs.
 
-    T_camera_base : (S, 4, 4). station : (K,). legs : (K, G) whose axes are seen. T_platform_board :
-    (4, 4) of a board that is seen, None without one.
+    T_camera_base : (S, 4, 4). station : (K,). legs : (K, G) legs whose axes are observed.
+    T_platform_board : (4, 4), None without a board.
     """
 
     T_camera_base: Array
@@ -38,8 +38,10 @@ class Viewpoints:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations. reading : m or rad, of errors spread evenly where ``even``, normally
-    else. axis : (4,) of an axis's psi, theta, x and z. pose : (6,) of a board's (omega, tau).
+    """Standard deviations of the measurements.
+
+    reading : m or rad; errors are uniform if ``even``, else normal. axis : (4,) of an axis's psi,
+    theta, x and z. pose : (6,) of a board's (omega, tau).
     """
 
     reading: float
@@ -52,9 +54,10 @@ class Noise:
 class SimulatedRuns:
     """Simulated runs with their truth.
 
-    machine : the truth's document. theta : (B, P). T_base_platform : (B, K, 4, 4) true. joints :
-    (B, K, m) measured. axis : (B, K, G, 4) measured. T_camera_board : (B, K', 4, 4) measured.
-    control : configurations at the end that are held back from the calibration.
+    machine : model of the truth. theta : (B, P). T_base_platform : (B, K, 4, 4) true. joints : (B,
+    K, m) measured. axis : (B, K, G, 4) measured. T_camera_board : (B, K, 4, 4) measured; (B, 0, 4,
+    4) without a board. control : number of configurations at the end that are held out from the
+    calibration.
     """
 
     machine: Machine
@@ -69,12 +72,12 @@ class SimulatedRuns:
 
     @property
     def count(self) -> int:
-        """Configurations for the calibration."""
+        """Number of configurations for the calibration."""
         return self.joints.shape[1] - self.control
 
 
 def spread_evenly(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Array:
-    """Draws from a uniform distribution of zero mean and standard deviation sigma."""
+    """Uniform random numbers of zero mean and standard deviation sigma."""
     return rng.uniform(-1, 1, shape) * np.sqrt(3) * sigma
 
 
@@ -88,7 +91,9 @@ def simulate_runs(
     rng: np.random.Generator,
     control: int = 0,
 ) -> SimulatedRuns:
-    """What is measured of machines (B, P) at exact readings (B, K, m) and poses (B, K, 4, 4)."""
+    """Simulate the measurements of machines (B, P) at exact readings (B, K, m) and poses (B, K, 4,
+    4).
+    """
     runs, count = readings.shape[:2]
     camera = view.T_camera_base[view.station]
     axis, board = np.zeros((runs, count, 0, 4)), np.zeros((runs, 0, 4, 4))
@@ -109,14 +114,16 @@ def simulate_runs(
 
 
 def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
-    """One run's calibration as a session gives it; of an axis the place of one edge alone."""
+    """Measurements of one run's calibration, as a session gives them; axes only with the place of
+    one edge.
+    """
     n, view = data.count, data.view
     none = np.zeros(n, dtype=int)
     poses, mounts = PoseSet.empty(), ()
     if view.T_platform_board is not None:
         whiten = np.broadcast_to(np.diag(1 / data.noise.pose), (n, 6, 6))
-        in_view = data.T_camera_board[run, :n]
-        poses = PoseSet(view.station[:n], np.arange(n), none, in_view, whiten)
+        measured = data.T_camera_board[run, :n]
+        poses = PoseSet(view.station[:n], np.arange(n), none, measured, whiten)
         mounts = (Mount("board", "platform"),)
     stations = len(view.T_camera_base)
     return Measurements(
@@ -131,7 +138,7 @@ def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
 
 
 def _places_of_axes(view: Viewpoints) -> EdgeSet:
-    """One edge for each axis, with its place and nothing else."""
+    """One edge for each axis, with its indices and no numbers."""
     legs = view.legs.reshape(-1)
     n, each = len(legs), view.legs.shape[1]
     configuration = np.repeat(np.arange(len(view.legs)), each)
@@ -146,24 +153,24 @@ def _places_of_axes(view: Viewpoints) -> EdgeSet:
 def joint_problem(
     machine: Machine, data: SimulatedRuns, gauge: Gauge, *, use_drawing: bool = False
 ) -> Problem:
-    """The joint problem of all runs with a model: that of a session, with all runs' data.
+    """Joint problem of all runs with a model: that of a session, with the data of all runs.
 
-    An axis stands for two edges that are whitened together, [A] Table 1.
+    An axis is represented by two edges that are whitened together, [A] Table 1.
     """
     n = data.count
     assembled = assemble(machine, measurements(data), gauge, use_drawing=use_drawing)
-    one, at = assembled.problem, assembled.places.edges
-    blocks, numbers = one.blocks, replace(one.data, joints=data.joints[:, :n])
+    template, at = assembled.problem, assembled.places.edges
+    blocks, edge_data = template.blocks, replace(template.data, joints=data.joints[:, :n])
     if data.view.legs.size:
         axis = data.axis.reshape(len(data.axis), -1, 4)
         radius = machine.parameters.drawing[blocks.radius[at.row, at.place]]
-        count = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
-        basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in count)
-        basis[:, at.row, at.place], white[:, at.row, at.place] = count
+        whitened = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
+        basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in whitened)
+        basis[:, at.row, at.place], white[:, at.row, at.place] = whitened
         blocks = replace(blocks, side=np.broadcast_to([0, 1], (*at.shape, 2)))
         none = np.zeros((1, *at.shape, 4, 1))
-        numbers = replace(numbers, basis=basis, white=white, optics=none)
-    poses = one.pose_data
+        edge_data = replace(edge_data, basis=basis, white=white, optics=none)
+    poses = template.pose_data
     if data.view.T_platform_board is not None:
         poses = replace(poses, T_station_target=data.T_camera_board[:, :n, None])
-    return replace(one, blocks=blocks, data=numbers, pose_data=poses)
+    return replace(template, blocks=blocks, data=edge_data, pose_data=poses)

@@ -1,7 +1,7 @@
-"""What errors over simulated runs come to, each figure with its Monte-Carlo standard error.
+"""Summaries of errors over simulated runs, each with its Monte-Carlo standard error.
 
-Standard errors come from the runs' scatter, as coordinates within a run are correlated. Errors are
-arrays (B,) or (B, n), B runs.
+Standard errors are computed from the scatter between runs, because the coordinates within a run are
+correlated. Errors are arrays (B,) or (B, n) for B runs.
 """
 
 from __future__ import annotations
@@ -17,23 +17,26 @@ Statistic = Literal["rms", "mean"]
 
 
 class Summary(NamedTuple):
-    """A figure and its Monte-Carlo standard error, in one unit."""
+    """Value and its Monte-Carlo standard error, in the same unit."""
 
     value: float
     error: float
 
     def times(self, factor: float) -> Summary:
-        """The same in another unit."""
+        """Value and standard error times a factor, for a change of unit."""
         return Summary(factor * self.value, factor * self.error)
 
 
 def mean(values: Array) -> Summary:
-    """Of values (B,)."""
+    """Mean of values (B,) and its standard error."""
     return Summary(float(values.mean()), float(values.std() / np.sqrt(len(values))))
 
 
 def rms_over_runs(errors: Array) -> Summary:
-    """Root mean square over runs, and over coordinates where a run has several."""
+    """Root mean square of errors (B,) or (B, n) over runs and, if there are several, coordinates.
+
+    The standard error follows to first order from the scatter of the runs' mean squares.
+    """
     squares = np.square(errors).reshape(len(errors), -1).mean(axis=1)
     value = float(np.sqrt(squares.mean()))
     error = squares.std() / np.sqrt(len(squares)) / (2 * max(value, 1e-300))
@@ -41,20 +44,22 @@ def rms_over_runs(errors: Array) -> Summary:
 
 
 def each_rms(errors: Array) -> Array:
-    """Root mean square over runs of every coordinate, (B, n) -> (n,)."""
+    """Root mean square over runs of each coordinate, (B, n) -> (n,)."""
     return np.sqrt(np.mean(np.square(errors), axis=0))
 
 
 def ratio_of_figures(summary: Summary, bound: Summary) -> Summary:
-    """One figure over another, as if their errors were independent."""
+    """Ratio of two summaries; their errors are taken as independent."""
     value = summary.value / bound.value
     return Summary(value, value * float(np.hypot(summary.error / summary.value,
                                                  bound.error / bound.value)))  # fmt: skip
 
 
 def covered(errors: Array, sigma: Array, share: float = 0.95) -> Array:
-    """Part (B,) of a run's errors (B, ...) that lie in the intervals that their stated sigma
-    promises, of those where both are known.
+    """Share (B,) of a run's errors (B, ...) inside the intervals ± z sigma of their stated sigma.
+
+    share : nominal coverage of the intervals, 0.95 for 95 %. Entries with an error or a sigma that
+    is not finite do not count; a run without any finite entry has share 0.
     """
     from scipy.special import ndtri
 

@@ -1,9 +1,9 @@
-"""Finished batches of a study on disk, so that it goes on where it was stopped.
+"""Storage of a study's finished batches, so that an interrupted study can be resumed.
 
-A folder ``batches`` beside the results holds one file a batch, written whole or not at all, and
-``study.json``, which says of what study they are; one process at a time works there. A batch
-depends on its own seed alone, so a study that was stopped and goes on, on any number of workers,
-ends at the same numbers as one that was not. More runs of the same study take the finished ones in.
+A folder ``batches`` beside the results holds one file for each batch, written atomically, and
+``study.json``, which identifies the study; one process at a time works there. A batch depends on
+its own seed alone, so a resumed study gives the same numbers as an uninterrupted one, for any
+number of workers. A study with more runs reuses the finished batches.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from pkmcal.studies.tasks import Batch, Key, Sample, SolvedBatch, StudySetting
 BATCHES_FOLDER = "batches"
 STUDY_DESCRIPTION_FILE = "study.json"
 ARRAY_NAME_SEPARATOR = "/"
-"""Between what names an array in a batch's file."""
+"""Separator of key, kind and quantity in the names of a batch file's arrays."""
 
 
 @dataclass(frozen=True)
 class Store:
-    """The batches of one study. folder : theirs."""
+    """Batches of one study in their folder."""
 
     folder: Path
 
@@ -46,10 +46,10 @@ class Store:
     def opened(
         cls, out: Path, title: str, settings: Sequence[StudySetting], seed: int
     ) -> Generator[Store]:
-        """The store in a results folder, made or found there, for this process alone.
+        """Open or create the store in a results folder, exclusively for this process.
 
-        title : the study in words. Raises InputError where it holds finished batches of another
-        study, and while another process works in it.
+        title : the study in words. Raises InputError if the store holds finished batches of another
+        study, or if another process works in the folder.
         """
         folder = out / BATCHES_FOLDER
         path = folder / STUDY_DESCRIPTION_FILE
@@ -62,8 +62,8 @@ class Store:
                     raise InputError(
                         "the folder holds the batches of another study",
                         where=f"{path}, digest",
-                        found=_in_words(before),
-                        expected=_in_words(own),
+                        found=_description_text(before),
+                        expected=_description_text(own),
                         next_step="Name another folder with -o, or remove this one",
                     )
             else:
@@ -71,7 +71,9 @@ class Store:
             yield cls(folder)
 
     def load(self, cell: int, number: int, batch: Batch) -> SolvedBatch | None:
-        """A finished batch; None where it is still to be done, or has another number of runs."""
+        """Load a finished batch; None if it is missing, unreadable, or has another number of
+        runs.
+        """
         try:
             path = self._path(cell, number)
             check_regular(path, path.name)
@@ -93,7 +95,7 @@ class Store:
         )
 
     def save(self, cell: int, number: int, done: SolvedBatch) -> None:
-        """Keep a batch."""
+        """Save a finished batch."""
         arrays = {
             ARRAY_NAME_SEPARATOR.join((*key, kind, quantity)): array
             for key, sample in done.samples.items()
@@ -110,13 +112,15 @@ class Store:
 
 
 def digest(settings: Any, seed: int) -> str:
-    """What tells studies apart: the program, what is studied, and the seed; not how many runs."""
+    """Hash that identifies a study: program version, settings and seed, but not the number of
+    runs.
+    """
     text = json.dumps([version("pkmcal"), settings, seed], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def plainly(value: Any) -> Any:
-    """A setting as plain data: all that its numbers depend on."""
+    """A setting as plain data, with everything that its numbers depend on."""
     if isinstance(value, Machine):
         return {"machine": json_value(value.to_document()), "model": list(value.parameters.fixed)}
     if isinstance(value, Camera | Board):
@@ -145,6 +149,6 @@ def _description(path: Path) -> dict[str, Any]:
     )
 
 
-def _in_words(description: Mapping[str, Any]) -> str:
+def _description_text(description: Mapping[str, Any]) -> str:
     parts = [f"{description.get('study')}", f"seed {description.get('seed')}"]
     return ", ".join([*parts, f"pkmcal {description.get('pkmcal')}"])

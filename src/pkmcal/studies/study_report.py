@@ -1,5 +1,5 @@
-"""A study as an outcome: what accuracy each combination gives, whether its stated deviations hold,
-and which of what was varied gains most.
+"""Report of a study: accuracy of each combination, coverage of the stated standard deviations, and
+the varied name with the largest gain.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from pkmcal.studies.sweep import SweptSetting, Value, in_words
 from pkmcal.wording import amount, brief, count, decimals, number
 
 MOST_LINES = 8
-"""Curves in one plot; where there would be more, they are taken together."""
+"""Maximum number of curves in one plot; beyond it, one curve averages all combinations."""
 MOST_TICKS = 8
-"""Values that an axis names; of more, as many as it chooses."""
+"""Maximum number of values that are ticks of an axis; beyond it, the axis chooses its ticks."""
 MANY_FAILED = 0.1
-"""Share of failed runs from which a combination is named."""
+"""Share of failed runs from which a combination is reported."""
 STUDY_METHOD_TEXT = (
     "Each run draws a machine from the drawing's tolerances, measures it with the noise that is"
     " stated, and calibrates it as pkmcal calibrate does: from the drawing, robust, with the scale"
@@ -56,7 +56,7 @@ PAPER_STUDY_METHOD_TEXT = (
 
 
 def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
-    """Everything that ``pkmcal study`` tells and writes. table : the name of the runs' table."""
+    """Outcome of ``pkmcal study``. table : file name of the table of runs."""
     gains, bad = study.gains, [c for c in study.found if c.honest is False]
     failing = [cell for cell in study.found if cell.failed.value > MANY_FAILED]
     paper = not hasattr(study.subject.design, "observe")
@@ -71,13 +71,13 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
         verdict=Verdict(
             usable=not bad and not failing,
             headline=_headline(study, gains, bad),
-            findings=(*map(_reason, bad), *map(_failing, failing)),
+            findings=(*map(_coverage_finding, bad), *map(_failure_finding, failing)),
         ),
         stamp="Deviations hold" if not bad and not failing else "Look closer",
-        figures=_cards(study),
+        figures=_key_figures(study),
         parts=(
             Part("accuracy", "Accuracy", tables=(_table(study),), plots=_curves(study)),
-            _honesty(study),
+            _coverage_part(study),
             Part(
                 "how",
                 "How it was found",
@@ -95,7 +95,7 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
 
 
 def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) -> str:
-    """The verdict in a sentence or two."""
+    """Verdict in one sentence or two."""
     covered = [c.covered.value for c in study.found] + [c.covered_tool.value for c in study.found]
     if any(cell.honest is None for cell in study.found):
         where = " of some combinations" if len(study.found) > 1 else ""
@@ -110,10 +110,10 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
         text = f"The stated deviations hold: {share} of the 95 % intervals do."
     if len(study.found) == 1:
         cell = study.found[0]
-        residual = amount(cell.position.value, "m")
-        if _turns(study):
-            residual += f" and {amount(cell.orientation.value, 'rad')}"
-        return f"Calibrations leave {residual} at the tool. {text}"
+        error = amount(cell.position.value, "m")
+        if _rotates(study):
+            error += f" and {amount(cell.orientation.value, 'rad')}"
+        return f"Calibrations leave {error} at the tool. {text}"
     sure = [gain for gain in gains if gain.sure]
     if not sure:
         return f"{text} Nothing of what was varied shows beyond chance in so many runs."
@@ -127,7 +127,7 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     )
 
 
-def _reason(cell: CellFindings) -> Finding:
+def _coverage_finding(cell: CellFindings) -> Finding:
     where = in_words(cell.values) if cell.values else ""
     return wrong(
         "study.coverage",
@@ -139,7 +139,7 @@ def _reason(cell: CellFindings) -> Finding:
     )
 
 
-def _failing(cell: CellFindings) -> Finding:
+def _failure_finding(cell: CellFindings) -> Finding:
     where = in_words(cell.values) if cell.values else ""
     return wrong("study.fails", where, of=where or None, percent=100 * cell.failed.value)
 
@@ -158,26 +158,34 @@ def value_with_unit(study: SweepResult, name: str, value: Value) -> str:
 # ------------------------------------------------------------------ cards and tables
 
 
-def _turns(study: SweepResult) -> bool:
-    """Whether the platform turns at all; a delta's does not."""
+def _rotates(study: SweepResult) -> bool:
+    """Whether the platform rotates at all; that of a delta robot does not."""
     return not all(cell.orientation.value == 0 for cell in study.found)
 
 
-def _cards(study: SweepResult) -> tuple[Figure, ...]:
-    """Of the best combination."""
+def _key_figures(study: SweepResult) -> tuple[Figure, ...]:
+    """Key figures of the best combination."""
     best = min(study.found, key=lambda cell: np.nan_to_num(cell.position.value, nan=np.inf))
     which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
-    off = ((brief(1e3 * best.position.value), "mm"), (brief(1e3 * best.orientation.value), "mrad"))
-    below = ((brief(1e3 * best.position_95), "mm"), (brief(1e3 * best.orientation_95), "mrad"))
-    display = slice(None) if _turns(study) else slice(1)
+    errors = (
+        (brief(1e3 * best.position.value), "mm"),
+        (brief(1e3 * best.orientation.value), "mrad"),
+    )
+    percentiles = (
+        (brief(1e3 * best.position_95), "mm"),
+        (brief(1e3 * best.orientation_95), "mrad"),
+    )
+    columns = slice(None) if _rotates(study) else slice(1)
     return (
         Figure(
             "How far off is the tool after a calibration?",
-            off[display],
+            errors[columns],
             f"{which}; ± {brief(1e3 * best.position.error)} mm by chance",
         ),
         Figure(
-            "What stays below in 95 % of the workspace?", below[display], "over all runs and poses"
+            "What stays below in 95 % of the workspace?",
+            percentiles[columns],
+            "over all runs and poses",
         ),
         Figure(
             "Do its 95 % intervals hold?",
@@ -193,8 +201,8 @@ def _cards(study: SweepResult) -> tuple[Figure, ...]:
 
 
 def _table(study: SweepResult) -> Table:
-    """A row a combination."""
-    rows, turns = list[Row](), _turns(study)
+    """Table with one row for each combination."""
+    rows, turns = list[Row](), _rotates(study)
     for cell in study.found:
         turn = (
             _with_error(1e3 * cell.orientation.value, 1e3 * cell.orientation.error),
@@ -223,15 +231,15 @@ def _table(study: SweepResult) -> Table:
 
 
 def _with_error(value: float, error: float) -> str:
-    """A figure with its standard error, as many decimals as show one digit of both."""
+    """A number with its standard error, with the decimals that show at least one digit of each."""
     if not np.isfinite(error):
         return brief(value)
     places = max(decimals(value), decimals(error) - 1 if error > 0 else 0)
     return f"{number(value, places)} ± {number(error, places)}"
 
 
-def _honesty(study: SweepResult) -> Part:
-    """How often intervals hold, of each size and of each kind of parameter."""
+def _coverage_part(study: SweepResult) -> Part:
+    """Coverage of intervals of each nominal size, and for each kind of parameter."""
     kinds: dict[str, list[float]] = {}
     for cell in study.found:
         for name, share in zip(cell.parameters, cell.by_parameter.tolist(), strict=True):
@@ -252,12 +260,12 @@ def _honesty(study: SweepResult) -> Part:
         "Where an interval of 95 % holds the truth in 95 of 100 calibrations, its deviation may be"
         " believed. Above the line deviations are on the safe side, below it they promise too much."
     )
-    return Part("honesty", "Do the stated deviations hold?", (text,), plots=(_held(study),),
-                tables=(table,))  # fmt: skip
+    plots = (_coverage_plot(study),)
+    return Part("honesty", "Do the stated deviations hold?", (text,), plots=plots, tables=(table,))
 
 
 def _kind(name: str) -> str:
-    """What a parameter is, without its leg and coordinate."""
+    """Kind of a parameter: its name without leg and coordinate."""
     if "]" not in name:  # [A]'s: A2 x, q5
         return {"A": "base centres", "B": "platform centres"}.get(name[:1], "offsets")
     rest = name.partition("].")[2]
@@ -269,7 +277,7 @@ def _kind(name: str) -> str:
 
 
 def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindings]]]:
-    """Cells along a name, for every combination of all else."""
+    """Combinations along a name, for each combination of the other values."""
     others: dict[tuple[Any, ...], list[CellFindings]] = {}
     for cell in study.found:
         rest = {key: value for key, value in cell.values.items() if key != name}
@@ -279,7 +287,7 @@ def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindi
 
 
 def _curves(study: SweepResult) -> tuple[Plot, ...]:
-    """The tool's error and what is stated of it, along each name."""
+    """Plots of the tool's error and its stated standard deviation along each name."""
     out: list[Plot] = []
     for name, values in study.varied.items():
         if len(values) < 2:
@@ -324,8 +332,8 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
     return tuple(out)
 
 
-def _held(study: SweepResult) -> Plot:
-    """Intervals that hold against their promise, all combinations together."""
+def _coverage_plot(study: SweepResult) -> Plot:
+    """Plot of actual against nominal coverage, all combinations together."""
     x = 100 * COVERAGE_INTERVALS
     used = [cell for cell in study.found if np.isfinite(cell.held).all()]
     own, tool = (
@@ -353,8 +361,9 @@ def _held(study: SweepResult) -> Plot:
 
 
 def study_document(study: SweepResult) -> dict[str, Any]:
-    """Everything for programs, m and rad; nothing of how long it took, so that the same study is
-    the same file.
+    """Document of the study for programs, in m and rad.
+
+    Durations are left out, so that the same study gives the same file.
     """
     return {
         "pkmcal_study": 1,
@@ -378,8 +387,8 @@ def _cell(cell: CellFindings) -> dict[str, Any]:
     summaries = ("position", "orientation", "covered", "covered_tool", "failed")
     out: dict[str, Any] = {"values": dict(cell.values), "runs": cell.runs}
     for name in summaries:
-        results = getattr(cell, name)
-        out[name] = {"value": results.value, "standard_error": results.error}
+        summary = getattr(cell, name)
+        out[name] = {"value": summary.value, "standard_error": summary.error}
     for name in ("position_95", "orientation_95", "position_sigma", "orientation_sigma", "chi2"):
         out[name] = getattr(cell, name)
     out["intervals"] = {
@@ -396,11 +405,13 @@ RUN_TABLE_COLUMNS = (
     "worst_parameter_error", "worst_parameter_sigma", "covered", "covered_tool", "chi2", "scale",
     "steps", "failed",
 )  # fmt: skip
-"""Of the table of runs, after what is varied and the run's number; m, rad, and shares."""
+"""Columns of the table of runs, after the varied names and the run's number; m, rad, and shares."""
 
 
 def runs_table(study: SweepResult) -> dict[str, list[Any]]:
-    """One row a run, by column: what is varied, ``run``, then RUN_TABLE_COLUMNS."""
+    """Table by column with one row for each run: the varied names, ``run``, then
+    RUN_TABLE_COLUMNS.
+    """
     out: dict[str, list[Any]] = {name: [] for name in (*study.varied, "run", *RUN_TABLE_COLUMNS)}
     for cell, result in zip(study.cells, study.results, strict=True):
         own = _runs_of(result, [name for name, _ in cell.setting.parameters])
@@ -413,8 +424,9 @@ def runs_table(study: SweepResult) -> dict[str, list[Any]]:
 
 
 def _runs_of(result: StudyResult[SweptSetting], names: list[str]) -> dict[str, list[Any]]:
-    """Columns of one combination. The worst parameter is that with the largest error in stated
-    deviations.
+    """Columns of one combination.
+
+    The worst parameter is that with the largest error relative to its stated standard deviation.
     """
     sample = result.samples[JOINT_ESTIMATE_KEY]
     values: Mapping[str, Array] = sample.values
@@ -431,7 +443,7 @@ def _runs_of(result: StudyResult[SweptSetting], names: list[str]) -> dict[str, l
 
 
 def runs_bytes(study: SweepResult, name: str) -> str | bytes:
-    """The table of runs as CSV, or as Parquet where its name ends so."""
+    """The table of runs as CSV, or as Parquet if its name ends in ``.parquet``."""
     table = runs_table(study)
     if name.endswith(".parquet"):
         pyarrow, parquet = (import_module(name) for name in ("pyarrow", "pyarrow.parquet"))

@@ -1,8 +1,8 @@
-"""What a study varies: names, values and what each changes in a design; and where designs begin.
+"""Subjects of a study and the names that can be varied, with their effect on a design.
 
-A study begins with a machine, a session or a paper's setting, and tries every combination of the
-values that are given (a full grid). All combinations get the same seeds: their machines, noise and
-choices of configurations differ by nothing but what is varied.
+A study starts from a machine, a session or a paper's setting, and runs every combination of the
+given values (a full grid). All combinations use the same seeds: their machines, noise and choices
+of configurations differ only by what is varied.
 """
 
 from __future__ import annotations
@@ -35,18 +35,21 @@ from pkmcal.wording import listed
 STUDIED_PAPER = "a"
 MOST_CELLS = 500
 BUILT_IN_CAMERA_SIZE = (1024, 768)
-"""Pixels of the built-in cameras."""
+"""Width and height in px of the built-in cameras."""
 MIRROR_FOCAL, MIRROR_XI = 0.35, 1.0
-"""Focal length of the built-in mirror, in the image's height: a parabola shows all to 110 degrees
-from its axis."""
+"""Focal length of the built-in mirror in image heights, and its xi: a parabola, in view up to 110
+degrees from its axis.
+"""
 Value = float | int | str
 SweptSetting = SimulatedCalibrations | JointByAxes
 
 
 @dataclass(frozen=True)
 class Varied:
-    """A name that can be varied. least, most : its numbers. whole : no fractions. unit : of its
-    numbers. cell_text : what it is. words : its values where they are no numbers.
+    """Name that can be varied.
+
+    cell_text : description. least, most : limits of its numbers. whole : integers only. unit : of
+    its numbers. words : its values if they are not numbers.
     """
 
     cell_text: str
@@ -88,7 +91,10 @@ PAPER_NAMES_VARIED: Mapping[str, Varied] = {
 
 @dataclass(frozen=True)
 class StudySubject:
-    """What is studied: a design, or [A] 4.3. name : in words. findings : what to know of it."""
+    """Subject of a study: a design, or the setting of [A] 4.3.
+
+    name : description in words. findings : remarks on how the subject differs from the session.
+    """
 
     name: str
     design: Design | JointByAxes
@@ -96,20 +102,22 @@ class StudySubject:
 
     @property
     def names(self) -> Mapping[str, Varied]:
-        """What can be varied."""
+        """Names that can be varied."""
         return PAPER_NAMES_VARIED if isinstance(self.design, JointByAxes) else DESIGN_NAMES_VARIED
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination. values : of what is varied, by name. setting : what is simulated."""
+    """One combination. values : of the varied names. setting : of the simulation."""
 
     values: Mapping[str, Value]
     setting: SweptSetting
 
 
 def in_words(values: Mapping[str, Value]) -> str:
-    """A combination in words, such as "stations 2, edge noise 0.1"; empty where nothing varies."""
+    """Description of a combination, such as "stations 2, edge noise 0.1"; empty if nothing
+    varies.
+    """
     return ", ".join(
         f"{name.replace('_', ' ')} {value if isinstance(value, str) else f'{value:g}'}"
         for name, value in values.items()
@@ -117,9 +125,10 @@ def in_words(values: Mapping[str, Value]) -> str:
 
 
 def subject_of(origin: str) -> StudySubject:
-    """A paper's letter, a session's folder, a mechanism file or a built-in machine by its name.
+    """Subject by a paper's letter, a session's folder, a mechanism file or a built-in machine's
+    name.
 
-    Raises InputError where it is none of these.
+    Raises InputError if the origin is none of these.
     """
     if origin == STUDIED_PAPER:
         return StudySubject("the joint calibration of [A] 4.3", JointByAxes())
@@ -142,7 +151,10 @@ def subject_of(origin: str) -> StudySubject:
 
 
 def _of_session(session: Session) -> StudySubject:
-    """A session's machine, cameras, stations and noise, and as many configurations."""
+    """Subject with a session's machine, cameras, stations, noise, and number of configurations.
+
+    Raises InputError if stations are hand-held or do not all observe the same.
+    """
     if not session.stations or any(station.handheld for station in session.stations):
         raise InputError(
             "a study needs cameras that stand still",
@@ -150,6 +162,7 @@ def _of_session(session: Session) -> StudySubject:
             found="photographs by hand" if session.stations else "trackers alone",
             next_step="Study the machine itself: pkmcal study with its mechanism file",
         )
+    # What a study leaves out of the session.
     on_base = session.board is not None and session.board_body == "base"
     findings: list[Finding] = []
     if on_base:
@@ -158,40 +171,45 @@ def _of_session(session: Session) -> StudySubject:
         findings.append(note("study.without_trackers"))
     if session.workspace is not None:
         findings.append(note("study.whole_reach"))
-    words = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
-    if any(own != words[0] for own in words) or not words[0]:
+    observed = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
+    if any(own != observed[0] for own in observed) or not observed[0]:
         raise InputError(
             "a study needs stations that all observe the same, legs or a board on the platform",
             where=str(session.folder),
-            found=listed([" and ".join(sorted(own)) or "the base's board" for own in words], 4),
+            found=listed([" and ".join(sorted(own)) or "the base's board" for own in observed], 4),
         )
-    places = [station.T_camera_base for station in session.stations]
-    above_limit = [place for place in places if place is not None]
-    if len(above_limit) < len(places):
+    # Stations keep their poses if all are known, and the number of their configurations.
+    poses = [station.T_camera_base for station in session.stations]
+    given = [place for place in poses if place is not None]
+    if len(given) < len(poses):
         findings.append(note("study.chosen_stations"))
-    in_view = [{p.configuration for p in station.photographs} for station in session.stations]
+    by_station = [{p.configuration for p in station.photographs} for station in session.stations]
     usual = Design.configurations
-    if not any(in_view):
+    if not any(by_station):
         findings.append(note("study.no_images", number=usual))
     board = None if session.board is None or on_base else load_board(session.board)
     design = Design(
         session.machine,
         tuple(station.camera for station in session.stations),
-        stations=len(places),
-        T_camera_base=np.stack(above_limit) if len(above_limit) == len(places) else None,
-        observe=tuple(word for word in ("legs", "board") if word in words[0]),
+        stations=len(poses),
+        T_camera_base=np.stack(given) if len(given) == len(poses) else None,
+        observe=tuple(word for word in ("legs", "board") if word in observed[0]),
         board=board,
-        configurations=max(2, round(float(np.median([len(own) for own in in_view]))))
-        if any(in_view)
+        configurations=max(2, round(float(np.median([len(own) for own in by_station]))))
+        if any(by_station)
         else usual,
-        shared=len(in_view) > 1 and any(in_view) and all(own == in_view[0] for own in in_view),
+        shared=len(by_station) > 1
+        and any(by_station)
+        and all(own == by_station[0] for own in by_station),
         reading_noise=session.joint_noise,
     )
     return StudySubject(f"the session {session.folder}", design, tuple(findings))
 
 
 def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value, ...]]:
-    """``NAME=V1,V2,…`` each; raises InputError for what cannot be varied so."""
+    """Values by name from texts ``NAME=V1,V2,…``; raises InputError for a name or value that is
+    invalid.
+    """
     out: dict[str, tuple[Value, ...]] = {}
     for text in texts:
         name, equals, rest = text.partition("=")
@@ -219,7 +237,7 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
 
 
 def _value(name: str, varied: Varied, text: str) -> Value:
-    """One value, checked."""
+    """One value of a name, validated."""
     if varied.words:
         if text in varied.words or (name == "camera" and Path(text).is_file()):
             return text
@@ -243,7 +261,7 @@ def _value(name: str, varied: Varied, text: str) -> Value:
 
 
 def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> list[Cell]:
-    """Every combination of the values."""
+    """All combinations of the values."""
     count = math.prod(map(len, varied.values()))
     if count > MOST_CELLS:
         raise InputError(
@@ -254,14 +272,14 @@ def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> li
     for values in product(*varied.values()):
         chosen = dict(zip(varied, values, strict=True))
         if isinstance(subject.design, JointByAxes):
-            out.append(Cell(chosen, _paper(subject.design, chosen)))
+            out.append(Cell(chosen, _paper_setting(subject.design, chosen)))
         else:
             out.append(Cell(chosen, SimulatedCalibrations(_design(subject.design, chosen))))
     return out
 
 
-def _paper(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
-    """[A] 4.3 with other values."""
+def _paper_setting(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
+    """Setting of [A] 4.3 with other values."""
     own: dict[str, Any] = {
         {"configurations": "poses", "legs": "legs_observed", "reading_noise": "joint_noise"}.get(
             name, name
@@ -276,9 +294,9 @@ def _paper(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
 
 
 def _design(design: Design, values: Mapping[str, Value]) -> Design:
-    """A design with other values; where stations have moved, places are drawn anew."""
-    shifted = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
-    if shifted:
+    """Design with other values; stations are chosen anew if their poses no longer fit."""
+    affects_stations = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
+    if affects_stations:
         design = replace(design, T_camera_base=None)
     if "stations" in values and len(design.cameras) > 1:
         design = replace(design, cameras=design.cameras[:1])
@@ -310,7 +328,7 @@ def _design(design: Design, values: Mapping[str, Value]) -> Design:
 
 
 def _camera(name: str) -> Camera:
-    """A built-in camera, or one of a file."""
+    """Built-in camera by its name, or camera from a file."""
     if name == "pinhole":
         return camera_of_size(BUILT_IN_CAMERA_SIZE)
     if name == "mirror":
@@ -323,17 +341,17 @@ def _camera(name: str) -> Camera:
 
 
 def _resized(camera: Camera, width: int) -> Camera:
-    """The same lens on a sensor of the same size with other pixels."""
+    """Camera with the same lens and sensor size, and another number of pixels."""
     factor = width / camera.image_size[0]
     size = (width, max(1, round(factor * camera.image_size[1])))
     parameters = _scaled_pixels(camera, factor)
-    # pixel centres are at integers, so the image's corner is at -0.5
+    # pixel centres are at integers, so the corner of the image is at -0.5
     parameters[2:4] = factor * (camera.parameters[2:4] + 0.5) - 0.5
     return replace(camera, image_size=size, parameters=parameters, covariance=None)
 
 
 def _refocused(camera: Camera, focal: float) -> Camera:
-    """Another focal length before the same sensor."""
+    """Camera with another focal length and the same sensor."""
     parameters = _scaled_pixels(camera, focal / float(camera.parameters[0]))
     return replace(camera, parameters=parameters, covariance=None)
 
@@ -345,7 +363,7 @@ def _scaled_pixels(camera: Camera, factor: float) -> Array:
 
 
 def _with_radii(machine: Machine, factor: float) -> Machine:
-    """The machine with other tubes."""
+    """Machine with its tubes' radii times a factor."""
     document = machine.to_document()
     for leg in document["legs"]:
         for tube in leg.get("tubes", ()):
@@ -354,16 +372,16 @@ def _with_radii(machine: Machine, factor: float) -> Machine:
 
 
 def scaled(machine: Machine, factor: float) -> Machine:
-    """The machine with all lengths of its drawing times a factor; tolerances stay as they are, as
-    those of a workshop do.
+    """Machine with all its nominal lengths times a factor; prior sigmas are unchanged, because
+    those of a workshop do not depend on the size.
     """
     values = machine.values.copy()
     lengths = np.array(machine.parameters.units) == "m"
     values[lengths] *= factor
     document = machine.with_values(values).to_document()
-    for leg, unit in zip(document["legs"], _units(machine), strict=True):
+    for leg, motor in zip(document["legs"], machine.layout.actuated.tolist(), strict=True):
         _scale(leg["length"], "range", factor)
-        if unit == "m":
+        if motor >= 0 and machine.joint_units[motor] == "m":
             _scale(leg["base"], "range", factor)
         for tube in leg.get("tubes", ()):
             tube["from"] *= factor
@@ -371,12 +389,6 @@ def scaled(machine: Machine, factor: float) -> Machine:
     if document.get("home"):
         _scale(document["home"], "position", factor)
     return _rebuilt(document)
-
-
-def _units(machine: Machine) -> list[str]:
-    """The unit of each leg's reading, empty without one."""
-    motors = machine.layout.actuated
-    return [machine.joint_units[k] if k >= 0 else "" for k in motors.tolist()]
 
 
 def _scale(node: dict[str, Any], key: str, factor: float) -> None:

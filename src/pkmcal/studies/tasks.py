@@ -1,8 +1,8 @@
-"""What a study is made of: settings, batches of runs, and the work on one of them.
+"""Settings, batches and jobs of a study, and the computation of one batch.
 
-A :class:`StudySetting` says how machines, configurations and measurements are drawn, which
-estimators are tried, and how far off each is. A batch carries the seeds of all that is drawn for
-it, and depends on nothing else, so it may be done anywhere.
+A :class:`StudySetting` defines how machines, configurations and measurements are drawn, which
+estimators are applied, and how their errors are computed. A batch carries the seed of all its
+random draws and depends on nothing else, so it can be computed anywhere.
 """
 
 from __future__ import annotations
@@ -20,12 +20,17 @@ from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.statistics import Statistic
 
 Key = tuple[str, ...]
-"""What was estimated how: a method's name, after those of the truth and the model where a study has
-several."""
+"""Identification of a sample: the method's name, preceded by the names of the truth and the model
+if a study has several.
+"""
 
 
 class Population(NamedTuple):
-    """Runs of one kind of truth. batch : how many are solved at once; it belongs to the seeds."""
+    """Runs with one kind of truth.
+
+    batch : number of runs that are solved together; results depend on it, since each batch has its
+    own seed.
+    """
 
     name: str
     runs: int
@@ -33,7 +38,7 @@ class Population(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """How a quantity is summed up over the runs, and shown: times ``factor``, in ``unit``."""
+    """Statistic of a quantity over the runs, and its display: times ``factor``, in ``unit``."""
 
     statistic: Statistic
     factor: float = 1.0
@@ -42,22 +47,26 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class Batch:
-    """Runs of one population that are solved at once, with the seed of all that is drawn."""
+    """Runs of one population that are solved together, with the seed of all their random draws."""
 
     population: str
     runs: int
     seed: np.random.SeedSequence
 
     def generator(self, use: int) -> np.random.Generator:
-        """Independent draws for each use: 0 is the simulation, the others are a setting's own."""
+        """Independent random generator for each use: 0 is the simulation, others belong to the
+        setting.
+        """
         key = (*self.seed.spawn_key, use)
         return np.random.default_rng(np.random.SeedSequence(self.seed.entropy, spawn_key=key))
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One method on all runs. values : by quantity, (B,) or (B, n): errors, and what else a run
-    tells. sigma : standard deviations that the method itself states, of the same shape.
+    """Results of one method for all runs.
+
+    values : by quantity, (B,) or (B, n): errors and other figures of a run. sigma : standard
+    deviations stated by the method, of the same shape.
     """
 
     values: Mapping[str, Array]
@@ -65,8 +74,10 @@ class Sample:
 
 
 class StudySetting(Protocol):
-    """What is studied: a frozen dataclass. quantities : those that are summed up over the runs.
-    doing : what it does, in words.
+    """Interface of a study's setting, a frozen dataclass.
+
+    quantities : the quantities that are summarized over the runs. doing : description of the work,
+    for progress displays.
     """
 
     @property
@@ -76,24 +87,24 @@ class StudySetting(Protocol):
     def doing(self) -> str: ...
 
     def populations(self, runs: int) -> Sequence[Population]:
-        """What ``runs`` runs of the study are made of."""
+        """Populations of a study with ``runs`` runs."""
         ...
 
     def draw(self, batch: Batch) -> Any:
-        """True machines and their measurements, in the setting's own form."""
+        """Draw true machines and their measurements, in the setting's own form."""
         ...
 
     def solve(self, batch: Batch, data: Any) -> Mapping[Key, Fitted]:
-        """Every estimator's answer."""
+        """Apply every estimator to the data."""
         ...
 
     def judge(self, batch: Batch, data: Any, fits: Mapping[Key, Fitted]) -> Mapping[Key, Sample]:
-        """How far each is from the truth."""
+        """Errors of every estimate with respect to the truth."""
         ...
 
 
 class Job(NamedTuple):
-    """One batch of one setting: all that a worker needs. name : what errors say it is."""
+    """One batch of one setting, all that a worker needs. name : location of errors."""
 
     setting: StudySetting
     batch: Batch
@@ -101,7 +112,7 @@ class Job(NamedTuple):
 
 
 class SolvedBatch(NamedTuple):
-    """A batch's samples, and seconds of its solving: on the clock and of the processor."""
+    """Samples of a batch, and the wall and processor time of its solution in seconds."""
 
     samples: Mapping[Key, Sample]
     wall: float
@@ -109,18 +120,23 @@ class SolvedBatch(NamedTuple):
 
 
 Finished = Callable[[int, SolvedBatch], None]
-"""Called with a task's number as soon as it is done, from one thread at a time."""
+"""Callback with a task's number and result as soon as the task is done; never called
+concurrently.
+"""
 Runner = Callable[[Sequence[Job], Finished], int]
-"""Does all tasks in any order, and returns how many workers it had."""
+"""Function that runs all tasks, in any order, and returns the number of workers."""
 
 
 def work(task: Job) -> SolvedBatch:
-    """A batch drawn, solved and judged, on one thread."""
+    """Draw, solve and judge a batch on one thread.
+
+    Raises the setting's PkmcalError, located at the task's name.
+    """
     from threadpoolctl import threadpool_limits
 
     setting, batch = task.setting, task.batch
     try:
-        # Small matrices: threads inside the linear algebra would only wait for one another.
+        # The matrices are small: threads inside the linear algebra would only wait for one another.
         with threadpool_limits(1, "blas"):
             data = setting.draw(batch)
             began, used = time.perf_counter(), time.thread_time()

@@ -1,10 +1,10 @@
-"""A study's batches on all cores of this machine: this process, and others beside it.
+"""Process pool that runs a study's batches on all cores of this machine.
 
-Threads would wait for one another: half of the time goes into small steps between NumPy's calls,
-which one thread of a process does at a time. The other processes are started as programs of their
-own (``python -m pkmcal.studies.workers``), so that a user's script needs no guard, read pickled
-tasks from their input and write what came of them to their output. One that dies has its batch
-done again.
+Threads alone would block each other: half of the time is spent in small steps between NumPy's
+calls, under the interpreter's lock. The other processes are started as programs (``python -m
+pkmcal.studies.workers``), so that a user's script needs no guard; they read pickled tasks from
+standard input and write pickled results to standard output. The batch of a process that dies is run
+again.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from pkmcal.errors import ResultError
 from pkmcal.studies.tasks import Finished, Job, SolvedBatch, work
 
 MOST_DEATHS_A_BATCH = 3
-"""Workers that one batch may cost before the study gives up."""
+"""Number of workers that may die at one batch before the study stops with an error."""
 MESSAGE_SIZE_FORMAT = struct.Struct("<Q")
 INTERRUPT_POLL_INTERVAL = 0.5
-"""Seconds between looks for Ctrl-C, which some systems do not let through to a waiting thread."""
+"""Seconds between checks for Ctrl-C, which some systems do not deliver to a waiting thread."""
 
 
 def cores() -> int:
-    """Processors that this process may use."""
+    """Number of processors that this process may use."""
     usable = getattr(os, "sched_getaffinity", None)
     return min(os.cpu_count() or 1, len(usable(0))) if usable else os.cpu_count() or 1
 
 
 def on_cores(tasks: Sequence[Job], finished: Finished) -> int:
-    """All tasks, on every core; returns the number of workers.
+    """Run all tasks on every core; return the number of workers.
 
-    An interruption ends the other processes, lets this one finish its batch, and keeps it.
+    An interruption kills the other processes, lets this process finish its batch, and keeps that
+    batch. Raises the first error of a task.
     """
     pool = _Pool(tasks, finished)
     count = max(1, min(cores(), len(tasks)))
@@ -62,7 +63,7 @@ def on_cores(tasks: Sequence[Job], finished: Finished) -> int:
 
 
 class _Pool:
-    """Tasks that wait, and what has come of the others."""
+    """Queue of pending tasks, with the state shared by all workers."""
 
     def __init__(self, tasks: Sequence[Job], finished: Finished) -> None:
         self.tasks, self.finished = tasks, finished
@@ -75,14 +76,14 @@ class _Pool:
         self.processes: list[subprocess.Popen[bytes]] = []
 
     def stop(self) -> None:
-        """No further task; other processes end at once."""
+        """Start no further task and kill the other processes."""
         self.stopped.set()
         with self.lock:
             for process in self.processes:
                 process.kill()
 
     def next(self) -> int | None:
-        """The number of a task that waits."""
+        """Number of the next pending task; None if there is none or the pool is stopped."""
         if self.stopped.is_set():
             return None
         try:
@@ -91,13 +92,13 @@ class _Pool:
             return None
 
     def failed(self, error: BaseException) -> None:
-        """The first error ends the study."""
+        """Record the first error and stop the study."""
         with self.lock:
             self.failure = self.failure or error
         self.stop()
 
     def done(self, number: int, result: SolvedBatch) -> None:
-        """Hand on what came of a task."""
+        """Pass a task's result to the callback, under the lock."""
         with self.lock:
             self.finished(number, result)
 
@@ -112,27 +113,32 @@ class _Pool:
             self.failed(error)
 
     def elsewhere(self) -> None:
-        """Work in another process, and in a new one where it dies."""
+        """Work in another process; start a new one if it dies."""
         try:
             number = self.next()
             while number is not None:
                 with self._process() as process:
-                    while number is not None and (answer := _answer(process, self.tasks[number])):
-                        self._answered(number, answer)
+                    while number is not None and (
+                        answer := _result_of(process, self.tasks[number])
+                    ):
+                        self._handle_result(number, answer)
                         number = self.next()
-                if number is not None:  # the process has ended with a task in hand
-                    number = self._again(number)
+                if number is not None:  # the process has died at this task
+                    number = self._retry(number)
         except BaseException as error:  # noqa: BLE001 - raised again where the study was begun
             self.failed(error)
 
-    def _answered(self, number: int, answer: bytes) -> None:
+    def _handle_result(self, number: int, answer: bytes) -> None:
         result = pickle.loads(answer)
         if isinstance(result, BaseException):
             raise result
         self.done(number, result)
 
-    def _again(self, number: int) -> int | None:
-        """The task once more, unless the study has ended or it kills every process."""
+    def _retry(self, number: int) -> int | None:
+        """Number of the task of a dead process, to be run again; None if the pool is stopped.
+
+        Raises ResultError if the task has cost MOST_DEATHS_A_BATCH processes.
+        """
         if self.stopped.is_set():
             return None
         self.deaths[number] += 1
@@ -154,7 +160,7 @@ class _Pool:
 
 
 class _Worker:
-    """Another process; it ends with the block, or with this process."""
+    """Another process, killed at the end of the ``with`` block."""
 
     def __init__(self) -> None:
         environment = dict(os.environ)
@@ -173,34 +179,30 @@ class _Worker:
         self.process.kill()
         for stream in (self.process.stdin, self.process.stdout):
             if stream is not None:
-                _closed(stream)
+                with suppress(OSError):  # nobody reads what was still to be written
+                    stream.close()
         self.process.wait()
 
 
-def _closed(stream: IO[bytes]) -> None:
-    with suppress(OSError):  # what was still to be written has nobody to read it
-        stream.close()
-
-
-def _answer(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
-    """What a process answers to a task; None where it has died."""
+def _result_of(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
+    """Pickled result of a task from a process; None if the process has died."""
     if process.stdin is None or process.stdout is None:
         return None
     try:
-        _send(process.stdin, task)
+        _write_message(process.stdin, task)
     except OSError:
         return None
-    return _received(process.stdout)
+    return _read_message(process.stdout)
 
 
-def _send(stream: IO[bytes], message: Any) -> None:
+def _write_message(stream: IO[bytes], message: Any) -> None:
     content = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
     stream.write(MESSAGE_SIZE_FORMAT.pack(len(content)) + content)
     stream.flush()
 
 
-def _received(stream: IO[bytes]) -> bytes | None:
-    """The next message; None at the end, and where one breaks off."""
+def _read_message(stream: IO[bytes]) -> bytes | None:
+    """Next message of a stream; None at its end or if the message is truncated."""
     head = stream.read(MESSAGE_SIZE_FORMAT.size)
     if len(head) < MESSAGE_SIZE_FORMAT.size:
         return None
@@ -210,20 +212,24 @@ def _received(stream: IO[bytes]) -> bytes | None:
 
 
 def answer_tasks(source: IO[bytes], target: IO[bytes]) -> None:
-    """Do tasks until their source ends; an error is an answer, too."""
-    while (message := _received(source)) is not None:
+    """Run tasks until their source ends; exceptions are returned as results."""
+    while (message := _read_message(source)) is not None:
         try:
             answer: Any = work(pickle.loads(message))
         except Exception as error:  # noqa: BLE001 - the study's own process tells it
             answer = error
-        _send(target, answer)
+        _write_message(target, answer)
 
 
 def run_worker() -> None:
-    """A worker's whole life. Ctrl-C is for the study's own process, which then ends this one."""
+    """Main function of a worker process.
+
+    A worker ignores Ctrl-C: the study's main process handles it and kills the workers.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as target:
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what is printed is no answer
+        # printed text must not enter the stream of results
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         answer_tasks(sys.stdin.buffer, target)
 
 
