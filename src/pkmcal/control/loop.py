@@ -275,7 +275,11 @@ class VisualServo:
         if stop is not None:
             return stop
         above_limit = noise > 0
-        sigma = noise * _spread(task) if above_limit else np.full(self.machine.n_joints, np.nan)
+        sigma = np.full(self.machine.n_joints, np.nan)
+        if above_limit:
+            # covariance of the readings' distances: R (N^T N)^-1 R^T for rows with unit variance
+            factor = task.readings @ np.linalg.inv(task.matrix.T @ task.matrix)
+            sigma = noise * np.sqrt(np.sum(factor * task.readings, axis=1))
         vague = float(sigma.max()) if above_limit else 0.0
         if vague > UNSEEN_READING_SIGMA:
             return self._stopped(sample, Status.LOST, self._missing(sample, used))
@@ -310,10 +314,15 @@ class VisualServo:
 
     def _unfit(self, sample: _Sample, used: Booleans, task: Task) -> Step | None:
         """Stopped step if the linearized law must not be solved, else None."""
-        rows = task.legs.rows @ task.twist
         if not (np.isfinite(task.matrix).all() and np.isfinite(task.readings).all()):
             return self._stopped(sample, Status.SINGULAR, "a motor is in line with its rod")
-        least = self._least(sample, rows)
+        # distance from a singular pose, as mechanisms.kinematics.singularity_of has it
+        if self.machine.layout.n_internal:
+            fk = self.machine.forward_result(sample.readings, self._pose)
+            least = float(fk.singularity)
+        else:
+            rows = task.legs.rows @ task.twist
+            least = float(np.linalg.svd(rows, compute_uv=False)[-1])
         if least < NEAR_SINGULAR:
             why = f"smallest singular value {least:.2g}; {NEAR_SINGULAR} is the least allowed"
             return self._stopped(sample, Status.SINGULAR, why)
@@ -324,14 +333,6 @@ class VisualServo:
             why = "it was crossed, or the goal is in another assembly: choose a goal on this side"
             return self._stopped(sample, Status.CROSSING, why)
         return None
-
-    def _least(self, sample: _Sample, rows: Array) -> float:
-        """Distance from a singular pose, as in
-        :func:`pkmcal.mechanisms.kinematics.singularity_of`.
-        """
-        if not self.machine.layout.n_internal:
-            return float(np.linalg.svd(rows, compute_uv=False)[-1])
-        return float(self.machine.forward_result(sample.readings, self._pose).singularity)
 
     def _pose_of(self, sample: _Sample, view: MachineView) -> Array | None:
         """Pose (4, 4) from forward kinematics; None if they do not converge.
@@ -407,14 +408,6 @@ class VisualServo:
 def _root_mean_square(error: Array) -> float:
     """RMS length, in rad, of a law's error vectors, stacked as (3 k,)."""
     return float(np.sqrt(3 * np.mean(error**2)))
-
-
-def _spread(task: Task) -> Array:
-    """Standard deviations (m,) of the readings' distance to the goal, for rows with unit
-    variance.
-    """
-    factor = task.readings @ np.linalg.inv(task.matrix.T @ task.matrix)
-    return np.sqrt(np.sum(factor * task.readings, axis=1))
 
 
 def _check_positive(name: str, value: float) -> None:

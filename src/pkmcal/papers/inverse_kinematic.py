@@ -425,7 +425,11 @@ def estimable_unknowns(
     keep = np.ones(len(sizes), dtype=bool)
     rank, _ = _loose(jac, sizes)
     if not whitened:
-        keep[_tilts(problem)] = False
+        # the axis of rotation determines rotations that the machine itself cannot make: of the
+        # mounts, and of the camera for one axis and one camera
+        names: tuple[Name, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
+        bodies = problem.unknowns.columns(*names).reshape(-1, 6)
+        keep[bodies[:, :3][:, ~problem.layout.motion[:3].any(axis=1)]] = False
     loose = _loose(jac[:, keep], sizes[keep])[1]
     keep[np.flatnonzero(keep)[_pivots(loose)]] = False
     return keep, rank
@@ -441,17 +445,6 @@ def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
     s, vt = np.linalg.svd(jac / extreme)[1:]
     rank = int(np.sum(s > POSE_FIT_RANK_TOLERANCE * s[0]))
     return rank, vt[rank:] / (extreme * sizes)
-
-
-def _tilts(problem: ImplicitProblem) -> Integers:
-    """Columns that the axis of rotation determines beforehand.
-
-    These are the rotations of the mounts that the machine itself cannot make and, for one axis and
-    one camera, the camera's.
-    """
-    names: tuple[Name, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
-    bodies = problem.unknowns.columns(*names).reshape(-1, 6)
-    return bodies[:, :3][:, ~problem.layout.motion[:3].any(axis=1)].ravel()
 
 
 def _pivots(loose: Array) -> list[int]:

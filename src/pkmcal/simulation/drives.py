@@ -16,7 +16,7 @@ from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.mechanisms.closure import joint_values, skeletons
-from pkmcal.mechanisms.document import Tube
+from pkmcal.mechanisms.document import Leg, Tube
 from pkmcal.mechanisms.motors import bodies
 
 MOTOR_STOP_MARGIN = 0.1
@@ -236,19 +236,13 @@ def with_forearms(machine: Machine) -> Machine:
         )
     ends = machine.ends_at(readings, home)
     lengths = np.linalg.norm(ends.b - ends.a, axis=1)
-    legs = tuple(
-        leg.model_copy(update={"tubes": (_tube(float(length)),)})
-        for leg, length in zip(document.legs, lengths, strict=True)
-    )
-    return machine_from_document(document.model_copy(update={"legs": legs}))
-
-
-def _tube(length: float) -> Tube:
-    """Tube of a rod of this length, rounded to millimetres; its radius to half millimetres."""
-    return Tube.model_validate(
-        {
+    legs: list[Leg] = []
+    for leg, length in zip(document.legs, lengths.tolist(), strict=True):
+        # in millimetres; the radius in half millimetres
+        tube = {
             "radius": max(round(2000 * ROD_RADIUS * length) / 2000, 0.001),
             "from": round(ROD_MARGIN * length, 3),
             "to": round((1 - ROD_MARGIN) * length, 3),
         }
-    )
+        legs.append(leg.model_copy(update={"tubes": (Tube.model_validate(tube),)}))
+    return machine_from_document(document.model_copy(update={"legs": tuple(legs)}))

@@ -303,8 +303,13 @@ def arm_parts(
     """
     foot, v, ball = drives.foot[j], drives.axis[j], float(balls[j])
     wide = motor_radius(float(np.linalg.norm(chain[-1] - foot)), ball)
-    length = min(2.4 * wide, 0.6 * _room(drives.foot, j))
-    sense = _motor_side(drives, j) * v
+    # length by the distance to the nearest other motor; arms that share one have the same foot
+    apart = np.linalg.norm(np.delete(drives.foot, j, axis=0) - foot, axis=1)
+    apart = apart[apart > 1e-2 * apart.max(initial=0.0)]
+    length = min(2.4 * wide, 0.6 * float(apart.min(initial=np.inf)))
+    # on the side away from the other arms, if the sides differ
+    off = foot - drives.foot[drives.arms].mean(axis=0)
+    sense = -v if off @ v < -0.1 * np.linalg.norm(off) else v
     first = foot + 1.1 * ball * sense
     post = float((foot - plate) @ up)
     middle = first + 0.5 * length * sense
@@ -330,23 +335,6 @@ def _web(start: Array, stop: Array, v: Array, ball: float) -> Box:
     across = across / float(np.linalg.norm(across))
     half = np.array([length / 2, 0.7 * ball, 1.1 * ball])
     return Box((start + stop) / 2, np.stack([e, across, np.cross(e, across)]), half)
-
-
-def _room(feet: Array, j: int) -> float:
-    """Distance to the nearest other motor, m; inf for a single motor."""
-    apart = np.linalg.norm(np.delete(feet, j, axis=0) - feet[j], axis=1)
-    # arms that share a motor have the same foot
-    apart = apart[apart > 1e-2 * apart.max(initial=0.0)]
-    return float(apart.min(initial=np.inf))
-
-
-def _motor_side(drives: Drives, j: int) -> float:
-    """Side of the motor, +1 along the axis or -1 against it: away from the other arms, if that
-    differs.
-    """
-    off = drives.foot[j] - drives.foot[drives.arms].mean(axis=0)
-    outward = float(off @ drives.axis[j])
-    return -1.0 if outward < -0.1 * np.linalg.norm(off) else 1.0
 
 
 def guide_parts(

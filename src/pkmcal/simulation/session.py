@@ -134,8 +134,12 @@ class Studio:
         if not any(shake):
             light = self._light(index, still, rngs[0])
             return [photograph(light, self.sensor, rng) for rng in rngs]
-        shifted = [_shaken(shake, rng) @ still for rng in rngs]
-        lights = [self._light(index, T, rng) for T, rng in zip(shifted, rngs, strict=True)]
+        # a camera that shakes about its own position
+        lights: list[Array] = []
+        for rng in rngs:
+            turn, move = rng.standard_normal((2, 3))
+            motion = pose(rotation(shake[1] * turn), shake[0] * move)
+            lights.append(self._light(index, motion @ still, rng))
         return [photograph(x, self.sensor, rng) for x, rng in zip(lights, rngs, strict=True)]
 
     def _light(self, index: int, T_camera_base: Array, rng: np.random.Generator) -> Array:
@@ -153,14 +157,6 @@ class Studio:
         camera = self.cameras[station]
         view = self.views.get(id(camera)) or PixelRays.of(camera)
         return render_light(scene, view, T_camera_base, rng)
-
-
-def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
-    """Random motion (4, 4) of a camera about its own position; shake : standard deviations, m and
-    rad.
-    """
-    turn, move = rng.standard_normal((2, 3))
-    return pose(rotation(shake[1] * turn), shake[0] * move)
 
 
 def _check(folder: Path, drawing: Machine) -> None:
