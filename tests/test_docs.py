@@ -19,7 +19,7 @@ from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_do
 from pkmcal.session.schema import session_schema
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 PICTURES = ROOT / "docs" / "pictures"
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
@@ -42,7 +42,7 @@ def blocks(text: str, kind: str) -> list[str]:
 
 
 def anchors(text: str) -> set[str]:
-    """What GitHub makes of a page's headings."""
+    """Anchors that GitHub makes of a page's headings."""
     headings = re.findall(r"^#+ (.+)$", prose(text), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
@@ -232,7 +232,7 @@ def test_keys_of_a_truth_are_explained(demo):
 
 
 def test_options_that_commands_share_are_theirs():
-    """What docs/commands.md says of all commands, or of some: which have --json, and --quiet."""
+    """Options that docs/commands.md states for all commands, or for some: --json, and --quiet."""
     from typer.main import get_command
 
     group = get_command(app)

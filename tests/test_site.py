@@ -47,7 +47,7 @@ def test_every_link_leads_somewhere(site):
         parser = Links()
         parser.feed(path.read_text("utf-8"))
         pages[path] = parser
-    assert len(pages) > len(list((ROOT / "docs").glob("*.md")))
+    assert len(pages) > len(list((ROOT / "docs").rglob("*.md")))
     lost = []
     for path, page in pages.items():
         for link in page.links if path.name != "404.html" else ():
@@ -64,13 +64,13 @@ def test_every_link_leads_somewhere(site):
 
 
 def test_no_mark_of_the_pages_source_is_left_over(site):
-    for path in site.glob("*.html"):
+    for path in site.rglob("*.html"):
         text = re.sub(r"<(pre|code).*?</\1>", "", path.read_text("utf-8"), flags=re.DOTALL)
         assert not re.search(r"```|^#+ |^\| ?---", text, re.MULTILINE), path.name
 
 
 def test_no_head_of_a_table_is_empty(site):
-    for path in site.glob("*.html"):
+    for path in site.rglob("*.html"):
         assert not re.search(r"<th[^>]*>\s*</th>", path.read_text("utf-8")), path.name
 
 
@@ -96,6 +96,9 @@ def test_docstrings_are_typeset(site):
 
 
 def test_every_page_stands_in_the_menu_once():
-    pages = re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8").partition("nav:")[2])
-    there = [path.name for path in (ROOT / "docs").glob("*.md")]
+    pages = re.findall(
+        r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8").partition("nav:")[2]
+    )
+    docs = ROOT / "docs"
+    there = [path.relative_to(docs).as_posix() for path in docs.rglob("*.md")]
     assert sorted(pages) == sorted([*there, "readme.md"])  # the README is taken in

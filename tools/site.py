@@ -15,7 +15,8 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 SCROLL = ROOT / "src/pkmcal/pages/templates/scroll.js"
-OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./(?!README\.md)[^)]+\)")
+OUTSIDE = r"\[([^\]]+)\]\({}(?!README\.md)[^)]+\)"
+"""A link out of the folder of the pages, by the way up from the page's own folder."""
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -43,9 +44,9 @@ ROLE = re.compile(r":(?:class|data|func|meth|mod):<code>~?(?:pkmcal\.(?:\w+\.)+(
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links that lead out of the pages' folder, and fences of two words."""
-    del page
     markdown = FENCE.sub(r"```\1", markdown)
-    return OUTSIDE.sub(r"\1", markdown).replace("(../README.md", "(readme.md")
+    outside = OUTSIDE.format(re.escape("../" * (page.file.src_uri.count("/") + 1)))
+    return re.sub(outside, r"\1", markdown).replace("(../README.md", "(readme.md")
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:

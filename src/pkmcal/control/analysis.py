@@ -1,9 +1,8 @@
-"""Where control by the legs works: which legs must be seen, where it is singular, and other
-equilibria.
+"""Visibility, singularities and other equilibria of visual servoing by the legs.
 
-The control rests where N^T e = 0. That is the goal; another pose at which the legs look the same,
-e = 0; or one at which their errors cancel. Three legs' directions, for instance, leave several
-poses of a platform of six freedoms, as three points seen by a camera do.
+The control comes to rest where N^T e = 0: at the goal; at another pose with the same image of the
+legs, e = 0; or at a pose where the legs' errors cancel. The directions of three legs, for instance,
+leave several poses of a platform with six degrees of freedom, as three points seen by a camera do.
 """
 
 from __future__ import annotations
@@ -22,22 +21,22 @@ from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.mechanisms.velocities import assembly_sign
 
 UNSEEN_MOTION_VISIBILITY = 1e-6
-"""Visibility below which a motion is not seen at all: rounding leaves 1e-9."""
+"""Visibility below which a motion is unobservable; rounding leaves 1e-9."""
 FADING_VISIBILITY_SHARE = 0.1
-"""Part of its usual visibility below which a pose is near one where a motion is not seen."""
+"""Share of the median visibility below which a pose is close to one with an unobservable motion."""
 MOST_DESCENT_STEPS = 80
 DESCENT_END_STEP = 1e-13
-"""m or rad; a descent whose steps are shorter has ended."""
+"""Length of a step, in m or rad, below which a descent has converged."""
 INDISTINGUISHABLE_ERROR = 1e-7
-"""Norm of e below which two poses look the same: a tenth of a thousandth of a pixel."""
+"""Norm of e below which two poses have the same image: about 1e-4 px."""
 CANCELLED_ERROR_SHARE = 1e-6
-"""Norm of N^T e, as a part of |N| |e|, below which the errors cancel."""
+"""Norm of N^T e relative to |N| |e| below which the errors cancel."""
 DIFFERENT_POSE_DISTANCE = 1e-3
-"""m, root mean square of the platform's joints, beyond which two poses are different ones."""
+"""RMS distance of the platform's joints, in metres, above which two poses differ."""
 
 
 def matrix_at(view: MachineView, law: str, poses: Array) -> Array:
-    """N (R, s, k 3, f) at goals themselves, poses (R, 4, 4), by the free twists in metres."""
+    """Interaction N (R, s, k 3, f) at goal poses (R, 4, 4), by the free twists in metres."""
     task = _task(view, law, poses, true_edges(view, poses))
     return task.matrix.reshape(len(poses), len(view.legs), -1, task.matrix.shape[-1])
 
@@ -49,7 +48,9 @@ def _task(view: MachineView, law: str, poses: Array, goal: Array) -> Task:
 
 
 def visibility(matrix: Array) -> Array:
-    """Smallest singular value of N (..., s, k, f) as a part of its largest, (...); 0 is blind."""
+    """Smallest singular value of N (..., s, k, f) relative to its largest, (...); 0 if N is rank
+    deficient.
+    """
     rows = matrix.reshape(*matrix.shape[:-3], -1, matrix.shape[-1])
     values = np.linalg.svd(np.nan_to_num(rows), compute_uv=False)
     if rows.shape[-2] < rows.shape[-1]:
@@ -59,8 +60,9 @@ def visibility(matrix: Array) -> Array:
 
 @dataclass(frozen=True)
 class Subset:
-    """Some of the legs. legs : from 0. worst, usual : visibility over the workspace, its smallest
-    and its median.
+    """Subset of the legs, with the visibility of the platform's motion by it.
+
+    legs : numbers from 0. worst, usual : smallest and median visibility over the workspace.
     """
 
     legs: tuple[int, ...]
@@ -69,19 +71,19 @@ class Subset:
 
     @property
     def blind(self) -> bool:
-        """Whether some motion is seen nowhere."""
+        """Whether some motion is unobservable over most of the workspace."""
         return self.usual < UNSEEN_MOTION_VISIBILITY
 
     @property
     def fading(self) -> bool:
-        """Whether some motion is hardly seen at some poses."""
+        """Whether some motion is hardly observable at some poses."""
         return self.worst < FADING_VISIBILITY_SHARE * self.usual
 
 
 def subsets(matrix: Array, legs: Integers) -> tuple[Subset, ...]:
-    """Every choice of legs, the smaller first, the best first of those of a size.
+    """All subsets of the legs by size, and by their worst visibility within a size.
 
-    matrix : (R, s, k, f) of all legs. legs : (s,) their numbers.
+    matrix : (R, s, k, f) of all legs. legs : (s,) their numbers from 0.
     """
     results: list[Subset] = []
     for size in range(1, len(legs) + 1):
@@ -96,13 +98,14 @@ def subsets(matrix: Array, legs: Integers) -> tuple[Subset, ...]:
 
 @dataclass(frozen=True)
 class Equilibria:
-    """Where the control could come to rest, from S starts to G goals each.
+    """Points at which the control may come to rest, from S starts to each of G goals.
 
-    reached, same_image, cancelled, out : parts of the starts whose descent ends at the goal; at
-    another pose that looks the same; where errors cancel; and outside of the workspace.
-    T_base_platform : (k, 4, 4) poses other than the goal, in the workspace and the goal's assembly.
-    goal : (k,) of which goal. same_edges : (k,). distance : (k,) m of the platform's joints.
-    readings : (k,) largest difference of a reading from the goal's, m or rad.
+    reached, same_image, cancelled, out : shares of the descents that end at the goal; at another
+    pose with the same image; where errors cancel; and outside the workspace.
+    T_base_platform : (k, 4, 4) poses other than the goal, in the workspace and in the goal's
+    assembly mode. goal : (k,) number of the goal. same_edges : (k,) whether the image is the
+    goal's. distance : (k,) RMS distance of the platform's joints from the goal, m. readings : (k,)
+    largest difference of a reading from the goal's, m or rad.
     """
 
     reached: float
@@ -119,7 +122,7 @@ class Equilibria:
 def equilibria(view: MachineView, law: str, goals: Array, starts: Array) -> Equilibria:
     """Descents of |e|^2 from starts (S, 4, 4) to every goal (G, 4, 4), batched.
 
-    Every equilibrium that is found is one; that none is missing is not proven.
+    The search is not exhaustive: equilibria may be missed.
     """
     machine = view.machine
     g, s = len(goals), len(starts)
@@ -157,12 +160,13 @@ def equilibria(view: MachineView, law: str, goals: Array, starts: Array) -> Equi
 
 
 def _descended(view: MachineView, law: str, poses: Array, goal: Array) -> Array:
-    """Levenberg-Marquardt on |e|^2 with the poses' free twists, (R, 4, 4)."""
+    """Poses (R, 4, 4) after Levenberg-Marquardt steps on |e|^2 along the free twists."""
     layout, theta = view.machine.layout, view.theta
     bound = layout.n_equations > layout.driven_rows.size or layout.shares_motors
     damping = np.full(len(poses), 1e-3)
     now = _Slope.of(_task(view, law, poses, goal))
     for _ in range(MOST_DESCENT_STEPS):
+        # an overdetermined closure: return each trial to the poses that it allows
         step = now.step(damping, poses)
         if np.abs(step).max() < DESCENT_END_STEP:
             break
@@ -180,7 +184,7 @@ def _descended(view: MachineView, law: str, poses: Array, goal: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Slope:
-    """A task's arrays (R, ...) that a descent needs."""
+    """Error and linearization (R, ...) of a task, as a descent needs them."""
 
     error: Array
     matrix: Array
@@ -197,12 +201,12 @@ class _Slope:
         return dot(self.error, self.error)
 
     def replaced(self, new: _Slope, where: Booleans) -> _Slope:
-        """The new rows where they count."""
+        """Rows of `new` where the mask is True, own rows elsewhere."""
         pairs = zip(vars(self).values(), vars(new).values(), strict=True)
         return _Slope(*(np.where(where.reshape(-1, *[1] * (b.ndim - 1)), b, a) for a, b in pairs))
 
     def step(self, damping: Array, poses: Array) -> Array:
-        """Damped steps (R, 6), the project's twist at the platform's origin; at most 0.1 m."""
+        """Damped steps (R, 6) as twists at the platform's origin, limited to 0.1 m."""
         turned = self.matrix.mT
         normal = turned @ self.matrix
         scale = np.trace(normal, axis1=-2, axis2=-1) / normal.shape[-1] + 1e-300
@@ -216,9 +220,9 @@ class _Slope:
 
 
 def _distinct(joints: Array, which: Booleans, goal_of: Integers) -> Integers:
-    """Of rows that are the same pose for the same goal the first."""
+    """Row numbers of the distinct poses among the selected rows, for each goal."""
     retained_rows: list[int] = []
-    for row in np.flatnonzero(which):  # few distinct ones: a loop over results
+    for row in np.flatnonzero(which):  # few distinct poses: a loop is cheap
         same = [k for k in retained_rows if goal_of[k] == goal_of[row]]
         off = joints[same] - joints[row]
         if (

@@ -1,4 +1,4 @@
-"""What one step of control tells, in numbers and sentences, and the goal that it goes to."""
+"""Result of a control step, its sentences and checks, and the goal of the control."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from pkmcal.mechanisms.velocities import sign_of
 from pkmcal.wording import named
 
 UNIT_LENGTH_TOLERANCE = 1e-6
-"""By how much a normal's length may differ from 1: six digits written to a file."""
+"""Difference of a normal's length from 1 that rounding to six written digits may cause."""
 
 
 class Status(Enum):
-    """What the controller does with this sample; only the first two move the machine."""
+    """State of the controller after a sample; the machine moves in the first two only."""
 
     RUNNING = "on its way to the goal"
     CONVERGED = "at the goal"
@@ -45,22 +45,22 @@ class Status(Enum):
 
     @property
     def moves(self) -> bool:
-        """Whether velocities are given."""
+        """Whether the controller gives velocities."""
         return self in (Status.RUNNING, Status.CONVERGED)
 
 
 @dataclass(frozen=True)
 class Step:
-    """The answer to one sample; m readings, s seen legs.
+    """Result of the controller for one sample; m readings, s seen legs.
 
-    joint_velocities : (m,) per second, in the readings' units; zero unless ``status.moves``.
-    error : root mean square angle (rad) of the law's error over the legs used; NaN without any.
-    remaining : (m,) by how much each reading is still off, as the law sees it; NaN when stopped
-    before that was known. sigma : (m,) its standard deviation by what the photograph shows, NaN
-    for edges given without one. converged : at the goal within the tolerance.
-    status, sentence : what is the matter, for programs and for people. warnings : what the
-    controller goes on with.
-    used : (s,) legs that entered the law. normals : (s, 2, 3) edges as measured, camera frame.
+    joint_velocities : (m,) per second, in the readings' units; zero unless ``status.moves``. error
+    : RMS angle, in rad, of the law's error over the legs used; NaN without any. remaining : (m,)
+    distance of each reading from the goal, as estimated by the law; NaN if the controller stopped
+    before. sigma : (m,) standard deviation of `remaining` from the image's noise; NaN for edges
+    without covariances. converged : at the goal within the tolerance. status, sentence : the
+    controller's state, for programs and for people. warnings : problems that do not stop the
+    controller. used : (s,) legs that enter the law. normals : (s, 2, 3) measured edges, camera
+    frame.
     """
 
     joint_velocities: Array
@@ -76,7 +76,7 @@ class Step:
 
 
 def motor_name(machine: Machine, column: int) -> str:
-    """A reading by the leg, or legs, that it drives."""
+    """Name of a motor by the leg, or legs, that it drives."""
     return named(np.flatnonzero(machine.layout.actuated == column))
 
 
@@ -96,7 +96,7 @@ def missing_clauses(
 
 
 def vague_sentence(machine: Machine, sigma: Array) -> str:
-    """Which motor's way to the goal is known worst; sigma (m,)."""
+    """Sentence on the motor whose distance to the goal has the largest sigma (m,)."""
     k = int(np.nanargmax(sigma))
     return (
         f"what is seen tells where the motor of {motor_name(machine, k)} should be"
@@ -105,7 +105,7 @@ def vague_sentence(machine: Machine, sigma: Array) -> str:
 
 
 def range_sentence(machine: Machine, ranges: Array, readings: Array, leaves: Booleans) -> str:
-    """Which motor would leave its range (m, 2)."""
+    """Sentence on the first motor that would leave its range (m, 2)."""
     k = int(np.argmax(leaves))
     (low, high), unit = ranges[k], machine.joint_units[k]
     return (
@@ -117,8 +117,9 @@ def range_sentence(machine: Machine, ranges: Array, readings: Array, leaves: Boo
 def leaving(
     ranges: Array, readings: Array, velocities: Array, period: float
 ) -> tuple[Booleans, Booleans]:
-    """Motors (m,) that the velocities would drive out of their range (m, 2) within a period, and
-    those that are outside already. Ranges that are NaN bound nothing.
+    """Motors (m,) that leave their range (m, 2) within a period, and motors that are outside.
+
+    A NaN in a range is no bound.
     """
     after = readings + velocities * period
     with np.errstate(invalid="ignore"):
@@ -130,7 +131,7 @@ def leaving(
 
 @dataclass(frozen=True)
 class GoalPhotograph:
-    """A photograph of the machine at the goal, (height, width) uint8, and its readings (m,)."""
+    """Image of the machine at the goal, (height, width) uint8, and its readings (m,)."""
 
     image: Integers
     readings: Array
@@ -138,8 +139,10 @@ class GoalPhotograph:
 
 @dataclass(frozen=True)
 class Goal:
-    """normals : (s, 2, 3) edges to be seen, camera frame; NaN for legs that the goal leaves out.
-    aspect : sign of the closure's determinant there, 0 where it is not known.
+    """Goal of the control.
+
+    normals : (s, 2, 3) edges at the goal, camera frame; NaN for legs without a goal. aspect : sign
+    of the closure's determinant at the goal, 0 if unknown.
     """
 
     normals: Array
@@ -147,9 +150,10 @@ class Goal:
 
 
 def goal_of(sight: Sight | None, view: MachineView, goal: Array | GoalPhotograph) -> Goal:
-    """A platform pose (4, 4), edges (s, 2, 3) or a photograph as a goal.
+    """Goal from a platform pose (4, 4), edges (s, 2, 3) or an image.
 
-    Raises InputError for what cannot be one.
+    Raises InputError for any other array, for an unreachable or singular pose, and for an image
+    without a camera; GeometryError for an image in which no leg is found.
     """
     if isinstance(goal, GoalPhotograph):
         return _of_photograph(sight, view, goal)
@@ -166,9 +170,9 @@ def goal_of(sight: Sight | None, view: MachineView, goal: Array | GoalPhotograph
 
 
 def checked_normals(view: MachineView, normals: Array, name: str) -> Array:
-    """Edges (s, 2, 3) as given, NaN where a leg is not seen.
+    """Edges (s, 2, 3) as an array, NaN for a leg that is not seen.
 
-    Raises InputError for what cannot be edges of these legs.
+    Raises InputError for a wrong shape and for normals that are not unit vectors.
     """
     array = np.asarray(normals, dtype=float)
     if array.shape != (len(view.legs), 2, 3):
@@ -190,8 +194,9 @@ def checked_normals(view: MachineView, normals: Array, name: str) -> Array:
 def aspect_of(machine: Machine, legs: Legs) -> float:
     """Sign of the determinant of the closure's rows by the machine's motion.
 
-    It changes only where the platform can move with all motors locked, so between poses of two
-    signs lies a singular one. 0 where axes or hinges make the rows more than the freedoms.
+    The sign changes only where the platform can move with all motors locked, so a singular pose
+    lies between poses of different signs. 0 for a platform with hinges, where the rows outnumber
+    the degrees of freedom.
     """
     if machine.layout.n_internal:
         return 0.0
@@ -199,8 +204,10 @@ def aspect_of(machine: Machine, legs: Legs) -> float:
 
 
 def check_sides(view: MachineView, normals: Array, T_base_platform: Array) -> None:
-    """Raise InputError where edges (s, 2, 3) point along the legs from platform to base, seen from
-    a pose (4, 4) of the right assembly: the two sides are exchanged.
+    """Raise InputError if the two sides of the edges (s, 2, 3) are exchanged.
+
+    The legs' directions from exchanged edges point from platform to base; they are compared with
+    the directions at a pose (4, 4) in the right assembly mode.
     """
     a, b = leg_ends_in_view(view, T_base_platform)
     finite = np.isfinite(normals).all(axis=(-1, -2))
@@ -243,11 +250,11 @@ def _of_pose(view: MachineView, T_base_platform: Array) -> Goal:
 
 
 def _check_closes(view: MachineView, T_base_platform: Array) -> None:
-    """The machine can be there, and the pose is not singular."""
+    """Raise InputError if the machine cannot take the pose, or if the pose is nearly singular."""
     machine = view.machine
     readings = machine.inverse(T_base_platform[None])[0]
     if not np.isfinite(readings).all():
-        return  # said better by what follows
+        return  # reported by the caller with the motor's name
     fk = machine.forward_result(readings, T_base_platform)
     shifted = np.abs(fk.T_base_platform - T_base_platform).max()
     if not bool(fk.converged) or shifted > UNIT_LENGTH_TOLERANCE:

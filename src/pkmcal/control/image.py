@@ -1,8 +1,8 @@
-"""What the camera of a simulated loop measures: edges with noise, and whether legs are in view.
+"""Simulated camera of a control loop: edges with noise, and whether legs are in view.
 
-The edges are those that :mod:`pkmcal.observe.predict` expects, each with a sideways error and a
-tilt in pixels as :class:`pkmcal.simulation.edges.EdgeNoise` has them; places a few along each edge,
-because a loop runs a hundred thousand samples.
+The edges are those of :mod:`pkmcal.observe.predict`, each with a sideways error and a tilt in
+pixels as in :class:`pkmcal.simulation.edges.EdgeNoise`; an edge has few samples, because a loop
+runs a hundred thousand images.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ from pkmcal.observe.predict import (
 from pkmcal.simulation.edges import EdgeNoise, disturbed, responses
 
 IMAGED_EDGE_PLACES = 5
-"""Places along an edge; more change its noise by less than a tenth."""
+"""Samples along an edge; more samples change its noise by less than a tenth."""
 IN_VIEW = 0.5
-"""Part of a leg's edge that must be in the image; with less, a tracker has lost it."""
+"""Share of a leg's edge that must be in the image; with less, a tracker loses the leg."""
 
 
 @dataclass(frozen=True)
 class Eye:
-    """The true machine before the true camera. tubes : the edges that are measured, E = 2 s, leg
-    by leg in the order of ``true.legs``.
+    """True machine in front of the true camera.
+
+    tubes : the edges that are measured, E = 2 s, leg by leg in the order of ``true.legs``.
     """
 
     true: MachineView
@@ -44,7 +45,7 @@ class Eye:
 
     @classmethod
     def of(cls, true: MachineView, camera: Camera) -> Eye:
-        """The edges of one tube a leg."""
+        """Eye with both edges of one tube of each leg."""
         every = tubes_of(true.machine)
         chosen = visible_tubes(true.machine, true.legs)
         rows = [
@@ -56,19 +57,19 @@ class Eye:
         return cls(true, camera, TubeList(*(getattr(every, f.name)[picked] for f in fields(every))))
 
     def points(self, poses: Array, readings: Array, places: int = IMAGED_EDGE_PLACES) -> EdgePoints:
-        """Places (R, E, n) along the edges at poses (R, 4, 4) and readings (R, m)."""
+        """Samples (R, E, n) along the edges at poses (R, 4, 4) and readings (R, m)."""
         legs = legs_in_camera(self.true.machine, self.true.T_camera_base, poses, readings)
         return edge_points(self.true.machine, self.camera, legs, self.tubes, places)
 
     def in_view(self, points: EdgePoints) -> Booleans:
-        """(R, s) legs of which enough is in the image."""
+        """(R, s) legs with at least IN_VIEW of both edges in the image."""
         with np.errstate(invalid="ignore"):
             inside = points.valid & self.camera.in_image(points.pixel)
         share = inside.mean(axis=-1)
         return (share >= IN_VIEW).reshape(*share.shape[:-1], -1, 2).all(axis=-1)
 
     def hidden(self, poses: Array, readings: Array) -> Booleans:
-        """(R, s) legs of which more than half stands behind another leg."""
+        """(R, s) legs with more than half of an edge behind another leg."""
         machine = self.true.machine
         legs = legs_in_camera(machine, self.true.T_camera_base, poses, readings)
         points = edge_points(machine, self.camera, legs, self.tubes, IMAGED_EDGE_PLACES)
@@ -88,8 +89,9 @@ class Eye:
 
 
 def edge_responses(points: EdgePoints) -> tuple[Array, Array, Array]:
-    """Turns (R, E, 2) of the normals by a pixel's shift and by a pixel's tilt, see
-    :func:`pkmcal.simulation.edges.responses`; and the bases (R, E, 3, 2) that they are told in.
+    """Rotations (R, E, 2) of the normals by a shift and by a tilt of one pixel, and their bases.
+
+    The rotations are those of :func:`pkmcal.simulation.edges.responses`, in the bases (R, E, 3, 2).
     """
     middle = points.point[..., points.point.shape[-2] // 2, :]
     basis = tangent_basis(points.normal, middle / np.sqrt(dot(middle, middle))[..., None])

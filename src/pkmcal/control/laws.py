@@ -1,19 +1,19 @@
-"""Control by the legs in the image, [B] eq. 4-9 with the errata.
+"""Control laws by the legs in the image, [B] eq. 4-9 with the errata.
 
 The error is e_j = u_j x u*_j of the legs' directions, or e_ij = n_ij x n*_ij of their edges'
-normals; measured and wanted, camera frame. It changes with the platform's twist by
-N_j = -[u*_j]x L_j, where L_j is the direction's interaction matrix, and the drives follow
+normals; measured and wanted (*), camera frame. Its derivative by the platform's twist is N_j =
+-[u*_j]x L_j, where L_j is the direction's interaction matrix, and the motors follow
 
-    q' = -gain D N+ e,        D the inverse Jacobian, [B] eq. 6-7.
+q' = -gain D N+ e,        D the inverse Jacobian, [B] eq. 6-7.
 
-[B] eq. 9 holds for base centres that stay where they are. Here the base's end moves with its
-reading as well, A_j(q_j), so cranks and sliders are served: with q' = D twist,
+[B] eq. 9 holds for fixed base centres. Here the base's end of a leg depends on its reading as well,
+A_j(q_j), which covers cranks and sliders: with q' = D twist,
 
-    du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
+du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
 
-which is [B] eq. 9 where dA_j / dq_j = 0. Machines with fewer than six freedoms are restricted to
-twists that they can make. Wanted values are measured, too (the machine was there once), so errors
-of the believed geometry change the way and not the end.
+which is [B] eq. 9 where dA_j / dq_j = 0. Machines with fewer than six degrees of freedom are
+restricted to the twists that they can make. The wanted values are measured as well (the machine was
+at the goal once), so errors of the controller's geometry change the path and not its end.
 """
 
 from __future__ import annotations
@@ -32,17 +32,16 @@ from pkmcal.geometry.rigid import apply, cross, dot, skew
 MatrixPlace = Literal["measured", "goal", "mean"]
 
 UNCOMMANDED_MOTION_SHARE = 1e-4
-"""Singular value of the scaled interaction, as a part of the largest, below which a motion counts
-as unseen and is not commanded. Edges of all legs of a hexapod have 0.02 to 0.2, of three legs
+"""Singular value of the scaled interaction matrix, relative to the largest, below which a motion is
+unobservable and is not commanded. Edges of all legs of a hexapod have 0.02 to 0.2, of three legs
 0.001."""
 
 
 class Rates(NamedTuple):
-    """How everything moves at one moment.
+    """Derivatives of readings and hinges by the twist, and the free twists.
 
-    readings : (..., m, 6) D of [B] eq. 6-7, by the twist. hinges : (..., n, 6).
-    free : (..., 6, f) orthonormal twists (turns times the platform's radius) that the machine can
-    make.
+    readings : (..., m, 6) D of [B] eq. 6-7. hinges : (..., n, 6). free : (..., 6, f) orthonormal
+    twists (rotations times the platform's radius) that the machine can make.
     """
 
     readings: Array
@@ -51,14 +50,16 @@ class Rates(NamedTuple):
 
 
 def rates(view: MachineView, legs: Legs) -> Rates:
-    """Readings' and hinges' rates by the twist, and the twists that nothing forbids.
+    """Derivatives of readings and hinges by the twist, and the twists that the closure allows.
 
     Least squares where several rods share a motor. NaN where a crank is in line with its rod.
     """
+    # platform's radius, by which rotations are scaled to metres
     layout = view.machine.layout
     m, spread = layout.n_readings, legs.b - legs.b.mean(axis=-2, keepdims=True)
     scale = np.sqrt(np.mean(dot(spread, spread), axis=-1))
     scale = np.where(scale > 0, scale, 1.0)
+    # closure: rows @ twist + driving @ (readings', hinges') = 0
     driving = np.concatenate([legs.drives, legs.hinges], axis=-1)
     if layout.shares_motors or layout.n_internal:
         solved = -np.linalg.pinv(driving) @ legs.rows
@@ -71,12 +72,15 @@ def rates(view: MachineView, legs: Legs) -> Rates:
 
 
 def _free(view: MachineView, legs: Legs, driving: Array, scale: Array) -> Array:
-    """Twists (..., 6, f) that neither the motion nor undriven rows of the closure forbid."""
+    """Twists (..., 6, f) allowed by the machine's motion and by the undriven rows of the
+    closure.
+    """
     layout = view.machine.layout
     units = np.ones((*scale.shape, 6))
     units[..., :3] /= scale[..., None]
     motion = np.broadcast_to(layout.motion, (*scale.shape, *layout.motion.shape))
     bound = driving.shape[-2] - driving.shape[-1]
+    # more rows than unknown rates: the left null space of `driving` constrains the twist
     if bound > 0:
         if layout.shares_motors or layout.n_internal:
             blind = np.linalg.qr(driving, mode="complete")[0][..., driving.shape[-1] :]
@@ -102,10 +106,10 @@ def moving(view: MachineView, legs: Legs, rate: Rates) -> tuple[Array, Array]:
 
 
 def direction_interaction(view: MachineView, legs: Legs, rate: Rates | None = None) -> Array:
-    """L (..., s, 3, 6): rates of the seen legs' directions, camera frame, by the twist.
+    """Interaction matrix L (..., s, 3, 6) of the seen legs' directions, camera frame, by the twist.
 
-    [B] eq. 8-9; its twist is this one with the pivot in the camera's centre, told in the camera
-    frame, its velocity first. See :class:`pkmcal.control.machine_view.Legs` for the twist.
+    [B] eq. 8-9; [B]'s twist has its pivot in the camera's centre, is in the camera frame, and has
+    its velocity first. See :class:`pkmcal.control.machine_view.Legs` for the twist used here.
     """
     by_a, by_b = moving(view, legs, rates(view, legs) if rate is None else rate)
     u, length = legs.u[..., view.legs, :], legs.length[..., view.legs, None, None]
@@ -117,11 +121,11 @@ def direction_interaction(view: MachineView, legs: Legs, rate: Rates | None = No
 def edge_interaction(
     view: MachineView, legs: Legs, normals: Array, rate: Rates | None = None
 ) -> Array:
-    """(..., s, 2, 3, 6): rates of the edges' normals, camera frame, by the twist.
+    """Interaction matrix (..., s, 2, 3, 6) of the edges' normals, camera frame, by the twist.
 
     normals : (..., s, 2, 3) measured. From n.a = -R, n.b = -R and n.n = 1, as in
-    :func:`pkmcal.geometry.cylinders.edge_normal_jacobians`. Where A stays this is the errata's
-    J L, with J = -(A x n) n^T / (u . (A x n)) and the direction's L; [B] 12-13 differentiated.
+    :func:`pkmcal.geometry.cylinders.edge_normal_jacobians`. For a fixed A this is the errata's J L,
+    with J = -(A x n) n^T / (u . (A x n)) and the direction's L; [B] 12-13 differentiated.
     """
     by_a, by_b = moving(view, legs, rates(view, legs) if rate is None else rate)
     T = view.T_camera_base[..., None, :, :]
@@ -141,7 +145,7 @@ def edge_interaction(
 
 
 class Law(ABC):
-    """What is regulated to zero: its error and the matrix by which a twist changes it.
+    """Control law: an error that is regulated to zero, and its derivative by the twist.
 
     name : on the command line and in files. title : for people.
     """
@@ -152,12 +156,12 @@ class Law(ABC):
     @staticmethod
     @abstractmethod
     def error(measured: Array, goal: Array) -> Array:
-        """The error (..., s, k, 3) of normals (..., s, 2, 3), measured and wanted."""
+        """Error (..., s, k, 3) of normals (..., s, 2, 3), measured and wanted."""
 
     @staticmethod
     @abstractmethod
     def matrix(view: MachineView, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
-        """N (..., s, k, 3, 6) by the twist, with the limbs and normals at one moment."""
+        """Interaction N (..., s, k, 3, 6) by the twist, for limbs and normals at one moment."""
 
 
 @final
@@ -169,12 +173,12 @@ class DirectionLaw(Law):
 
     @staticmethod
     def error(measured: Array, goal: Array) -> Array:
-        """One vector a leg, (..., s, 1, 3)."""
+        """Error (..., s, 1, 3), one vector for each leg."""
         return cross(directions_of(measured), directions_of(goal))[..., None, :]
 
     @staticmethod
     def matrix(view: MachineView, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
-        """N (..., s, 1, 3, 6)."""
+        """Interaction N (..., s, 1, 3, 6)."""
         del normals
         by_twist = -skew(directions_of(goal)) @ direction_interaction(view, legs, rate)
         return by_twist[..., None, :, :]
@@ -189,21 +193,21 @@ class EdgeLaw(Law):
 
     @staticmethod
     def error(measured: Array, goal: Array) -> Array:
-        """Two vectors a leg, (..., s, 2, 3)."""
+        """Error (..., s, 2, 3), two vectors for each leg."""
         return cross(measured, goal)
 
     @staticmethod
     def matrix(view: MachineView, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
-        """N (..., s, 2, 3, 6)."""
+        """Interaction N (..., s, 2, 3, 6)."""
         return -skew(goal) @ edge_interaction(view, legs, normals, rate)
 
 
 CONTROL_LAWS: dict[str, type[Law]] = {law.name: law for law in (EdgeLaw, DirectionLaw)}
-"""By name; edges first, which hold the platform an order of magnitude steadier."""
+"""Laws by name. Edges come first: they hold the platform steadier by an order of magnitude."""
 
 
 def law_named(name: str) -> type[Law]:
-    """A law by its name. Raises InputError for an unknown one."""
+    """Law with this name. Raises InputError for an unknown name."""
     if name not in CONTROL_LAWS:
         raise InputError(
             "there is no such law of control", found=name, expected=" or ".join(CONTROL_LAWS)
@@ -213,10 +217,11 @@ def law_named(name: str) -> type[Law]:
 
 @dataclass(frozen=True)
 class Task:
-    """One control problem at one moment, linear: e changes by ``matrix @ y`` (..., r, f).
+    """Linearized control problem at one moment: e changes by ``matrix @ y`` (..., r, f).
 
-    error : (..., r). y are the free twists' amounts in metres, turns as the platform's joints
-    move by them; twist : (..., 6, f). readings : (..., m, f) rates by y. legs : as believed.
+    error : (..., r). y : amounts of the free twists in metres, rotations as the displacement of the
+    platform's joints. twist : (..., 6, f). readings : (..., m, f) derivatives by y. legs : limbs of
+    the controller's model.
     """
 
     error: Array
@@ -235,9 +240,10 @@ def task_of(
     goal_legs: Legs | None = None,
     at: MatrixPlace = "measured",
 ) -> Task:
-    """The law's linear problem for normals (..., s, 2, 3), measured and wanted.
+    """Linearization of a law for normals (..., s, 2, 3), measured and wanted.
 
-    goal_legs : the limbs at the goal, needed where N is to be taken there or in the mean.
+    goal_legs : limbs at the goal, required if N is taken at the goal or as the mean. Raises
+    InputError without them.
     """
     kind, rate = law_named(law), rates(view, legs)
     parts: list[Array] = []
@@ -264,10 +270,9 @@ def task_of(
 
 
 def solution(task: Task) -> Array:
-    """N+ e (..., f), by least squares; what the legs do not see, :data:`UNCOMMANDED_MOTION_SHARE`,
-    stays at rest.
+    """Least-squares solution N+ e (..., f); motions below UNCOMMANDED_MOTION_SHARE stay at rest.
 
-    NaN where an edge or a limb has no place.
+    NaN where an edge or a limb is undefined.
     """
     finite = np.asarray(np.isfinite(task.matrix).all(axis=(-1, -2)))
     finite = finite & np.isfinite(task.error).all(axis=-1)
@@ -295,12 +300,12 @@ def joint_velocities(
     at: MatrixPlace = "measured",
     goal_readings: Array | None = None,
 ) -> Array:
-    """The drives' rates -gain D N+ e, (..., m) per second; errata, "Servoing".
+    """Motor velocities -gain D N+ e, (..., m) per second; errata, "Servoing".
 
     law : "directions" or "edges". measured, goal : (..., s, 2, 3) unit normals of the seen legs'
-    edges, camera frame, sides as in :mod:`pkmcal.geometry.cylinders`. readings : (..., m).
-    gain : 1/s. at : where N is taken; "goal" and "mean" need the goal_readings (..., m).
-    NaN where an edge has no place, or a limb cannot be where the readings put it.
+    edges, camera frame, sides as in :mod:`pkmcal.geometry.cylinders`. readings : (..., m). gain :
+    1/s. at : where N is evaluated; "goal" and "mean" need goal_readings (..., m). NaN where an edge
+    is undefined, or a limb cannot be at its reading.
     """
     legs = legs_from_image(view, directions_of(measured), readings)
     goal_legs = None
@@ -311,7 +316,9 @@ def joint_velocities(
 
 
 def limited(speeds: Array, fastest: Array | float | None) -> Array:
-    """All drives' rates (..., m) slowed together until none is too fast: the direction stays."""
+    """Velocities (..., m) with a common factor so that none exceeds its limit; the direction is
+    kept.
+    """
     if fastest is None:
         return speeds
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Visual servoing of a calibrated machine: from a photograph and its readings to velocities."""
+"""Visual servoing of a calibrated machine: from an image and its readings to motor velocities."""
 
 from __future__ import annotations
 
@@ -56,19 +56,21 @@ from pkmcal.wording import named
 __all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
 
 GOAL_READING_TOLERANCE = 5e-4
-"""Reading (m or rad) by which the machine may still be off at the goal: one photograph of 640x480
-pixels tells it to 0.3 mm."""
+"""Difference of a reading, in m or rad, from the goal's that counts as converged: one image of
+640x480 pixels determines it to 0.3 mm."""
 UNEXPLAINED_READINGS_LAG = 3 * READINGS_LAG_SIGMA
-"""Metres between a photograph and its readings that a control loop's delay does not explain."""
+"""Difference, in metres, between an image and its readings that a control loop's delay does not
+explain."""
 VAGUE_DISTANCE_TOLERANCES = 4.0
-"""Tolerances that the standard deviation of a reading's way to the goal may have without a word."""
+"""Standard deviation of a reading's distance to the goal, in tolerances, above which there is a
+warning."""
 AT_GOAL_DEVIATIONS = 5.0
-"""The same in standard deviations, where a photograph says what these are."""
+"""RMS of the law's error, in standard deviations, below which a machine at rest is at its goal."""
 UNSEEN_READING_SIGMA = 0.05
-"""m or rad of a reading: what a photograph tells worse than that it does not show."""
+"""Standard deviation of a reading, in m or rad, above which an image does not determine it."""
 OTHER_PLACE_ANGLE = 0.02
-"""Root mean square angle (rad) that is no noise: where readings are to stay and the edges are this
-far from the goal, the law has come to rest in another place."""
+"""RMS angle, in rad, that is more than noise: with readings at rest and edges this far from the
+goal, the law has reached another equilibrium."""
 NO_EDGES_TEXT = (
     "likely causes: another assembly than the start's, readings of another photograph, a camera"
     " that was moved, too little light"
@@ -77,9 +79,11 @@ NO_EDGES_TEXT = (
 
 @dataclass(frozen=True)
 class _Sample:
-    """One sample: edges (s, 2, 3) of the seen legs, readings (m,), why legs are missing (s,), their
-    lines where a photograph gave them, the pose (4, 4) by the readings, where it is known, and by
-    how much (m) the photograph contradicts the readings.
+    """One sample of the control loop.
+
+    normals : (s, 2, 3) edges of the seen legs. readings : (m,). reasons : (s,) why legs are
+    missing. lines : lines of the legs, for a sample from an image. pose : (4, 4) from the readings,
+    if computed. beside : m by which the image contradicts the readings.
     """
 
     normals: Array
@@ -91,18 +95,18 @@ class _Sample:
 
 
 class VisualServo:
-    """Control of a calibrated machine by its legs in one camera, [B] III with the errata.
+    """Controller of a calibrated machine by its legs in one camera, [B] III with the errata.
 
-    machine : with calibrated values. camera : needed for photographs only. T_camera_base : (4, 4).
+    machine : with calibrated values. camera : required for images only. T_camera_base : (4, 4).
     goal : a platform pose (4, 4), edges (s, 2, 3) of the seen legs, or a :class:`GoalPhotograph`.
-    law : "edges" or "directions". gain : 1/s; less than one over the time from one sample to the
-    next, delay included. rate_limits : the largest velocity of every motor, or (m,) of each.
-    legs : (s,) seen legs from 0, all with tubes unless given. start : (4, 4) a pose near which the
-    machine stands at first, its home unless given: it decides which assembly is meant.
-    tolerance : m or rad of a reading, at the goal. period : s between samples, to foresee the end
-    of a motor's range. edge_shift : px of a photograph, as calibrated. binning : how many of its
-    pixels across, and down, are one where edges are looked for; about as many as leave 1024 along
-    its longer side unless given. Raises InputError for what cannot be.
+    law : "edges" or "directions". gain : 1/s; less than the inverse of the time between samples,
+    delay included. rate_limits : largest velocity of all motors, or (m,) of each. legs : (s,) seen
+    legs from 0, by default all with tubes. start : (4, 4) a pose near the machine's first pose, by
+    default its home; it selects the assembly mode. tolerance : m or rad of a reading, at the goal.
+    period : s between samples, to predict the end of a motor's range. edge_shift : px of an image,
+    as calibrated. binning : pixels that are averaged in each direction before edges are measured;
+    by default such that about 1024 remain along the longer side. Raises InputError for invalid
+    arguments.
     """
 
     def __init__(
@@ -148,11 +152,11 @@ class VisualServo:
         session: Path | None = None,
         **options: Any,
     ) -> VisualServo:
-        """The machine, the camera and its place as ``pkmcal calibrate`` found them.
+        """Controller from the results of ``pkmcal calibrate``: machine, camera and its pose.
 
-        session : where the cameras' files are, if not above or beside the folder. options : as for
-        the class. Raises InputError where the calibration has no such station, and ResultError
-        for a calibration that was refused.
+        session : folder of the cameras' files, if not above or beside the calibration. options : as
+        for the class. Raises InputError if the calibration has no such station, and ResultError for
+        a refused calibration.
         """
         from pkmcal.calibration.machine_source import load_source
         from pkmcal.calibration.saved_calibration import load
@@ -189,23 +193,27 @@ class VisualServo:
         return cls(source.machine, source.cameras[station], T_camera_base, goal, **options)
 
     def reset(self, start: Array | None = None) -> None:
-        """Forget all samples; the next one is a first one near ``start`` (4, 4), or home."""
+        """Forget all samples; the next sample is a first one near ``start`` (4, 4), by default
+        home.
+        """
         self._start = np.asarray(self.machine.home() if start is None else start, dtype=float)
         self._pose, self._started = self._start, False
         self._track = first_track_state(self.view, self._start)
 
     def step_edges(self, normals: Array, readings: Array) -> Step:
-        """Velocities from the edges (s, 2, 3) of the seen legs, camera frame, NaN for a leg that
-        is not seen, and the readings (m,). Raises InputError for arrays that cannot be these.
+        """Velocities from the edges (s, 2, 3) of the seen legs and the readings (m,).
+
+        The edges are in the camera frame, NaN for a leg that is not seen. Raises InputError for
+        invalid arrays.
         """
         edges = checked_normals(self.view, normals, "the edges")
         reasons = ("no edges were given",) * len(self.view.legs)
         return self._step(_Sample(edges, self._checked(readings), reasons))
 
     def step_image(self, image: Integers, readings: Array) -> Step:
-        """Velocities from a photograph (height, width), uint8, and the readings (m,).
+        """Velocities from an image (height, width), uint8, and the readings (m,).
 
-        Raises InputError for an image that is not this camera's.
+        Raises InputError for an image of another size or type than the camera's.
         """
         if self._sight is None:
             raise InputError("a photograph needs the camera", next_step="give it to VisualServo")
@@ -225,7 +233,8 @@ class VisualServo:
         return self._step(sample)
 
     def _step(self, sample: _Sample) -> Step:
-        """Everything after the edges."""
+        """Velocities from a sample's edges: checks of the pose, then the law."""
+        # legs with edges and a goal
         finite = np.isfinite(sample.normals + self.goal.normals)
         used = np.all(finite.reshape(len(finite), -1), axis=1)
         if not used.any():
@@ -234,6 +243,7 @@ class VisualServo:
         pose = self._pose_of(sample, in_view)
         if pose is None:
             return self._stopped(sample, Status.UNREACHABLE, "")
+        # first sample: sides of the edges, and the assembly mode
         if not self._started:
             check_sides(self.view, sample.normals, pose)
             off = misfit(self.view, sample.normals, pose, sample.readings)
@@ -246,6 +256,7 @@ class VisualServo:
             far = named(in_view.legs[np.min(cosine, axis=1) < 0])
             why = f"{far} would turn by more than 90 degrees in the image; go there in parts"
             return self._stopped(sample, Status.TOO_FAR, why)
+        # linearized law, its rows weighted by the image's covariances
         u = directions_of(sample.normals[used])
         legs = legs_from_image(in_view, u, sample.readings, self._pose)
         task = task_of(self.law, in_view, sample.normals[used], self.goal.normals[used], legs)
@@ -257,12 +268,18 @@ class VisualServo:
     def _answer(
         self, sample: _Sample, used: Booleans, task: Task, error: float, noise: float
     ) -> Step:
-        """Checks of the law's problem, then its solution; noise : rad of each of its rows."""
+        """Checks of the linearized law, then its solution; noise : standard deviation, in rad, of
+        its rows.
+        """
         stop = self._unfit(sample, used, task)
         if stop is not None:
             return stop
         above_limit = noise > 0
-        sigma = noise * _spread(task) if above_limit else np.full(self.machine.n_joints, np.nan)
+        sigma = np.full(self.machine.n_joints, np.nan)
+        if above_limit:
+            # covariance of the readings' distances: R (N^T N)^-1 R^T for rows with unit variance
+            factor = task.readings @ np.linalg.inv(task.matrix.T @ task.matrix)
+            sigma = noise * np.sqrt(np.sum(factor * task.readings, axis=1))
         vague = float(sigma.max()) if above_limit else 0.0
         if vague > UNSEEN_READING_SIGMA:
             return self._stopped(sample, Status.LOST, self._missing(sample, used))
@@ -276,7 +293,7 @@ class VisualServo:
             why = range_sentence(self.machine, self._ranges, sample.readings, leaves)
             return self._stopped(sample, Status.OUT_OF_RANGE, why)
         still = bool(np.max(np.abs(off)) <= self.tolerance)
-        # a leg's direction scatters by more than that, so photographs are asked in sigmas
+        # a single direction has more noise than that angle: compare images in standard deviations
         typical = _root_mean_square(task.error / np.sqrt(3)) / noise if above_limit else np.inf
         converged = still and (error < OTHER_PLACE_ANGLE or typical < AT_GOAL_DEVIATIONS)
         warnings = self._warnings(sample, used, slowed, outside)
@@ -296,11 +313,16 @@ class VisualServo:
         )  # fmt: skip
 
     def _unfit(self, sample: _Sample, used: Booleans, task: Task) -> Step | None:
-        """Why the law's problem must not be solved, if it must not."""
-        rows = task.legs.rows @ task.twist
+        """Stopped step if the linearized law must not be solved, else None."""
         if not (np.isfinite(task.matrix).all() and np.isfinite(task.readings).all()):
             return self._stopped(sample, Status.SINGULAR, "a motor is in line with its rod")
-        least = self._least(sample, rows)
+        # distance from a singular pose, as mechanisms.kinematics.singularity_of has it
+        if self.machine.layout.n_internal:
+            fk = self.machine.forward_result(sample.readings, self._pose)
+            least = float(fk.singularity)
+        else:
+            rows = task.legs.rows @ task.twist
+            least = float(np.linalg.svd(rows, compute_uv=False)[-1])
         if least < NEAR_SINGULAR:
             why = f"smallest singular value {least:.2g}; {NEAR_SINGULAR} is the least allowed"
             return self._stopped(sample, Status.SINGULAR, why)
@@ -312,16 +334,10 @@ class VisualServo:
             return self._stopped(sample, Status.CROSSING, why)
         return None
 
-    def _least(self, sample: _Sample, rows: Array) -> float:
-        """Distance from a singular pose, as :func:`pkmcal.mechanisms.kinematics.singularity_of`."""
-        if not self.machine.layout.n_internal:
-            return float(np.linalg.svd(rows, compute_uv=False)[-1])
-        return float(self.machine.forward_result(sample.readings, self._pose).singularity)
-
     def _pose_of(self, sample: _Sample, view: MachineView) -> Array | None:
-        """The pose (4, 4) by forward kinematics, None where there is none.
+        """Pose (4, 4) from forward kinematics; None if they do not converge.
 
-        Where the law does without, the last one known serves: it decides the assembly only.
+        Laws that do not need the pose use the last one, which selects the assembly mode only.
         """
         if sample.pose is not None:
             return sample.pose
@@ -331,7 +347,7 @@ class VisualServo:
         return fk.T_base_platform if bool(fk.converged) else None
 
     def _part(self, used: Booleans) -> MachineView:
-        """The seen machine with some of its legs only; made once for each choice."""
+        """Machine view with the used legs only; cached for each choice."""
         key = used.tobytes()
         if key not in self._parts:
             self._parts[key] = self.view.only(used)
@@ -353,7 +369,7 @@ class VisualServo:
         )
 
     def _missing(self, sample: _Sample, used: Booleans) -> str:
-        """Which legs are missing and why, and what is left."""
+        """Sentence on the missing legs with their reasons, and on the remaining ones."""
         lost = "; ".join(self._lost(sample, used))
         if not used.any():
             return lost
@@ -390,14 +406,8 @@ class VisualServo:
 
 
 def _root_mean_square(error: Array) -> float:
-    """Root mean square length (rad) of a law's error vectors, (3 k,) one behind the other."""
+    """RMS length, in rad, of a law's error vectors, stacked as (3 k,)."""
     return float(np.sqrt(3 * np.mean(error**2)))
-
-
-def _spread(task: Task) -> Array:
-    """Standard deviations (m,) of the readings' way to the goal, for rows with that of 1."""
-    factor = task.readings @ np.linalg.inv(task.matrix.T @ task.matrix)
-    return np.sqrt(np.sum(factor * task.readings, axis=1))
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -1,14 +1,14 @@
-"""A machine before a camera, as a controller believes it to be, and its legs at one moment.
+"""Machine in front of a camera, as a controller models it, and its legs at one moment.
 
-What control by the legs needs ([B] III): the points A_j and the rods' lengths by the readings, both
-believed, and the legs' directions, measured. Where every leg is seen and the platform is rigid,
-nothing else enters: B = A + length u, and neither the platform's geometry nor forward kinematics
-is asked. What is not seen, and what axes and articulated platforms add, comes from the pose that
-the readings give.
+Visual servoing by the legs ([B] III) needs the points A_j and the rods' lengths, from the readings
+and the model, and the legs' measured directions. If every leg is seen and the platform is rigid,
+nothing else enters: B = A + length u, without the platform's geometry and without forward
+kinematics. Legs that are not seen, joint axes and articulated platforms need the pose from the
+readings.
 
 A twist is (omega, tau) as in :mod:`pkmcal.geometry.rigid`, along the base frame's axes; tau is the
-velocity of the point of the platform that is at ``pivot``, which for the project's own twist is
-the platform's origin, and for [B]'s the camera's centre.
+velocity of the point of the platform that is at ``pivot``. The pivot of the project's own twist is
+the platform's origin, the pivot of [B]'s twist the camera's centre.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from pkmcal.mechanisms.kinematics import closure_at, forward
 
 @dataclass(frozen=True)
 class MachineView:
-    """What a controller believes of a machine and of the camera before it.
+    """Controller's model of a machine and of the camera in front of it.
 
-    machine : its values may be (..., P), one machine a run. T_camera_base : (..., 4, 4).
-    legs : (s,) the legs that are seen, from 0. radius : (s,) m, of each one's visible tube.
+    machine : its values may be (..., P), one machine for each run. T_camera_base : (..., 4, 4).
+    legs : (s,) seen legs, from 0. radius : (s,) m, of each leg's visible tube.
     """
 
     machine: Machine
@@ -52,17 +52,17 @@ class MachineView:
     radius: Array
 
     def only(self, which: Integers | Booleans) -> MachineView:
-        """The same with some of the seen legs, by their places (s,) or a mask of them."""
+        """Machine view with some of the seen legs, by index or mask (s,)."""
         return replace(self, legs=self.legs[which], radius=self.radius[which])
 
     @property
     def theta(self) -> Array:
-        """The machine's values, (..., P)."""
+        """Parameter values (..., P) of the machine."""
         return self.machine.values
 
     @cached_property
     def by_image_alone(self) -> bool:
-        """Whether every leg is seen and closes, and nothing but rods holds a rigid platform."""
+        """Whether all legs are seen and close, and only rods constrain a rigid platform."""
         layout = self.machine.layout
         every = len(self.legs) == layout.n_legs and bool(layout.closing.all())
         return self.rigid and every and not len(layout.angles)
@@ -75,17 +75,17 @@ class MachineView:
 
     @cached_property
     def home(self) -> Array:
-        """The drawing's home pose (4, 4)."""
+        """Home pose (4, 4) of the nominal model."""
         return self.machine.with_values(self.machine.parameters.drawing).home()
 
 
 def machine_view(
     machine: Machine, T_camera_base: Array, legs: Integers | None = None
 ) -> MachineView:
-    """A machine whose given legs (all that have tubes unless given) are seen by a camera.
+    """View of a machine whose given legs are seen by a camera; by default all legs with tubes.
 
-    Of a leg's tubes the one of which most is to be seen at home counts.
-    Raises InputError for a leg that does not exist or has no tube.
+    Each leg is seen by its tube with the longest visible length at home. Raises InputError for a
+    leg that does not exist, is repeated or has no tube.
     """
     tubed = [j for j, leg in enumerate(machine.document.legs) if leg.tubes]
     wanted = np.array(tubed if legs is None else legs, dtype=int)
@@ -102,7 +102,7 @@ def machine_view(
 
 
 def visible_tubes(machine: Machine, legs: Integers) -> Integers:
-    """Of each leg (s,) the number of the tube of which most is to be seen at home."""
+    """Number of the tube with the longest visible length at home, for each leg (s,)."""
     home = machine.with_values(machine.parameters.drawing).home()
     readings = machine.inverse(home[None])[0]
     ends = limb_ends(machine.layout, machine.parameters.drawing, readings, home)
@@ -119,10 +119,10 @@ def visible_tubes(machine: Machine, legs: Integers) -> Integers:
 class Legs:
     """All limbs at one moment, base frame, leading axes broadcast; L legs, E rows of closure.
 
-    a, b, u : (..., L, 3). length : (..., L). pivot : (..., 3) where tau is taken.
+    a, b, u : (..., L, 3). length : (..., L). pivot : (..., 3) point of tau.
     a_by_reading : (..., L, 3). b_by_pose : (..., L, 3, 6), b_by_internal : (..., L, 3, n).
-    rows : (..., E, 6), hinges : (..., E, n), drives : (..., E, m) of the closure, by the twist,
-    the hinges' and the readings' rates.
+    rows : (..., E, 6), hinges : (..., E, n), drives : (..., E, m) derivatives of the closure by the
+    twist, the hinges and the readings.
     """
 
     a: Array
@@ -139,8 +139,9 @@ class Legs:
 
 
 def legs_at(view: MachineView, T_base_platform: Array, readings: Array | None = None) -> Legs:
-    """The limbs of the believed machine at poses (..., 4, 4); readings (..., m) of inverse
-    kinematics unless given. The twist is the project's: the pivot is the platform's origin.
+    """Limbs of the model at poses (..., 4, 4), with the platform's origin as pivot.
+
+    readings : (..., m), by default from inverse kinematics.
     """
     layout, theta = view.machine.layout, view.theta
     c = closure_at(layout, theta, T_base_platform)
@@ -152,11 +153,11 @@ def legs_at(view: MachineView, T_base_platform: Array, readings: Array | None = 
 def legs_from_image(
     view: MachineView, u_camera: Array, readings: Array, near: Array | None = None
 ) -> Legs:
-    """The limbs as the controller takes them to be.
+    """Limbs with measured directions; other quantities from the model and the readings.
 
     u_camera : (..., s, 3) measured directions of the seen legs, camera frame. readings : (..., m).
-    near : (..., 4, 4) a pose to start forward kinematics from, where it is needed; the pose that
-    the seen legs give, or home, unless given. The pivot is the middle of the platform's joints.
+    near : (..., 4, 4) start of forward kinematics, where they are needed; by default the pose from
+    the seen legs, or home. The pivot is the mean of the platform's joints.
     """
     rot_t = view.T_camera_base[..., :3, :3].mT[..., None, :, :]
     u = (rot_t @ u_camera[..., None])[..., 0]
@@ -174,7 +175,7 @@ def legs_from_image(
 
 
 def moved_to(legs: Legs, pivot: Array) -> Legs:
-    """The same with tau taken at another point (..., 3), base frame."""
+    """Limbs with tau at another point (..., 3), base frame."""
     change = twist_change(legs.pivot - pivot)
     return replace(
         legs,
@@ -185,7 +186,7 @@ def moved_to(legs: Legs, pivot: Array) -> Legs:
 
 
 def twist_change(arm: Array) -> Array:
-    """(..., 6, 6): the twist at a point ``arm`` (..., 3) further on, from that at the first."""
+    """Matrix (..., 6, 6) from a twist to the twist at a point displaced by ``arm`` (..., 3)."""
     out = np.zeros((*arm.shape[:-1], 6, 6))
     out[...] = np.eye(6)
     out[..., 3:, :3] = -skew(arm)
@@ -193,7 +194,7 @@ def twist_change(arm: Array) -> Array:
 
 
 def _start(view: MachineView, u: Array, readings: Array) -> Array:
-    """The pose that three or more seen legs of a rigid platform give, or home; u in the base."""
+    """Pose from three or more seen legs of a rigid platform, else home; u in the base frame."""
     layout = view.machine.layout
     ends = limb_ends(layout, view.theta, readings, np.eye(4))
     shape = np.broadcast_shapes(ends.a.shape[:-2], u.shape[:-2])
@@ -207,7 +208,7 @@ def _start(view: MachineView, u: Array, readings: Array) -> Array:
 
 
 def _by_image(view: MachineView, u: Array, readings: Array) -> Legs:
-    """Every leg seen, a rigid platform: A and the length are believed, u is measured."""
+    """Limbs of a rigid platform with all legs seen: A and length from the model, u measured."""
     layout, theta = view.machine.layout, view.theta
     order = np.argsort(view.legs)
     u = u[..., order, :]
@@ -226,8 +227,9 @@ def _by_image(view: MachineView, u: Array, readings: Array) -> Legs:
 
 
 def _of_closure(view: MachineView, c: Closure, u: Array, pivot: Array) -> Legs:
-    """The limbs of a closed machine, with the directions (..., L, 3) given: the lengths' rows are
-    by these, and the axes' rows stay.
+    """Limbs of a closed machine, with given directions (..., L, 3).
+
+    The rows of the rods' lengths use these directions; the rows of joint axes are unchanged.
     """
     layout, a_by_reading = c.layout, np.broadcast_to(c.a_by_reading, u.shape)
     b_by_internal = c.platform.by_internal
@@ -258,8 +260,8 @@ def _of_closure(view: MachineView, c: Closure, u: Array, pivot: Array) -> Legs:
 def true_edges(view: MachineView, T_base_platform: Array, readings: Array | None = None) -> Array:
     """Normals (..., s, 2, 3) of the seen legs' edges at poses (..., 4, 4), camera frame, [B] eq. 3.
 
-    readings : (..., m), of inverse kinematics unless given. NaN where the camera's centre lies in
-    a leg, and where a limb cannot reach.
+    readings : (..., m), by default from inverse kinematics. NaN where the camera's centre lies in a
+    leg, and where a limb cannot reach.
     """
     a, b = leg_ends_in_view(view, T_base_platform, readings)
     u, m = line_through(a, b)

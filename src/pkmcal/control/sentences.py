@@ -1,4 +1,4 @@
-"""What is wrong with a control by the legs, in sentences; and whether it may be used."""
+"""Findings of a servoing study, and whether the control may be used."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
 from pkmcal.wording import named
 
 ENOUGH_REACHED_SHARE = 0.9
-"""Part of the runs with the identified geometry that must reach their goal."""
+"""Share of the runs with the identified geometry that must reach their goal."""
 UNMENTIONED_HIDDEN_SHARE = 0.05
-"""Part of the poses at which a leg may stand behind another without a warning."""
+"""Share of the poses with a leg behind another leg above which there is a finding."""
 UNMENTIONED_OVERSHOOT = 0.05
-"""Part of the way by which a platform may pass its goal without a word."""
+"""Overshoot, relative to the path's length, above which there is a finding."""
 UNMENTIONED_DEVIATION = 0.01
-"""Part of the way by which a platform may leave it without a word."""
+"""Deviation from the path, relative to its length, above which there is a finding."""
 UNMENTIONED_GOAL_NOISE = 0.02
-"""Noise at the goal, as a part of the usual way, that deserves a word."""
+"""Noise at the goal, relative to the median path's length, above which there is a finding."""
 
 
 def judgement(study: Study) -> Verdict:
-    """The study in words."""
+    """Verdict on a study: headline and findings."""
     own, good = study.own, study.outcome("identified")
     reasons = (*_blind(study), *_failures(good))
     share = good.reached / len(good.runs.end)
@@ -51,12 +51,12 @@ def judgement(study: Study) -> Verdict:
 
 
 def chosen_legs(choice: Subset, study: Study) -> str:
-    """``all legs``, ``legs 1, 3 and 5``."""
+    """Legs of a subset as text: ``all legs``, ``legs 1, 3 and 5``."""
     return named(choice.legs, study.scene.machine.n_legs)
 
 
 def _blind(study: Study) -> tuple[Finding, ...]:
-    """Motions that are never seen."""
+    """Finding on motions that are unobservable."""
     if not study.own.blind:
         return ()
     law, legs = study.plan.loop.law, chosen_legs(study.own, study)
@@ -64,7 +64,7 @@ def _blind(study: Study) -> tuple[Finding, ...]:
 
 
 def _failures(outcome: Trials) -> tuple[Finding, ...]:
-    """How runs failed, the most frequent first."""
+    """Findings on failed runs, the most frequent end first."""
     n = len(outcome.runs.end)
     return tuple(
         wrong("servo.failures", number=count, of=n, end=end.sentence)
@@ -82,7 +82,7 @@ def _fading(study: Study) -> tuple[Finding, ...]:
 
 
 def _others(study: Study) -> Iterator[Finding]:
-    """Other equilibria."""
+    """Findings on other equilibria."""
     equilibria, legs = study.equilibria, chosen_legs(study.own, study)
     for same_edges, part in ((True, equilibria.same_image), (False, equilibria.cancelled)):
         rows = equilibria.same_edges == same_edges
@@ -111,7 +111,7 @@ def _hidden(study: Study) -> tuple[Finding, ...]:
 
 
 def _by_hand(study: Study) -> Iterator[Finding]:
-    """What calibration is good for here."""
+    """Findings on the hand-measured geometry: what calibration improves here."""
     hand, n = study.outcome("hand"), study.plan.runs
     failed = n - hand.reached
     if failed > study.plan.runs - study.outcome("identified").reached:
@@ -141,7 +141,7 @@ def _noise(study: Study) -> tuple[Finding, ...]:
 
 
 def _advice(study: Study) -> Iterator[Finding]:
-    """Which legs would do better, where something is wrong with those seen."""
+    """Findings on better choices of legs, if the seen legs have a problem."""
     own = study.own
     if not (
         own.blind or own.fading or study.equilibria.same_image + study.equilibria.cancelled > 0

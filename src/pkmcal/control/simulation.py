@@ -1,7 +1,7 @@
-"""Simulated control: many runs at once, how each can end, and what noise leaves at the goal.
+"""Simulated control: many runs in parallel, how each run ends, and the noise at the goal.
 
-The true machine stands before the true camera, :class:`pkmcal.control.image.Eye`; the controller
-believes its own geometry, and its readings and edges come late and with noise.
+The true machine stands in front of the true camera, :class:`pkmcal.control.image.Eye`; the
+controller has its own geometry, and its readings and edges are delayed and noisy.
 """
 
 from __future__ import annotations
@@ -23,27 +23,30 @@ from pkmcal.mechanisms.velocities import assembly_sign
 from pkmcal.simulation.edges import EdgeNoise
 
 IMAGES_A_GOAL = 24
-"""Images of each goal; the standard deviation over all goals is then good to a few percent."""
+"""Images of each goal; the standard deviation over all goals is then accurate to a few percent."""
 ARRIVED_DISTANCE_SHARE = 0.02
-"""Part of the way at which a platform counts as arrived, as control engineers have it."""
+"""Distance from the goal, relative to the path's length, of a platform that has arrived: 2 %, as
+usual for settling times."""
 LEAST_DISTANCE = 5e-4
-"""m, of the platform's joints, within which a goal is reached however short the way was."""
+"""Distance of the platform's joints, in metres, within which a goal is reached however short the
+path."""
 FINAL_RUN_SHARE = 0.1
-"""Part of a run, at its end, whose mean decides where it ended."""
+"""Share of a run, at its end, whose mean decides how the run ended."""
 AT_GOAL_NOISE_DEVIATIONS = 3.0
-"""Standard deviations of the noise at the goal within which a platform is there."""
+"""Distance from the goal, in standard deviations of the noise there, within which a platform has
+arrived."""
 TREMBLING_DISTANCE_SHARE = 0.1
-"""Part of the way beyond which a platform that trembles is not at its goal."""
+"""Distance from the goal, relative to the path's length, beyond which noise is no excuse."""
 AT_REST = 0.02
-"""Part of the rate that the error would ask for, below which a run stands still."""
+"""Velocity, relative to the one that the error asks for, below which a run is at rest."""
 AT_STOP = 1e-9
-"""m or rad by which a reading may be beyond its range: rounding."""
+"""Distance, in m or rad, by which rounding may put a reading beyond its range."""
 NO_EDGE_NOISE = EdgeNoise(shift=0.0, tilt=0.0)
-"""A camera without errors."""
+"""Camera without errors."""
 
 
 class End(Enum):
-    """A run's end: a word for files, what happened, and what would help.
+    """End of a run: a word for files, what happened, and what would help.
 
     ``good`` is a platform at its goal; every other end is a failure.
     """
@@ -114,7 +117,7 @@ class End(Enum):
 
     @property
     def sentence(self) -> str:
-        """What happened and what would help."""
+        """Sentence of what happened and what would help."""
         what = self.what[0].upper() + self.what[1:] + "."
         return f"{what} {self.help[0].upper()}{self.help[1:]}." if self.help else what
 
@@ -124,9 +127,9 @@ RUN_ENDS = tuple(End)
 
 @dataclass(frozen=True)
 class Stillness:
-    """What one image's noise is, told as the platform's place, root mean squares of the goals.
+    """Noise of one image as a displacement of the platform, RMS over images for each goal.
 
-    joints : (R,) m, over the platform's joints. position : (R,) m of their middle. turn : (R,) rad.
+    joints : (R,) m, over the platform's joints. position : (R,) m, of their mean. turn : (R,) rad.
     """
 
     joints: Array
@@ -134,18 +137,19 @@ class Stillness:
     turn: Array
 
     def held(self, step: float, delay: int) -> Stillness:
-        """The same in the closed loop."""
+        """Noise of the platform in the closed loop."""
         part = loop_factor(step, delay)
         return Stillness(self.joints * part, self.position * part, self.turn * part)
 
 
 def loop_factor(step: float, delay: int) -> float:
-    """Standard deviation of the platform in the loop, as a part of one image's.
+    """Standard deviation of the platform in the closed loop, relative to the noise of one image.
 
-    step : gain / rate, what of an error is corrected in a sample. The platform follows
-    x(k + 1) = x(k) - step (x(k - delay) + noise); without delay its variance is
-    step / (2 - step) of the noise's. inf where the loop is unstable.
+    step : gain / rate, the share of an error that is corrected in a sample. The platform follows
+    x(k + 1) = x(k) - step (x(k - delay) + noise); without delay its variance is step / (2 - step)
+    times the noise's. inf where the loop is unstable.
     """
+    # companion matrix F of the states x(k), ..., x(k - delay)
     n = delay + 1
     follow = np.eye(n, k=-1)
     follow[0, 0] += 1.0
@@ -154,7 +158,7 @@ def loop_factor(step: float, delay: int) -> float:
         return float("inf")
     drive = np.zeros((n, n))
     drive[0, 0] = step**2
-    # P = F P F^T + Q, as one linear system
+    # stationary covariance: P = F P F^T + Q, as one linear system
     whole = np.eye(n * n) - np.kron(follow, follow)
     return float(np.sqrt(np.linalg.solve(whole, drive.ravel())[0]))
 
@@ -169,7 +173,7 @@ def one_image(
     rng: np.random.Generator,
     draws: int = IMAGES_A_GOAL,
 ) -> Stillness:
-    """The platform's apparent displacement at goals (R, 4, 4) by the noise of single images."""
+    """Apparent displacement of the platform at goals (R, 4, 4) from the noise of single images."""
     points = eye.points(goals, readings)
     wanted = eye.normals(points, EdgeNoise(0.0, 0.0), rng)
     squares = np.zeros((3, len(goals)))
@@ -188,11 +192,12 @@ def one_image(
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """A controller's settings.
+    """Settings of a controller.
 
-    gain : 1/s. rate : samples a second. delay : samples from the exposure to the drives' answer.
-    noise : of the edges, px. joint_noise : of a reading, m or rad. speed : (m,) fastest rates of
-    the drives, all scaled together. duration : s. at : where the interaction is taken.
+    gain : 1/s. rate : samples per second. delay : samples from the exposure to the motors'
+    response. noise : of the edges, px. joint_noise : of a reading, m or rad. speed : (m,) largest
+    velocities of the motors, which are scaled together. duration : s. at : where the interaction
+    matrix is evaluated.
     """
 
     law: str = "edges"
@@ -215,10 +220,10 @@ class LoopSettings:
 class ServoRuns:
     """R runs of K samples.
 
-    time : (K,) s. error : (R, K) norm of e. travel : (R, K) m, root mean square distance of the
-    platform's joints from the goal. past : (R, K) part of the way by which they are beyond it.
-    T_base_platform : (R, K, 4, 4). readings : (R, K, m). end : R of them. last : (R,) the sample at
-    which a run was stopped; later ones repeat it. goals : (R, 4, 4).
+    time : (K,) s. error : (R, K) norm of e. travel : (R, K) RMS distance of the platform's joints
+    from the goal, m. past : (R, K) share of the path by which they are beyond the goal.
+    T_base_platform : (R, K, 4, 4). readings : (R, K, m). end : R ends. last : (R,) sample at which
+    a run was stopped; later samples repeat it. goals : (R, 4, 4).
     """
 
     time: Array
@@ -246,10 +251,11 @@ def simulate_servo_runs(
     rng: np.random.Generator,
     progress: Callable[[float], None] = lambda _: None,
 ) -> ServoRuns:
-    """R runs from starts to goals (R, 4, 4), the true platform's poses.
+    """R runs from starts to goals (R, 4, 4), poses of the true platform.
 
-    believed : its values (R, P) or (P,), its camera's place (R, 4, 4) or (4, 4). The wanted edges
-    are the true ones at the goal, taught there without noise.
+    believed : controller's model, with values (R, P) or (P,) and camera poses (R, 4, 4) or (4, 4).
+    The wanted edges are the true edges at the goal, without noise. progress : called with the share
+    of samples done.
     """
     kind, goal_readings = law_named(loop.law), eye.true.machine.inverse(goals)
     wanted = eye.normals(eye.points(goals, np.nan_to_num(goal_readings)), NO_EDGE_NOISE, rng)
@@ -277,8 +283,10 @@ def simulate_servo_runs(
 
 @dataclass(frozen=True)
 class _Now:
-    """All runs at one sample. sign : (R,) of the start's assembly. end : (R,) place in
-    ``RUN_ENDS``, -1 for none yet. last : (R,) sample at which it came.
+    """State of all runs at one sample.
+
+    sign : (R,) of the start's assembly mode. end : (R,) index into ``RUN_ENDS``, -1 for running.
+    last : (R,) sample of the end.
     """
 
     poses: Array
@@ -289,12 +297,12 @@ class _Now:
 
     @property
     def active(self) -> Booleans:
-        """(R,) runs that still go."""
+        """(R,) runs that have not ended."""
         return self.end < 0
 
 
 def _begin(eye: Eye, starts: Array, goals: Array) -> _Now:
-    """All runs at their start; those that cannot begin are ended."""
+    """All runs at their start; runs that cannot begin are ended."""
     machine = eye.true.machine
     readings, wanted = machine.inverse(starts), machine.inverse(goals)
     n = len(starts)
@@ -308,7 +316,7 @@ def _begin(eye: Eye, starts: Array, goals: Array) -> _Now:
 
 
 def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
-    """The runs that still go are ended where ``which`` says so."""
+    """State with the running runs of ``which`` ended."""
     which = which & now.active
     return replace(
         now,
@@ -318,7 +326,7 @@ def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
 
 
 def _driven(machine: Machine, now: _Now, step: Array, sample: int) -> _Now:
-    """Drives go by steps (R, m), and the platforms follow."""
+    """State after the motors have moved by steps (R, m), and the platforms have followed."""
     step = np.where(now.active[:, None], step, 0.0)
     now = _stopped(now, ~np.all(np.isfinite(step), axis=-1), End.LOST_LEG, sample)
     wanted = now.readings + np.nan_to_num(step)
@@ -345,14 +353,16 @@ def outside(machine: Machine, readings: Array) -> Booleans:
 
 
 def platform_joints(machine: Machine, poses: Array) -> Array:
-    """The platform's joint centres (R, L, 3) at poses (R, 4, 4), m, base frame."""
+    """Joint centres (R, L, 3) of the platform at poses (R, 4, 4), m, base frame."""
     return closure_at(machine.layout, machine.values, poses).b
 
 
 @dataclass(frozen=True)
 class _Record:
-    """Arrays that fill as the loop runs. goals : the platform's joints there; first : their
-    distance at the start, (R, L, 3).
+    """Arrays that are filled during the loop.
+
+    goals : (R, L, 3) the platform's joints at the goal. first : (R, L, 3) their displacement at the
+    start.
     """
 
     machine: Machine
@@ -375,7 +385,7 @@ class _Record:
         )  # fmt: skip
 
     def take(self, sample: int, now: _Now, error: Array) -> None:
-        """One sample of all runs."""
+        """Record one sample of all runs."""
         flat = error.reshape(len(error), -1)
         off = platform_joints(self.machine, now.poses) - self.goals
         whole = np.sum(self.first**2, axis=(-1, -2))
@@ -386,7 +396,7 @@ class _Record:
         self.poses[:, sample], self.readings[:, sample] = now.poses, now.readings
 
     def runs(self, now: _Now, goals: Array, loop: LoopSettings, floor: Array) -> ServoRuns:
-        """What the runs were, with their ends judged."""
+        """The finished runs with their ends."""
         last = np.where(now.active, loop.samples - 1, now.last)
         judged = _judged(self.error, self.travel, loop, floor)
         ends = [RUN_ENDS[e] if e >= 0 else end for e, end in zip(now.end, judged, strict=True)]
@@ -400,7 +410,7 @@ class _Record:
 def _floor(
     eye: Eye, goals: Array, readings: Array, loop: LoopSettings, rng: np.random.Generator
 ) -> Array:
-    """Distance (R,) m of the platform's joints from the goal that the noise alone explains."""
+    """Distance (R,), in m, of the platform's joints from the goal that noise alone explains."""
     still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
     part = loop_factor(loop.gain / loop.rate, loop.delay)
     return np.nan_to_num(
@@ -409,9 +419,9 @@ def _floor(
 
 
 def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) -> list[End]:
-    """Where runs (R, K) that used all their time ended, by the means over their last part.
+    """End of each run (R, K) that used all its time, from means over the last part of the run.
 
-    floor : (R,) m, what noise alone explains.
+    floor : (R,) m, distance that noise alone explains.
     """
     n = max(1, round(FINAL_RUN_SHARE * error.shape[1]))
     e, w = error[:, -n:].mean(axis=1), direction[:, -n:].mean(axis=1)
@@ -419,7 +429,7 @@ def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) ->
     near = np.maximum(ARRIVED_DISTANCE_SHARE * direction[:, 0], LEAST_DISTANCE)
     arrived = w < np.maximum(near, np.minimum(floor, TREMBLING_DISTANCE_SHARE * direction[:, 0]))
     shaken = w < floor
-    # what an exponential of this gain would still go in that time, were the control not at rest
+    # at rest: much slower than an exponential approach with this gain
     rest = np.abs(before - w) < AT_REST * w * (1 - np.exp(-loop.gain * n / loop.rate))
     same = e < ARRIVED_DISTANCE_SHARE * error[:, 0]
     worse = w > direction[:, 0]

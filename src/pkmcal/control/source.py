@@ -1,4 +1,6 @@
-"""What is controlled in a study: a calibration with its cameras, or a machine by its drawing."""
+"""Plant of a servoing study: a calibration with its cameras, or a machine from its
+nominal model.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,11 @@ from pkmcal.simulation.placement import default_stations
 from pkmcal.simulation.truth import stream, true_machine
 
 CALIBRATED_TOLERANCE_SHARE = 1 / 30
-"""What a calibration leaves of a drawing's tolerances: 2 mm become 0.06 mm, as in the
-demonstration."""
+"""Share of a nominal model's prior sigmas that remains after a calibration: 2 mm become 0.06 mm, as
+in the demonstration."""
 CAMERA_ROTATION = float(np.deg2rad(0.02))
 CAMERA_POSITION = 2e-4
-"""rad and m, standard deviations of a camera's place by the same demonstration."""
+"""Standard deviations, in rad and m, of a camera's pose in the same demonstration."""
 
 
 def load_plant(
@@ -36,10 +38,10 @@ def load_plant(
     legs: tuple[int, ...] | None = None,
     seed: int = 0,
 ) -> Plant:
-    """The plant of a calibration's folder, of a mechanism file, or of a built-in machine.
+    """Plant of a calibration's folder, of a mechanism file, or of a built-in machine.
 
-    legs : numbers from 0. Raises InputError for what is none of these, for a station or camera that
-    is not there, and for legs that cannot be seen.
+    legs : numbers from 0. Raises InputError for any other source, for a station or camera that does
+    not exist, and for legs that cannot be seen.
     """
     source = load_source(what, session)
     eye = load_camera(camera) if camera is not None else None
@@ -62,8 +64,9 @@ def _of_calibration(
     eye: Camera | None,
     legs: tuple[int, ...] | None,
 ) -> Plant:
-    """The calibrated machine stands for the true one; estimates differ from it as it may from the
-    truth.
+    """Plant with the calibrated machine as the true one.
+
+    Estimates differ from it as the calibrated machine may differ from the real one.
     """
     place = _station(saved, source, station, eye)
     eye = source.cameras[place.name] if eye is None else eye
@@ -88,7 +91,7 @@ def _of_calibration(
 def _station(
     saved: SavedCalibration, source: MachineSource, name: str | None, eye: Camera | None
 ) -> SavedStation:
-    """The station asked for, or the first one whose camera is known."""
+    """Station of this name, or the first station whose camera is available."""
     names = [one.name for one in saved.stations]
     if name is not None and name not in names:
         raise InputError(
@@ -112,9 +115,9 @@ def _station(
 def _of_drawing(
     source: MachineSource, eye: Camera, legs: tuple[int, ...] | None, seed: int
 ) -> Plant:
-    """A machine built within its drawing's tolerances."""
+    """Plant with a random machine within the prior sigmas of its nominal model."""
     machine = source.machine
-    machine_view(machine, np.eye(4), None if legs is None else np.array(legs))  # before any place
+    machine_view(machine, np.eye(4), None if legs is None else np.array(legs))  # checks legs
     rng = np.random.default_rng(stream(seed, "stations"))
     place = default_stations(machine, (eye,), rng)[0]
     table = machine.parameters
@@ -140,7 +143,7 @@ def _of_drawing(
 
 
 def pose_of_text(text: str, where: str) -> Array:
-    """A pose (4, 4) of six numbers x,y,z,rx,ry,rz: metres and a rotation vector in radians."""
+    """Pose (4, 4) from six numbers x,y,z,rx,ry,rz: metres and a rotation vector in radians."""
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -156,7 +159,7 @@ def pose_of_text(text: str, where: str) -> Array:
 
 
 def legs_of_text(text: str) -> tuple[int, ...]:
-    """Numbers from 0 of legs told from 1, such as 1,3,5."""
+    """Legs, counted from 0, from a text that counts them from 1, such as 1,3,5."""
     try:
         numbers = [int(part) for part in text.split(",")]
     except ValueError:

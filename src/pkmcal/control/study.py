@@ -1,9 +1,9 @@
-"""How well a machine is controlled with what may be believed of its geometry, [B] Fig. 10.
+"""Study of visual servoing with different estimates of the geometry, [B] Fig. 10.
 
-Every belief is tried in many runs of the simulated loop at once, and the legs' choice and other
-equilibria are looked at beside them. The beliefs: E1, the drawing, laid on the identified base
-centres ([B] eq. 15). E2, the identified geometry. E3, the drawing, with the camera's place measured
-by hand. Beside them the truth.
+Each estimate controls many runs of the simulated loop; visibility, the choice of legs and other
+equilibria are analysed beside them. The estimates: E1, the nominal model fitted to the identified
+base centres ([B] eq. 15). E2, the identified geometry. E3, the nominal model with a hand-measured
+camera pose. The true geometry is the reference.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ from pkmcal.simulation.placement import draw_configurations
 
 HAND_POSITION = 0.03
 HAND_ROTATION = float(np.deg2rad(3))
-"""m and rad by which a camera's place is wrong that was measured by ruler and eye."""
+"""Errors, in m and rad, of a camera pose that was measured by ruler and eye."""
 RANGE_END_SHARE = 0.15
-"""Part of a reading's range at both ends in which no way begins or ends: a platform that is led
-by its image does not go straight in its readings."""
+"""Share of a reading's range at both ends in which no path begins or ends: a platform that is
+controlled by its image does not follow a straight line in its readings."""
 VISIBILITY_POSES = 60
-"""Poses of the workspace at which visibility is judged."""
+"""Number of poses in the workspace at which visibility is computed."""
 WRITTEN_POSE_ROUNDING = 1e-6
-"""m; a pose told with six decimals leaves so much."""
+"""Error, in metres, of a pose written with six decimals."""
 MOST_LEGS = 8
-"""Legs of which all choices are compared."""
+"""Largest number of legs for which all subsets are compared."""
 EQUILIBRIA_GOALS, EQUILIBRIA_STARTS = 5, 40
-"""Goals for which other equilibria are sought, and starts of the search for each."""
+"""Number of goals for which other equilibria are searched, and of starts for each."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What a calibration leaves open.
+    """Uncertainty of a calibration.
 
-    covariance : (P, P) of the machine's values. rotation, translation : standard deviations (3,)
-    of T_base_camera's six numbers, rad and m, base axes.
+    covariance : (P, P) of the machine's values. rotation, translation : standard deviations (3,) of
+    T_base_camera's six numbers, rad and m, base axes.
     """
 
     covariance: Array
@@ -69,7 +69,10 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Belief:
-    """One estimate of the geometry. view : values (R, P) and camera's places (R, 4, 4)."""
+    """Estimate of the geometry.
+
+    view : with values (R, P) and camera poses (R, 4, 4), one for each run.
+    """
 
     name: str
     title: str
@@ -85,11 +88,11 @@ def estimates(
     hand_position: float = HAND_POSITION,
     hand_rotation: float = HAND_ROTATION,
 ) -> tuple[Belief, ...]:
-    """The truth, the identified geometry, the drawing fitted to it, and the drawing by hand.
+    """True geometry, identified geometry, fitted nominal model, and hand-measured nominal model.
 
-    true : the machine that is controlled. drawing : (P,) values. Every run has its own error of
-    calibration, drawn from the uncertainty, and its own error by hand: of the given sizes, in
-    random directions.
+    true : the machine that is controlled. drawing : (P,) nominal values. Every run has its own
+    error of calibration, drawn from the uncertainty, and its own error of the hand-measured pose,
+    of the given size in a random direction.
     """
     identified = _identified(true, uncertainty, runs, rng)
     T_camera_base = np.broadcast_to(true.T_camera_base, (runs, 4, 4))
@@ -110,7 +113,7 @@ def estimates(
 def _identified(
     true: MachineView, uncertainty: Uncertainty, runs: int, rng: np.random.Generator
 ) -> MachineView:
-    """Values and camera's places as a calibration would have them."""
+    """Random values and camera poses with the uncertainty of a calibration."""
     size, axes = np.linalg.eigh(uncertainty.covariance)
     root = axes * np.sqrt(np.maximum(size, 0.0))
     values = true.theta + rng.standard_normal((runs, len(size))) @ root.T
@@ -121,7 +124,7 @@ def _identified(
 
 
 def _fitted(drawing: Machine, view: MachineView) -> MachineView:
-    """The drawing with the camera where the seen machine's base centres put it, [B] eq. 15."""
+    """Nominal model with the camera pose that fits its base centres to the view's, [B] eq. 15."""
     middle, poses = drawing.middle_readings(), np.eye(4)
     here = limb_ends(drawing.layout, drawing.values, middle, poses).a
     there = limb_ends(view.machine.layout, view.theta, middle, poses).a
@@ -133,7 +136,7 @@ def _fitted(drawing: Machine, view: MachineView) -> MachineView:
 def _placed_by_hand(
     view: MachineView, position: float, turn: float, rng: np.random.Generator
 ) -> MachineView:
-    """The camera's places off by the sizes, m and rad, in random directions."""
+    """View with camera poses off by the given sizes, m and rad, in random directions."""
     drawn = rng.standard_normal((2, *view.T_camera_base.shape[:-2], 3))
     direction, axis = drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
     T = inverse(view.T_camera_base)
@@ -143,10 +146,10 @@ def _placed_by_hand(
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked of a study.
+    """Settings of a study.
 
-    runs : of every estimate. hand_position, hand_rotation : m and rad by which the camera's place
-    by hand is off. start, goal : (4, 4) of every run; drawn unless given.
+    runs : number for each estimate. hand_position, hand_rotation : errors of the hand-measured
+    camera pose, m and rad. start, goal : (4, 4) of every run; random by default.
     """
 
     loop: LoopSettings = field(default_factory=LoopSettings)
@@ -160,9 +163,11 @@ class Plan:
 
 @dataclass(frozen=True)
 class Plant:
-    """What is controlled. drawing : (P,) values. uncertainty : of its calibration. legs : numbers
-    from 0 of those seen, all with tubes unless given. origin : a sentence, for people. station :
-    the camera's, None for a drawing. findings : what people should know.
+    """Machine and camera under control.
+
+    drawing : (P,) nominal values. uncertainty : of the calibration. legs : seen legs, from 0; by
+    default all with tubes. origin : a sentence for people. station : the camera's station, None
+    without a calibration. findings : findings on the source.
     """
 
     machine: Machine
@@ -176,20 +181,20 @@ class Plant:
     findings: tuple[Finding, ...] = ()
 
     def view(self) -> MachineView:
-        """The true machine before the camera."""
+        """View of the true machine by the camera."""
         legs = None if self.legs is None else np.array(self.legs, dtype=int)
         return machine_view(self.machine, self.T_camera_base, legs)
 
 
 @dataclass(frozen=True)
 class Trials:
-    """The runs with one estimate of the geometry.
+    """Runs with one estimate of the geometry, and their figures.
 
-    overshoot : (R,) largest part of its way by which a platform was beyond the goal. rise : (R,)
-    largest rise of the norm of e above an earlier value, as a part of its start's. settling : (R,)
-    s after which the platform is within ARRIVED_DISTANCE_SHARE of its way, NaN where it never is.
-    astray : (R,) m, root mean square of the platform's joints, by which the platform left the way
-    that it takes with the true geometry, at most.
+    overshoot : (R,) largest distance beyond the goal, relative to the path's length. rise : (R,)
+    largest rise of the norm of e above an earlier value, relative to its start. settling : (R,) s
+    after which the platform stays within ARRIVED_DISTANCE_SHARE of its path, NaN for never.
+    astray : (R,) m, largest RMS distance of the platform's joints from the path with the true
+    geometry.
     """
 
     estimate: Belief
@@ -201,21 +206,22 @@ class Trials:
 
     @property
     def reached(self) -> int:
-        """Runs that ended at their goal."""
+        """Number of runs that ended at their goal."""
         return int(self.runs.reached.sum())
 
     @property
     def ends(self) -> dict[End, int]:
-        """How many runs ended how, the most frequent first."""
+        """Number of runs for each end, the most frequent first."""
         return dict(Counter(self.runs.end).most_common())
 
 
 @dataclass(frozen=True)
 class Study:
-    """All that was found. outcomes : true, identified, cad, hand. image, held : stillness at the
-    goals, of one image and in the loop. hidden : (s,) part of starts and goals at which a leg
-    stands behind another. choices : of legs, :func:`pkmcal.control.analysis.subsets`, of all legs
-    with tubes.
+    """Results of a study.
+
+    outcomes : true, identified, cad, hand. image, held : noise at the goals, of one image and in
+    the loop. hidden : (s,) share of starts and goals at which a leg stands behind another. choices
+    : subsets of all legs with tubes, see :func:`pkmcal.control.analysis.subsets`.
     """
 
     scene: Plant
@@ -230,22 +236,22 @@ class Study:
 
     @property
     def own(self) -> Subset:
-        """The legs that are seen."""
+        """Subset of the seen legs."""
         wanted = set(self.eye.true.legs.tolist())
         return next(choice for choice in self.choices if set(choice.legs) == wanted)
 
     def outcome(self, name: str) -> Trials:
-        """By the estimate's name."""
+        """Trials of an estimate by its name."""
         return next(o for o in self.outcomes if o.estimate.name == name)
 
 
 def study_servoing(
     scene: Plant, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
 ) -> Study:
-    """Simulate the loop with every estimate, and analyse what the legs show.
+    """Simulate the loop with every estimate, and analyse visibility and equilibria.
 
-    Raises InputError where the loop would be unstable with perfect knowledge, where a start or goal
-    is unreachable, and where the camera does not see the legs.
+    Raises InputError if the loop would be unstable with perfect knowledge, if a start or goal is
+    unreachable, and if the camera does not see the legs.
     """
     check_loop(plan.loop)
     seeds = np.random.SeedSequence(plan.seed).spawn(5)
@@ -263,7 +269,7 @@ def study_servoing(
     outcomes: list[Trials] = []
     for k, belief in enumerate(beliefs):
         subprogress = _subprogress(progress, f"Servoing: {belief.title.lower()}", 0.05 + 0.2 * k)
-        # the same noise for all, so that differences are the estimates'
+        # the same noise for all estimates, so that differences are due to the estimates
         rng = np.random.default_rng(seeds[3])
         runs = simulate_servo_runs(eye, belief.view, starts, goals, plan.loop, rng, subprogress)
         ideal = outcomes[0].runs if outcomes else runs
@@ -272,7 +278,7 @@ def study_servoing(
     ends, joints = np.concatenate([starts, goals]), np.nan_to_num(scene.machine.inverse(goals))
     rng, loop = np.random.default_rng(seeds[4]), plan.loop
     image = one_image(eye, eye.true, loop.law, goals, joints, loop.noise, rng)
-    # of all legs with tubes; of those seen where there are too many to choose from
+    # choices among all legs with tubes; among the seen legs if there are too many
     view = machine_view(scene.machine, scene.T_camera_base)
     if len(view.legs) > MOST_LEGS and scene.legs is not None:
         view = scene.view()
@@ -292,9 +298,10 @@ def study_servoing(
 
 
 def check_loop(loop: LoopSettings) -> None:
-    """Raise InputError where the loop is unstable even with perfect knowledge."""
+    """Raise InputError if the loop is unstable even with perfect knowledge."""
     if np.isfinite(loop_factor(loop.gain / loop.rate, loop.delay)):
         return
+    # largest stable step, by bisection, for the message
     low, high = 0.0, 3.0
     for _ in range(40):
         middle = (low + high) / 2
@@ -309,7 +316,7 @@ def check_loop(loop: LoopSettings) -> None:
 
 
 def outcome(true: Machine, estimate: Belief, runs: ServoRuns, ideal: ServoRuns) -> Trials:
-    """The figures of an estimate's runs. ideal : the same with the true machine's geometry."""
+    """Figures of an estimate's runs; ideal : runs with the true machine's geometry."""
     last = np.arange(len(runs.time)) <= runs.last[:, None]
     past = np.where(last, runs.past, 0.0)
     lowest = np.minimum.accumulate(runs.error, axis=1)
@@ -325,7 +332,9 @@ def outcome(true: Machine, estimate: Belief, runs: ServoRuns, ideal: ServoRuns) 
 
 
 def _astray(machine: Machine, runs: ServoRuns, ideal: ServoRuns) -> Array:
-    """How far (R,) m the platform's joints were from their nearest place on the ideal way."""
+    """Largest distance (R,), in m, of the platform's joints from their nearest point on the ideal
+    path.
+    """
     out = np.zeros(len(runs.end))
     for r, (last, end) in enumerate(zip(runs.last, ideal.last, strict=True)):
         here, there = (
@@ -338,8 +347,8 @@ def _astray(machine: Machine, runs: ServoRuns, ideal: ServoRuns) -> Array:
 
 
 def _settling(runs: ServoRuns) -> Array:
-    """Time (R,) after which the platform stays within ARRIVED_DISTANCE_SHARE of its way; NaN where
-    never.
+    """Time (R,) after which the platform stays within ARRIVED_DISTANCE_SHARE of its path,
+    or NaN.
     """
     far = runs.travel > ARRIVED_DISTANCE_SHARE * runs.travel[:, :1]
     n = far.shape[1]
@@ -356,7 +365,7 @@ def _subprogress(
 
 
 def _ways(eye: Eye, plan: Plan, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Starts and goals (R, 4, 4): those asked for, or drawn with all legs in view."""
+    """Starts and goals (R, 4, 4): those of the plan, or random ones with all legs in view."""
     n = plan.runs
     given = (plan.start, plan.goal)
     for wanted, where in zip(given, ("--start", "--goal"), strict=True):
@@ -370,7 +379,7 @@ def _ways(eye: Eye, plan: Plan, rng: np.random.Generator) -> tuple[Array, Array]
 
 
 def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
-    """Raise InputError where a machine cannot take a pose (4, 4); where : names it."""
+    """Raise InputError if a machine cannot take a pose (4, 4); where : its name in the message."""
     layout, theta = machine.layout, machine.values
     readings, internal = inverse_result(layout, theta, T_base_platform)
     unreached = np.flatnonzero(~np.isfinite(readings))
@@ -396,7 +405,7 @@ def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
 
 
 def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
-    """Poses (count, 4, 4) well inside the ranges, with all seen legs in view."""
+    """Random poses (count, 4, 4) well inside the ranges, with all seen legs in view."""
     machine, tried = eye.true.machine, 0
     results: list[Array] = [np.zeros((0, 4, 4))]
     low, high = machine.joint_ranges.T

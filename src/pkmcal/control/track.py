@@ -1,8 +1,9 @@
-"""Tracking of the legs from photograph to photograph: edges, lines with covariances, the pose.
+"""Tracking of the legs from image to image: edges, lines with covariances, the pose.
 
-A photograph is looked at about the pose that the readings give. Its edges become the legs' lines,
-which the law needs, and correct the pose for the next look. Where the machine is not seen where
-its readings put it, other assemblies are asked: once, while it stands still.
+Each image has one measurement pass about the pose from the readings. The edges give the legs'
+lines, which the law needs, and correct the predicted pose for the next image. If the legs are not
+found there, one wide search follows; other assembly modes are tried once, while the machine stands
+still.
 """
 
 from __future__ import annotations
@@ -30,27 +31,27 @@ from pkmcal.observe.legs import (
 )
 
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
-"""Angle between a leg as seen and as predicted, median over the legs, up to which it is the
-assembly that was expected: a camera placed by hand is right to a few degrees, other assemblies
-lie tens of degrees away."""
+"""Angle between a measured and a predicted leg, median over the legs, up to which the assembly mode
+is the expected one: a hand-measured camera pose is right to a few degrees, other assembly modes
+differ by tens of degrees."""
 SHADING_EDGE_SHIFT = 0.1
-"""Pixels, of those in which edges are looked for, by which a whole edge may lie off, whatever its
-own sigma: shading that the edge model leaves out (docs/observation.md measures 0.14 and 0.22 px a
-place)."""
+"""Shift of a whole edge, in pixels after binning, in addition to its own sigma: shading that the
+edge model omits (docs/observation.md measures 0.14 and 0.22 px per sample)."""
 LEG_ENDS_LATERAL_SIGMA = 0.1
-"""Metres by which a leg's ends are believed to lie beside the prediction: no knowledge at all, but
-it keeps the line of a leg with one edge finite until that leg is found to be lost."""
+"""Prior sigma, in metres, of a leg's ends across the leg: uninformative, but it keeps the line of a
+leg with a single edge finite until that leg is rejected."""
 READINGS_LAG_SIGMA = 0.001
-"""Metres by which a reading may lie beside the photograph: 50 mm/s for 20 ms between the two. Edges
-tell some motions of the platform a hundred times worse than others, and there readings decide."""
+"""Standard deviation, in metres, between a reading and the image: 50 mm/s for 20 ms between the
+two. Edges determine some motions of the platform a hundred times worse than others; readings
+determine those."""
 ONE_LEG_MISFIT = 16.0
-"""Mean squared misfit, in variances, beyond which a leg's edges are not one leg's."""
+"""Mean squared misfit, in variances, above which edges are not those of one leg."""
 LEG_EDGE_SIDES = np.array([0, 1])
 LOST_EDGE_DISTANCE = 0.7
-"""Median distance (px) of edges from their prediction from which none is believed: of legs that
-turned away more than that, the ends that still lie within reach pass for whole edges."""
+"""Median distance, in px, of edges from their prediction above which all are rejected: if legs
+turned by more than that, the ends that are still within reach would pass for whole edges."""
 SEARCH_ROUNDS = 3
-"""Gauss-Newton steps of the pose after a search: ten pixels are far enough to bend the way."""
+"""Gauss-Newton steps of the pose after a search: over ten pixels the problem is not linear."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,9 @@ class LegLines:
     """Seen legs as two edges each, of the radius that the controller uses; camera frame.
 
     normal : (L, 2, 3) unit, NaN where the leg was not found. basis : (L, 2, 3, 2) tangent bases,
-    shift first. joint : (L, 4, 4) covariance in these, rad^2, side 0 before side 1: how far away a
-    leg is turns both against each other. agrees : (L,) its edges fit one leg.
-    valid : (L,) an edge of either side was measured, and they agree.
+    shift first. joint : (L, 4, 4) covariance in these bases, rad^2, side 0 before side 1; the edges
+    are correlated, because the distance of a leg turns both against each other. agrees : (L,)
+    whether the edges fit one leg. valid : (L,) whether edges of both sides were measured and agree.
     """
 
     normal: Array
@@ -71,7 +72,7 @@ class LegLines:
 
     @classmethod
     def nothing(cls, count: int) -> LegLines:
-        """No leg found of ``count``."""
+        """Lines of ``count`` legs that were not found."""
         normal, basis, joint = (
             np.full((count, *shape), np.nan) for shape in ((2, 3), (2, 3, 2), (4, 4))
         )
@@ -81,12 +82,13 @@ class LegLines:
 
 @dataclass(frozen=True)
 class EdgeMisfits:
-    """Edges of one photograph against the pose where they were looked for; M edges of s seen legs.
+    """Misfits of an image's edges at the predicted pose; M edges of s seen legs.
 
-    leg : (M,) place of the edge's leg among the seen ones. misfit : (M, 2) turn from the predicted
-    plane to the measured one, in the edge's basis. by_a, by_b : (M, 2, 3) its derivatives by the
-    ends of the leg, camera frame. information : (M, 2, 2). side : (M,). closure : of the machine
-    at that pose. a, b : (s, 3) ends of the seen legs, camera frame.
+    leg : (M,) index of the edge's leg among the seen ones. misfit : (M, 2) rotation from the
+    predicted plane to the measured one, in the edge's basis. by_a, by_b : (M, 2, 3) derivatives of
+    the predicted plane by the leg's ends, camera frame. information : (M, 2, 2). side : (M,).
+    closure : of the machine at the predicted pose. a, b : (s, 3) ends of the seen legs, camera
+    frame.
     """
 
     leg: Integers
@@ -100,16 +102,16 @@ class EdgeMisfits:
     b: Array
 
     def of_leg(self, count: int) -> Array:
-        """(count, M): 1 where the edge is the leg's."""
+        """(count, M) incidence matrix: 1 where the edge is the leg's."""
         return (self.leg == np.arange(count)[:, None]).astype(float)
 
 
 def edge_misfits(
     view: MachineView, readings: Array, T_base_platform: Array, edges: EdgeSet, edge_shift: float
 ) -> EdgeMisfits:
-    """Edges of the seen legs against the machine at a pose (4, 4) and its readings (m,).
+    """Misfits of the seen legs' edges for the machine at a pose (4, 4) and its readings (m,).
 
-    edge_shift : px by which the camera shows all edges outward.
+    edge_shift : px by which all edges of the camera are shifted outward.
     """
     machine = view.machine
     c = closure(machine.layout, machine.values, readings, T_base_platform)
@@ -138,9 +140,11 @@ def edge_misfits(
 def leg_lines(view: MachineView, rows: EdgeMisfits) -> LegLines:
     """Lines of the seen legs from their edges.
 
-    A leg's line has four freedoms, its two ends across the leg; every edge tells two, whatever its
-    tube's radius. One Gauss-Newton step: a prediction right to 1.5 px leaves 1e-5 rad.
+    A leg's line has four degrees of freedom, its two ends across the leg; every edge measures two
+    of them, whatever its tube's radius. One Gauss-Newton step suffices: from a prediction within
+    1.5 px it leaves 1e-5 rad.
     """
+    # normal equations of each leg: edges, and the prior of its ends
     count = len(view.legs)
     pick = rows.of_leg(count)
     d = rows.b - rows.a
@@ -153,6 +157,7 @@ def leg_lines(view: MachineView, rows: EdgeMisfits) -> LegLines:
     )
     right = pick @ (to_right @ rows.misfit[..., None])[..., 0]
     shifted = (covariance @ right[..., None])[..., 0]
+    # consistency of the edges with one leg
     residual = rows.misfit - (jac @ shifted[rows.leg][..., None])[..., 0]
     square = pick @ dot(residual, (rows.information @ residual[..., None])[..., 0])
     agrees = square < ONE_LEG_MISFIT * np.maximum(2 * pick.sum(axis=1) - 4, 1)
@@ -161,7 +166,7 @@ def leg_lines(view: MachineView, rows: EdgeMisfits) -> LegLines:
         p + (across @ m[..., None])[..., 0]
         for p, m in ((rows.a, shifted[:, :2]), (rows.b, shifted[:, 2:]))
     )
-    # and as the edges that a cylinder of the controller's radius would show
+    # edges of a cylinder with the controller's radius on the estimated axis
     radius = view.radius[:, None]
     at = edge_normal_jacobians(a[:, None], b[:, None], radius, LEG_EDGE_SIDES)
     middle = (a + b)[:, None] / 2 + radius[..., None] * at.n
@@ -175,11 +180,10 @@ def leg_lines(view: MachineView, rows: EdgeMisfits) -> LegLines:
 
 
 def weighted_task(law: str, task: Task, lines: LegLines, used: Booleans) -> tuple[Task, float]:
-    """A task with its rows weighed by what the photograph tells of the legs used, (s,); and the
-    standard deviation (rad) that every row then has.
+    """Task with rows whitened by the image's covariances, and the rows' common sigma in rad.
 
-    Divided by their standard deviations and multiplied by a typical one, rows stay about what they
-    were.
+    used : (s,) legs of the task. Rows are divided by their standard deviations and multiplied by a
+    typical one, the geometric mean, so that their magnitude is kept.
     """
     normal, basis, joint = lines.normal[used], lines.basis[used], lines.joint[used]
     if law == "directions":
@@ -200,9 +204,9 @@ def weighted_task(law: str, task: Task, lines: LegLines, used: Booleans) -> tupl
 
 
 def _error_to_turn(basis: Array) -> Array:
-    """From e = v x v* to the turn (x, y) of v in its tangent basis (t, s = v x t): (..., 2, 3).
+    """Matrix (..., 2, 3) from e = v x v* to the rotation (x, y) of v in its basis (t, s = v x t).
 
-    A small turn gives e = -s x + t y, which has no part along v.
+    A small rotation gives e = -s x + t y, which has no component along v.
     """
     return np.stack([-basis[..., 1], basis[..., 0]], axis=-2)
 
@@ -222,13 +226,14 @@ def _direction_spread(normal: Array, basis: Array, joint: Array) -> tuple[Array,
 def corrected_pose(
     view: MachineView, T_base_platform: Array, rows: EdgeMisfits, valid: Booleans
 ) -> Array:
-    """The pose (4, 4) moved so that the edges of the legs found (s,) fit best: one Gauss-Newton
-    step, in the directions in which the platform moves.
+    """Pose (4, 4) after one Gauss-Newton step on the edges of the valid legs (s,).
 
-    Edges far off count less (Cauchy), so that one leg taken for another does not carry the pose.
+    The step is along the platform's motion. Edges with large misfits have small weights (Cauchy),
+    so that a leg taken for another does not pull the pose.
     """
     use = valid[rows.leg]
     if not use.any():
+        # edges: derivatives by the pose, robust weights
         return T_base_platform
     motion, c, rot = view.machine.layout.motion, rows.closure, view.T_camera_base[:3, :3]
     leg, misfit, information = view.legs[rows.leg[use]], rows.misfit[use], rows.information[use]
@@ -236,6 +241,7 @@ def corrected_pose(
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
     weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
     to_right = jac.mT @ information * weight[:, None, None]
+    # readings: the closure equations with READINGS_LAG_SIGMA
     closing = c.rows.by_pose @ motion / READINGS_LAG_SIGMA
     normal = np.sum(to_right @ jac, axis=0) + closing.T @ closing
     right = (
@@ -247,10 +253,10 @@ def corrected_pose(
 
 @dataclass(frozen=True)
 class Sight:
-    """What is looked at: the machine as believed, in the camera that stands before it.
+    """Controller's model of the machine, and the camera in front of it.
 
-    edge_shift : px by which all edges lie outward of where they should, as calibrated. binning :
-    how many pixels across, and down, are one where they are looked for.
+    edge_shift : px by which all edges lie outward, as calibrated. binning : pixels that are
+    averaged in each direction before edges are measured.
     """
 
     view: MachineView
@@ -259,24 +265,24 @@ class Sight:
     binning: int = 1
 
     def photograph(self, image: Integers, readings: Array) -> Photographs:
-        """A photograph as its edges are looked for."""
+        """Binned image, as edges are measured in it."""
         station = np.zeros(1, dtype=int)
         one = Photographs(0, self.camera, station, readings[None], [image], binning=self.binning)
         return one.binned()
 
     def misfits(self, readings: Array, T_base_platform: Array, edges: EdgeSet) -> EdgeMisfits:
-        """The :func:`edge_misfits` of edges found in one."""
+        """Misfits of the edges measured in a binned image, see :func:`edge_misfits`."""
         shift = self.edge_shift / self.binning
         return edge_misfits(self.view, readings, T_base_platform, edges, shift)
 
 
 @dataclass(frozen=True)
 class TrackState:
-    """What one photograph tells the next.
+    """State of the tracker between two images.
 
-    T_base_platform : (4, 4) pose that the readings gave. correction : (6,) by which the edges lay
-    beside it (left perturbation). valid : (L,) seen legs that were found. blur : px, NaN before
-    legs were found for the first time. searched : whether they had to be searched.
+    T_base_platform : (4, 4) pose from the readings. correction : (6,) left perturbation from that
+    pose to the edges'. valid : (L,) seen legs that were found. blur : px, NaN before any leg was
+    found. searched : whether the last image needed a wide search.
     """
 
     T_base_platform: Array
@@ -288,13 +294,13 @@ class TrackState:
 
 @dataclass(frozen=True)
 class TrackedLegs:
-    """The seen legs in one photograph; L seen legs, camera frame.
+    """Seen legs in one image; L seen legs, camera frame.
 
-    lines : normals (L, 2, 3) with tangent bases and covariances, NaN where lost.
-    valid : (L,). reasons : (L,) why a leg is lost, "" where it is not.
-    T_base_platform : (4, 4) pose that the edges show, near the one that the readings give.
-    closed : False where no pose fits the readings. beside : m, the largest error of a rod's length
-    that this pose means: readings that are late, or another photograph's. state : for the next one.
+    lines : normals (L, 2, 3) with tangent bases and covariances, NaN where lost. valid : (L,).
+    reasons : (L,) why a leg is lost, "" otherwise. T_base_platform : (4, 4) pose from the edges,
+    near the pose from the readings. closed : False if no pose fits the readings. beside : m,
+    largest error of a rod's length at this pose, from late readings or those of another image.
+    state : for the next image.
     """
 
     lines: LegLines
@@ -307,14 +313,16 @@ class TrackedLegs:
 
 
 def first_track_state(view: MachineView, start: Array | None = None) -> TrackState:
-    """Before the first photograph; start : (4, 4) pose near which the machine stands."""
+    """State before the first image; start : (4, 4) pose near which the machine stands, by default
+    home.
+    """
     begin = view.machine.home() if start is None else start
     none = np.zeros(len(view.legs), dtype=bool)
     return TrackState(np.asarray(begin, dtype=float), np.zeros(6), none)
 
 
 def warm_up(blur: float) -> None:
-    """Fill the tables of edge profiles for a blur (px), so that no photograph waits for them."""
+    """Fill the tables of edge profiles for a blur (px), so that no image waits for them."""
     samples = len(profiles.profile_offsets())
     width = np.repeat(profiles.HALF_WIDTHS, samples)
     cut = np.tile(np.arange(samples), len(profiles.HALF_WIDTHS))
@@ -325,7 +333,7 @@ def warm_up(blur: float) -> None:
 
 
 def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> TrackedLegs:
-    """Edges of the seen legs in one photograph.
+    """Edges of the seen legs in one image.
 
     image : (height, width) uint8 grey levels. readings : (m,) m or rad. Raises InputError for an
     image that is not this camera's.
@@ -362,14 +370,15 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
 
 
 def _poor(valid: Booleans) -> bool:
-    """Fewer than half of the legs: the prediction is at fault and not what hides them."""
+    """Whether fewer than half of the legs were found, so that the prediction is at fault."""
     return 2 * int(valid.sum()) < len(valid)
 
 
 @dataclass(frozen=True)
 class _EdgePass:
-    """A sub-pixel look about a predicted pose (4, 4), and the legs' lines from it; far : the
-    prediction was so wrong that they are not believed.
+    """One measurement pass about a predicted pose (4, 4), and the legs' lines from it.
+
+    far : the prediction was too far off, so the lines are rejected.
     """
 
     predicted: Array
@@ -380,7 +389,7 @@ class _EdgePass:
 
     @property
     def quality(self) -> tuple[int, float]:
-        """More edges are better, then smaller distances from the prediction."""
+        """Order of passes: more edges first, then smaller distances from the prediction."""
         return (0 if self.far else len(self.rows.leg), -self.station_edges.shift)
 
 
@@ -397,7 +406,7 @@ def _edge_pass(sight: Sight, photograph: Photographs, predicted: Array, blur: fl
 
 
 def _searched(sight: Sight, photograph: Photographs, predicted: Array) -> Array:
-    """The pose (4, 4) that the wide search gives."""
+    """Pose (4, 4) from the wide search."""
     view, readings = sight.view, photograph.joints[0]
     station_edges = search(photograph, view.machine, view.T_camera_base, predicted[None])
     every = np.ones(len(view.legs), dtype=bool)
@@ -420,7 +429,7 @@ def _reasons(sight: Sight, at: _EdgePass) -> tuple[str, ...]:
 
 
 def check_image(image: Integers, camera: Camera) -> None:
-    """Raise InputError where an image is not one grey-level photograph of this camera."""
+    """Raise InputError for an image that is not one grey-level image of this camera."""
     if image.dtype != np.uint8 or image.ndim != 2:
         raise InputError(
             what="the photograph is not an array of grey levels",
@@ -439,7 +448,7 @@ def check_image(image: Integers, camera: Camera) -> None:
 
 
 def misfit(view: MachineView, normals: Array, T_base_platform: Array, readings: Array) -> float:
-    """Median angle (rad) between the legs as seen, (s, 2, 3), and at a pose (4, 4)."""
+    """Median angle, in rad, between the measured legs (s, 2, 3) and the legs at a pose (4, 4)."""
     a, b = leg_ends_in_view(view, T_base_platform, readings)
     finite = np.isfinite(normals).all(axis=(-1, -2))
     cosine = dot(directions_of(normals[finite]), line_through(a[finite], b[finite])[0])
@@ -449,8 +458,9 @@ def misfit(view: MachineView, normals: Array, T_base_platform: Array, readings: 
 def nearest_assembly(
     view: MachineView, normals: Array, readings: Array
 ) -> tuple[Array, float] | None:
-    """Of all assemblies at the readings the one that the legs (s, 2, 3) show best, and its misfit;
-    None where there is none. A search: takes a fraction of a second.
+    """Pose of the assembly mode at the readings that fits the legs (s, 2, 3) best, with its misfit.
+
+    None without any assembly mode. The search takes a fraction of a second.
     """
     modes = view.machine.assembly_modes(readings, np.random.default_rng(0))
     if not len(modes):
@@ -461,7 +471,7 @@ def nearest_assembly(
 
 
 def assembly_sentence(view: MachineView, normals: Array, expected: Array, readings: Array) -> str:
-    """What the legs show instead of the expected pose (4, 4)."""
+    """Sentence that compares the measured legs with the expected pose (4, 4)."""
     off = np.rad2deg(misfit(view, normals, expected, readings))
     text = f"the legs point {off:.0f} degrees away from where the start and the readings put them"
     value = nearest_assembly(view, normals, readings)

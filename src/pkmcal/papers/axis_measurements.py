@@ -1,11 +1,12 @@
-"""An axis measured as direction and point, [A] Table 1, as two edges with their joint noise.
+"""Axis measured as direction and point, [A] Table 1, as two edges with their joint noise.
 
-There is one measurement type for legs, the edge. An axis with its 4x4 covariance is the pair
-of edges that a cylinder of the leg's radius around it would show: four numbers (two normals,
-two tangent components each) that depend smoothly and invertibly on the axis's four. Whitening
-the pair's four residuals together by ``chol(C)^-1 J^-1``, J the derivative of the four tangent
-components by the axis's coordinates, makes it the same estimator as a residual on the axis up
-to the second order of the noise (1e-3 rad here). The radius drops out; keep it fixed.
+Legs have one kind of measurement, the edge. An axis with its 4x4 covariance is equivalent to the
+pair of edges of a cylinder of the leg's radius around it: four numbers (two normals with two
+tangent components each) that are a smooth, invertible function of the axis's four coordinates.
+Whitening the pair's four residuals together by ``chol(C)^-1 J^-1``, with J the derivative of the
+four tangent components by the axis's coordinates, gives the same estimator as a residual on the
+axis up to the second order of the noise (1e-3 rad here). The radius has no influence and must be
+fixed.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from pkmcal.geometry.rigid import dot
 
 @dataclass(frozen=True)
 class AxisNoise:
-    """Standard deviations of one measured axis: [A] Table 1, in degrees and millimetres.
+    """Standard deviations of one measured axis, with the values of [A] Table 1 as defaults.
 
-    psi : direction in the image plane. theta : towards the viewer. x, z : the axis's point with
-    y = 0, camera frame. Defaults are the paper's, rad and m; ``images`` are averaged.
+    psi : direction in the image plane, rad. theta : direction towards the viewer, rad. x, z : the
+    axis's point with y = 0, camera frame, m. images : number of images that are averaged.
     """
 
     psi: float = float(np.radians(0.05))
@@ -34,15 +35,15 @@ class AxisNoise:
     images: int = 3
 
     def sigma(self) -> Array:
-        """The four, after averaging the images."""
+        """Standard deviations (4,) of the mean over the images."""
         return np.array([self.psi, self.theta, self.x, self.z]) / np.sqrt(self.images)
 
 
 def to_coordinates(a: Array, b: Array) -> Array:
     """Axis coordinates (psi, theta, x, z) (..., 4) of the line from a to b, camera frame.
 
-    u = (cos theta sin psi, -cos theta cos psi, sin theta): psi = 0 is up in the image, and a
-    leg may not lie level in it ([A]'s point with y = 0 does not exist then; errata).
+    u = (cos theta sin psi, -cos theta cos psi, sin theta): psi = 0 is up in the image. A leg must
+    not be level in the image, because [A]'s point with y = 0 does not exist then (errata).
     """
     d = b - a
     u = d / np.sqrt(dot(d, d))[..., None]
@@ -52,7 +53,7 @@ def to_coordinates(a: Array, b: Array) -> Array:
 
 
 def from_coordinates(axis: Array) -> tuple[Array, Array, Array, Array]:
-    """Direction u, point M (..., 3) and their derivatives (..., 3, 4) by the coordinates."""
+    """Direction u and point M (..., 3) of axis coordinates, and their derivatives (..., 3, 4)."""
     psi, theta = axis[..., 0], axis[..., 1]
     cp, sp, ct, st = np.cos(psi), np.sin(psi), np.cos(theta), np.sin(theta)
     u = np.stack([ct * sp, -ct * cp, st], axis=-1)
@@ -66,10 +67,10 @@ def from_coordinates(axis: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def as_edges(axis: Array, sigma: Array, radius: Array) -> tuple[Array, Array]:
-    """The pair of edges of measured axes (..., 4) with standard deviations sigma (4,).
+    """Pair of edges of measured axes (..., 4) with standard deviations sigma (4,).
 
-    Returns bases (..., 2, 3, 2) at the measured normals of sides 0 and 1, and the pair's
-    whitening matrices (..., 4, 4), as measurements.edges.EdgeData wants them.
+    Returns bases (..., 2, 3, 2) at the measured normals of sides 0 and 1, and the pair's whitening
+    matrices (..., 4, 4), as in measurements.edges.EdgeData.
     """
     u, point, du, dpoint = from_coordinates(axis)
     side = np.broadcast_to([0, 1], (*u.shape[:-1], 2))
@@ -78,7 +79,7 @@ def as_edges(axis: Array, sigma: Array, radius: Array) -> tuple[Array, Array]:
         point[..., None, :], other[..., None, :], np.asarray(radius)[..., None], side
     )
     basis = tangent_basis(e.n, np.broadcast_to(point[..., None, :], e.n.shape))
-    # a normal moves by by_a (n . da) + by_b (n . db)
+    # derivative of a normal: by_a (n . da) + by_b (n . db)
     by_a, by_b = ((by[..., None, :] @ basis).mT for by in (e.by_a, e.by_b))
     along_a, along_b = (e.n @ end for end in (dpoint, dpoint + 0.3 * du))
     jac = by_a * along_a[..., None, :] + by_b * along_b[..., None, :]

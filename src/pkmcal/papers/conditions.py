@@ -1,8 +1,8 @@
-"""[A]'s identifiability conditions: equations counted against unknowns, 10-12, 15 and 17.
+"""Identifiability conditions of [A] 10-12, 15 and 17: number of equations against unknowns.
 
-They are necessary at most: products and distances of coplanar joints are counted twice (12
-equations of rank 11 occur, and failing counts at full rank; errata). The test is the rank of
-the Jacobian; these numbers are for comparison with the paper and for a first look.
+The conditions are necessary at most, because products and distances of coplanar joints are counted
+twice (12 equations of rank 11 occur, and failing counts at full rank; errata). The rank of the
+Jacobian is the actual test; these counts are for comparison with the paper.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pkmcal.wording import named
 
 
 def conditions(machine: Machine, visible: Booleans) -> tuple[Condition, ...]:
-    """All conditions for a machine and the legs that each station sees at once, (S, L).
+    """All conditions for a machine and the legs that each station sees in one image, (S, L).
 
     Necessary at most, see the module.
     """
@@ -31,7 +31,7 @@ def conditions(machine: Machine, visible: Booleans) -> tuple[Condition, ...]:
 
 
 def every_leg(visible: Booleans) -> Condition:
-    """[A] 3.3, first condition: each leg is seen by one station at least."""
+    """[A] 3.3, first condition: at least one station sees each leg."""
     lost = np.flatnonzero(~visible.any(axis=0))
     text = "every leg is seen by a station"
     if lost.size:
@@ -42,10 +42,10 @@ def every_leg(visible: Booleans) -> Condition:
 def base(machine: Machine, visible: Booleans) -> Condition:
     """[A] 12 with 11 (spatial) or 10 (planar): products of the base joints' vectors.
 
-    Unknowns: 3 + 3(n - 3) + 2r of n centres and r revolute axes. Planar, as printed
-    2 + 2(n - 2); corrected 1 + 2(n - 2), as in 17: two centres leave one distance.
-    Equations: sum over stations of C(n, 2) + C(r, 2) + r(n - 1). A planar machine's axes are
-    all its normal; their products say nothing of the plane's points and are not counted.
+    Unknowns: 3 + 3(n - 3) + 2r of n centres and r revolute axes. Planar, as printed 2 + 2(n - 2);
+    corrected 1 + 2(n - 2), as in 17: two centres have one distance. Equations: sum over stations of
+    C(n, 2) + C(r, 2) + r(n - 1). The axes of a planar machine are all its normal; their products do
+    not depend on the points in the plane and are not counted.
     """
     n, legs = visible.shape[1], legs_as_drawn(machine)
     count = visible.sum(axis=1)
@@ -69,10 +69,10 @@ def offsets_condition(machine: Machine, visible: Booleans) -> Condition:
 
 
 def platform(machine: Machine, visible: Booleans) -> Condition:
-    """[A] 17: the same distances against the platform's centres.
+    """[A] 17: distances between platform joints against the platform's centres.
 
-    E = 3 + 3(n - 3) spatial, 1 + 2(n - 2) planar; n counts legs with a length, as the centre
-    of a passive leg comes from 19.
+    E = 3 + 3(n - 3) spatial, 1 + 2(n - 2) planar; n is the number of legs with a length, because
+    the centre of a passive leg follows from 19.
     """
     closing = machine.layout.closing
     n = int(closing.sum())
@@ -83,9 +83,9 @@ def platform(machine: Machine, visible: Booleans) -> Condition:
 
 
 def at_once(machine: Machine, visible: Booleans) -> tuple[Condition, ...]:
-    """[A] 3.5: three legs with a length at once with each passive leg and platform axis.
+    """[A] 3.5: three legs with a length in one image with each passive leg and platform axis.
 
-    Legs with a revolute joint count among the three themselves, passive ones do not.
+    Legs with a revolute joint count among the three themselves, passive legs do not.
     """
     legs = legs_as_drawn(machine)
     count = (visible & legs.closing).sum(axis=1)
@@ -104,5 +104,5 @@ def _condition(equation: str, needed: int, available: int, text: str) -> Conditi
 
 
 def _pairs(n: Integers) -> Integers:
-    """C(n, 2)."""
+    """Number of pairs, C(n, 2)."""
     return n * (n - 1) // 2

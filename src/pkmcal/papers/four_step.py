@@ -7,12 +7,12 @@
 4. platform joints: centres (16), revolute axes (18, 7), passive legs (19), universal axes by
    the inverse kinematics — ``four_step_platform``.
 
-``corrected`` follows errata: stations and photographs are joined by rigid registration,
-offsets minimise the deviations from each pair's mean distance, and what several stations see
-in one configuration counts as seen at once. ``printed`` uses products of distances,
-consecutive differences and averaged distances as the paper has them.
+``corrected`` follows the errata: stations and images are joined by rigid registration, offsets
+minimize the deviations from each pair's mean distance, and legs that several stations see in one
+configuration count as seen together. ``printed`` uses products of distances, consecutive
+differences and averaged distances as in the paper.
 
-Arrays: B runs, S stations, C photographs (one station, one configuration), L legs.
+Arrays: B runs, S stations, C images (one station, one configuration), L legs.
 """
 
 from __future__ import annotations
@@ -67,18 +67,18 @@ from pkmcal.papers.registration import RegisteredBody, extent, fixes_pose, poses
 
 FourStepForm = Literal["corrected", "printed"]
 VAGUE_CENTRE_SHARE = 0.1
-"""Standard deviation of a base centre, of the base's size, beyond which it does not count."""
+"""Standard deviation of a base centre, relative to the base's size, above which it is rejected."""
 
 
 @dataclass(frozen=True)
 class FourSteps:
-    """The steps' results; a spatial machine's frames are those of three centres.
+    """Results of the steps; the frames of a spatial machine are those of three centres.
 
-    base, platform (B, L, 3) m, the latter NaN for passive legs that could not be found. offsets
-    (B, L) m, zero for passive legs. T_camera_base (B, S, 4, 4). base_axes, platform_axes
-    (B, L, 3) unit, NaN where the machine has none; as drawn where nothing could be found.
-    T_base_platform (B, K, 4, 4) of the configurations ``configuration`` (K,) where ``posed``
-    (K,): enough legs with a length were seen at once.
+    base, platform : (B, L, 3) m, the latter NaN for passive legs that are unidentifiable.
+    offsets : (B, L) m, zero for passive legs. T_camera_base : (B, S, 4, 4). base_axes,
+    platform_axes : (B, L, 3) unit, NaN where the machine has none; nominal where unidentifiable.
+    T_base_platform : (B, K, 4, 4) of the configurations ``configuration`` (K,). posed : (K,)
+    whether enough legs with a length were seen together for that pose.
     """
 
     base: Array
@@ -98,9 +98,9 @@ class FourSteps:
 def base_items(
     machine: Machine, axes: Axes, a_camera: Array, valid: Booleans, views: StationViews
 ) -> Items:
-    """What the views saw of the base: centres, and revolute axes ([A] 7) with their signs.
+    """Items of the base in each view: centres, and revolute axes ([A] 7) with their signs.
 
-    a_camera : (B, S, L, 3) centres in the camera frames, found (S, L).
+    a_camera : (B, S, L, 3) centres in the camera frames. valid : (S, L).
     """
     legs, n = legs_as_drawn(machine), len(valid)
     centres, visible = gathered_points(a_camera, valid, views)
@@ -124,11 +124,12 @@ def solve_from_centres(
     form: FourStepForm,
     views: StationViews | None = None,
 ) -> FourSteps:
-    """Steps 2 to 4 from the base centres in the camera frames, all runs at once.
+    """Steps 2 to 4 from the base centres in the camera frames, all runs together.
 
-    a_camera : (B, S, L, 3) with (S, L) whether found; the drawing's values start the search.
-    views : stations joined beforehand, each on its own when absent.
+    a_camera : (B, S, L, 3) centres, valid (S, L); the nominal values start the search. views :
+    stations that are joined already; by default each station is a view of its own.
     """
+    # step 2: base joints in one frame
     legs = legs_as_drawn(machine)
     views = stations_apart(len(valid)) if views is None else views
     items = base_items(machine, axes, a_camera, valid, views)
@@ -137,29 +138,31 @@ def solve_from_centres(
     T_camera_base = views.T_camera_view @ base.T_view_base[:, views.of_station]
     usable = items.fixed()[views.of_station][axes.station]
     axes = replace(axes, visible=axes.visible & usable[:, None])
+    # steps 3 and 4: offsets and platform centres
     merged = in_base(axes, T_camera_base)
     if form == "corrected":
         q0, platform = _ends(machine, legs, merged, base.centres)
     else:
         a_photo = np.where(valid[..., None], a_camera, 0.0)[:, axes.station]
         q0, platform = _ends_printed(machine, legs, axes, a_photo)
-    if legs.planar:  # a leg lies level, so both its ends have one height
+    if legs.planar:  # a leg is level, so both its ends have one height
         rise = legs.platform[:, 2] - legs.base[:, 2]
         platform[..., 2] = base.centres[..., 2] + rise
 
-    # each configuration's pose ([A] 18), by the legs with a length
+    # pose of each configuration ([A] 18), by the legs with a length
     visible = merged.visible & legs.closing
     b = base.centres[:, None] + (merged.readings + q0[:, None])[..., None] * merged.u
     posed = fixes_pose(legs.platform, visible, motion=legs.motion)
     weight = np.broadcast_to(visible, b.shape[:-1]).astype(float)
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
-        # distances leave a translating platform turned against the base frame
+        # distances do not determine the rotation of a translating platform against the base frame
         laid = poses_laying_items(platform[:, None], b[:, posed], weight[:, posed])
         rot = laid[..., :3, :3].mean(axis=1)
         platform = platform @ nearest_rotation(rot).mT
     T = poses_laying_items(platform[:, None], b, weight, motion=legs.motion)
-    if legs.planar:  # the platform frame keeps the height that the drawing gives it
+    if legs.planar:  # the platform frame keeps its nominal height
         T[..., 2, 3] = np.mean(legs.base[:, 2] - legs.platform[:, 2])
+    # passive legs ([A] 19) and joint axes
     if not legs.closing.all():
         rows = merged.visible & posed[:, None]
         passive, reference_values = passive_centres(merged.u, base.centres, rows, T)
@@ -188,12 +191,14 @@ def _ends(machine: Machine, legs: DrawnLegs, merged: Axes, base: Array) -> tuple
 def _ends_printed(
     machine: Machine, legs: DrawnLegs, axes: Axes, a_photo: Array
 ) -> tuple[Array, Array]:
-    """The same as printed: each photograph in its camera frame, a_photo (B, C, L, 3)."""
+    """Offsets and platform centres as printed: in each image's camera frame; a_photo (B,
+    C, L, 3).
+    """
     with_length = replace(axes, visible=axes.visible & legs.closing)
     q0 = joint_distance_offsets(with_length, a_photo, legs.rod, "printed")
     b = a_photo + (axes.readings + q0[:, None])[..., None] * axes.u
     gauge = platform_gauge(machine, replace(legs, motion=np.eye(6)))
-    if legs.planar:  # distances say nothing of the heights, which are the base's
+    if legs.planar:  # distances do not depend on the heights, which are the base's
         heights = np.eye(legs.platform.size)[2::3]
         gauge = np.concatenate([platform_gauge(machine, legs), heights])
     return q0, platform_by_distances(b, with_length.visible, axes.station, legs.platform, gauge)
@@ -210,14 +215,14 @@ def _axes(
 ) -> tuple[Array, Array]:
     """Axes on base and platform (B, L, 3): revolute by [A] 7, universal by the torsion.
 
-    body : the platform's centres and its poses, known where ``posed`` (K,).
+    body : platform centres and its poses, valid where ``posed`` (K,).
     """
     u, visible = merged.u, merged.visible & posed[:, None]
     v = _as_drawn(machine, legs.base_axes, legs.base, base.centres)
     w = _as_drawn(machine, legs.platform_axes, legs.platform, body.points)
     if legs.base_revolute.any():
         v[:, legs.base_revolute] = base.directions
-        if form == "corrected":  # all stations together know a leg's directions better than one
+        if form == "corrected":  # more accurate than one station
             valid, reference_values = revolute_axes(
                 u, merged.visible, merged.station, 1, merged.information
             )
@@ -234,15 +239,16 @@ def _axes(
 
 
 def _where(legs: Booleans, values: Array, axes: Array) -> Array:
-    """Axes (B, L, 3) replaced by the found ones of some legs, on the same side."""
+    """Axes (B, L, 3) with some legs' axes replaced by their estimates, on the same side."""
     side = np.where(dot(values, axes) < 0, -1.0, 1.0)[..., None]
     return np.where(legs[:, None], side * values, axes)
 
 
 def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Array:
-    """The drawing's axes (L, 3) as the found centres (B, L, 3) say that it lies, (B, L, 3).
+    """Nominal axes (L, 3) in the frame of the estimated centres (B, L, 3), (B, L, 3).
 
-    Its frame is laid on all centres: three of them alone would turn it by their own errors.
+    The nominal model is fitted to all centres: a frame of three centres would add their errors to
+    the rotation.
     """
     out = np.tile(axes, (len(centres), 1, 1))
     if np.isnan(axes).all() or isinstance(default_gauge(machine), BestFit):
@@ -253,7 +259,7 @@ def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Ar
 
 
 def parameters_of(machine: Machine, steps: FourSteps) -> Array:
-    """The machine's parameters (B, P) with what the steps found."""
+    """Parameters (B, P) of the machine with the results of the steps."""
     layout, theta = machine.layout, np.tile(machine.values, (len(steps.base), 1))
     base_index, platform_index = centre_index(layout)
     theta[:, base_index], theta[:, platform_index] = steps.base, steps.platform
@@ -279,13 +285,14 @@ def four_step(
     T_camera_base_guess: Array | None = None,
     rng: np.random.Generator | None = None,
 ) -> State:
-    """[A]'s four steps on a session: a state that can be used as it is or start the bundle.
+    """[A]'s four steps on a session; the state is an estimate or a start of the bundle.
 
-    corrected takes the edges themselves for the base centres and survives wrong edges.
-    T_camera_base_guess : (S, 4, 4) for stations that see too few legs well enough, and for all
-    where they share too few; without it, and without a board on the base, they are an error.
-    Poses come from the readings by forward kinematics. Frames are those of three centres.
-    Raises ResultError where the data do not allow a step, with [A]'s condition in words.
+    The corrected form estimates the base centres from the edges themselves and is robust against
+    wrong edges. T_camera_base_guess : (S, 4, 4) for stations that see too few legs well enough, and
+    for all stations if they share too few; without a guess, and without a board on the base, such
+    stations are an error. Poses follow from the readings by forward kinematics. Frames are those of
+    three centres. Raises ResultError where the data do not allow a step, with [A]'s condition in
+    words.
     """
     edges = measurements.edges
     checks.can_be_tried(machine, len(edges))
@@ -311,12 +318,14 @@ def four_step(
     poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
     state = with_boards(measurements, theta, stations, poses)
     if legs_as_drawn(machine).framed:
-        return state  # in the machine's own frames already
+        return state  # already in the machine's own frames
     return in_gauge(machine, state, default_gauge(machine))
 
 
 def _determined_mask(value: linear.LinearCentres, machine: Machine) -> Booleans:
-    """Base centres (S, L) that their edges fix, to a part of the base's own size at least."""
+    """(S, L) base centres whose standard deviation is below VAGUE_CENTRE_SHARE of the
+    base's size.
+    """
     size = extent(machine.base_centers())
     finite = np.all(np.isfinite(value.centres), axis=-1)
     covariance = np.where(finite[..., None, None], value.covariance, np.eye(3))
@@ -331,7 +340,7 @@ def _views(
     valid: Booleans,
     guess: Array | None,
 ) -> StationViews:
-    """How the stations are joined: by boards on the base, by the legs they share, or as given."""
+    """Views of the stations: joined by boards on the base, by shared legs, or by the guess."""
     on_base = ~measurements.on_platform
     views = joined_by_boards(measurements.poses, on_base, len(valid))
     items = base_items(machine, axes, a_camera, valid, views)
@@ -344,9 +353,9 @@ def _views(
 
 
 def _poses(machine: Machine, measurements: Measurements, steps: FourSteps, home: Array) -> Array:
-    """Platform poses (K, 4, 4) by forward kinematics: from home, else from the pose seen.
+    """Platform poses (K, 4, 4) by forward kinematics from home, else from the pose of step 4.
 
-    home : (4, 4) of the drawing; what the steps found need not assemble at mid-range.
+    home : (4, 4) of the nominal model; the estimated machine need not assemble at mid-range.
     """
     fk = machine.forward_result(measurements.joints, home)
     poses = fk.T_base_platform

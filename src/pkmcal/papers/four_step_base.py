@@ -1,12 +1,12 @@
 """[A] 3.3, step 2 of four: the base's joints from the stations' frames into one frame.
 
-Items of the base are its L joint centres and then D directions: the revolute joints' axes, or
-the one normal of a planar machine. A station sees directions with either sign; one sign over
-all stations is chosen first (errata, A 9), by the drawing.
+Items of the base are its L joint centres and then D directions: the revolute joints' axes, or the
+normal of a planar machine. A station sees directions with either sign; a common sign for all
+stations is chosen first, by the nominal model (errata, A 9).
 
-What one frame sees is a *view*: a station's, or that of all stations that a calibration board on
-the base joins (3.3, last paragraph). The same photographs show legs and board; where stations
-share too few legs, the board says how they stand to each other.
+A *view* is a frame in which items are gathered: a station's camera frame, or one frame for all
+stations that a calibration board on the base joins (3.3, last paragraph). The same images show legs
+and board; where stations share too few legs, the board determines their relative poses.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from pkmcal.papers.registration import (
 
 
 class StationViews(NamedTuple):
-    """Frames in which joints are gathered: one a station, or one for all that a board joins.
+    """Frames in which joints are gathered: one for each station, or one for all that a board joins.
 
     of_station : (S,) view of each station. T_camera_view : (S, 4, 4).
     """
@@ -53,19 +53,19 @@ class StationViews(NamedTuple):
 
 
 def stations_apart(n_stations: int) -> StationViews:
-    """Every station a view of its own."""
+    """Views with every station on its own."""
     return StationViews(np.arange(n_stations), np.tile(np.eye(4), (n_stations, 1, 1)))
 
 
 def stations_together(T_camera_base: Array) -> StationViews:
-    """All stations in one view, their poses (S, 4, 4) given: the view is that base frame."""
+    """One view for all stations with given poses (S, 4, 4); the view is that base frame."""
     return StationViews(np.zeros(len(T_camera_base), dtype=int), np.asarray(T_camera_base))
 
 
 def mean_pose(T: Array, whiten: Array, group: Integers, n_groups: int) -> Array:
-    """Poses (G, 4, 4) nearest to measured ones (N, 4, 4), by their covariances.
+    """Mean poses (G, 4, 4) of measured poses (N, 4, 4), weighted by their covariances.
 
-    Least squares of whiten @ (left perturbation), Gauss-Newton; every group has a member.
+    Least squares of whiten @ (left perturbation), by Gauss-Newton; every group must have a member.
     """
     first = np.searchsorted(np.sort(group), np.arange(n_groups))
     mean = T[np.argsort(group, kind="stable")[first]]
@@ -80,9 +80,9 @@ def mean_pose(T: Array, whiten: Array, group: Integers, n_groups: int) -> Array:
 
 
 def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> StationViews:
-    """Views of the stations that boards on the base join; the others stay apart.
+    """Views of the stations that boards on the base join; other stations stay on their own.
 
-    on_base : (M,) mounts that are fixed to the base; poses on others are left out. A station
+    on_base : (M,) mounts that are fixed to the base; poses of other mounts are ignored. A station
     that sees two boards joins the stations of both.
     """
     used = poses.select(on_base[poses.mount])
@@ -98,7 +98,7 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Stat
         if of_station[first] >= 0:
             continue
         of_station[first] = view = of_station.max() + 1
-        for _ in range(n_stations):  # from the first station to its boards, to their stations
+        for _ in range(n_stations):  # breadth first: stations to boards to stations
             for s, m, T in in_view:
                 if of_station[s] == view and of_mount[m] < 0:
                     of_mount[m] = view
@@ -110,18 +110,18 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Stat
 
 
 def gathered_points(points: Array, valid: Booleans, views: StationViews) -> tuple[Array, Booleans]:
-    """Points of the stations (B, S, L, 3), found (S, L), as the views have them (B, V, L, 3).
+    """Points of the stations (B, S, L, 3), valid (S, L), in the views' frames (B, V, L, 3).
 
-    The mean, where several stations of a view know a point.
+    The mean where several stations of a view have a point.
     """
     back = apply(inverse(views.T_camera_view)[:, None], points)
     return _mean(np.where(valid[..., None], back, 0.0), valid, views)
 
 
 def gathered_directions(v: Array, valid: Booleans, views: StationViews) -> tuple[Array, Booleans]:
-    """Directions of either sign, (B, S, D, 3), as the views have them: unit (B, V, D, 3).
+    """Directions of either sign (B, S, D, 3) in the views' frames, unit (B, V, D, 3).
 
-    One sign in each view: that of the first station that knows the direction.
+    The sign in each view is that of the first station with the direction.
     """
     rot = views.T_camera_view[:, None, :3, :3].mT
     back = np.where(valid[..., None], (rot @ v[..., None])[..., 0], 0.0)
@@ -145,10 +145,10 @@ def _mean(values: Array, valid: Booleans, views: StationViews) -> tuple[Array, B
 def with_boards(
     measurements: Measurements, theta: Array, T_camera_base: Array, T_base_platform: Array
 ) -> State:
-    """A session's state by one of these methods, its boards where their poses say.
+    """Session state from an estimate of one of these methods, with the boards' mean poses.
 
-    Where a board sits on the base or the platform is the mean over its photographs, by their
-    covariances; one that none shows is at the body's origin.
+    The pose of a board on the base or the platform is the mean over its images, weighted by their
+    covariances; a board without an image is at the body's origin.
     """
     poses = measurements.poses
     mounts = np.tile(np.eye(4), (len(measurements.mounts), 1, 1))
@@ -156,7 +156,7 @@ def with_boards(
         moving = measurements.on_platform[poses.mount, None, None]
         body = np.where(moving, T_base_platform[poses.configuration], np.eye(4))
         T_camera_body = T_camera_base[poses.station] @ body
-        # the left perturbation of T_camera_board is that of T_body_board, turned
+        # the left perturbation of T_camera_board is that of T_body_board, rotated
         turn = np.zeros((len(poses), 6, 6))
         turn[:, :3, :3] = turn[:, 3:, 3:] = T_camera_body[:, :3, :3]
         names, group = np.unique(poses.mount, return_inverse=True)
@@ -173,9 +173,9 @@ def with_boards(
 
 
 class Base(NamedTuple):
-    """The base's joints in its own frame, and the poses of the views on it.
+    """Joints of the base in its own frame, and the poses of the views.
 
-    centres (B, L, 3) m. directions (B, D, 3) unit. T_view_base (B, V, 4, 4).
+    centres : (B, L, 3) m. directions : (B, D, 3) unit. T_view_base : (B, V, 4, 4).
     """
 
     centres: Array
@@ -184,8 +184,10 @@ class Base(NamedTuple):
 
 
 class Items(NamedTuple):
-    """What each of V views saw: centres (B, V, L, 3) m, seen (V, L), directions (B, V, D, 3)
-    unit and seen (V, D); as drawn on the base: (L, 3) and (D, 3).
+    """Items of the base in V views, and their nominal values.
+
+    centres : (B, V, L, 3) m, visible (V, L). directions : (B, V, D, 3) unit, visible (V, D). drawn,
+    drawn_directions : (L, 3) and (D, 3) of the nominal model.
     """
 
     centres: Array
@@ -197,7 +199,7 @@ class Items(NamedTuple):
 
     @property
     def lever(self) -> float:
-        """Length (m) by which a direction weighs as a centre does: the base's own size."""
+        """Length (m) by which a direction has the weight of a centre: the base's own size."""
         return extent(self.drawn)
 
     @property
@@ -207,35 +209,35 @@ class Items(NamedTuple):
 
     @property
     def visible(self) -> Booleans:
-        """Which were seen, (V, L + D)."""
+        """Visible items, (V, L + D)."""
         return np.concatenate([self.centres_visible, self.directions_visible], axis=1)
 
     @property
     def drawing(self) -> Array:
-        """All items as drawn, (L + D, 3) m."""
+        """All items of the nominal model, (L + D, 3) m."""
         return np.concatenate([self.drawn, self.lever * self.drawn_directions])
 
     @property
     def n_directions(self) -> int:
-        """D."""
+        """Number of directions, D."""
         return len(self.drawn_directions)
 
     def fixed(self) -> Booleans:
-        """Views (V,) whose own items fix their pose."""
+        """Views (V,) whose own items determine their pose."""
         return fixes_pose(self.drawing, self.visible, self.n_directions)
 
     def placed(self, items: Array) -> Array:
-        """Poses (B, V, 4, 4) of the views on items (B, L + D, 3)."""
+        """Poses (B, V, 4, 4) of the views that fit items (B, L + D, 3)."""
         weight = np.broadcast_to(self.visible, self.measured.shape[:-1]).astype(float)
         return poses_laying_items(items[:, None], self.measured, weight, self.n_directions)
 
 
 def base_by_registration(items: Items, gauge: Array) -> Base:
-    """Step 2 corrected, [A] 9: the views laid over each other, centres and axes together.
+    """Step 2 corrected, [A] 9: registration of the views, centres and axes together.
 
-    min sum |R_v A_j + t_v - A_j^(v)|^2 + lever^2 |R_v n_i - n_i^(v)|^2 over A, n and the
-    views' poses. gauge : (6, 3 (L + D)) rows that hold the base frame. Views that fix no pose
-    are left out.
+    min sum |R_v A_j + t_v - A_j^(v)|^2 + lever^2 |R_v n_i - n_i^(v)|^2 over A, n and the views'
+    poses. gauge : (6, 3 (L + D)) rows that fix the base frame. Views without a determined pose are
+    ignored.
     """
     use = items.fixed()
     measured, weight = items.measured, items.visible.astype(float)
@@ -249,8 +251,8 @@ def base_by_products(items: Items, gauge: Array) -> Base:
     """Step 2 as printed, [A] 8-9: scalar products of V, vectors between centres and axes.
 
     C_1 = sum (V_p . V_q |view - V_p . V_q |base)^2, p <= q: squares belong in the sum, as the
-    paper's count of C(n, 2) products has it. The vectors of a view run from its first seen
-    centre to its others; axes are scaled by a length, on which the paper is silent.
+    paper's count of C(n, 2) products shows. The vectors of a view run from its first visible centre
+    to its others; axes are scaled by a length, which the paper does not specify.
     """
     n = len(items.drawing)
     to_p, to_q, view = [np.zeros((0, n))], [np.zeros((0, n))], [np.zeros(0, dtype=int)]
@@ -276,7 +278,7 @@ def base_by_products(items: Items, gauge: Array) -> Base:
 
 
 def _base(items: Items, points: Array) -> Base:
-    """Centres and unit directions from the fitted items, and where the views stand."""
+    """Centres and unit directions from the fitted items, and the poses of the views."""
     n = len(items.drawn)
     directions = points[:, n:]
     size = np.sqrt(dot(directions, directions))[..., None]
@@ -285,17 +287,19 @@ def _base(items: Items, points: Array) -> Base:
 
 
 def with_signs(items: Items, rough: Array) -> Items:
-    """Directions turned to the drawing's side; rough (B, V, 3, 3) rotates base to view."""
+    """Items with directions on the nominal model's side; rough : (B, V, 3, 3) rotations base to
+    view.
+    """
     drawn = (rough[:, :, None] @ items.drawn_directions[:, :, None])[..., 0]
     sign = np.where(dot(drawn, items.directions) < 0, -1.0, 1.0)
     return items._replace(directions=items.directions * sign[..., None])
 
 
 def rough_rotations(machine: Machine, axes: Axes, items: Items, views: StationViews) -> Array:
-    """Rotations (B, V, 3, 3) from base to view, good to the drawing's own errors.
+    """Rotations (B, V, 3, 3) from base to view, as accurate as the nominal model.
 
-    By the centres where three of them span a plane; else by the legs' directions that the
-    drawing predicts at the readings, which one leg is enough for.
+    From the centres where three of them span a plane; else from the legs' directions that the
+    nominal model predicts at the readings, for which one leg is enough.
     """
     alone = items._replace(
         directions=items.directions[:, :, :0],
@@ -310,7 +314,7 @@ def rough_rotations(machine: Machine, axes: Axes, items: Items, views: StationVi
 
 
 def _by_directions(machine: Machine, axes: Axes, views: StationViews) -> Array:
-    """Rotations (B, V, 3, 3) that lay the drawn directions of the legs on the seen ones."""
+    """Rotations (B, V, 3, 3) that fit the nominal directions of the legs to the measured ones."""
     joints = axes.readings[..., machine.layout.actuated >= 0]
     drawn = machine.with_values(machine.parameters.drawing)
     poses = drawn.forward_result(joints, drawn.home()).T_base_platform

@@ -1,7 +1,7 @@
-"""Where the data do not allow one of [A]'s four steps: said in words, before or after it.
+"""Checks of [A]'s four steps, before or after a step, with messages for people.
 
-The papers count equations (``conditions``); these are the tests themselves, the rank of each
-step's Jacobian at the drawing.
+The papers count equations (``conditions``); these are the tests themselves, the rank of each step's
+Jacobian at the nominal model.
 """
 
 from __future__ import annotations
@@ -21,15 +21,19 @@ from pkmcal.papers.registration import fixes_pose, loose, parts_of
 from pkmcal.wording import named
 
 FREE_OFFSETS_SINGULAR_VALUE = 1e-3
-"""Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
-which a combination of offsets is free."""
+"""Singular value of the distances' derivatives by the offsets, relative to at most 1 for an image,
+below which a combination of offsets is unidentifiable."""
 VAGUE_LENGTH_SHARE = 0.5
-"""Standard deviation of a combination of lengths, of a leg's own, beyond which it is free."""
+"""Standard deviation of a combination of lengths, relative to a leg's length, above which it is
+unidentifiable."""
 USE_JOINT_METHOD = "use the joint method (bundle)"
 
 
 def can_be_tried(machine: Machine, edges: int) -> None:
-    """[A] is about legs with a joint fixed to each body, and its steps about pictures of them."""
+    """Raise ResultError for a machine with moving base joints, and for a session without edges.
+
+    [A] treats legs with one joint fixed to each body, in images of the legs.
+    """
     carried = any(group.carrier.driven for group in machine.layout.base)
     for group in machine.layout.platform:
         carried |= group.carrier.turns or group.carrier.floats
@@ -47,7 +51,7 @@ def can_be_tried(machine: Machine, edges: int) -> None:
 
 
 def every_leg_visible(machine: Machine, valid: Booleans) -> None:
-    """[A] 3.3, first condition; found (S, L) base centres."""
+    """Raise ResultError for a leg without a base centre, valid (S, L); [A] 3.3, first condition."""
     lost = np.flatnonzero(~valid.any(axis=0))
     if lost.size:
         raise ResultError(
@@ -58,7 +62,7 @@ def every_leg_visible(machine: Machine, valid: Booleans) -> None:
 
 
 def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> None:
-    """Every station sees enough of the base to know where it stands."""
+    """Raise ResultError for a station that sees too little of the base to determine its pose."""
     few = np.flatnonzero(~items.fixed()[views.of_station])
     if not few.size:
         return
@@ -76,7 +80,9 @@ def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> N
 
 
 def stations_are_joined(items: Items, views: StationViews) -> None:
-    """The stations share enough legs, or a board, to become one frame ([A] 3.3)."""
+    """Raise ResultError for stations that share too few legs, and no board, to be joined
+    ([A] 3.3).
+    """
     free = free_ways(items)
     if not free.shape[-1]:
         return
@@ -98,12 +104,14 @@ def stations_are_joined(items: Items, views: StationViews) -> None:
 
 
 def free_ways(items: Items) -> Array:
-    """Ways (L + D, 3, f) in which the views leave base joints free to move against others."""
+    """Unidentifiable directions (L + D, 3, f): motions of base joints against others in
+    all views.
+    """
     return loose(items.drawing, items.visible[items.fixed()], items.n_directions)
 
 
 def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
-    """[A] 3.5: enough legs with a length at once, each leg with enough others."""
+    """Raise ResultError unless enough legs with a length are seen together, [A] 3.5."""
     legs = legs_as_drawn(machine)
     visible = axes.visible & usable[axes.station][:, None]
     if form == "corrected":
@@ -134,7 +142,7 @@ def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, for
 def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
     turns = np.any(legs.motion[:3], axis=1)
     need = "three or more, not on one line" if turns.all() else "one or more"
-    if turns.any() and not turns.all():  # about z alone
+    if turns.any() and not turns.all():  # rotation about z only
         need = "two or more" + ("" if legs.planar else ", not one above the other")
     raise ResultError(
         what="no configuration shows enough legs with a length at once to place the platform",
@@ -146,7 +154,7 @@ def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
 
 
 def _needs_poses(legs: DrawnLegs, visible: Booleans) -> None:
-    """Passive legs and revolute axes need the platform's pose and the leg, twice."""
+    """Raise ResultError for a passive leg or revolute axis seen in fewer than two poses."""
     for which, what in (
         (~legs.closing, "passive leg {}'s platform joint"),
         (legs.platform_revolute, "the revolute axis of leg {} on the platform"),
@@ -165,9 +173,10 @@ def _needs_poses(legs: DrawnLegs, visible: Booleans) -> None:
 def lengths_are_fixed(
     machine: Machine, axes: Axes, usable: Booleans, base: Array, T_camera_base: Array, q0: Array
 ) -> None:
-    """[A] 3.4: the distances between platform joints tell each offset; no length collapsed.
+    """Raise ResultError for unidentifiable lengths, [A] 3.4.
 
-    base (1, L, 3), T_camera_base (1, S, 4, 4) and offsets q0 (1, L) as the steps found them.
+    A length is unidentifiable if the distances between platform joints do not depend on it.
+    base : (1, L, 3), T_camera_base : (1, S, 4, 4) and offsets q0 : (1, L), results of the steps.
     """
     legs = legs_as_drawn(machine)
     not_collapsed(legs, q0[0])
@@ -195,7 +204,7 @@ def lengths_are_fixed(
 
 
 def not_collapsed(legs: DrawnLegs, q0: Array) -> None:
-    """No constant length in the false minimum of [A] 14, where both its joints fall together."""
+    """Raise ResultError for a constant length in the false minimum of [A] 14, where B = A."""
     short = np.flatnonzero(legs.constant & (q0 < COLLAPSED_LENGTH_SHARE * legs.rod))
     if short.size:
         raise ResultError(
@@ -208,7 +217,9 @@ def not_collapsed(legs: DrawnLegs, q0: Array) -> None:
 
 
 def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
-    """[A] 19 needs two directions of a passive leg in the platform frame; NaN centres lack them."""
+    """Raise ResultError for a passive leg (NaN centre) with a single direction on the platform, [A]
+    19.
+    """
     lost = np.flatnonzero(np.isnan(platform[0, :, 0]))
     if lost.size:
         raise ResultError(

@@ -1,12 +1,12 @@
 """[A] 3.4-3.5, steps 3 and 4 of four: offsets and constant lengths, then the platform's joints.
 
-The platform is rigid, so the distances between its joints do not change:
-``B = A + (q + q0) u`` ([A] 13) for each leg with a length, q = 0 and q0 the length where it is
-constant. Passive legs take no part.
+The platform is rigid, so the distances between its joints are constant: ``B = A + (q + q0) u``
+([A] 13) for each leg with a length, with q = 0 and q0 the length for a constant leg. Passive legs
+do not enter.
 
-Centres of legs with a length come from their ends (16), then each photograph's platform pose
-(18); with it, a leg's axis told in the platform frame gives a revolute axis (7) and the
-centre of a passive leg (19), and the joints' equations give universal axes.
+Centres of legs with a length follow from their ends (16), then the platform pose of each image
+(18); with the pose, a leg's axis in the platform frame gives a revolute axis (7) and the centre of
+a passive leg (19), and the joints' equations give universal axes.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from pkmcal.papers.registration import (
 )
 
 COLLAPSED_LENGTH_SHARE = 0.5
-"""A constant length below this part of its drawing is the false minimum B = A."""
+"""Length of a constant leg, relative to its nominal length, below which it is in the false minimum
+B = A."""
 TORSION_NOISE_TOLERANCES = 20.0
-"""Tolerances within which the torsion's noise is looked for."""
+"""Prior sigmas by which the nominal axes are weakened while the torsion's noise is estimated."""
 TORSION_STEPS, TORSION_SETTLED = 40, 1e-13
 ROUNDED_INFORMATION_SHARE = 1e-12
-"""Share of the best known direction's information below which a direction is rounding."""
+"""Information of a direction, relative to the best determined direction's, that is rounding."""
 
 
 def joint_distance_offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
-    """Step 3, [A] 13-14: offsets (B, L) that keep the distances between platform joints.
+    """Step 3, [A] 13-14: offsets (B, L) for constant distances between platform joints.
 
-    axes : only legs with a length in ``seen``. a_photo : (B, C, L, 3) base centres in each
-    photograph's frame. start : (L,) m, the drawing's: a length of zero is a false minimum.
+    axes : only legs with a length are visible. a_photo : (B, C, L, 3) base centres in each image's
+    frame. start : (L,) m, nominal; a length of zero is a false minimum.
     """
 
     def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
@@ -53,15 +54,16 @@ def joint_distance_offsets(axes: Axes, a_photo: Array, start: Array, form: str) 
 def joint_distance_deviations(
     axes: Axes, a_photo: Array, at: Array, form: str
 ) -> tuple[Array, Array]:
-    """The criterion's rows (B, r) m at offsets (B, L), and their derivatives (B, r, L).
+    """Residuals (B, r) m of step 3 at offsets (B, L), and their derivatives (B, r, L).
 
-    printed: differences of consecutive photographs of a station, C_2 as [A] 14 has it. corrected
-    (errata): deviations from each pair's mean, sum (d_k - mean d)^2.
+    printed : differences between consecutive images of a station, C_2 of [A] 14. corrected (errata)
+    : deviations from each pair's mean, sum (d_k - mean d)^2.
     """
     j, g = np.triu_indices(axes.visible.shape[1], 1)
     both = axes.visible[:, j] & axes.visible[:, g]
     used = both.sum(axis=0) > 1
     j, g, both = j[used], g[used], both[:, used]
+    # distance d of each pair of platform joints, and its derivatives by the two offsets
     b = a_photo + (axes.readings + at[:, None])[..., None] * axes.u
     d = b[:, :, j] - b[:, :, g]
     distance = np.sqrt(np.maximum(dot(d, d), 1e-300))
@@ -85,10 +87,10 @@ def joint_distance_deviations(
 def platform_by_registration(
     b: Array, visible: Booleans, drawing: Array, gauge: Array, motion: Array = ANY_MOTION
 ) -> Array:
-    """Step 4 corrected, [A] 16: platform centres (B, L, 3) from those in K frames.
+    """Step 4 corrected, [A] 16: platform centres (B, L, 3) from the centres in K frames.
 
-    min sum |R_k b_j + t_k - B_jk|^2 over b and the poses. b : (B, K, L, 3) m, seen (K, L);
-    each frame fixes its pose. motion : (6, d), how the platform moves in those frames.
+    min sum |R_k b_j + t_k - B_jk|^2 over b and the poses. b : (B, K, L, 3) m, visible (K, L); each
+    frame must determine its pose. motion : (6, d) of the platform in those frames.
     """
     weight = np.broadcast_to(visible, b.shape[:-1]).astype(float)
     return fit_body(b, weight, gauge, drawing, motion=motion).points
@@ -97,9 +99,9 @@ def platform_by_registration(
 def platform_by_distances(
     b: Array, visible: Booleans, station: Integers, drawing: Array, gauge: Array
 ) -> Array:
-    """Step 4 as printed, [A] 16: centres whose distances are each station's mean distances.
+    """Step 4 as printed, [A] 16: centres with each station's mean distances.
 
-    b : (B, C, L, 3) in the photographs' frames, seen (C, L), station (C,).
+    b : (B, C, L, 3) in the images' frames, visible (C, L), station (C,).
     """
     j, g = np.triu_indices(visible.shape[1], 1)
     both = (visible[:, j] & visible[:, g]).astype(float)
@@ -125,11 +127,11 @@ def platform_by_distances(
 def platform_axes(
     u: Array, visible: Booleans, T_base_platform: Array, information: Array | None = None
 ) -> tuple[Array, Booleans]:
-    """[A] 18, then 7 in the platform frame: axes v' (B, L, 3) of either sign, (L,) found.
+    """[A] 18, then 7 in the platform frame: axes v' (B, L, 3) of either sign, (L,) identifiable.
 
-    u : (B, K, L, 3) directions, base frame, and information (B, K, L, 3, 3) on them;
-    T_base_platform (B, K, 4, 4) of the same photographs, by registration: (18) as printed, a
-    cross product, drops the depth (errata).
+    u : (B, K, L, 3) directions, base frame, with information (B, K, L, 3, 3).
+    T_base_platform : (B, K, 4, 4) of the same images, by registration; (18) as printed, a cross
+    product, ignores the depth (errata).
     """
     rot = T_base_platform[..., None, :3, :3]
     back = rot.mT
@@ -144,8 +146,9 @@ def passive_centres(
 ) -> tuple[Array, Booleans]:
     """[A] 19: centres b (B, L, 3) of legs without a length, u x AB = 0 with B = R b + t.
 
-    Linear in b: in the platform frame, the point nearest to the leg's axes, as (6) on the base.
-    u : (B, K, L, 3), base (B, L, 3) in the base frame. Returns b and (L,) found: two directions.
+    Linear in b: the point nearest to the leg's axes in the platform frame, as (6) on the base.
+    u : (B, K, L, 3), base : (B, L, 3) in the base frame. Returns b and (L,) whether the leg has two
+    directions.
     """
     back = inverse(T_base_platform)[:, :, None]
     turned = (back[..., :3, :3] @ u[..., None])[..., 0]
@@ -156,10 +159,10 @@ def passive_centres(
 
 
 def torsion(u: Array, rot: Array, v: Array, w: Array) -> tuple[Array, Array, Array]:
-    """Twist u . (v x R w) of a universal-universal leg and its slopes by v and w (errata, 3-UPU).
+    """Twist u . (v x R w) of a universal-universal leg (errata, 3-UPU), and derivatives by v and w.
 
-    u : (..., 3) leg, v (..., 3) first axis on the base, w on the platform, rot (..., 3, 3)
-    from platform to base. Zero on the machine; two joints that share a leg cannot twist.
+    u : (..., 3) leg. v : (..., 3) first axis on the base, w : on the platform. rot : (..., 3, 3)
+    from platform to base. Zero on the machine: two universal joints of one leg cannot twist.
     """
     turned = (rot @ w[..., None])[..., 0]
     by_v = cross(turned, u)
@@ -172,13 +175,13 @@ def universal_axes(
 ) -> tuple[Array, Array]:
     """First axes of universal-universal legs by the inverse kinematics, [A] 3.5 and errata.
 
-    Least squares of the torsion over the photographs, beside the drawing with its tolerance
-    (rad): what the photographs do not tell stays as drawn. Of a leg's four freedoms that is a
-    common turn of both axes wherever the platform does not turn, as on a 3-UPU. The torsion's
-    own noise is taken from the residuals of a fit that hardly looks at the drawing, so that
-    the data decide where they know better.
-    u : (B, K, L, 3) base frame. rot : (B, K, 3, 3) platform to base. visible : (K, L).
-    drawn : axes v, w (B, L, 3). tolerance : (L,). Returns v, w (B, L, 3) unit.
+    Least squares of the torsion over the images, with the nominal axes and their prior sigmas (rad)
+    as a prior: unidentifiable directions stay nominal. One of a leg's four degrees of freedom, a
+    common rotation of both axes, is unidentifiable where the platform does not rotate, as on a
+    3-UPU. The torsion's noise is estimated from the residuals of a fit with a weak prior, so that
+    the data decide where they are more accurate. u : (B, K, L, 3) base frame. rot : (B, K, 3, 3)
+    platform to base. visible : (K, L). drawn : nominal axes v, w (B, L, 3). tolerance : (L,).
+    Returns v, w (B, L, 3) unit.
     """
 
     def rows(x: Array) -> tuple[Array, Array]:
@@ -197,7 +200,7 @@ def universal_axes(
 
 
 def _tilted(axis: Array, x: Array) -> tuple[Array, Array]:
-    """Unit axes (..., 3) moved by x (..., 2) across themselves, and derivatives (..., 3, 2)."""
+    """Unit axes (..., 3) tilted by x (..., 2), and derivatives (..., 3, 2)."""
     tangents = tangent_basis(axis, np.eye(3)[np.argmin(np.abs(axis), axis=-1)])
     shifted = axis + (tangents @ x[..., None])[..., 0]
     size = np.sqrt(dot(shifted, shifted))[..., None]
@@ -211,10 +214,11 @@ def _beside_drawing(
     tolerance: Array,
     variance: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Gauss-Newton from x (B, L, 4), the drawing x = 0 beside with its tolerance (L,).
+    """Gauss-Newton from x (B, L, 4) with the prior x = 0 and its sigma (L,).
 
     Returns x and the torsion's variance (B, L): as given, or from the residuals of count (L,)
-    photographs, of which a direction that the data know takes one, and the drawing's none.
+    images; a direction that the data determine takes one degree of freedom, a direction of the
+    prior none.
     """
     share = np.zeros(x.shape)
     noise = np.zeros(x.shape[:-1]) if variance is None else variance
@@ -227,7 +231,7 @@ def _beside_drawing(
         values = np.maximum(values, 0.0)
         right = (normal @ x[..., None])[..., 0] - np.einsum("bkli,bkl->bli", jac, value)
         along = (vectors.mT @ right[..., None])[..., 0]
-        # directions that the data do not know at all stay as drawn even without noise
+        # unobserved directions stay nominal even without noise
         hold = noise / tolerance**2 + ROUNDED_INFORMATION_SHARE * values[..., -1] + 1e-300
         share = values / (values + hold[..., None])
         before, x = x, (vectors @ (along / (values + hold[..., None]))[..., None])[..., 0]

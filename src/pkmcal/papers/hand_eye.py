@@ -1,13 +1,14 @@
-"""Where camera and board are, from measured board poses and readings alone; no rough pose needed.
+"""Robot-world/hand-eye calibration: camera and board from board poses and readings.
 
-Forward kinematics of the drawing gives the platform's poses, the photographs give the board's, so
-``T_camera_board = T_camera_base T_base_platform T_platform_board`` is the robot-world/hand-eye
-problem ([C] III.C). Rotations give both turns where the platform turns about two axes or more;
-where it turns about one, or not at all, positions decide. What neither tells (the board's height
-along the only axis of rotation, all of its place on a platform that does not turn) stays zero.
+No rough pose is needed. Forward kinematics of the nominal model gives the platform's poses, the
+images give the board's, so ``T_camera_board = T_camera_base T_base_platform T_platform_board`` is
+the robot-world/hand-eye problem ([C] III.C). Rotations determine both unknown rotations if the
+platform turns about two axes or more; if it turns about one axis, or not at all, positions are
+needed. Unidentifiable directions (the board's height along the only axis of rotation, the board's
+whole position on a platform that does not turn) are zero.
 
-The drawing is off by millimetres and degrees, so poses and not corners are fitted, with weights
-to match, and a pose that disagrees with the others counts less.
+The nominal model is off by millimetres and degrees, so poses instead of corners are fitted, with
+weights to match, and a pose that disagrees with the others has a small weight.
 """
 
 from __future__ import annotations
@@ -39,19 +40,19 @@ from pkmcal.solver.elimination import Linear
 from pkmcal.solver.search import Values, minimise, take
 
 DRAWN_POSE_TURN_SIGMA = 0.03
-"""Standard deviation (rad) that the drawing's poses are given: two degrees."""
+"""Standard deviation (rad) of the nominal model's platform poses: two degrees."""
 DRAWN_POSE_SHIFT_SHARE = 0.02
-"""The same of positions, as a share of the limbs' length: 10 mm of half a metre."""
+"""Standard deviation of their positions, relative to the limbs' length: 10 mm of half a metre."""
 HAND_EYE_ROUNDS = 4
 UNKNOWN_CAMERA_TURN = 0.3
-"""Standard deviation (rad) of the camera's turn above which the poses do not tell it."""
+"""Standard deviation (rad) of the camera's rotation above which it is unidentifiable."""
 LEAST_PAIR_CONFIGURATIONS = 3
-"""Configurations that a station and a mount need together."""
+"""Configurations in which a station must see a mount."""
 HAND_EYE_RANKS = (1, 2, 4)
 
 
 class Pair(NamedTuple):
-    """One station and one mount: T_camera_base and T_mount, (B, 4, 4) each."""
+    """Pose of one station and one mount, T_camera_base and T_mount, (B, 4, 4) each."""
 
     T_camera_base: Array
     T_mount: Array
@@ -59,10 +60,10 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class PairProblem:
-    """solver.LeastSquares of B runs: ``seen = T_camera_base body T_mount``, K poses each.
+    """solver.LeastSquares of B runs: ``observed = T_camera_base body T_mount``, K poses each.
 
-    body, observed : (B, K, 4, 4). weight : (B, K). turn, shift : rad and m that count as one
-    standard deviation. size : m, the standard deviation of the mount's place, zero expected.
+    body, observed : (B, K, 4, 4). weight : (B, K). turn, shift : standard deviations, rad and m.
+    size : prior sigma of the mount's position about zero, m.
     """
 
     body: Array
@@ -77,17 +78,17 @@ class PairProblem:
         return np.repeat([self.turn, self.shift], 3)
 
     def differences(self, state: Pair) -> Array:
-        """Errors (B, K, 6) of the predicted poses, in standard deviations, without weights."""
+        """Whitened errors (B, K, 6) of the predicted poses, without weights."""
         predicted = state.T_camera_base[:, None] @ self.body @ state.T_mount[:, None]
         return pose_difference(predicted, self.observed) / self._sigma
 
     def residuals(self, state: Pair) -> Values:
-        """Weighted errors and the mount's place."""
+        """Weighted errors and the prior of the mount's position."""
         value = np.sqrt(self.weight)[..., None] * self.differences(state)
         return Values(value, state.T_mount[:, :3, 3] / self.size)
 
     def linearize(self, state: Pair) -> Linear:
-        """Residuals and exact Jacobian: six numbers of the camera, six of the mount."""
+        """Residuals and exact Jacobian: six columns of the camera, six of the mount."""
         one = np.zeros((self.body.shape[1], 1), dtype=int)
         blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), one, np.zeros(1))
         data = PoseData(
@@ -108,13 +109,13 @@ class PairProblem:
         )
 
     def retract(self, state: Pair, shared: Array, own: Array) -> Pair:
-        """The pair after a step; a pose has no unknowns of its own."""
+        """Retract the pair along a step; a pose has no unknowns of its own."""
         del own
         camera = perturb(state.T_camera_base, shared[:, :6])
         return Pair(camera, perturb(state.T_mount, shared[:, 6:]))
 
     def select(self, runs: Integers) -> PairProblem:
-        """Some runs only."""
+        """Problem of some runs."""
         parts = (self.body[runs], self.observed[runs], self.weight[runs])
         return replace(self, body=parts[0], observed=parts[1], weight=parts[2])
 
@@ -122,9 +123,9 @@ class PairProblem:
 def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     """Camera and mount of B runs from the platform's poses and the board's, (B, K, 4, 4) each.
 
-    size : the limbs' length, m. Closed forms as starts, then least squares with poses that
-    disagree weighing less; of the starts the one that ends best.
-    Raises ResultError where the poses do not tell how the camera stands.
+    size : the limbs' length, m. Starts in closed form, then iteratively reweighted least squares
+    from each start; the result is the one with the smallest median error. Raises ResultError if the
+    poses do not determine the camera's rotation.
     """
     starts = [_placed(body, visibility, *turns) for turns in _turns(body, visibility)]
     n, runs = len(starts), len(body)
@@ -142,7 +143,7 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     for _ in range(HAND_EYE_ROUNDS):
         every = minimise(problem, every).state
         apart = np.linalg.norm(problem.differences(every), axis=-1)
-        # weights that fall beyond the poses' usual disagreement, after Cauchy
+        # Cauchy weights relative to the median error
         usual = np.maximum(np.median(apart, axis=1, keepdims=True), 1e-9)
         problem = replace(problem, weight=1 / (1 + (apart / (2.4 * usual)) ** 2))
     best = np.argmin(np.median(apart, axis=1).reshape(n, runs), axis=0)
@@ -156,7 +157,7 @@ def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
     linear = problem.linearize(pair)
     rows = linear.by_shared.reshape(len(linear.value), -1, 12)
     normal = rows.mT @ rows + linear.shared_by.T @ linear.shared_by
-    # as loose as a full turn where nothing tells
+    # prior as weak as a full turn
     normal = normal + np.diag(np.tile(np.repeat([0.1, 1e-3 / problem.size], 3) ** 2, 2))
     turn = np.linalg.inv(normal)[:, :3, :3]
     if np.sqrt(np.linalg.eigvalsh(turn)[:, -1]).max() > UNKNOWN_CAMERA_TURN:
@@ -169,15 +170,15 @@ def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
 
 
 def _turns(body: Array, visibility: Array) -> list[tuple[Array, Array]]:
-    """Possible turns of camera and mount, (B, 3, 3) each.
+    """Candidate rotations of camera and mount, (B, 3, 3) each.
 
-    ``q_measured = q_camera q_body q_mount`` is linear in either, so the sum over the poses has the
-    two as its leading singular vectors. Where the platform turns about one axis two singular values
-    are equal, where it does not turn all four: of what they leave open, the nearest to the turn
-    that lays the positions on one another.
+    ``q_measured = q_camera q_body q_mount`` is linear in either unknown, so the sum over the poses
+    has the two as its leading singular vectors. Two singular values are equal where the platform
+    turns about one axis, all four where it does not turn; in the space of equal values the rotation
+    nearest to the one that aligns the positions is chosen.
     """
     q_body, q_measured = (quaternion(poses[..., :3, :3]) for poses in (body, visibility))
-    # signs by the turns from the first pose, which both sides share
+    # signs from the rotations since the first pose, which both sides share
     sign = np.sign(dot(q_body, q_body[:, :1]) * dot(q_measured, q_measured[:, :1]))
     sign = np.where(sign == 0, 1.0, sign)
     # q_camera . (q_measured conj(q_mount) conj(q_body)) is linear in q_mount
@@ -210,8 +211,10 @@ def _right(q: Array) -> Array:
 
 
 def _placed(body: Array, visibility: Array, camera: Array, mount: Array) -> Pair:
-    """Places for known turns: ``t_seen = R_camera (R_body t_mount + t_body) + t_camera``, linear;
-    t_mount is held to zero within the limbs' length.
+    """Pair with least-squares positions for known rotations.
+
+    ``t_observed = R_camera (R_body t_mount + t_body) + t_camera`` is linear; t_mount has a prior at
+    zero with the limbs' length.
     """
     rot = camera[:, None] @ body[..., :3, :3]
     right = visibility[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
@@ -226,10 +229,10 @@ def _placed(body: Array, visibility: Array, camera: Array, mount: Array) -> Pair
 def start_from_poses(
     machine: Machine, measurements: Measurements, reference_values: Array | None = None
 ) -> State:
-    """A start for the joint estimate, from the measured poses and readings by the drawing.
+    """Start of the joint estimate from measured poses, readings and the nominal model.
 
     reference_values : (S, 4, 4) rough T_camera_base, NaN for stations without one; None without
-    any. Raises InputError for a station that nothing ties to the machine.
+    any. Raises InputError for a station without any relation to the machine.
     """
     fk = machine.forward_result(measurements.joints)
     n_stations = measurements.n_stations
@@ -263,10 +266,11 @@ def start_from_poses(
 def _carried_on(
     machine: Machine, measurements: Measurements, poses: Array, stations: Array
 ) -> tuple[Array, Array]:
-    """Stations (S, 4, 4) and mounts (M, 4, 4), NaN where nothing tells them: what is known carried
-    on to what shares a pose with it, and where that ends, the pair that most poses tie.
+    """Poses of stations (S, 4, 4) and mounts (M, 4, 4), NaN where undetermined.
 
-    poses : T_base_platform (K, 4, 4), NaN where unknown.
+    Known poses are propagated to stations and mounts that share a measured pose with them; when
+    this ends, the station and mount with the most common poses are solved. poses : T_base_platform
+    (K, 4, 4), NaN where unknown.
     """
     in_view, on_platform = measurements.poses, measurements.on_platform
     stations, mounts = stations.copy(), np.full((len(on_platform), 4, 4), np.nan)
@@ -304,6 +308,6 @@ def _carried_on(
 
 
 def size_of(machine: Machine) -> float:
-    """The limbs' mean length at home, m."""
+    """Mean length of the limbs at home, m."""
     ends = machine.ends_at(machine.middle_readings(), machine.home())
     return float(np.linalg.norm(ends.b - ends.a, axis=-1).mean())

@@ -1,17 +1,18 @@
-"""The inverse-kinematic method of [C]: identified at measured poses, without forward kinematics.
+"""Inverse-kinematic method of [C]: identification at measured poses, without forward kinematics.
 
-Four forms: ``joint`` (eq. 3), the readings less those that the inverse kinematics wants, or
-``implicit`` (eq. 5), the closure itself; each as printed or whitened by its noise with what the
-machine cannot move (errata, [C]). Whitened, the two are one estimate, near the joint one.
+Four forms: ``joint`` (eq. 3), the readings minus those of the inverse kinematics, or ``implicit``
+(eq. 5), the closure equations themselves; each as printed or whitened by its noise, including the
+pose components that the machine cannot move (errata, [C]). Whitened, the two are one estimate,
+close to the joint estimate.
 
-Unknowns are the machine's free parameters, the stations' poses and the mounts' (and the hinges of
-an articulated platform, each pose its own); platform poses are not, they are the measured ones. A
-fixed matrix per pose weighs the rows: as printed, equally; whitened, by what the measured pose's
-and the reading's noise make of them, what the machine cannot move (the two tilts of an H4)
-included. Any machine with a closure.
+Unknowns are the machine's free parameters and the poses of stations and mounts (and the hinges of
+an articulated platform, for each pose); platform poses are measured, not estimated. A fixed matrix
+for each pose weights the rows: equally as printed; whitened, by the noise of the measured pose and
+the reading, including the components that the machine cannot move (the two tilts of an H4). Any
+machine with closure equations.
 
-What the rows cannot tell keeps its first value: of each direction that nothing fixes, the unknown
-that is known best beforehand is held. The paper holds d and an angle about z_B for the same reason.
+Unidentifiable directions keep their start: for each such direction, the unknown with the smallest
+prior sigma is fixed. The paper fixes d and an angle about z_B for the same reason.
 """
 
 from __future__ import annotations
@@ -39,24 +40,25 @@ from pkmcal.solver.search import Solution, Stop, Values, minimise, of_runs, take
 
 PoseFitForm = Literal["joint", "implicit"]
 UNWHITENED_ROW_SIGMA = 1e-4
-"""Metres (and radians) that count as one standard deviation where rows are not whitened; it only
-sets where the search stops."""
+"""Standard deviation, in m or rad, of rows that are not whitened; it only determines when the
+search stops."""
 WHITENING_ROUNDS = 2
-"""Whitening again, at the solution: it changes by a thousandth after the second."""
+"""Further whitenings at the solution; after the second the rows change by a thousandth."""
 MOST_POSE_FIT_STEPS = 100
 PLACEMENT_PRIOR_SIGMA = 0.1
-"""How well stations and mounts are known before any data, rad and m: far less than a drawing."""
+"""Prior sigma of stations and mounts, in rad and m, far larger than a nominal model's."""
 POSE_FIT_RANK_TOLERANCE = 1e-8
-"""Singular values of the scaled Jacobian below this share of the largest are zero: with exact
-derivatives at data without noise, rounding leaves 1e-12."""
+"""Singular values of the scaled Jacobian, relative to the largest, below which they are zero: with
+exact derivatives at data without noise, rounding leaves 1e-12."""
 
 
 # ------------------------------------------------------------------ the rows
 
 
 class ImplicitState(NamedTuple):
-    """Unknowns of B runs: z (B, nz), T_camera_base (B, S, 4, 4), T_mount (B, M, 4, 4), internal
-    (B, N, n).
+    """Unknowns of B runs.
+
+    z : (B, nz). T_camera_base : (B, S, 4, 4). T_mount : (B, M, 4, 4). internal : (B, N, n).
     """
 
     z: Array
@@ -66,9 +68,10 @@ class ImplicitState(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Rows (B, N, r) without weights, closures and then what is off, and what they came from.
+    """Rows (B, N, r) without weights: closure equations, then deviations.
 
-    scale : (B, N, e) of the closures' derivatives.
+    platform, taken, closure : what the rows were computed from. scale : (B, N, e) factor on the
+    closures' derivatives.
     """
 
     value: Array
@@ -79,19 +82,25 @@ class _Rows(NamedTuple):
 
     @property
     def by_pose(self) -> Array:
-        """Rows by the platform's whole pose, (B, N, r, 6)."""
+        """Derivatives of the rows by the platform's whole pose, (B, N, r, 6)."""
         closures = self.scale[..., None] * (self.closure.rows.by_pose @ self.taken.by)
         return np.concatenate([closures, self.taken.off_by], axis=-2)
 
 
 @dataclass(frozen=True)
 class ImplicitProblem:
-    """solver.LeastSquares of B runs with N poses each. Stations' unknowns perturb T_base_camera.
+    """solver.LeastSquares of B runs with N poses each; stations' unknowns perturb T_base_camera.
 
     layout, drawing (P,), free (P, nz) : the machine. station, mount : (N,), of n_stations and
-    n_mounts. T_camera_board (B, N, 4, 4) and readings (B, N, m). form : see the module. weigh :
-    (B, N, r, r) of the rows, fixed while the search runs. prior : (c, nz) rows on z. keep : (na,)
-    False for what is held.
+    n_mounts. T_camera_board : (B, N, 4, 4) and readings : (B, N, m). form : see the module.
+    weigh : (B, N, r, r) of the rows, constant during the search. prior : (c, nz) rows on z.
+    keep : (na,) False for fixed unknowns.
+
+    Jacobian of one pose (own columns are eliminated by the Schur complement):
+
+                     z      stations   mounts  | own (hinges)
+    closure rows   [ X         X         X     |     X       ]
+    deviations     [           X         X     |             ]
     """
 
     layout: LimbLayout
@@ -110,7 +119,7 @@ class ImplicitProblem:
 
     @property
     def unknowns(self) -> Unknowns:
-        """Which unknown stands in which column, na in all."""
+        """Columns of the unknowns, na in all."""
         n_free = self.free.shape[1]
         return Unknowns(n_free, self.n_stations, n_cameras=0, n_mounts=self.n_mounts)
 
@@ -119,12 +128,12 @@ class ImplicitProblem:
         return self.drawing + state.z @ self.free.T
 
     def residuals(self, state: ImplicitState) -> Values:
-        """Weighted rows; NaN where the inverse kinematics has no answer."""
+        """Weighted rows; NaN where the inverse kinematics has no solution."""
         value = (self.weigh @ self._rows(state).value[..., None])[..., 0]
         return Values(value, state.z @ self.prior.T)
 
     def linearize(self, state: ImplicitState) -> Linear:
-        """Weighted rows and exact Jacobian by z, stations and mounts, zero for what is held."""
+        """Weighted rows and exact Jacobian by z, stations and mounts, zero for fixed unknowns."""
         rows = self._rows(state)
         off = ((0, 0), (0, 0), (0, rows.taken.off.shape[-1]), (0, 0))
         closures = rows.scale[..., None] * (dense(rows.closure, self.drawing.size) @ self.free)
@@ -162,7 +171,7 @@ class ImplicitProblem:
         if self.form == "joint":
             motor = self.layout.row_motor
             read = motor >= 0
-            # r = measured - wanted, and the closure stays zero: dr = dc / (dc/dq)
+            # r = measured - wanted at a zero closure: dr = dc / (dc/dq)
             scale = np.where(read, 1 / np.where(read, c.by_reading, 1.0), 1.0)
             value = np.where(read, (self.readings - readings)[..., np.maximum(motor, 0)], value)
         return _Rows(np.concatenate([value, own.off], axis=-1), in_view, own, c, scale)
@@ -170,8 +179,8 @@ class ImplicitProblem:
     def whitening(self, state: ImplicitState, noise: Array, joint_noise: float) -> Array:
         """Matrices (B, N, r, r) that whiten the rows at a state.
 
-        noise : (N, 6, 6) covariance of the measured poses. The rows' covariance is theirs and the
-        reading's, carried through the rows' derivatives.
+        noise : (N, 6, 6) covariance of the measured poses. The rows' covariance is that of the pose
+        and of the reading, propagated through the rows' derivatives.
         """
         rows = self._rows(state)
         by = rows.by_pose @ rows.platform.by_measured
@@ -183,13 +192,14 @@ class ImplicitProblem:
         return np.linalg.inv(np.linalg.cholesky(covariance))
 
     def platform_poses(self, state: ImplicitState) -> Array:
-        """The measured poses (B, N, 4, 4) as the machine can take them."""
+        """Measured poses (B, N, 4, 4) without the components that the machine cannot move."""
         return self._rows(state).taken.pose
 
     def ideal(self, state: ImplicitState) -> ImplicitProblem:
-        """The same problem with poses and readings that the state explains without any residual.
+        """Problem with poses and readings for which the state has zero residuals.
 
-        Ranks are told there: at the data, noise makes what cannot be told look faintly known.
+        Ranks are computed there: at the data, noise gives unidentifiable directions a small
+        singular value.
         """
         poses = self.platform_poses(state)
         readings = kinematics.readings_at_poses(self.layout, self.theta(state)[:, None], poses)
@@ -198,7 +208,7 @@ class ImplicitProblem:
         return replace(self, T_camera_board=case, readings=readings)
 
     def retract(self, state: ImplicitState, shared: Array, own: Array) -> ImplicitState:
-        """The state after a step."""
+        """Retract the state along a step."""
         shared, u = shared * self.keep, self.unknowns
         camera = shared[:, u.stations].reshape(-1, self.n_stations, 6)
         mount = shared[:, u.mounts].reshape(-1, self.n_mounts, 6)
@@ -210,14 +220,14 @@ class ImplicitProblem:
         )
 
     def select(self, runs: Integers) -> ImplicitProblem:
-        """Some runs only."""
+        """Problem of some runs."""
         weigh = of_runs(self.weigh, runs)
         poses, readings = self.T_camera_board[runs], self.readings[runs]
         return replace(self, T_camera_board=poses, readings=readings, weigh=weigh)
 
 
 def _placed(values: Array, which: Array) -> Array:
-    """Columns (B, N, r, 6) at the place of their own of n, which (N, n): (B, N, r, 6 n)."""
+    """Columns (B, N, r, 6) in the block of each pose's own body, one-hot (N, n): (B, N, r, 6 n)."""
     out = which[:, None, :, None] * values[..., None, :]
     return out.reshape(*values.shape[:-1], -1)
 
@@ -227,10 +237,10 @@ def _placed(values: Array, which: Array) -> Array:
 
 @dataclass(frozen=True)
 class PoseFit:
-    """The method's result on B runs.
+    """Result of the method on B runs.
 
-    problem : with the weights and held unknowns of the end. solution : its state, cost, stops.
-    rank : of the Jacobian with everything free.
+    problem : with the final weights and fixed unknowns. solution : its state, cost, stops. rank :
+    of the Jacobian with all unknowns free.
     """
 
     problem: ImplicitProblem
@@ -239,12 +249,12 @@ class PoseFit:
 
 
 def inverse_kinematic(machine: Machine, measurements: Measurements, start: State) -> State:
-    """One session's machine, stations and mounts from boards' poses and readings; [C] eq. 5,
-    whitened, beside the drawing's values with their tolerances.
+    """Machine, stations and mounts of one session from board poses and readings.
 
-    start : from the drawing, see :mod:`pkmcal.papers.hand_eye`. Platform poses are then by the
-    readings and the new machine.
-    Raises InputError without a board on the platform, ResultError where the search fails.
+    [C] eq. 5, whitened, with the nominal values and their prior sigmas as a prior. start : from the
+    nominal model, see :mod:`pkmcal.papers.hand_eye`. Platform poses follow from the readings and
+    the estimated machine. Raises InputError without whole poses of a board on the platform,
+    ResultError if the search fails.
     """
     poses = measurements.poses
     rows = np.flatnonzero(measurements.on_platform[poses.mount])
@@ -284,10 +294,11 @@ def pose_problem(
     start: State,
     form: PoseFitForm,
 ) -> tuple[ImplicitProblem, ImplicitState]:
-    """The problem of B runs on the measurements' stations and mounts, unweighted, and its start.
+    """Unweighted problem of B runs with the measurements' stations and mounts, and its start.
 
-    T_camera_board : (B, N, 4, 4). readings : (B, N, m). start : of one run, or with a leading
-    axis B on ``T_camera_base`` and ``T_mount``.
+    T_camera_board : (B, N, 4, 4). readings : (B, N, m). start : of one run, or with a leading axis
+    B on ``T_camera_base`` and ``T_mount``. Raises InputError for the joint form on a machine with
+    several rods on a motor.
     """
     layout, table = machine.layout, machine.parameters
     if form == "joint" and layout.shares_motors:
@@ -300,7 +311,7 @@ def pose_problem(
     camera = np.broadcast_to(start.T_camera_base, (runs, *start.T_camera_base.shape[-3:]))
     mount = np.broadcast_to(start.T_mount, (runs, *start.T_mount.shape[-3:]))
     n_stations, n_mounts = camera.shape[1], mount.shape[1]
-    off = 6 - layout.motion.shape[1]  # rows that do not count as printed
+    off = 6 - layout.motion.shape[1]  # rows of deviations, without weight as printed
     problem = ImplicitProblem(
         layout=layout,
         drawing=table.drawing,
@@ -324,7 +335,7 @@ def pose_problem(
         mount.copy(),
         np.zeros((runs, count, layout.n_internal)),
     )
-    if layout.n_internal:  # the hinges' turns that the poses ask for
+    if layout.n_internal:  # hinge angles at the measured poses
         poses = problem.platform_poses(state)
         internal = kinematics.inverse_result(layout, problem.theta(state)[:, None], poses)[1]
         state = state._replace(internal=np.nan_to_num(internal))
@@ -340,10 +351,11 @@ def fit_machine_to_poses(
     *,
     use_drawing: bool,
 ) -> PoseFit:
-    """The estimate of B runs. noise : (N, 6, 6) of the poses to whiten by; None as printed.
-    use_drawing : take the drawing's values as measurements.
+    """Estimate of B runs.
 
-    As printed, the axis that the boards turn about is found first and held, [C] III.B.
+    noise : (N, 6, 6) covariance of the poses for whitening; None for the printed form, in which the
+    boards' axis of rotation is estimated first and fixed, [C] III.B. use_drawing : use the nominal
+    values as measurements.
     """
     if use_drawing:
         problem = replace(problem, prior=np.diag(1 / machine.parameters.tolerances_free()))
@@ -363,10 +375,10 @@ def fit_machine_to_poses(
 
 
 def on_axis(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
-    """The state with base and platform turned until the boards' one axis of rotation is their z.
+    """State with base and platform rotated so that the boards' axis of rotation is their z axis.
 
-    For machines that turn about one axis, where one camera sees one board; others stay as they are.
-    The workspace keeps its place before the camera.
+    For machines that turn about one axis, with one camera and one board; other states are
+    unchanged. The workspace keeps its position in the camera frame.
     """
     if not _one_axis(problem):
         return state
@@ -390,7 +402,7 @@ def _one_axis(problem: ImplicitProblem) -> bool:
 
 
 def turn_between(a: Array, b: Array) -> Array:
-    """The shortest turns (..., 3, 3) that lay unit vectors a (..., 3) on b."""
+    """Shortest rotations (..., 3, 3) from unit vectors a (..., 3) to b."""
     across = cross(a, np.broadcast_to(b, a.shape))
     size = np.sqrt(dot(across, across))[..., None]
     angle = np.arctan2(size, dot(a, b)[..., None])
@@ -400,10 +412,10 @@ def turn_between(a: Array, b: Array) -> Array:
 def estimable_unknowns(
     machine: Machine, problem: ImplicitProblem, state: ImplicitState, *, whitened: bool
 ) -> tuple[Booleans, int]:
-    """Unknowns (na,) that are estimated, and the rank of the Jacobian with all of them.
+    """Estimated unknowns (na,), and the rank of the Jacobian with all of them.
 
-    By the first run. As printed, the tilts of a board against the axis of rotation have only a
-    second-order influence ([C] III.C) and are held.
+    Computed for the first run. In the printed form the tilts of a board against the axis of
+    rotation, which have a second-order influence only ([C] III.C), are fixed.
     """
     first, begin = problem.select(np.array([0])), take(state, np.array([0]))
     linear = first.ideal(begin).linearize(begin)
@@ -413,15 +425,20 @@ def estimable_unknowns(
     keep = np.ones(len(sizes), dtype=bool)
     rank, _ = _loose(jac, sizes)
     if not whitened:
-        keep[_tilts(problem)] = False
+        # the axis of rotation determines rotations that the machine itself cannot make: of the
+        # mounts, and of the camera for one axis and one camera
+        names: tuple[Name, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
+        bodies = problem.unknowns.columns(*names).reshape(-1, 6)
+        keep[bodies[:, :3][:, ~problem.layout.motion[:3].any(axis=1)]] = False
     loose = _loose(jac[:, keep], sizes[keep])[1]
     keep[np.flatnonzero(keep)[_pivots(loose)]] = False
     return keep, rank
 
 
 def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
-    """Rank of a Jacobian (rows, n) and the directions (k, n) that nothing fixes, in units of what
-    is known beforehand. Columns scaled by their extreme value, [C] IV.C.
+    """Rank of a Jacobian (rows, n) and its null space (k, n), in units of the prior sigmas.
+
+    Columns are scaled by their largest absolute value, [C] IV.C.
     """
     extreme = np.abs(jac).max(axis=0)
     extreme = np.where(extreme > 0, extreme, 1.0)
@@ -430,17 +447,10 @@ def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
     return rank, vt[rank:] / (extreme * sizes)
 
 
-def _tilts(problem: ImplicitProblem) -> Integers:
-    """Columns of what the axis found beforehand tells: the mounts' turns that the machine itself
-    cannot make and, where there is one axis and one camera, the camera's.
-    """
-    names: tuple[Name, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
-    bodies = problem.unknowns.columns(*names).reshape(-1, 6)
-    return bodies[:, :3][:, ~problem.layout.motion[:3].any(axis=1)].ravel()
-
-
 def _pivots(loose: Array) -> list[int]:
-    """One column for each row of (k, n), chosen so that the rows are fixed best."""
+    """One column for each row of (k, n), chosen such that fixing the columns fixes the
+    rows best.
+    """
     rows, chosen = loose.copy(), list[int]()
     for _ in range(len(loose)):
         size = np.sum(rows**2, axis=0)
@@ -454,7 +464,7 @@ def _pivots(loose: Array) -> list[int]:
 def _session_state(
     machine: Machine, measurements: Measurements, start: State, fit: PoseFit
 ) -> State:
-    """The fit as a session's state, in the default frames, poses by the readings."""
+    """State of the session from the fit, in the default gauge, with poses from the readings."""
     stop, solution = fit.solution.stop[0], fit.solution.state
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(what=f"the inverse-kinematic method failed: {stop.value}")

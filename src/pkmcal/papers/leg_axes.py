@@ -1,10 +1,10 @@
 """[A] 3.2, step 1 of four: joint centres and revolute axes from the legs' axes.
 
-Both are least-squares answers to what a leg's axis says about a joint it turns in: it passes
-the centre ([A] 6) and is perpendicular to a revolute joint's axis ([A] 7). The same functions
-serve the camera frame (step 1) and the platform frame (step 4).
+Both are least-squares estimates from the constraints of a joint on its leg's axis: the axis passes
+through the centre ([A] 6) and is perpendicular to a revolute joint's axis ([A] 7). The same
+functions serve the camera frame (step 1) and the platform frame (step 4).
 
-Arrays: B runs, C photographs (one station, one configuration each), L legs, S stations.
+Arrays: B runs, C images (one station, one configuration each), L legs, S stations.
 """
 
 from __future__ import annotations
@@ -20,21 +20,23 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
 
 ONE_DIRECTION = 1e-6
-"""Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""
+"""Ratio of eigenvalues below which a leg has a single direction, so that its centre is
+unidentifiable."""
 REVOLUTE_WEIGHT_ROUNDS = 3
-"""Rounds of weighing a revolute axis's equations; the weights change little after the first."""
+"""Iterations for the weights of a revolute axis's equations; they change little after the first."""
 ONE_PLANE = 1e-4
-"""The same for a revolute axis: directions within 10 mrad of each other leave it to the noise."""
+"""Ratio of eigenvalues below which a revolute axis is unidentifiable: directions within 10 mrad of
+each other, where noise dominates."""
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Leg axes as the photographs show them, camera frame.
+    """Leg axes from images, camera frame.
 
-    station, configuration : (C,) of each photograph. visible : (C, L).
-    u, point : (B, C, L, 3) direction from A to B, and any point of the axis (m).
-    readings : (B, C, L). information : (B, C, L, 3, 3) how well each direction is known, any
-    scale; it tells where several photographs show the same leg. Without it all count alike.
+    station, configuration : (C,) of each image. visible : (C, L). u, point : (B, C, L, 3) direction
+    from A to B, and any point of the axis (m). readings : (B, C, L). information : (B, C, L, 3, 3)
+    information of each direction up to a common factor, used where several images show the same
+    leg; None for equal weights.
     """
 
     station: Integers
@@ -46,7 +48,7 @@ class Axes:
     information: Array | None = None
 
     def of_legs(self, legs: Integers) -> Axes:
-        """Some legs only."""
+        """Axes of some legs."""
         return replace(
             self,
             visible=self.visible[:, legs],
@@ -57,7 +59,7 @@ class Axes:
         )
 
     def of_runs(self, runs: Integers) -> Axes:
-        """Some runs only."""
+        """Axes of some runs."""
         return replace(
             self,
             u=self.u[runs],
@@ -75,11 +77,11 @@ def across_directions(u: Array) -> Array:
 def nearest_points(
     u: Array, point: Array, visible: Booleans, group: Integers, n_groups: int
 ) -> tuple[Array, Booleans]:
-    """[A] 6: the point nearest to a leg's axes, sum (I - u u^T)(M - A) = 0.
+    """[A] 6: point nearest to a leg's axes, sum (I - u u^T)(M - A) = 0.
 
-    As printed, AM x u = 0 for all photographs by SVD: the same least squares, without the
-    equations that are not independent. u, point : (B, C, L, 3) in the frames of ``group``
-    (C,). Returns A (B, G, L, 3) and (G, L) whether there are two directions.
+    The printed form, AM x u = 0 for all images by SVD, is the same least squares with dependent
+    equations. u, point : (B, C, L, 3) in the frames of ``group`` (C,). Returns A (B, G, L, 3) and
+    (G, L) whether the leg has two directions.
     """
     project = np.where(visible[..., None, None], across_directions(u), 0.0)
     right = (project @ np.where(visible[..., None], point, 0.0)[..., None])[..., 0]
@@ -95,7 +97,7 @@ def nearest_points(
 def centres_from_axes(axes: Axes, n_stations: int) -> tuple[Array, Booleans]:
     """Step 1, [A] 6, for the base centres in the stations' camera frames.
 
-    Returns A (B, S, L, 3) and (S, L) whether each could be found.
+    Returns A (B, S, L, 3) and (S, L) whether each centre is identifiable.
     """
     return nearest_points(axes.u, axes.point, axes.visible, axes.station, n_stations)
 
@@ -107,12 +109,13 @@ def revolute_axes(
     n_groups: int,
     information: Array | None = None,
 ) -> tuple[Array, Booleans]:
-    """[A] 7: the axis that is perpendicular to all directions of a leg, v . u = 0, by SVD.
+    """[A] 7: axis that is perpendicular to all directions of a leg, v . u = 0, by SVD.
 
-    u : (B, C, L, 3) in the frames of ``group`` (C,). Returns unit v (B, G, L, 3), of either
-    sign, and (G, L) whether each is fixed: the leg needs two different directions.
-    information : (B, C, L, 3, 3) of the directions. They are much worse known along the line of
-    sight than across it; with it, each equation counts by the noise that it has along v.
+    u : (B, C, L, 3) in the frames of ``group`` (C,). Returns unit v (B, G, L, 3), of either sign,
+    and (G, L) whether each is identifiable, which takes two different directions of the leg.
+    information : (B, C, L, 3, 3) of the directions. A direction is much less accurate along the
+    line of sight than across it; with the information, each equation is weighted by its noise along
+    v.
     """
     of_group = (group == np.arange(n_groups)[:, None]).astype(float)
     u = np.where(visible[..., None], u, 0.0)
@@ -126,7 +129,7 @@ def revolute_axes(
     values, vectors = least_along(np.ones(u.shape[:-1]))
     fixed = np.all(values[..., 1] > ONE_PLANE * values[..., 2], axis=0)
     if information is not None:
-        # covariances of the directions, across them, up to one factor
+        # covariances of the directions across themselves, up to a common factor
         size = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
         above_limit = visible[..., None, None] & (size > 0)
         along = size * (u[..., :, None] * u[..., None, :])
@@ -145,9 +148,9 @@ def plane_normals(
     n_groups: int,
     information: Array | None = None,
 ) -> tuple[Array, Booleans]:
-    """[A] 7 for a planar machine, whose joints all have one axis: the normal of its plane.
+    """[A] 7 for a planar machine, whose joints have a common axis: the normal of its plane.
 
-    All legs' directions together, (B, C, L, 3); returns (B, G, 1, 3) and (G, 1).
+    u : (B, C, L, 3) directions, all legs together. Returns (B, G, 1, 3) and (G, 1).
     """
     n = (u.shape[0], u.shape[1] * u.shape[2], 1)
     flat = None if information is None else information.reshape(*n, 3, 3)
@@ -156,11 +159,11 @@ def plane_normals(
 
 
 def in_base(axes: Axes, T_camera_base: Array) -> Axes:
-    """The directions in the base frame, one row a configuration; ``point`` is not kept.
+    """Directions in the base frame, one row for each configuration, without points.
 
-    T_camera_base : (B, S, 4, 4). A leg that several stations photographed in one configuration
-    gets the direction that all of them see best: least u^T (sum R^T W R) u over the
-    photographs, W their information.
+    T_camera_base : (B, S, 4, 4). A leg that several stations see in one configuration gets the
+    weighted mean direction: the minimum of u^T (sum R^T W R) u over the images, with their
+    information W.
     """
     rot = T_camera_base[:, axes.station, None, :3, :3]
     back = rot.mT
@@ -182,10 +185,11 @@ def in_base(axes: Axes, T_camera_base: Array) -> Axes:
 
 
 def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array) -> Axes:
-    """Leg axes of a session (B = 1) from the edges that count, [A] 4-5.
+    """Leg axes of a session (B = 1) from the inlier edges, [A] 4-5.
 
-    The direction is what is least along the normals, over all edges of the leg in a
-    photograph; both sides are needed, or the direction would be arbitrary. weights : (N,).
+    The direction is the smallest eigenvector of the normals' scatter, over all edges of the leg in
+    an image; edges of both sides are required, because one side leaves the direction undetermined.
+    weights : (N,).
     """
     edges, n_legs = measurements.edges, machine.n_legs
     radius = machine.radii_of(edges.leg, edges.tube)
@@ -221,10 +225,10 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
 
 
 def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet:
-    """Edges made to pass their base centre exactly, n.A = -R, at the least Mahalanobis change.
+    """Edges constrained to their base centre, n.A = -R, by the smallest Mahalanobis change.
 
-    The centre is known from all configurations, so it takes out most of an edge's tilt error.
-    centres : (S, L, 3) m, camera frames; edges of a NaN centre stay as they are.
+    A centre is estimated from all configurations, so the constraint removes most of an edge's tilt
+    error. centres : (S, L, 3) m, camera frames; edges of a NaN centre are unchanged.
     """
     a = centres[edges.station, edges.leg]
     finite: Booleans = np.all(np.isfinite(a), axis=-1)

@@ -1,4 +1,4 @@
-"""What [A]'s four steps need to know of a machine: joints, legs with a length, frames."""
+"""Nominal joints, legs with a length, and frames of a machine, as used by [A]'s four steps."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ PLANAR_REVOLUTE_AXIS = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class DrawnLegs:
-    """The joints of a machine as drawn, m; each body in its own frame.
+    """Joints of a machine's nominal model, m; each body in its own frame.
 
-    base, platform : (L, 3) centres. base_axes, platform_axes : (L, 3) unit, NaN without one.
-    base_revolute, platform_revolute : (L,) legs that are square to an axis on that body, [A] 7;
-    torsion : legs that cannot twist, with an axis on each.
-    rod : (L,) offsets and constant lengths. closing : (L,) legs with a length.
-    constant : (L,) legs of constant length.
+    base, platform : (L, 3) centres. base_axes, platform_axes : (L, 3) unit, NaN without an axis.
+    base_revolute, platform_revolute : (L,) legs that are perpendicular to an axis on that body, [A]
+    7. torsion : (L,) legs that cannot twist, with an axis on each body. rod : (L,) offsets and
+    constant lengths. closing : (L,) legs with a length. constant : (L,) legs of constant length.
     planar : all axes are the plane's normal. motion : (6, d) of the platform.
     """
 
@@ -41,17 +40,19 @@ class DrawnLegs:
 
     @property
     def directions(self) -> Array:
-        """Directions on the base that photographs show, (D, 3): revolute axes, or the normal."""
+        """Observable directions on the base, (D, 3): revolute axes, or the normal of a planar
+        machine.
+        """
         return PLANAR_REVOLUTE_AXIS[None] if self.planar else self.base_axes[self.base_revolute]
 
     @property
     def framed(self) -> bool:
-        """Whether the frames that the steps hold are the machine's own: by three centres each."""
+        """Whether the steps hold the machine's own frames, by three centres each."""
         return self.motion.shape[1] == 6 and bool(self.closing.all())
 
 
 def legs_as_drawn(machine: Machine) -> DrawnLegs:
-    """The machine's joints as its drawing has them."""
+    """Joints of the machine's nominal model."""
     layout, drawing = machine.layout, machine.parameters.drawing
     base, platform = (drawing[index] for index in centre_index(layout))
     base_axes, platform_axes = (
@@ -81,9 +82,9 @@ def legs_as_drawn(machine: Machine) -> DrawnLegs:
 
 
 def base_gauge(machine: Machine, legs: DrawnLegs) -> Array:
-    """Rows (6, 3 (L + D)) that hold the base frame on the centres, then the directions.
+    """Rows (6, 3 (L + D)) that fix the base frame, on the centres and then the directions.
 
-    Three centres for a spatial machine ([A] 3.3, N_d = 3); for a planar one its normal, its
+    Three centres for a spatial machine ([A] 3.3, N_d = 3); for a planar machine its normal, its
     mean height, one centre and the direction to another (N_d = 2).
     """
     n, d = len(legs.base), len(legs.directions)
@@ -99,10 +100,10 @@ def base_gauge(machine: Machine, legs: DrawnLegs) -> Array:
 
 
 def platform_gauge(machine: Machine, legs: DrawnLegs) -> Array:
-    """Rows (d, 3 L) that hold the platform frame on the centres of the legs with a length.
+    """Rows (d, 3 L) that fix the platform frame on the centres of the legs with a length.
 
-    As many as the platform's motion has directions: the others are not free, as the base
-    frame is known by now.
+    As many rows as the platform's motion has directions; the others are determined, because the
+    base frame is known at this step.
     """
     n = len(legs.platform)
     if legs.planar:
@@ -121,7 +122,9 @@ def platform_gauge(machine: Machine, legs: DrawnLegs) -> Array:
 
 
 def _plane_rows(points: Array) -> Array:
-    """Rows (3, n, 3) that hold points in the x-y plane: the first, and the way to the farthest."""
+    """Rows (3, n, 3) that fix points in the x-y plane: the first, and the direction to the
+    farthest.
+    """
     away = points[:, :2] - points[0, :2]
     far = int(np.argmax(np.linalg.norm(away, axis=1)))
     along = away[far] / np.linalg.norm(away[far])

@@ -1,11 +1,11 @@
 """[B] section IV: each base centre in the camera frame from its leg's edges, linear and robust.
 
-Every edge of a leg says ``n . A = -R`` ([B] 12-13); the edges of all configurations together
-fix A ([B] 14). All functions take many systems at once: leading axes (...), then the n edges
-of one leg at one station, padded with weight zero. Distances in metres, camera frame.
+Every edge of a leg is an equation ``n . A = -R`` ([B] 12-13); the edges of all configurations
+together determine A ([B] 14). All functions solve many systems together: leading axes (...), then
+the n edges of one leg at one station, padded with weight zero. Distances in metres, camera frame.
 
-Under wrong edges plain least squares and M-estimators that start from it collapse to A = 0,
-where every residual is only R; least median of squares does not (errata).
+With wrong edges, plain least squares and M-estimators that start from it collapse to A = 0, where
+every residual is only R; least median of squares does not (errata).
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ RegressionMethod = Literal[
 ]
 
 RANDOM_EDGE_TRIPLES = 500
-"""Random triples: with 35 % wrong edges a clean one is among them but for 1 case in 10^69."""
+"""Number of random triples: with 35 % wrong edges, the probability of no clean triple is 1e-69."""
 RESIDUALS_SORTED_TOGETHER = 2**22
-"""Residuals that are sorted together, 32 MB."""
+"""Number of residuals that are sorted together, 32 MB."""
 HUBER_TUNING, TUKEY_TUNING = 1.345, 4.685
-"""95 % efficiency for normal residuals."""
+"""Tuning constants with 95 % efficiency for normal residuals."""
 COUNTED_TUKEY_WEIGHT = 0.05
-"""Tukey's weight from which an edge counts fully afterwards: a clean one may lose most of its own.
-"""
+"""Tukey weight above which an edge is an inlier with full weight: a clean edge may have lost most
+of its weight."""
 POORLY_FIXED = 1e-7
-"""Ratio of the normal matrix's eigenvalues below which A is not fixed: one leg direction."""
+"""Ratio of the normal matrix's eigenvalues below which A is unidentifiable: one leg direction."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class LinearCentres:
 def weighted_solution(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
     """Weighted least squares of [B] 14: A (..., 3) and inverse normal matrix (..., 3, 3).
 
-    n : (..., n, 3). radius, weight : (..., n). NaN where A is not fixed.
+    n : (..., n, 3). radius, weight : (..., n). NaN where A is unidentifiable.
     """
-    # what is not known of a leg leaves it not fixed
+    # unknown edges have no weight
     n, weight = (np.where(np.isfinite(x), x, 0.0) for x in (n, weight))
     rows = n * weight[..., None]
     normal = rows.mT @ n
@@ -72,12 +72,16 @@ def weighted_solution(n: Array, radius: Array, weight: Array) -> tuple[Array, Ar
 
 
 def edge_plane_residuals(n: Array, radius: Array, a: Array) -> Array:
-    """N . A + R, (..., n) m: how far A lies from each edge's plane moved in by the radius."""
+    """Residuals n . A + R (..., n), in m: distance of A from each edge's plane moved in by the
+    radius.
+    """
     return (n @ a[..., None])[..., 0] + radius
 
 
 def scale_of(r: Array, present: Array) -> Array:
-    """Standard deviation (...) from the median of |r| over the present ones, n - 3 counted."""
+    """Robust standard deviation (...) from the median of |r| over the present edges, n - 3 degrees
+    of freedom.
+    """
     count = np.sum(present > 0, axis=-1)
     ordered = np.sort(np.where(present > 0, np.abs(r), np.inf), axis=-1)
     middle = np.where(count > 0, count // 2, 0)[..., None]
@@ -86,12 +90,12 @@ def scale_of(r: Array, present: Array) -> Array:
 
 
 def huber_weights(x: Array) -> Array:
-    """Huber's weights of residuals in standard deviations."""
+    """Huber weights of whitened residuals."""
     return HUBER_TUNING / np.maximum(np.abs(x), HUBER_TUNING)
 
 
 def tukey_weights(x: Array) -> Array:
-    """Tukey's biweight of residuals in standard deviations; 0 from 4.685."""
+    """Tukey biweights of whitened residuals; 0 above 4.685."""
     return np.where(np.abs(x) < TUKEY_TUNING, (1 - (x / TUKEY_TUNING) ** 2) ** 2, 0.0)
 
 
@@ -100,8 +104,8 @@ def reweighted(
 ) -> tuple[Array, Array, Array]:
     """Iteratively reweighted least squares from ``start`` (..., 3).
 
-    Returns A, weights (..., n) and the inverse normal matrix. The scale is that of the start:
-    a scale that is estimated anew in each step lets Tukey's weights run away.
+    Returns A, weights (..., n) and the inverse normal matrix. The scale is that of the start: with
+    a scale estimated anew in each step, Tukey's weights diverge.
     """
     weights_of = huber_weights if kind == "huber" else tukey_weights
     a, inverse, w = start, np.zeros((*start.shape, 3)), present
@@ -125,11 +129,12 @@ def least_median(
 ) -> Array:
     """Least median of squares: the best of random triples' exact solutions, A (..., 3).
 
-    noise : (..., n, 3, 3) covariances of the normals; residuals are then told in their own standard
-    deviations at each solution. Edges of a rod, far from A, say thirty times less of it than those
-    of its tube: in metres half of all edges are outliers to the other half. And A = 0, where wrong
-    edges drive a solution, has residuals without bound.
+    noise : (..., n, 3, 3) covariances of the normals; residuals are then divided by their own
+    standard deviations at each solution. Edges of a rod, far from A, determine A thirty times less
+    than edges of its tube: in metres half of all edges are outliers to the other half. With the
+    noise, A = 0, to which wrong edges pull a solution, has unbounded residuals.
     """
+    # random triples of present edges, and their exact solutions
     shape = (*present.shape[:-1], RANDOM_EDGE_TRIPLES, 3)
     count = np.sum(present > 0, axis=-1)[..., None, None]
     order = np.argsort(present <= 0, axis=-1, kind="stable")
@@ -141,10 +146,10 @@ def least_median(
     good = np.abs(det) > 1e-9
     rows = np.where(good[..., None, None], rows, np.eye(3))
     a = np.linalg.solve(rows, -right[..., None])[..., 0]
-    # the quantile that LMedS needs counts present edges only, so sort rather than take a median
+    # quantile over the present edges only, so sort instead of taking a median
     half = np.minimum((count[..., 0] + 3) // 2, present.shape[-1] - 1)
     cost = np.empty(a.shape[:-1])
-    # a residual of every edge for every triple: of thousands of photographs, leg after leg
+    # residuals of every edge for every triple, in blocks of legs that fit the memory
     each = max(RESIDUALS_SORTED_TOGETHER // (RANDOM_EDGE_TRIPLES * max(present.shape[-1], 1)), 1)
     every = a, n, np.broadcast_to(radius, present.shape), present
     a_of, n_of, radius_of, present_of = (x.reshape(-1, *x.shape[present.ndim - 1 :]) for x in every)
@@ -170,8 +175,8 @@ def errors_in_variables(
 ) -> tuple[Array, Array]:
     """Minimum of sum w (n.A + R)^2 / (A^T Sigma_n A): A and its covariance, (..., 3, 3).
 
-    covariance : (..., n, 3, 3) of the normals. The noise of n.A grows with A; leaving that
-    out, or its derivative, shrinks A towards the camera. Gauss-Newton, eight steps.
+    covariance : (..., n, 3, 3) of the normals. The noise of n.A grows with A; without it, or
+    without its derivative, A is biased towards the camera. Gauss-Newton, eight steps.
     """
     a, inverse = start, np.full((*start.shape, 3), np.nan)
     for _ in range(8):
@@ -191,16 +196,16 @@ def centres(
     method: RegressionMethod = "robust",
     rng: np.random.Generator | None = None,
 ) -> LinearCentres:
-    """All base centres seen by all stations, [B] 14, with the machine's present radii.
+    """All base centres from all stations, [B] 14, with the machine's present radii.
 
     method : plain, huber and tukey as the paper proposes; least-median alone; robust is least
-    median, then Tukey, then errors-in-variables on what is left; errors-in-variables alone
-    for edges known to be right. rng : draws the triples; seeded with 0 when absent.
+    median, then Tukey, then errors-in-variables on the inliers; errors-in-variables alone is for
+    edges without outliers. rng : for the random triples; seed 0 by default.
     """
     edges = measurements.edges
     group = edges.station * machine.n_legs + edges.leg
     n_groups = measurements.n_stations * machine.n_legs
-    # each edge's place in its group, as many places as the largest group has edges
+    # position of each edge in its group, padded to the largest group
     order = np.argsort(group, kind="stable")
     place = np.empty(len(group), dtype=int)
     place[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order])
@@ -230,7 +235,7 @@ def solve_regressions(
     method: RegressionMethod,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
-    """One method on many systems: A, weights, covariance (see :func:`centres`)."""
+    """Solution of many systems by one method: A, weights, covariance (see :func:`centres`)."""
     a, inverse = weighted_solution(n, radius, present)
     w = present
     if method in ("least-median", "robust"):
@@ -239,7 +244,7 @@ def solve_regressions(
         if method == "least-median":
             return a, w, np.full((*a.shape, 3), np.nan)
     if method == "robust":
-        # in standard deviations, as they are at the start
+        # whitened residuals, with the standard deviations at the start
         spread = dot(a[..., None, :], (noise @ a[..., None, :, None])[..., 0])
         sigma = np.sqrt(np.maximum(np.nan_to_num(spread), np.finfo(float).tiny))
         one = np.where(present > 0, 1 / sigma, 0.0)
@@ -247,7 +252,8 @@ def solve_regressions(
     if method in ("huber", "tukey"):
         a, w, inverse = reweighted(n, radius, present, a, method)
     if method in ("errors-in-variables", "robust"):
-        # a clean edge may lose most of its Tukey weight; count it fully, a wrong one not at all
+        # a clean edge may have lost most of its Tukey weight: inliers get full weight, outliers
+        # none
         w = np.where(w > COUNTED_TUKEY_WEIGHT, 1.0, 0.0) * present
         a, covariance = errors_in_variables(n, radius, noise, w, a)
         return a, w, covariance
@@ -258,7 +264,7 @@ def solve_regressions(
 def scale_ratio(points: Array, drawing: Array) -> float:
     """[B] 16 as printed: mean ratio of the distances; divide the points by it.
 
-    points, drawing : (n, 3). Close pairs dominate it: their ratio is the noisiest.
+    points, drawing : (n, 3). Close pairs dominate the mean, and their ratio is the noisiest.
     """
     i, j = np.triu_indices(len(points), 1)
     measured = np.linalg.norm(points[i] - points[j], axis=-1)
@@ -266,10 +272,10 @@ def scale_ratio(points: Array, drawing: Array) -> float:
 
 
 def procrustes_scale(points: Array, drawing: Array) -> float:
-    """Scale r of the similarity that lays the drawing on the points; divide the points by it.
+    """Scale r of the similarity that fits the nominal model to the points; divide the points by it.
 
-    Maximum over rotations of the least-squares scale: trace of the singular values over the
-    drawing's sum of squares (Umeyama).
+    points, drawing : (n, 3). Maximum over rotations of the least-squares scale: sum of the singular
+    values over the nominal model's sum of squares (Umeyama).
     """
     p, d = points - points.mean(axis=0), drawing - drawing.mean(axis=0)
     u, s, vt = np.linalg.svd(p.T @ d)

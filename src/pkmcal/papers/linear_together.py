@@ -1,15 +1,22 @@
-"""[B] 14 for all legs and stations at once, with what is known beforehand of base, radii and edges.
+"""[B] 14 for all legs and stations jointly, with priors on base, radii and edge shifts.
 
-Leg by leg, a base centre's distance comes from nothing but the apparent width of its tube: a shift
-of both its edges by a thousandth of that width puts it a thousandth nearer or farther. Edges have
-such shifts, by blur and shading, and no edge of the same leg tells them from distance. The other
-legs do: a shift that all edges share scales the whole base, and the drawing knows the base to a few
-thousandths. So this is the paper's first way, "solving simultaneously (14) together with
-constraints linking the attachment points", the constraints being the drawing's values with their
-tolerances. It contains 15, the stations' poses, and 16, the scale, whose cause (shift or radii) is
-left to the data. It is no longer linear; leg by leg, which needs no start and lets go of wrong
-edges, is where it begins. No reading is used and nothing that moves: platform and offsets stay the
-drawing's, and so do their deviations.
+Leg by leg, the distance of a base centre follows from the apparent width of its tube only: a shift
+of both edges by a thousandth of that width changes the distance by a thousandth. Edges have such
+shifts, from blur and shading, and no edge of the same leg separates them from distance. The other
+legs do: a shift common to all edges scales the whole base, and the nominal model determines the
+base to a few thousandths. This is the paper's first way, "solving simultaneously (14) together with
+constraints linking the attachment points", with the nominal values and their prior sigmas as
+constraints. It contains 15, the stations' poses, and 16, the scale, whose cause (shift or radii)
+the data decide. The problem is not linear; the solution leg by leg, which needs no start and
+rejects wrong edges, is its start. No reading and nothing that moves enters: platform and offsets
+keep their nominal values and prior sigmas.
+
+Rows of the system:
+
+               machine z   stations   edge shifts (cameras, lines)
+edges       [      X           X             X      ]   n.A + R = 0
+priors      [      1                                ]   nominal model
+            [                                1      ]   shifts
 """
 
 from __future__ import annotations
@@ -36,28 +43,27 @@ from pkmcal.papers import linear
 from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
 
 MOST_GAUSS_NEWTON_STEPS, MOST_VARIANCE_ROUNDS = 30, 30
-"""Most Gauss-Newton steps with given variances, and most rounds of variances."""
+"""Maximum number of Gauss-Newton steps with given variances, and of updates of the variances."""
 PREDICTED_MOVE_SETTLED = 1e-6
-"""The last step moves what the rows predict by no more than this part of what they miss."""
+"""Predicted change of the rows in the last step, relative to the residuals."""
 FEW_FREEDOMS_FOR_NOISE = 5.0
-"""Degrees of freedom, without more of which nothing is said of the noise."""
+"""Degrees of freedom up to which the noise scale is not estimated."""
 USE_DEFAULT_METHOD = "Use the joint method (bundle), which is the default"
 ONE_RESIDUAL_FACTOR = FULL_WEIGHT_DISTANCE / float(
     clean_norm(CLEAN_TAIL_SHARE, np.ones((), dtype=int))
 )
-"""Factor on one residual's size, so that as many clean ones lie beyond FULL_WEIGHT_DISTANCE as of
-pairs."""
+"""Factor on the magnitude of one residual, so that as many clean residuals as clean pairs exceed
+FULL_WEIGHT_DISTANCE."""
 
 
 @dataclass(frozen=True)
 class BaseSolution:
-    """What the edges tell of the base, with the drawing.
+    """Joint solution of the edges with the nominal model.
 
-    theta : (P,) all parameters; those that no edge tells of are the drawing's.
-    T_camera_base : (S, 4, 4). spread : (P + 6 S, m) square root of the covariance of parameters
-    and stations (omega, tau), in theta's frames. edge_shift, edge_shift_sigma : (C,) px.
-    shading : (n,) px, standard deviation of each line's own shift.
-    weights : (N,) of the edges. scale : factor on the edges' stated noise.
+    theta : (P,) all parameters; those without edges are nominal. T_camera_base : (S, 4, 4).
+    spread : (P + 6 S, m) square root of the covariance of parameters and stations (omega, tau), in
+    theta's frames. edge_shift, edge_shift_sigma : (C,) px. shading : (n,) px, standard deviation of
+    each line's own shift. weights : (N,) of the edges. scale : factor on the edges' stated noise.
     """
 
     theta: Array
@@ -73,12 +79,12 @@ class BaseSolution:
 def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
     """Base centres, radii, stations and edge shifts by [B] 14 on all edges, maximum likelihood.
 
-    One equation an edge, ``n.A + R = 0`` with A = T_camera_base P, its normal n as it is without
-    the camera's edge shift and the line's shading, divided by the deviation of n.A. Beside them
-    the drawing, 0.3 px for a camera's shift, and for the lines' what they have in common, which is
-    estimated as the joint estimate's is, but each tube's for itself and no less than usual.
-    Raises ResultError where a station sees fewer than three legs in two directions each, or the
-    legs' joints on the base move.
+    One equation for each edge, ``n.A + R = 0`` with A = T_camera_base P, its normal n corrected by
+    the camera's edge shift and the line's shading, divided by the standard deviation of n.A.
+    Priors: the nominal model, 0.3 px for a camera's shift, and for the lines' shifts their common
+    standard deviation, which is estimated as in the joint estimate, but for each tube and with a
+    lower bound. Raises ResultError if a station sees fewer than three legs in two directions each,
+    or if the legs' joints on the base move.
     """
     system = _system(machine, measurements)
     now = system.start
@@ -88,18 +94,20 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
     for _ in range(MOST_VARIANCE_ROUNDS):
         now, half = _solved(system, now, weight, scale, shading)
         residual, jac = _rows(system, now)
-        # the noise scale makes chi2 equal its degrees of freedom, as in the joint estimate
+        # the noise scale makes chi2 equal to its degrees of freedom, as in the joint estimate
         freedom = np.sum(weight) - np.sum(weight[:, None] * (jac @ half) ** 2) / scale**2
         before = weight, scale, shading
         if freedom > FEW_FREEDOMS_FOR_NOISE:
             scale = float(np.sqrt(np.sum(weight * residual**2) / freedom))
             scale = max(scale, LEAST_SCALE)
+        # standard deviation of the lines' shading
         if shading.size:
             lines = system.unknowns.shading
             covariance = half[lines] @ half[lines].T
             shift = now.shifts[system.unknowns.n_cameras :]
             given = shift[None], covariance[None], np.eye(len(shift)), shading[None]
             shading = common_shading(*given, SHADING_SIGMA)[0]
+        # weights at the new scale, and convergence of scale, shading and weights
         weight = final_weights(np.abs(residual) / scale * ONE_RESIDUAL_FACTOR) * system.used
         change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
         change = max(change, np.abs(weight - before[0]).max() / 1e-2)
@@ -122,8 +130,10 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
 
 
 class _State(NamedTuple):
-    """z : (nz,) free parameters off the drawing. T_camera_base : (S, 4, 4). shifts : (C + n,) px
-    outward, of cameras and then of lines.
+    """State of the iteration.
+
+    z : (nz,) deviations of the free parameters from the nominal model. T_camera_base : (S, 4, 4).
+    shifts : (C + n,) px outward, of cameras and then of lines.
     """
 
     z: Array
@@ -131,7 +141,7 @@ class _State(NamedTuple):
     shifts: Array
 
     def retract(self, step: Array, u: Unknowns) -> _State:
-        """The state after a step (na,) of all unknowns."""
+        """Retract the state along a step (na,) of all unknowns."""
         turns = step[u.stations].reshape(-1, 6)
         shifts = self.shifts + step[u.optics.start : u.shading.stop]
         return _State(self.z + step[u.machine], perturb(self.T_camera_base, turns), shifts)
@@ -139,11 +149,12 @@ class _State(NamedTuple):
 
 @dataclass(frozen=True)
 class _System:
-    """Everything of [B] 14 that stays: N edges, their places among the parameters and unknowns.
+    """Constant data of [B] 14: N edges and their columns among parameters and unknowns.
 
-    tolerance : (nz,) of the free parameters. shifts : (N, 1 or 2) which of the shifts each edge
-    has. noise : (N, 3, 3) covariances of the normals. by_shift : (N, 3) their change by a pixel
-    outward. used : (N,) of legs that their station knows. first : (N,) weights to begin with.
+    centre, radius : (N, 3) and (N,) columns of theta. shifts : (N, 1 or 2) columns of each edge's
+    shifts. noise : (N, 3, 3) covariances of the normals. by_shift : (N, 3) their derivatives by an
+    outward shift, per px. used : (N,) edges of legs that their station determines. start : the
+    first state.
     """
 
     machine: Machine
@@ -164,17 +175,21 @@ class _System:
 
     @property
     def believed(self) -> Integers:
-        """Columns (c,) of the unknowns of which something is known beforehand."""
+        """Columns (c,) of the unknowns with a prior."""
         return np.r_[self.unknowns.machine, self.unknowns.optics, self.unknowns.shading]
 
     def prior(self, shading: Array) -> Array:
-        """Their standard deviations, (c,); shading : (n,) px of the lines."""
+        """Prior sigmas (c,) of these unknowns; shading : (n,) px of the lines."""
         shift = np.full(self.unknowns.n_cameras, SHIFT_SIGMA)
         return np.concatenate([self.machine.parameters.tolerances_free(), shift, shading])
 
 
 def _system(machine: Machine, measurements: Measurements) -> _System:
-    """The system with its start: drawing, stations registered on the legs' own solutions (15)."""
+    """System with its start: nominal model, stations registered to the leg-by-leg solutions (15).
+
+    Raises ResultError for a machine with moving base joints, and for a station with fewer than
+    three legs.
+    """
     if any(group.carrier.driven for group in machine.layout.base):
         raise ResultError(
             "[B]'s linear method is for legs that turn about points of the base",
@@ -222,11 +237,11 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
 
 
 def _registered(system: _System, centres: Array, valid: Booleans) -> _System:
-    """The system with its stations where the drawing, laid on three legs' centres (15), explains
-    the most edges: among few configurations a leg may be lost to wrong edges, and would take a
-    station that is laid on all legs along.
+    """System with each station at the pose that explains the most edges.
 
-    centres : (S, L, 3) leg by leg; valid : (S, L).
+    Candidates are registrations of the nominal model to all legs' centres and to those of every
+    three legs (15): with few configurations a leg may be an outlier, which would pull a station
+    that is fitted to all legs. centres : (S, L, 3) leg by leg. valid : (S, L).
     """
     edges, start = system.edges, system.start
     drawing = system.theta(start)[centre_index(system.machine.layout)[0]]
@@ -249,8 +264,10 @@ def _registered(system: _System, centres: Array, valid: Booleans) -> _System:
 
 
 def _distance(system: _System, state: _State) -> Array:
-    """|n.A + R| (N,) in standard deviations of all that is known at the start: the edge's noise,
-    the drawing's tolerances and the shifts that edges may have.
+    """|n.A + R| (N,) in standard deviations at the start.
+
+    The variance is that of the edge's noise, the nominal model's prior sigmas and the edge's
+    possible shifts.
     """
     residual, jac = _rows(system, state)
     prior = np.square(system.prior(np.full(system.unknowns.n_lines, SHIFT_SIGMA)))
@@ -258,10 +275,10 @@ def _distance(system: _System, state: _State) -> Array:
 
 
 def _rows(system: _System, state: _State) -> tuple[Array, Array]:
-    """(n.A + R) by its standard deviation, (N,), and its derivatives, (N, na).
+    """Whitened residuals n.A + R (N,) and their derivatives (N, na).
 
-    The deviation is that of n.A by the normal's noise and grows with A: leaving its derivative out
-    would shrink A towards the camera, as in :func:`pkmcal.papers.linear.errors_in_variables`.
+    The standard deviation of n.A, from the normal's noise, grows with A: without its derivative A
+    is biased towards the camera, as in :func:`pkmcal.papers.linear.errors_in_variables`.
     """
     edges, u, theta = system.edges, system.unknowns, system.theta(state)
     station = state.T_camera_base[edges.station]
@@ -281,7 +298,7 @@ def _rows(system: _System, state: _State) -> tuple[Array, Array]:
     at = np.arange(len(value))
     arm = (turn @ point[..., None])[..., 0]
     columns = u.stations.start + 6 * edges.station[:, None] + np.arange(6)
-    # A moves by omega x arm + tau
+    # derivative of A by the station: omega x arm + tau
     by[at[:, None], columns] = np.concatenate([cross(arm, by_a), by_a], axis=1)
     by[at[:, None], u.optics.start + system.shifts] = (-dot(system.by_shift, a) / sigma)[:, None]
     return value, by
@@ -290,10 +307,10 @@ def _rows(system: _System, state: _State) -> tuple[Array, Array]:
 def _solved(
     system: _System, state: _State, weight: Array, scale: float, shading: Array
 ) -> tuple[_State, Array]:
-    """The best state with given variances, and a square root (na, na) of its covariance.
+    """Solution for given variances, and a square root (na, na) of its covariance.
 
-    weight : (N,) of the edges. scale : of their noise. shading : (n,) px of the lines.
-    Raises ResultError where the steps do not end.
+    weight : (N,) of the edges. scale : of their noise. shading : (n,) px of the lines. Raises
+    ResultError if the Gauss-Newton steps do not converge.
     """
     u, prior = system.unknowns, system.prior(shading)
     beliefs = np.zeros((len(prior), u.count))

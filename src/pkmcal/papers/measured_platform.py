@@ -1,9 +1,10 @@
-"""The platform's pose out of a measured board's, and what of it the machine cannot move.
+"""Platform pose from a measured board pose, and its components that the machine cannot move.
 
 ``T_base_platform = T_camera_base^-1 T_camera_board T_platform_board^-1``, [C] eq. 6. A machine with
-fewer than six freedoms cannot take that pose exactly: it is told as a pose that it can take, and as
-what is *off* (the tilt of an H4's nacelle, the turn of a delta's platform), which only noise and a
-wrong model explain. Perturbations are from the left, see :mod:`pkmcal.geometry.rigid`.
+fewer than six degrees of freedom cannot take that pose exactly: it is split into a pose that the
+machine can take, and deviations (the tilt of an H4's nacelle, the rotation of a delta's platform)
+that are due to noise and model errors. Perturbations are from the left, see
+:mod:`pkmcal.geometry.rigid`.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from pkmcal.measurements.poses import turn_jacobian
 
 
 class MeasuredPlatform(NamedTuple):
-    """Platform poses (..., 4, 4) and their change (..., 6, 6) by T_base_camera, by the mount's pose
-    and by the measured one.
+    """Platform poses (..., 4, 4) and their derivatives.
+
+    by_station, by_mount, by_measured : (..., 6, 6) by T_base_camera, by the mount's pose and by the
+    measured pose.
     """
 
     pose: Array
@@ -29,8 +32,10 @@ class MeasuredPlatform(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A pose split: what the machine can take (..., 4, 4), what is off (..., 6 - d), and the
-    change of both by the whole pose's, (..., 6, 6) and (..., 6 - d, 6).
+    """Pose split into the part that the machine can take and the deviations.
+
+    pose : (..., 4, 4). off : (..., 6 - d) deviations. by, off_by : (..., 6, 6) and (..., 6 - d, 6)
+    derivatives of both by the whole pose.
     """
 
     pose: Array
@@ -50,7 +55,9 @@ def measured_platform(
     place, camera = board - arm, -(back @ T_camera_base[..., :3, 3:])[..., 0]
 
     def by(turn: Array, lever: Array) -> Array:
-        """The pose's change where what is perturbed turns and shifts it by ``turn``."""
+        """Derivative of the pose by a perturbation in a frame rotated by ``turn``, at a distance
+        ``lever``.
+        """
         out = np.zeros((*place.shape[:-1], 6, 6))
         out[..., :3, :3] = out[..., 3:, 3:] = turn
         out[..., 3:, :3] = skew(lever) @ turn
@@ -62,10 +69,11 @@ def measured_platform(
 
 
 def taken(motion: Array, whole: Array) -> Taken:
-    """A pose as the machine can take it; motion (6, d) of ``MOTION_DIRECTIONS``.
+    """Split of a pose for a machine with motion (6, d) of ``MOTION_DIRECTIONS``.
 
-    Of the turn, ``R = Exp(s) R_own``: R_own about z where the machine turns about z alone (s is
-    then horizontal), none where it does not turn. Places that it cannot take are off as they are.
+    Rotation, ``R = Exp(s) R_own``: R_own is about z for a machine that turns about z only
+    (s is then horizontal), and the identity for one that does not turn. Translations that the
+    machine cannot make are deviations as they are.
     """
     can: Booleans = np.any(motion != 0, axis=1)
     own, off, turn_by, off_turn_by = _turn_split(int(can[:3].sum()), whole[..., :3, :3])
@@ -83,7 +91,7 @@ def taken(motion: Array, whole: Array) -> Taken:
 
 
 def _turn_split(freedoms: int, rot: Array) -> tuple[Array, Array, Array, Array]:
-    """Own turn (..., 3, 3), what is off (..., k), and their changes by the turn's."""
+    """Own rotation (..., 3, 3), deviation (..., k), and their derivatives by the rotation."""
     shape = rot.shape[:-2]
     eye = np.broadcast_to(np.eye(3), (*shape, 3, 3))
     if freedoms == 3:
@@ -91,12 +99,13 @@ def _turn_split(freedoms: int, rot: Array) -> tuple[Array, Array, Array, Array]:
     if freedoms == 0:
         off = rotation_vector(rot)
         return eye, off, np.zeros((*shape, 3, 3)), turn_jacobian(off)
-    # the twist about z that leaves the shortest turn, by the quaternion's scalar and z parts
+    # the twist about z with the shortest remaining rotation, from the quaternion's scalar and z
+    # parts
     angle = np.arctan2(rot[..., 1, 0] - rot[..., 0, 1], rot[..., 0, 0] + rot[..., 1, 1])
     own = rotation(angle[..., None] * np.array([0.0, 0.0, 1.0]))
     rest = rot @ own.mT
     s = rotation_vector(rest)
-    # a change of s turns by the left Jacobian, a change of the angle by the axis carried along
+    # ds acts through the left Jacobian, dangle along the rotated axis
     columns = np.linalg.inv(turn_jacobian(s))
     basis = np.concatenate([columns[..., :2], rest[..., 2:]], axis=-1)
     back = np.linalg.inv(basis)

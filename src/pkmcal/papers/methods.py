@@ -1,9 +1,8 @@
-"""[A]'s four steps, [B]'s linear solution and [C]'s inverse-kinematic method as results of their
-own, to compare with.
+"""Estimates by [A]'s four steps, [B]'s linear solution and [C]'s inverse-kinematic method.
 
-They come without uncertainties in the papers. Here the linear solution's standard deviations are
-those of its equations; the others' are the spread of the method over repetitions with the edges'
-and readings' stated noise added once more.
+The papers give no uncertainties. Here the linear solution's standard deviations are those of its
+equations; for the other methods they are the scatter over repetitions with the stated noise of
+edges and readings added once more.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from pkmcal.solver.search import NO_WEIGHT_DISTANCE
 
 Repeated = Literal["four-step", "inverse-kinematic"]
 SIGMA_REPETITIONS = 60
-"""Repetitions for the standard deviations: they are then known to 9 %."""
+"""Number of repetitions for the standard deviations, which are then accurate to 9 %."""
 
 
 def by_paper(
@@ -43,10 +42,10 @@ def by_paper(
     joint: Estimate,
     seed: int = 0,
 ) -> Estimate:
-    """An estimate by one of the papers' methods on the same edges.
+    """Estimate by one of the papers' methods on the same edges.
 
-    joint : the joint estimate, for the stations' poses where a station sees too few legs.
-    Raises ResultError where the method cannot be applied.
+    joint : the joint estimate, for the poses of stations that see too few legs. Raises ResultError
+    if the method cannot be applied.
     """
     if method == "linear":
         return linear_estimate(machine, measurements)
@@ -81,11 +80,11 @@ def _solve(method: Repeated, machine: Machine, measurements: Measurements, guess
 
 
 def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
-    """[B] 14 for base, radii, edge shift and stations; the platform and all lengths as drawn.
+    """[B] 14 for base, radii, edge shift and stations; platform and all lengths are nominal.
 
-    Its covariance is that of the equations, with the drawing's tolerances where nothing else is
-    known: platform joints that were not measured are no better known for being left alone.
-    Raises ResultError without edges of legs, and where a station sees too few of them.
+    Its covariance is that of the equations, with the nominal model's prior sigmas for parameters
+    without data, such as platform joints. Raises ResultError without edges of legs, and if a
+    station sees too few of them.
     """
     if not len(measurements.edges):
         raise ResultError(
@@ -124,7 +123,7 @@ def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     noise = measurements.joint_noise * rng.normal(size=measurements.joints.shape)
     poses = measurements.poses
-    # what was not measured has no noise
+    # components that were not measured have no noise
     shifted = (np.linalg.pinv(poses.whiten) @ rng.normal(size=(len(poses), 6, 1)))[..., 0]
     return replace(
         measurements,
@@ -141,11 +140,11 @@ def _estimate(
     joint: Array,
     irls_weight: tuple[Array, float] | None = None,
 ) -> Estimate:
-    """The method's result with its residuals.
+    """Estimate of a method with its residuals.
 
-    joint : covariance as :class:`~pkmcal.identify.estimate.Estimate` has it. irls_weight : weights
-    (N,) of the edges and the factor on their noise, where the method has its own; else edges far
-    off the rest have weight 0.
+    joint : covariance as in :class:`~pkmcal.identify.estimate.Estimate`. irls_weight : weights (N,)
+    of the edges and the factor on their noise, if the method has its own; by default edges with a
+    large residual have weight 0.
     """
     gauge = default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=False)

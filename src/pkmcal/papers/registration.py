@@ -1,12 +1,12 @@
-"""Points of one rigid body, seen in many frames: the body and its poses together.
+"""Registration of points of one rigid body in many frames: the body and its poses together.
 
-The corrected form of [A] 9 (base centres seen from the stations) and of [A] 16 (platform
-centres seen in the photographs): ``min sum w |T_k p_j - m_kj|^2`` over points p and poses T_k.
-Products of distances between coplanar points, as printed, leave the third coordinate to
-second order; this does not.
+The corrected form of [A] 9 (base centres in the stations' frames) and of [A] 16 (platform centres
+in the images' frames): ``min sum w |T_k p_j - m_kj|^2`` over points p and poses T_k. Products of
+distances between coplanar points, as printed, determine the third coordinate to second order only;
+the registration determines it to first order.
 
-Items of a body are points, and after them directions (joint axes), which turn but do not shift;
-directions are scaled to metres by a length, so that both kinds can be weighed together.
+Items of a body are points, and after them directions (joint axes), which rotate but do not shift;
+directions are scaled to metres by a length, so that both kinds can be weighted together.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from pkmcal.solver.elimination import Linear
 from pkmcal.solver.search import Solution, Values, minimise
 
 REGISTRATION_UNIT_SIGMA = 1e-4
-"""Metres that count as one standard deviation; it only sets where the search stops."""
+"""Standard deviation, in metres, of all rows; it only determines when the search stops."""
 LOOSE_ITEMS_EIGENVALUE = 1e-4
-"""Eigenvalue below which a body's items count as loose, of 1 for an item that one frame holds:
-a shape error is then seen a hundredth of its size."""
+"""Eigenvalue, relative to 1 for an item that one frame determines, below which a motion of items is
+unidentifiable: a shape error then appears with a hundredth of its size."""
 ANY_MOTION = np.eye(6)
-"""Motion (6, d) of a free body; columns as in
-:data:`pkmcal.mechanisms.document.MOTION_DIRECTIONS`."""
+"""Motion (6, d) of a free body; columns as in :data:`pkmcal.mechanisms.document.MOTION_DIRECTIONS`.
+"""
 
 
 class RegisteredBody(NamedTuple):
-    """Items (B, n, 3) and the poses (B, K, 4, 4) that map them to the frames they are seen in."""
+    """Items (B, n, 3) of a body, and poses (B, K, 4, 4) from the body to the frames."""
 
     points: Array
     poses: Array
@@ -43,8 +43,14 @@ class RegisteredBody(NamedTuple):
 class BodyProblem:
     """solver.LeastSquares for a rigid body; measured (B, K, n, 3), weight (B, K, n).
 
-    gauge : (c, 3 n) rows that hold the body's frame. drawing : (n, 3) their reference.
-    shifts : (n,) 1 for points, 0 for directions. motion : (6, d) how the body can move.
+    gauge : (c, 3 n) rows that fix the body's frame. drawing : (n, 3) their reference. shifts : (n,)
+    1 for points, 0 for directions. motion : (6, d) of the body.
+
+    Jacobian of frame k (own columns are eliminated by the Schur complement):
+
+                 items   | own (pose k)
+    frame k    [   X     |     X       ]
+    gauge      [   X     |             ]
     """
 
     measured: Array
@@ -90,12 +96,12 @@ class BodyProblem:
         )
 
     def retract(self, state: RegisteredBody, shared: Array, own: Array) -> RegisteredBody:
-        """The body after a step."""
+        """Retract the body along a step."""
         poses = perturb(state.poses, own @ self.motion.T)
         return RegisteredBody(state.points + shared.reshape(state.points.shape), poses)
 
     def select(self, runs: Integers) -> BodyProblem:
-        """Some runs only."""
+        """Problem of some runs."""
         return replace(self, measured=self.measured[runs], weight=self.weight[runs])
 
 
@@ -108,12 +114,12 @@ def fit_body(
     directions: int = 0,
     motion: Array = ANY_MOTION,
 ) -> RegisteredBody:
-    """The body and its poses from what was seen; [A] 9 and 16 corrected.
+    """Body and its poses by registration; [A] 9 and 16 corrected.
 
-    measured : (B, K, n, 3) m. weight : (B, K, n), 0 where not seen; a frame that leaves its
-    pose undetermined (fewer than three points of a spatial body) should be left out. gauge :
-    (c, 3 n) rows on the items. drawing : (n, 3) m, the start. directions : how many of the
-    last items are directions. motion : (6, d) of the body in the frames it is seen in.
+    measured : (B, K, n, 3) m. weight : (B, K, n), 0 where not visible; frames that leave their pose
+    undetermined (fewer than three points of a spatial body) must be removed. gauge : (c, 3 n) rows
+    on the items. drawing : (n, 3) m, the start. directions : number of the last items that are
+    directions. motion : (6, d) of the body in its frames.
     """
     measured = np.where(weight[..., None] > 0, measured, 0.0)
     points = np.broadcast_to(drawing, (measured.shape[0], *drawing.shape)).copy()
@@ -127,13 +133,13 @@ def fit_body(
 def poses_laying_items(
     items: Array, measured: Array, weight: Array, directions: int = 0, motion: Array = ANY_MOTION
 ) -> Array:
-    """Poses (..., 4, 4) within ``motion`` that lay items (..., n, 3) on what was seen.
+    """Poses (..., 4, 4) within ``motion`` that fit items (..., n, 3) to measured ones.
 
-    Least squares over the points, the last ``directions`` items without their shift: the
-    rotation that maximises tr(R^T H), H = sum w m p^T about the points' means (Kabsch; for a
-    motion in the plane its angle, for a translation none).
+    Least squares over the points, and over the last ``directions`` items without their shift: the
+    rotation that maximizes tr(R^T H), H = sum w m p^T about the points' means (Kabsch; the angle
+    for a motion in the plane, the identity for a translation).
     """
-    w = np.maximum(weight, 1e-12)  # a frame that shows nothing gets some pose, not NaN
+    w = np.maximum(weight, 1e-12)  # a frame without visible items gets some pose, not NaN
     n = items.shape[-2] - directions
     if motion.shape[1] == 6 and directions == 0:
         return register(items, measured, w)
@@ -156,7 +162,7 @@ def poses_laying_items(
 
 
 def extent(points: Array) -> float:
-    """Root mean square distance (m) of points (n, 3) from their mean."""
+    """RMS distance (m) of points (n, 3) from their mean."""
     away = points - points.mean(axis=0)
     return float(np.sqrt(np.mean(dot(away, away))))
 
@@ -164,15 +170,15 @@ def extent(points: Array) -> float:
 def loose(
     items: Array, visible: Booleans, directions: int = 0, motion: Array = ANY_MOTION
 ) -> Array:
-    """Ways (n, 3, f) in which a body's items could move against each other unnoticed.
+    """Unidentifiable directions (n, 3, f) of a body's items in all frames together.
 
-    The null space of the registration's Jacobian at ``items`` (n, 3), without the body's own
-    rigid motions: what frames that see ``visible`` (K, n) together leave open. f = 0 : all is
-    fixed. Every item should be seen.
+    The null space of the registration's Jacobian at ``items`` (n, 3), without the body's own rigid
+    motions, for frames with ``visible`` (K, n) items. f = 0 if all items are determined. Every item
+    should be visible in some frame.
     """
     own = _own_motions(items, directions, motion)
     mask = np.repeat(visible, 3, axis=1)[:, :, None]
-    # an orthonormal basis of each frame's motions; those that it does not see count as nothing
+    # orthonormal basis of each frame's motions, without motions that its items do not show
     u, s, _ = np.linalg.svd(own * mask, full_matrices=False)
     u = u * (s > LOOSE_ITEMS_EIGENVALUE * np.sqrt(len(items)))[:, None, :]
     normal = np.sum(np.eye(len(own)) * mask - u @ u.mT, axis=0)
@@ -184,11 +190,11 @@ def loose(
 def parts_of(
     items: Array, visible: Booleans, free: Array, directions: int = 0, motion: Array = ANY_MOTION
 ) -> tuple[Booleans, Booleans]:
-    """Two sets of items (n,) that ``free`` (n, 3, f), found by :func:`loose`, moves against each
-    other: what moves while one frame's items are held, and what while another's are.
+    """Two sets of items (n,) that ``free`` (n, 3, f), from :func:`loose`, moves against each other.
 
-    Items that belong to both, such as two joints about whose line the rest turns, are in none.
-    Distances would not do: out of a plane of joints they change in second order only.
+    The first set moves while the items of one frame are at rest, the second while another frame's
+    are. Items of both sets, such as two joints about whose line the rest rotates, are in neither.
+    Distances are no criterion: out of a plane of joints they change to second order only.
     """
     own = _own_motions(items, directions, motion)
     flat = free.reshape(len(own), -1)
@@ -199,7 +205,7 @@ def parts_of(
         rate = np.linalg.norm((flat - held).reshape(len(items), -1), axis=1)
         stay.append(rate < 0.05 * rate.max())
     first = next((s for s in stay if not s.all()), np.zeros(len(items), dtype=bool))
-    # where one frame holds nearly all, no other may look beyond it
+    # if one frame has nearly all items, the other frame need not see beyond it
     beyond = (s for s, frame in zip(stay, visible, strict=True) if (frame & ~first).any())
     other = next(beyond, ~first)
     return first & ~other, other & ~first
@@ -208,14 +214,14 @@ def parts_of(
 def fixes_pose(
     items: Array, visible: Booleans, directions: int = 0, motion: Array = ANY_MOTION
 ) -> Booleans:
-    """Frames (K,) whose own items, seen (K, n), fix their pose of the body."""
+    """Frames (K,) whose visible items (K, n) determine their pose of the body."""
     own = _own_motions(items, directions, motion)
     s = np.linalg.svd(own * np.repeat(visible, 3, axis=1)[:, :, None], compute_uv=False)
     return s[:, -1] > LOOSE_ITEMS_EIGENVALUE * np.sqrt(len(items))
 
 
 def _own_motions(items: Array, directions: int, motion: Array) -> Array:
-    """How the items move with their body, (3 n, d), turns scaled by the body's size."""
+    """Motions (3 n, d) of the items with their body, rotations scaled by the body's size."""
     n = len(items) - directions
     p = items.copy()
     p[:n] -= items[:n].mean(axis=0)
@@ -226,9 +232,9 @@ def _own_motions(items: Array, directions: int, motion: Array) -> Array:
 
 @dataclass(frozen=True)
 class Dense:
-    """A plain batched least-squares problem on a vector (B, n), for the papers' criteria.
+    """Batched dense least-squares problem on vectors (B, n), for the papers' criteria.
 
-    rows : function of x (b, n) and the runs' numbers (b,), gives values (b, r) and Jacobian
+    rows : function of x (b, n) and the runs' indices (b,), with values (b, r) and Jacobian
     (b, r, n).
     """
 
@@ -241,7 +247,7 @@ class Dense:
         return Values(value[:, None], np.zeros((len(value), 0)))
 
     def linearize(self, state: Array) -> Linear:
-        """Values and Jacobian; there are no unknowns of a configuration's own."""
+        """Values and Jacobian, without own unknowns."""
         value, jac = self.rows(state, self.runs)
         usable: Booleans = np.ones((len(value), 1, value.shape[-1]), dtype=bool)
         own = np.zeros((*usable.shape, 0))
@@ -252,11 +258,11 @@ class Dense:
 
     @staticmethod
     def retract(state: Array, shared: Array, own: Array) -> Array:
-        """The vector after a step."""
+        """Retract the vector along a step."""
         return state + shared + 0 * own.sum()
 
     def select(self, runs: Integers) -> Dense:
-        """Some runs only."""
+        """Problem of some runs."""
         return replace(self, runs=self.runs[runs])
 
 
@@ -273,10 +279,11 @@ def points_by(
     gauge: Array,
     n_runs: int,
 ) -> Array:
-    """Points (B, n, 3) by a criterion on them, their frame held by the gauge's rows (c, 3 n).
+    """Points (B, n, 3) that minimize a criterion.
 
-    criterion : function of points (b, n, 3) and the runs' numbers (b,), gives values (b, r) in m
-    (or m^2) and their derivatives (b, r, n, 3). drawing : (n, 3), the start.
+    gauge : (c, 3 n) rows that fix the points' frame. criterion : function of points (b, n, 3) and
+    the runs' indices (b,), with values (b, r) in m (or m^2) and their derivatives (b, r, n, 3).
+    drawing : (n, 3), the start.
     """
 
     def rows(x: Array, runs: Integers) -> tuple[Array, Array]:

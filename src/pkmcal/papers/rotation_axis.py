@@ -1,8 +1,8 @@
-"""How a board turned between its poses: about any axis, about one, or not at all; [C] III.B, IV.B.
+"""Test of a board's rotations between its poses: any axis, one axis, or none; [C] III.B, IV.B.
 
-Before any identification, the turns of a board seen by one camera tell how many ways the platform
-turns. The hypothesis of the mechanism file (an H4 turns about one axis, a delta does not) is put to
-a chi2 test by the poses' own noise; the spread of an axis alone proves nothing (errata, [C]).
+Before any identification, the rotations of a board in one camera show the platform's degrees of
+freedom. The hypothesis of the mechanism file (an H4 turns about one axis, a delta does not turn) is
+tested by chi2 with the poses' own noise; the scatter of an axis alone is no evidence (errata, [C]).
 """
 
 from __future__ import annotations
@@ -29,27 +29,28 @@ from pkmcal.papers.measured_platform import taken
 
 Turning = Literal["none", "one axis", "any"]
 TURNING_BY_FREEDOMS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
-"""By how many turns a machine's motion has."""
+"""Hypothesis by the number of rotations in a machine's motion."""
 LEAST_PAIR_TURN = np.radians(10.0)
-"""Turns (rad) between two poses below which their axis is left out: noise grows as 1 / turn."""
+"""Rotations (rad) between two poses below which their axis is ignored: its noise grows as 1 /
+rotation."""
 DROPPED_HYPOTHESIS_CHANCE = 1e-3
-"""Probability below which a hypothesis is dropped: one honest session in a thousand."""
+"""p-value below which a hypothesis is rejected: one valid session in a thousand."""
 ACCEPTED_CHI2_A_FREEDOM = 2.0
-"""chi2 per degree of freedom up to which a hypothesis is kept all the same: the noise of a pose out
-of a photograph is itself known to some 40 % only (lens, print, shading)."""
+"""chi2 per degree of freedom up to which a hypothesis is accepted all the same: the noise of a pose
+from an image is itself accurate to some 40 % only (lens, print, shading)."""
 ROTATION_AXIS_STEPS = 10
 MOST_TURN_PAIRS = 200_000
 
 
 @dataclass(frozen=True)
 class RotationAxis:
-    """How the boards of one camera and mount turned.
+    """Test of the rotations of the boards of one camera and mount.
 
-    hypothesis : how the machine should turn it.
-    tilt : (N,) rad that each pose is off the hypothesis; expected_tilt : (N,) what noise alone
-    would give, root mean square. spread, expected_spread : rad, root mean square angle of the axes
-    of pairs of poses to their mean, and what noise alone would give; NaN without pairs that turn.
-    chi2, dof, p_value : of the hypothesis; 0 and 1 where it asks for nothing.
+    hypothesis : rotations that the machine's motion allows. tilt : (N,) rad, deviation of each pose
+    from the hypothesis. expected_tilt : (N,) RMS deviation from noise alone. spread,
+    expected_spread : rad, RMS angle between the axes of pairs of poses and their mean, and its
+    value from noise alone; NaN without pairs that turn. chi2, dof, p_value : of the hypothesis; 0
+    and 1 if there is nothing to test.
     """
 
     hypothesis: Turning
@@ -63,7 +64,7 @@ class RotationAxis:
 
     @property
     def tenable(self) -> bool:
-        """Whether noise, or noise a little larger than stated, explains what is off."""
+        """Whether noise, or noise a little larger than stated, explains the deviations."""
         return (
             self.p_value >= DROPPED_HYPOTHESIS_CHANCE
             or self.chi2 <= ACCEPTED_CHI2_A_FREEDOM * self.dof
@@ -71,7 +72,7 @@ class RotationAxis:
 
     @property
     def sentence(self) -> str:
-        """What was found, in words."""
+        """Result of the test as a sentence."""
         if self.hypothesis == "any":
             return "The platform may turn about any axis, so there is nothing to test."
         rms, expected = (
@@ -90,9 +91,9 @@ class RotationAxis:
 
 
 def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
-    """The test for poses of one camera and one mount; motion as the mechanism file names it.
+    """Test for poses of one camera and one mount; motion : name in the mechanism file.
 
-    Needs one pose more than the hypothesis has unknowns: three to turn about an axis.
+    Needs one pose more than the hypothesis has unknowns: three for one axis.
     """
     from scipy.special import chdtrc
 
@@ -123,17 +124,19 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
 
 
 class Frames(NamedTuple):
-    """Rotations with ``seen = camera Rz(angle) board``: their z is the axis, (..., 3, 3) each."""
+    """Rotations with ``measured = camera Rz(angle) board``: their z is the axis, (..., 3,
+    3) each.
+    """
 
     camera: Array
     board: Array
 
 
 def axis_frames(rot: Array) -> Frames:
-    """The one axis of turns (..., N, 3, 3), closed form.
+    """Common axis of rotations (..., N, 3, 3), closed form.
 
     ``R_k a_board = a_camera`` for all k, so the two are the singular vectors of the mean rotation
-    that belong to its singular value 1.
+    for its singular value 1.
     """
     u, _, vt = np.linalg.svd(rot.mean(axis=-3))
     camera, board = u[..., :, 0], vt[..., 0, :]
@@ -141,7 +144,7 @@ def axis_frames(rot: Array) -> Frames:
 
 
 def facing(direction: Array) -> Array:
-    """A rotation (..., 3, 3) whose z axis is the unit direction (..., 3)."""
+    """Rotation (..., 3, 3) whose z axis is the unit direction (..., 3)."""
     least = np.eye(3)[np.argmin(np.abs(direction), axis=-1)]
     x = cross(direction, least)
     x = x / np.sqrt(dot(x, x))[..., None]
@@ -153,7 +156,8 @@ def _about_one(rot: Array, noise: Array) -> tuple[Array, Array]:
     frames = axis_frames(rot)
     for _ in range(ROTATION_AXIS_STEPS):
         off, by, own, covariance = _tilts(rot, noise, frames)
-        # camera turns by its own x, y; the board by the axis' x, y: what they do to the tilts
+        # derivatives of the tilts: the camera's rotation about its x, y, the board's about the
+        # axis' x, y
         jac = np.concatenate([-by[..., :2], -(by @ own)[..., :2]], axis=-1)
         weigh = np.linalg.inv(np.linalg.cholesky(covariance))
         rows, value = (weigh @ jac).reshape(-1, 4), (weigh @ off[..., None]).ravel()
@@ -165,8 +169,10 @@ def _about_one(rot: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Array, Array]:
-    """Tilts (N, 2) of turns told in the frames, their change (N, 2, 3) by the turns (N, 3, 3) in
-    those, the latter themselves, and the tilts' covariance (N, 2, 2).
+    """Tilts of rotations in the frames, with derivatives and covariance.
+
+    Returns tilts (N, 2), their derivatives (N, 2, 3) by the rotations in the frames, these
+    rotations (N, 3, 3), and the tilts' covariance (N, 2, 2).
     """
     back = frames.camera.mT
     own = back @ rot @ frames.board.mT
@@ -176,7 +182,7 @@ def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Arra
 
 
 def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
-    """Turns (N, 3) from the weighted mean orientation, and their covariance."""
+    """Rotations (N, 3) from the weighted mean orientation, and their covariance."""
     mean = nearest_rotation(rot.mean(axis=0))
     weight = np.linalg.inv(noise)
     for _ in range(ROTATION_AXIS_STEPS):
@@ -189,10 +195,10 @@ def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
-    """Axes of the turns between two poses, in the camera frame: how far they spread (rad), and what
-    noise alone would give.
+    """RMS scatter (rad) of the axes of rotation between two poses, and its value from noise alone.
 
-    A turn phi with noise n of its two poses moves the axis by n / (2 sin(phi / 2)) across.
+    In the camera frame. A rotation phi with noise n of its two poses moves the axis by n / (2
+    sin(phi / 2)) across.
     """
     i, j = _pairs(len(rot))
     turn = rotation_vector(rot[j] @ rot[i].mT)
@@ -207,7 +213,7 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     mean = axis.sum(axis=0)
     mean = mean / np.linalg.norm(mean)
     apart = np.linalg.norm(skew(mean) @ axis[..., None], axis=(-1, -2))
-    by = turn_jacobian(turn)  # of the later pose; of the earlier one, its other half
+    by = turn_jacobian(turn)  # by the later pose; the earlier pose's is its other half
     across = (np.eye(3) - axis[:, :, None] * axis[:, None, :]) @ by / angle[:, None, None]
     back = across @ rot[j] @ rot[i].mT
     covariance = across @ noise[j] @ across.mT
@@ -218,8 +224,9 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
 
 
 def _pairs(n: int) -> tuple[Integers, Integers]:
-    """Pairs i < j of n, told by their number row by row; of many an even choice, which is as good:
-    they grow with the square.
+    """Pairs i < j of n, in row-major order; an even subset of at most MOST_TURN_PAIRS.
+
+    The number of pairs grows with the square of n, and the subset gives as good a mean.
     """
     first, total = np.arange(n), n * (n - 1) // 2
     before = first * (2 * n - first - 1) // 2

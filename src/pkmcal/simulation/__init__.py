@@ -1,10 +1,10 @@
-"""Sessions with known truth: photographs, edges, joint readings; for tests, studies, demos.
+"""Simulated sessions with known truth: images, edges and joint readings for tests and studies.
 
-Modules from bottom to top: shapes, surfaces and render make one photograph; drives says where
-motors and guides are, and gives cylinders to drawings without any; scene draws the whole machine in
-its room, board a calibration board in it; placement says where machine and cameras stand; truth
-draws what is in a session, and session writes it; edges gives measurements without photographs;
-demo holds the demonstration's settings.
+Modules from bottom to top: `shapes`, `surfaces` and `render` make one image; `drives` locates
+motors and guides, and adds cylinders to nominal models without any; `scene` builds the whole
+machine in its room, `board` a calibration board in that room; `placement` chooses configurations
+and camera poses; `truth` draws the true values of a session, and `session` writes the session;
+`edges` simulates measured edges without images; `demo` holds the settings of the demonstration.
 """
 
 from pkmcal.simulation.board import board_for

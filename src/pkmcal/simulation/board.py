@@ -1,8 +1,8 @@
-"""A calibration board in the simulated scene: its print to the last module, and a place for it.
+"""Calibration board in the simulated scene: exact geometry of its print, and a pose that is seen.
 
-The board is a thin plate whose print is part of its shape: black and white are faces of their
-own, so the renderer averages over the pixels between them as it does along every silhouette, and
-a printed corner is right to a hundredth of a pixel.
+The board is a thin plate whose print is part of its shape. Black and white are faces of their own,
+so the renderer averages over the pixels between them as along every silhouette, and a printed
+corner is right to a hundredth of a pixel.
 """
 
 from __future__ import annotations
@@ -28,39 +28,41 @@ from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned_components
 from pkmcal.simulation.surfaces import Material, Pattern, SmoothNoise
 
 BOARD_THICKNESS = 0.004
-"""m."""
+"""Thickness of the plate, in metres."""
 HOLDER_ROD_RADIUS = 0.08
-"""Radius of the rod that holds a board on the platform, in the platform's radius."""
+"""Radius of the rod that holds a board on the platform, relative to the platform's radius."""
 PRINTED_BLACK_LIGHT = 0.06
-"""Light that printed black sends back, as a share of white's."""
+"""Reflectance of printed black relative to white."""
 MADE_BOARD_SQUARES = {"base": (6, 5), "platform": (5, 4)}
-"""Of the board made to measure: large squares are read from afar."""
+"""Squares (columns, rows) of a board made to measure: few and large, to be read from afar."""
 BASE_BOARD_DIAGONAL = 1.4
-"""Diagonal of that board with its margin, in radii of the base."""
+"""Diagonal of a board on the base with its margin, in radii of the base."""
 PLATFORM_BOARD_DIAGONAL = 2.0
-"""Diagonal of a board on the platform with its margin, in radii of that."""
+"""Diagonal of a board on the platform with its margin, in radii of the platform."""
 PICTURED_BOARD_DIAGONAL = 0.75
-"""That diagonal at least, in radii of the space that the machine needs: cameras stand so far away
-that they see all of it."""
+"""Least diagonal of a board on the platform, in radii of the machine's workspace. Cameras stand so
+far away that they see the whole workspace, and the board has to fill enough of the image."""
 BOARD_TRIAL_CONFIGURATIONS = 6
-"""Configurations at which the places for a board are tried."""
+"""Number of configurations at which candidate poses of a board are tried."""
 SLANTED_BOARD_COSINE = 0.6
-"""Cosine of the angle between normal and line of sight below which a board is read less well."""
+"""Cosine of the angle between the board's normal and the line of sight below which fewer corners
+are detected."""
 STANDING_BOARD_LEAN = 0.25
-"""rad; by which a standing board leans, and turns, from the middle of the cameras."""
+"""Angle, in rad, by which a standing board leans and turns away from the mean direction of the
+cameras."""
 LEAST_VISIBLE_CORNERS = 0.4
-"""Share of a board's corners that every station has to see, on average."""
+"""Mean share of a board's corners that every station has to see."""
 VISIBILITY_ADVICE = {
     "base": "put the stations higher, or use a wider lens",
     "platform": "put the stations on one side of the machine, or use one",
 }
-"""What to do where a station sees less."""
+"""Advice for a station that sees fewer corners, by the body that carries the board."""
 
 
 @final
 @dataclass(frozen=True)
 class Sheet(Shape):
-    """A printed plate: a box with T_outer_board (4, 4), printed on one face."""
+    """Printed plate: a box with T_outer_board (4, 4) and a print on one face."""
 
     box: Box
     T_outer_board: Array
@@ -68,7 +70,7 @@ class Sheet(Shape):
 
     @classmethod
     def at(cls, board: Board, T_outer_board: Array) -> Sheet:
-        """A board with a white margin of half a square round its print."""
+        """Plate of a board with a white margin of half a square round its print."""
         printed = Print.of(board)
         low = np.array([printed.x[0], printed.y[0]])
         high = np.array([printed.x[-1], printed.y[-1]])
@@ -79,20 +81,20 @@ class Sheet(Shape):
         return cls(box, T_outer_board, printed)
 
     def enter(self, origin: Array, d: Array) -> Array:
-        """The plate's."""
+        """Distance to the plate's box, as in `Shape.enter`."""
         return self.box.enter(origin, d)
 
     def normal(self, points: Array) -> Array:
-        """The plate's."""
+        """Outward normals of the plate's box."""
         return self.box.normal(points)
 
     def local(self, points: Array) -> Array:
-        """In the board's frame."""
+        """Surface points (3, n) in the board's frame."""
         T = inverse(self.T_outer_board)
         return turned_components(T[:3, :3], points) + T[:3, 3:]
 
     def face(self, points: Array) -> Integers:
-        """White, black, and the plate's other sides."""
+        """Face number: 0 white, 1 black, 2 the sides and the back of the plate."""
         q = self.local(points)
         dark = self.print.dark_at(q[0], q[1])
         return np.where(q[2] < BOARD_THICKNESS / 2, dark.astype(np.int16), np.int16(2)).astype(
@@ -100,25 +102,25 @@ class Sheet(Shape):
         )
 
     def balls(self) -> tuple[Array, Array]:
-        """The plate's."""
+        """Bounding balls of the plate's box."""
         return self.box.balls()
 
 
 @final
 @dataclass(frozen=True)
 class Printed(Pattern):
-    """Black and white by the print, at points in the board's frame."""
+    """Pattern of black and white from the print, at points in the board's frame."""
 
     print: Print
 
     def factor(self, q: Array) -> Array:
-        """1 on white, and on the plate's sides and back."""
+        """Factors (n,): PRINTED_BLACK_LIGHT on black, 1 on white and on the plate's other sides."""
         dark = self.print.dark_at(q[0], q[1]) & (q[2] < BOARD_THICKNESS / 2)
         return np.where(dark, PRINTED_BLACK_LIGHT, 1.0)
 
 
 def board_part(board: Board, T_base_board: Array) -> ScenePart:
-    """The board as a part of the scene, matt."""
+    """Matt plate of a board as a part of the scene."""
     sheet = Sheet.at(board, T_base_board)
     return ScenePart(sheet, Material(0.75, Printed(sheet.print)))
 
@@ -126,7 +128,7 @@ def board_part(board: Board, T_base_board: Array) -> ScenePart:
 def holder_part(
     board: Board, T_platform_board: Array, T_base_platform: Array, discs: Discs
 ) -> ScenePart:
-    """The rod that holds a board on the platform, from under its plate to the board's back."""
+    """Rod that holds a board on the platform, from the platform's plate to the board's back."""
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     back = (low + high) / 2 + np.array([0.0, 0.0, BOARD_THICKNESS])
     lift = discs.platform_side * discs.thickness * np.array([0.0, 0.0, 1.0])
@@ -140,8 +142,8 @@ def holder_part(
 
 
 def board_for(machine: Machine, on: BoardBody = "base") -> Board:
-    """A ChArUco board in proportion to the machine: BASE_BOARD_DIAGONAL, or PLATFORM_BOARD_DIAGONAL
-    and PICTURED_BOARD_DIAGONAL.
+    """ChArUco board in proportion to the machine, by BASE_BOARD_DIAGONAL on the base, and by
+    PLATFORM_BOARD_DIAGONAL and PICTURED_BOARD_DIAGONAL on the platform.
     """
     discs = discs_of(machine)
     diagonal = BASE_BOARD_DIAGONAL * discs.base_radius
@@ -165,7 +167,7 @@ def board_for(machine: Machine, on: BoardBody = "base") -> Board:
 
 
 def board_from_fields(fields: dict[str, Any]) -> Board:
-    """A board of board.yaml's fields."""
+    """Board with the fields of a board.yaml."""
     from pathlib import Path
 
     from pkmcal.files import Document
@@ -183,12 +185,13 @@ def place_board(
     joints: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """The place (4, 4) on the base or the platform, in its frame, where a board is seen best.
+    """Best visible pose (4, 4) of the board on the base or the platform, in that body's frame.
 
-    On the base it lies on it or beside it, or stands behind it; on the platform it is held by a
-    bracket above the plate. T_camera_base : (S, 4, 4). T_base_platform (K, 4, 4) and joints (K, m)
-    : configurations. The corners seen are counted past the machine's parts; the station that sees
-    least decides.
+    On the base the candidates lie on the base plate, beside it, or stand behind it; on the platform
+    they are held by a bracket above the plate. T_camera_base : (S, 4, 4). T_base_platform (K, 4, 4)
+    and joints (K, m) : configurations of the session. Visible corners are those that no part of the
+    machine occludes; a candidate's score is the share of the station that sees least. Raises
+    GeometryError if that share is below LEAST_VISIBLE_CORNERS for all candidates.
     """
     discs = discs_of(machine)
     places: list[Array] = []
@@ -229,11 +232,11 @@ def place_board(
 
 
 def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
-    """Boards above the platform's plate, their faces away from the base and to all sides."""
+    """Candidates above the platform's plate, facing away from the base and to all sides."""
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     reach = 0.6 * float(np.linalg.norm(high - low))
     up = np.array([0.0, 0.0, discs.platform_side])
-    # below a plate, the board would stand in its shadow
+    # below the plate the board would lie in the plate's shadow
     out_of = discs.platform_radius if discs.platform_side < 0 else 0.0
     out: list[Array] = []
     for direction, lean in product(
@@ -253,10 +256,12 @@ def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Arra
 
 
 def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
-    """Lying on the base disc, and beside it, turned as by hand; printed face to the platform."""
+    """Candidates on the base plate and beside it, turned at random, the print towards the
+    platform.
+    """
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     up = discs.side
-    # x, y, z of the board, z into it: away from the platform
+    # axes of the board; z points into the board, away from the platform
     flat = np.diag([1.0, -up, -up])
     radius = discs.base_radius + 0.65 * float(np.linalg.norm(high - low))
     ring = 2 * np.pi * (np.arange(12) + rng.random()) / 12
@@ -266,7 +271,7 @@ def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
     for spot, height in zip(spots, heights, strict=True):
         lean = rotation(np.array([*rng.normal(0, 0.01, 2), rng.uniform(-np.pi, np.pi)]))
         centre = discs.base + np.array([*spot, up * height])
-        # a board that leans stands on its lowest corner
+        # a tilted board rests on its lowest corner
         rise = up * 0.02 * float(np.linalg.norm(high - low))
         rot = lean @ flat
         out.append(pose(rot, centre + np.array([0, 0, rise]) - rot @ ((low + high) / 2)))
@@ -274,20 +279,22 @@ def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
 
 
 def _standing(board: Board, discs: Discs, eyes: Array, rng: np.random.Generator) -> list[Array]:
-    """Upright behind the machine, higher and higher, its face to the middle of the cameras."""
+    """Candidates upright behind the machine at several heights, facing the middle of the
+    cameras.
+    """
     direction = (eyes - discs.base).mean(axis=0)[:2]
     if np.linalg.norm(direction) < 0.4 * np.linalg.norm((eyes - discs.base)[:, :2], axis=1).mean():
-        return []  # cameras all round: none would see its back
+        return []  # cameras stand all round: some would see only the back
     direction = np.append(direction / np.linalg.norm(direction), 0.0)
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     out: list[Array] = []
     for depth, lateral, height in product(
         (0.6, 1.2), (-1.2, -0.6, 0.0, 0.6, 1.2), np.arange(0.2, 2.6, 0.15)
     ):
-        # x to the right of who looks at it, y down, z into it
+        # x to the right of a viewer, y down, z into the board
         right = np.cross([0.0, 0.0, 1.0], direction)
         flat = np.stack([right, [0.0, 0.0, -1.0], -direction], axis=-1)
-        # seen straight on, a board hardly tells its tilt
+        # seen from straight ahead, a board hardly determines its tilt
         slant = rotation(STANDING_BOARD_LEAN * right) @ rotation(
             np.array([0.0, 0.0, STANDING_BOARD_LEAN])
         )
@@ -301,8 +308,9 @@ def _standing(board: Board, discs: Discs, eyes: Array, rng: np.random.Generator)
 def _visible_shares(
     board: Board, T_camera_base: Array, parts: list[ScenePart], camera: Camera, T_base_board: Array
 ) -> Array:
-    """Share (P,) of a board's corners that a camera sees past a machine's parts, less on a slant,
-    at each of its places (P, 4, 4).
+    """Visible share (P,) of a board's corners at each candidate pose (P, 4, 4).
+
+    Corners seen at a slant, below SLANTED_BOARD_COSINE, count in proportion.
     """
     points = apply(T_base_board[:, None], board.points)
     pixels = camera.project(apply(T_camera_base, points))
@@ -314,7 +322,7 @@ def _visible_shares(
         np.sum(T_base_board[:, None, :3, 2] * rays, axis=-1) / SLANTED_BOARD_COSINE, 0, 1
     )
     visible = camera.in_image(pixels, margin=10.0)
-    # all places' rays at once: a part is asked in microseconds a call, and in few a corner
+    # the rays of all candidates together: a call for one shape has a fixed cost
     ways = np.ascontiguousarray(rays[visible].T)
     hit = np.min([part.shape.enter(eye[:, None], ways) for part in parts], axis=0)
     visible[visible] = hit > distance[visible] - 1e-4

@@ -1,4 +1,4 @@
-"""The demonstration session: small enough to be rendered while one waits."""
+"""Settings of the demonstration session, small enough to be rendered while the user waits."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ DEMO_SETTINGS = Settings(stations=3, configurations=6)
 
 
 def demo_camera() -> Camera:
-    """A small industrial camera with a 6 mm lens and its usual barrel distortion."""
+    """Small industrial camera with a 6 mm lens and its usual barrel distortion."""
     parameters = np.array([705.0, 706.0, 402.3, 297.8, -0.11, 0.09, 0.0004, -0.0003, 0.0])
     return camera_models()["pinhole"]((800, 600), parameters)
 
 
 def camera_of_size(size: tuple[int, int]) -> Camera:
-    """The demonstration's camera with the same lens and another number of pixels."""
+    """Camera of the demonstration with the same lens and another image size (width, height)."""
     camera = demo_camera()
     width, height = camera.image_size
     scale = size[0] / width

@@ -1,6 +1,7 @@
-"""Where motors, guides and side bars of a machine are, and how far its legs' ends go.
+"""Motors, guides and side bars of a machine, and the space that its legs' ends reach.
 
-A drawing without any visible cylinder, as of machines known from boards alone, gets one a rod.
+A nominal model without any visible cylinder (a machine known from boards alone) gets one cylinder
+for each rod.
 """
 
 from __future__ import annotations
@@ -15,35 +16,37 @@ from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.mechanisms.closure import joint_values, skeletons
-from pkmcal.mechanisms.document import Tube
+from pkmcal.mechanisms.document import Leg, Tube
 from pkmcal.mechanisms.motors import bodies
 
 MOTOR_STOP_MARGIN = 0.1
-"""Share of its range that a motor stays from its stops where reaches are compared."""
+"""Share of its range that a motor keeps from its stops where the reach of a machine is computed."""
 NO_RANGE = 0.25
-"""Length of a guide on either side, in the leg's length, where the file gives no range."""
+"""Half length of a guide relative to the leg's length, where the file gives no joint range."""
 BENT_GUIDE_PIECES = 16
-"""Straight pieces that a bent guide is drawn with."""
+"""Number of straight pieces that render a bent guide."""
 STRAIGHT_GUIDE_DEVIATION = 1e-9
-"""A guide's way off the line between its ends, m, below which it is one piece."""
+"""Deviation of a guide from the line between its ends, in metres, up to which it is one straight
+piece."""
 ROD_RADIUS = 0.02
-"""Of a rod, in its length: 10 mm for half a metre, as carbon tubes of such machines have."""
+"""Radius of a rod relative to its length: 10 mm for half a metre, as the carbon tubes of such
+machines."""
 ROD_MARGIN = 0.07
 """Share of the rod's length at either end that fork and joint hide."""
 
 
 @dataclass(frozen=True)
 class Drives:
-    """What moves the legs' ends on the base; base frame, m, one row a leg.
+    """Actuators of the legs' ends on the base, one row for each leg; base frame, m.
 
-    arms, guides : (L,) whether an arm carries the leg's end, or it runs along a guide; neither is
-        a joint that stands still.
-    foot : (L, 3) the joint, where the motor holds the arm, or the middle of a guide.
-    axis : (L, 3) unit axis of an arm's motor, or direction of a guide; zero where there is none.
-    arm : (L,) how far the leg's end is from the foot of its arm, zero elsewhere.
-    ways : L arrays (n, 3), the leg's end along its guide from one stop to the other, two points of
-        a straight one; elsewhere the foot twice.
-    away : (L, 3) unit, square to a guide and away from the platform; zero elsewhere.
+    arms, guides : (L,) whether an arm carries the leg's end, or a guide does; both are False for
+        a fixed joint.
+    foot : (L, 3) the fixed joint, the motor that holds the arm, or the middle of a guide.
+    axis : (L, 3) unit axis of an arm's motor, or direction of a guide; zero for a fixed joint.
+    arm : (L,) distance from the foot of an arm to the leg's end; zero for other legs.
+    ways : L arrays (n, 3), path of the leg's end along its guide from one stop to the other,
+        two points for a straight guide; for other legs the foot twice.
+    away : (L, 3) unit vector square to a guide and away from the platform; zero for other legs.
     """
 
     arms: Booleans
@@ -56,34 +59,37 @@ class Drives:
 
     @property
     def any(self) -> bool:
-        """Whether there is a motor on the base at all."""
+        """Whether any motor stands on the base."""
         return bool((self.arms | self.guides).any())
 
     @property
     def upright(self) -> Booleans:
-        """(L,) guides that stand rather than lie."""
+        """(L,) whether a leg's guide is closer to the vertical than to the horizontal."""
         return self.guides & (np.abs(self.axis[:, 2]) > np.sqrt(0.5))
 
     @cached_property
     def ends(self) -> Array:
-        """(L, 2, 3) the leg's end at both ends of a guide; elsewhere the foot twice."""
+        """(L, 2, 3) both ends of each guide; for other legs the foot twice."""
         return np.stack([direction[[0, -1]] for direction in self.ways])
 
 
 def drives_of(machine: Machine) -> Drives:
-    """The machine's motors, from its carriers: none is known by its name here."""
+    """Actuators of a machine, derived from its carriers without reference to their kinds."""
     layout, zero = machine.layout, np.zeros(machine.n_legs)
+    # arms and guides: a driven carrier with and without a link of its own
     chains = skeletons(layout, machine.values, zero)
     driven = np.zeros(machine.n_legs, dtype=bool)
     for g in layout.base:
         driven[g.legs] = g.carrier.driven
     several = np.array([len(chain) > 1 for chain in chains])
     arms, guides = driven & several, driven & ~several
+    # arms: radius, and axis from the velocities at two joint values a quarter turn apart
     a, by_value = _placed(machine, zero)
     foot = np.array([chain[0] for chain in chains])
     arm = np.where(arms, np.sqrt(dot(a - foot, a - foot)), 0.0)
     turned = cross(by_value, _placed(machine, zero + np.pi / 2)[1])
     axis = np.where(arms[:, None], _unit(turned, a - foot), 0.0)
+    # guides: path of the leg's end between its stops, and the direction in the middle
     ways = [np.stack([p, p]) for p in foot]
     low, high = _guide_ranges(machine, by_value).T
     for j in np.flatnonzero(guides):
@@ -98,7 +104,7 @@ def drives_of(machine: Machine) -> Drives:
 
 
 def _placed(machine: Machine, joint_value: Array) -> tuple[Array, Array]:
-    """Legs' ends on the base and their derivatives, (..., L, 3) each, by joint values (..., L)."""
+    """Legs' ends on the base and their derivatives, (..., L, 3) each, at joint values (..., L)."""
     shape = (*joint_value.shape, 3)
     a, by_value = np.empty(shape), np.empty(shape)
     for g in machine.layout.base:
@@ -108,7 +114,7 @@ def _placed(machine: Machine, joint_value: Array) -> tuple[Array, Array]:
 
 
 def _is_bent(direction: Array) -> bool:
-    """Whether a way (n, 3) leaves the line between its ends."""
+    """Whether a path (n, 3) deviates from the line between its ends."""
     u = (direction[-1] - direction[0]) / max(
         float(np.linalg.norm(direction[-1] - direction[0])), 1e-300
     )
@@ -119,16 +125,16 @@ def _is_bent(direction: Array) -> bool:
 
 
 def _unit(v: Array, otherwise: Array) -> Array:
-    """Vectors (..., 3) of length one; where they are none, some direction square to another."""
+    """Unit vectors of v (..., 3); a direction square to `otherwise` where v vanishes."""
     lateral = np.cross(otherwise, np.eye(3)[np.abs(otherwise).argmin(axis=-1)])
     v = np.where(dot(v, v)[..., None] > 1e-12 * dot(otherwise, otherwise)[..., None], v, lateral)
     size = np.linalg.norm(v, axis=-1, keepdims=True)
-    # what is a unit vector stays what it is, to the last digit
+    # unit vectors are returned unchanged to the last digit
     return v / np.where(np.abs(size - 1) < 1e-12, 1.0, np.maximum(size, 1e-300))
 
 
 def _guide_ranges(machine: Machine, by_value: Array) -> Array:
-    """Least and largest value of each leg's joint, (L, 2); about home's if the file is silent."""
+    """Range (L, 2) of each leg's joint value; an interval about home where the file gives none."""
     layout, home = machine.layout, machine.home()
     readings = machine.inverse(home[None])[0]
     ends = machine.ends_at(readings, home)
@@ -142,14 +148,16 @@ def _guide_ranges(machine: Machine, by_value: Array) -> Array:
 
 
 def _away(machine: Machine, foot: Array, axis: Array, guides: Booleans) -> Array:
-    """Where guides stand back from their legs' ends: the platform's joints lie on the other side,
-    all of them, so that two carriages on one guide agree about it.
+    """Unit directions (L, 3) in which guides stand back from their legs' ends.
+
+    The platform's joints all lie on the other side, so that two carriages on one guide have the
+    same direction.
     """
     home = machine.home()
     b = machine.ends_at(np.zeros(machine.n_joints), home).b
     back = foot - np.array(b).mean(axis=0)
     back = back - dot(back, axis)[:, None] * axis
-    # a guide through the platform's middle may stand back to any side
+    # a guide through the platform's middle may stand back in any direction square to it
     lateral = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
     back = np.where((dot(back, back) > 1e-6)[:, None], back, lateral)
     size = np.linalg.norm(back, axis=1, keepdims=True)
@@ -157,11 +165,11 @@ def _away(machine: Machine, foot: Array, axis: Array, guides: Booleans) -> Array
 
 
 def reaches(machine: Machine) -> tuple[Array, Array]:
-    """Legs' ends A and B (n, L, 3), base frame, m: with the platform at home, and, where motors
-    stand on the base, with all of them near either stop.
+    """Legs' ends A and B (n, L, 3) that bound the machine's workspace; base frame, m.
 
-    A carriage or an arm takes its leg's end along, so that home alone says little of the space
-    that the machine needs.
+    Rows: the home pose and, if motors stand on the base, the poses with all motors near either
+    stop. A carriage or an arm takes its leg's end along, so the home pose alone does not bound the
+    machine's workspace.
     """
     poses, readings = [machine.home()], [machine.inverse(machine.home()[None])[0]]
     ranges = machine.joint_ranges
@@ -176,25 +184,28 @@ def reaches(machine: Machine) -> tuple[Array, Array]:
 
 
 def legs_space(machine: Machine) -> Array:
-    """Points (n, 3) that a picture of the machine has to hold, base frame, m."""
+    """Points (n, 3) that an image of the machine has to contain; base frame, m."""
     return np.concatenate([ends.reshape(-1, 3) for ends in reaches(machine)])
 
 
 def ball_of(points: Array) -> tuple[Array, float]:
-    """Centre (3,) and radius, m, of the ball about the middle of points (n, 3) that holds them."""
+    """Centre (3,) and radius, in m, of a ball about the middle of the bounding box of points (n, 3)
+    that contains them.
+    """
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
 def side_bars(machine: Machine) -> tuple[Integers, ...]:
-    """Legs of each body of an articulated platform, in the order of their numbers."""
+    """Legs of each body of an articulated platform, in the order of the bodies' numbers."""
     on = bodies(machine.document)
     return tuple(np.flatnonzero(on == body) for body in range(on.max(initial=-1) + 1))
 
 
 def to_simulate(drawing: Machine, where: str) -> Machine:
-    """The drawing :func:`with_forearms`, if it can be put together at home; else InputError, with
-    where the drawing is from.
+    """Nominal model with cylinders (:func:`with_forearms`), checked to assemble at home.
+
+    where : source of the nominal model, for the message. Raises InputError.
     """
     try:
         machine = with_forearms(drawing)
@@ -205,10 +216,11 @@ def to_simulate(drawing: Machine, where: str) -> Machine:
 
 
 def with_forearms(machine: Machine) -> Machine:
-    """The machine with one cylinder a rod where its drawing gives no leg any; else unchanged.
+    """Machine with one cylinder for each rod, if its nominal model has no tubes.
 
-    A forearm is two rods where it is a parallelogram; here it is the one that stands for them.
-    Raises InputError where a limb does not reach the platform at home.
+    A machine with any tube is returned unchanged. A forearm that is a parallelogram has two rods;
+    here one rod in their middle stands for both. Raises InputError if a limb does not reach the
+    platform at home.
     """
     document = machine.document
     if any(leg.tubes for leg in document.legs):
@@ -224,19 +236,13 @@ def with_forearms(machine: Machine) -> Machine:
         )
     ends = machine.ends_at(readings, home)
     lengths = np.linalg.norm(ends.b - ends.a, axis=1)
-    legs = tuple(
-        leg.model_copy(update={"tubes": (_tube(float(length)),)})
-        for leg, length in zip(document.legs, lengths, strict=True)
-    )
-    return machine_from_document(document.model_copy(update={"legs": legs}))
-
-
-def _tube(length: float) -> Tube:
-    """A rod's, in whole millimetres and half ones of the radius."""
-    return Tube.model_validate(
-        {
+    legs: list[Leg] = []
+    for leg, length in zip(document.legs, lengths.tolist(), strict=True):
+        # in millimetres; the radius in half millimetres
+        tube = {
             "radius": max(round(2000 * ROD_RADIUS * length) / 2000, 0.001),
             "from": round(ROD_MARGIN * length, 3),
             "to": round((1 - ROD_MARGIN) * length, 3),
         }
-    )
+        legs.append(leg.model_copy(update={"tubes": (Tube.model_validate(tube),)}))
+    return machine_from_document(document.model_copy(update={"legs": tuple(legs)}))

@@ -1,6 +1,6 @@
-"""Measurements without photographs: edges with known noise, for studies and tests.
+"""Simulated edge measurements with known noise, without images; for studies and tests.
 
-Axes: M photographs, E edges of the machine (each tube, side 0 then 1), n places along an edge.
+Axes: M images, E edges of the machine (each tube, side 0 then 1), n samples along an edge.
 """
 
 from __future__ import annotations
@@ -27,24 +27,26 @@ from pkmcal.observe.predict import TubeList, tubes_of
 from pkmcal.simulation.placement import one_a_station
 
 PLACES_ALONG_EDGE = 48
-"""Places looked at along each tube: a hidden stretch is found to a fiftieth of the tube."""
+"""Samples along each tube: a hidden stretch is bounded to a fiftieth of the tube."""
 EDGE_TURN_PLACES = 13
-"""Of these, by which an edge's turns are told: how a plane follows is as smooth as the lens."""
+"""Samples for an edge's response to a shift and a tilt, which is as smooth as the lens distortion.
+"""
 JOINT_HOUSING = 0.005
-"""Metres at both ends of a tube that are never measured."""
+"""Length, in metres, at both ends of a tube that is never measured."""
 HIDING_LEG_CLEARANCE = 2.0
-"""Pixels between an edge and a leg in front of it, nearer than which the two are one edge."""
+"""Distance, in pixels, between an edge and a leg in front of it below which the two cannot be
+separated."""
 LEAST_VISIBLE_SAMPLES = 8
-"""Places in a row that an edge needs; shorter stretches say little about the tilt."""
+"""Consecutive visible samples that an edge needs; a shorter stretch hardly determines the tilt."""
 
 
 @dataclass(frozen=True)
 class EdgeNoise:
     """Errors of measured edges.
 
-    shift, tilt : standard deviations (px) of the whole edge's sideways place, and of its ends
-    when it turns about its middle. outward : constant shift of all edges (px). wrong : fraction
-    of edges that are another leg's.
+    shift, tilt : standard deviations, in px, of the sideways position of the whole edge, and of its
+    ends when the edge turns about its middle. outward : constant shift of all edges, px. wrong :
+    fraction of edges that are replaced by another leg's.
     """
 
     shift: float = 0.1
@@ -64,12 +66,12 @@ def simulate_edges(
     photographs: Integers | None = None,
     joint_noise: float = 3e-6,
 ) -> tuple[EdgeSet, Array]:
-    """Edges and readings (K, m) that a true machine would give.
+    """Edges that a true machine would give, and its readings (K, m).
 
-    T_camera_base : (S, 4, 4). camera : one for all stations, or one a station.
-    T_base_platform : (K, 4, 4). photographs : (M, 2) pairs of station and configuration; all
-    pairs when absent. Edges outside the image or hidden behind other legs are left out; an edge
-    that is hidden in part keeps its longest visible stretch.
+    T_camera_base : (S, 4, 4). camera : one for all stations, or one for each.
+    T_base_platform : (K, 4, 4). photographs : (M, 2) pairs of station and configuration; all pairs
+    by default. Edges outside the image or hidden behind other legs are omitted; a partly hidden
+    edge keeps its longest visible stretch.
     """
     cameras = one_a_station(camera, len(T_camera_base))
     joints = machine.inverse(T_base_platform)
@@ -95,11 +97,12 @@ def simulate_edges(
 def visible_edges(
     camera: Camera, tubes: TubeList, radius: Array, a: Array, b: Array
 ) -> tuple[EdgeSet, Array]:
-    """All visible edges of a camera's M photographs, and unit rays along each, (N, n, 3).
+    """Visible edges in M images of one camera, and unit rays (N, n, 3) along each edge.
 
-    radius : (E,) m. a, b : (M, L, 3), camera frame. Stations are all 0, and configurations count
-    the photographs; covariances and shifts are zero.
+    radius : (E,) m. a, b : (M, L, 3) legs' ends, camera frame. In the result all stations are 0,
+    and configurations are the images' numbers; covariances and shifts are zero.
     """
+    # exact silhouettes, sampled along each tube
     a_e, b_e = a[:, tubes.leg], b[:, tubes.leg]
     u, m = line_through(a_e, b_e)
     length = np.sqrt(dot(b_e - a_e, b_e - a_e))
@@ -111,10 +114,12 @@ def visible_edges(
     points = contour_point(
         a_e[..., None, :], u[..., None, :], normal[..., None, :], radius[:, None], along
     )
+    # visibility of each sample: in the image, and in front of all other tubes
     with np.errstate(invalid="ignore"):
         prediction = camera.in_image(camera.project(points))
         prediction &= (has_silhouette(m, radius) & (last > first))[..., None]
     prediction &= ~hidden(points, tubes.leg, tubes.tube, tubes, radius, a, b, pixel_angle(camera))
+    # longest visible stretch of each edge
     begin, count = _longest_run(prediction)
     photo, edge = np.nonzero(count >= LEAST_VISIBLE_SAMPLES)
     begin, count = begin[photo, edge], count[photo, edge]
@@ -138,11 +143,12 @@ def hidden(
     points: Array, leg: Integers, tube: Integers, tubes: TubeList, radius: Array,
     a: Array, b: Array, pixel: float,
 ) -> Booleans:  # fmt: skip
-    """(M, G, n) True where a tube of another leg, or of the own one, is in front of a point.
+    """(M, G, n) True where another leg, or another tube of the same leg, occludes a point.
 
-    points : (M, G, n, 3), camera frame, m. leg, tube : (G,) what they lie on, -1 for nothing of the
-    machine. radius : (E,) of the tubes. a, b : (M, L, 3) the legs' ends. pixel : angle of a pixel,
-    rad; another leg hides what comes within HIDING_LEG_CLEARANCE of it, too.
+    points : (M, G, n, 3), camera frame, m. leg, tube : (G,) the tube that the points lie on, -1 for
+    points off the machine. radius : (E,) of the tubes, m. a, b : (M, L, 3) the legs' ends. pixel :
+    angle of a pixel, rad; another leg also hides points within HIDING_LEG_CLEARANCE of its
+    silhouette.
     """
     distance = np.sqrt(dot(points, points))
     margin = HIDING_LEG_CLEARANCE * pixel * distance
@@ -169,17 +175,17 @@ def hidden(
 
 
 def pixel_angle(camera: Camera) -> float:
-    """Angle (rad) between neighbouring pixels in the middle of the image."""
+    """Angle, in rad, between neighbouring pixels in the middle of the image."""
     middle = (np.array(camera.image_size) - 1) / 2
     rays = camera.ray(middle + np.array([[0.0, 0.0], [1.0, 0.0]]))
     return float(np.linalg.norm(rays[1] - rays[0]))
 
 
 def _longest_run(visible: Booleans) -> tuple[Integers, Integers]:
-    """First place and number of places of the longest run of True along the last axis."""
+    """Start and length of the longest run of True along the last axis."""
     index = np.arange(visible.shape[-1])
     gap = np.where(visible, -1, index)
-    # places since the last gap, by a running maximum
+    # samples since the last gap, by a running maximum
     run = np.where(visible, index - np.maximum.accumulate(gap, axis=-1), 0)
     last = np.argmax(run, axis=-1)
     count = np.take_along_axis(run, last[..., None], axis=-1)[..., 0]
@@ -189,7 +195,7 @@ def _longest_run(visible: Booleans) -> tuple[Integers, Integers]:
 def _with_errors(
     camera: Camera, edges: EdgeSet, rays: Array, noise: EdgeNoise, rng: np.random.Generator
 ) -> EdgeSet:
-    """Edges with noise, its covariance, and what an outward shift by a pixel does."""
+    """Edges with noise, its covariance, and the derivative of the normal by an outward shift."""
     few = rays[:, np.linspace(0, PLACES_ALONG_EDGE - 1, EDGE_TURN_PLACES).astype(int)]
     by_shift, by_tilt = moved_outward(camera, edges.normal, edges.basis, few)
     normal = disturbed(edges.normal, edges.basis, by_shift, by_tilt, noise, rng)
@@ -201,11 +207,11 @@ def _with_errors(
 
 
 def moved_outward(camera: Camera, normal: Array, basis: Array, rays: Array) -> tuple[Array, Array]:
-    """:func:`responses` (N, 2) of edges with normals (N, 3) and bases (N, 3, 2) from unit rays
-    (N, n, 3) along each.
+    """Response of edges to a shift and to a tilt, (N, 2) each, as :func:`responses` defines them.
 
-    A point at ray s that moves outward by e px turns by e c, c = |J^T n| with J = d ray/d pixel,
-    and the plane follows where s . dn = -c e.
+    normal : (N, 3). basis : (N, 3, 2). rays : (N, n, 3) unit rays along each edge. A point at ray s
+    that moves outward by e px turns by e c, with c = |J^T n| and J = d ray / d pixel; the plane
+    follows where s . dn = -c e.
     """
     pixels = camera.project(rays)
     by_pixel, _ = camera.ray_jacobians(pixels)
@@ -215,11 +221,12 @@ def moved_outward(camera: Camera, normal: Array, basis: Array, rays: Array) -> t
 
 
 def responses(by_turn: Array, pixels: Array) -> tuple[Array, Array]:
-    """Turns (..., 2) of edges' normals, in their bases, when an edge moves outward by one pixel
-    everywhere, and when its far end moves out by one pixel and its near end in.
+    """Rotations (..., 2) of edges' normals, in their bases, by an outward shift and by a tilt.
 
-    by_turn : (..., n, 2) outward motion (px) of n places by a turn. pixels : (..., n, 2). Least
-    squares over the places, each in px; zero where no place of an edge has an image (NaN).
+    The shift moves the whole edge outward by one pixel; the tilt moves the far end out by one pixel
+    and the near end in. by_turn : (..., n, 2) outward motion, in px, of n samples per unit
+    rotation. pixels : (..., n, 2). Least squares over the samples; zero if no sample of an edge
+    projects into the image (NaN).
     """
     step = np.diff(np.nan_to_num(pixels), axis=-2)
     run = np.cumsum(np.sqrt(dot(step, step)), axis=-1)
@@ -229,7 +236,7 @@ def responses(by_turn: Array, pixels: Array) -> tuple[Array, Array]:
     rows = np.nan_to_num(by_turn)
     turned = rows.mT
     normal = turned @ rows + 1e-300 * np.eye(2)
-    gone = np.abs(np.linalg.det(normal)) < 1e-200  # no place of the edge has an image
+    gone = np.abs(np.linalg.det(normal)) < 1e-200  # no sample of the edge projects into the image
     solved = np.linalg.solve(np.where(gone[..., None, None], np.eye(2), normal), turned @ value)
     return solved[..., 0], solved[..., 1]
 
@@ -238,8 +245,9 @@ def disturbed(
     normal: Array, basis: Array, by_shift: Array, by_tilt: Array, noise: EdgeNoise,
     rng: np.random.Generator,
 ) -> Array:  # fmt: skip
-    """Normals (..., 3) as measured; basis (..., 3, 2), by_shift and by_tilt (..., 2) as of
-    :func:`responses`.
+    """Normals (..., 3) with random shift, tilt and the constant outward shift.
+
+    basis : (..., 3, 2). by_shift, by_tilt : (..., 2), as from :func:`responses`.
     """
     error = rng.standard_normal((*by_shift.shape[:-1], 2)) * (noise.shift, noise.tilt)
     turn = by_shift * (error[..., :1] + noise.outward) + by_tilt * error[..., 1:]
@@ -248,7 +256,9 @@ def disturbed(
 
 
 def _with_wrong_ones(edges: EdgeSet, fraction: float, rng: np.random.Generator) -> EdgeSet:
-    """Some edges replaced by what another leg of the same photograph gave on the same side."""
+    """Edges of which a fraction is replaced by the edge of another leg on the same side of the
+    image.
+    """
     if fraction <= 0:
         return edges
     source = np.arange(len(edges))
@@ -257,7 +267,7 @@ def _with_wrong_ones(edges: EdgeSet, fraction: float, rng: np.random.Generator) 
     order = np.argsort(member, kind="stable")
     first = np.cumsum(count) - count
     wrong = rng.random(len(edges)) < fraction
-    for _ in range(8):  # a draw may hit the leg itself; an edge that is alone stays right
+    for _ in range(8):  # a draw may hit the leg itself; a lone edge stays as it is
         pick = order[first[member] + (rng.random(len(edges)) * count[member]).astype(int)]
         again = wrong & (edges.leg[source] == edges.leg)
         source = np.where(again, pick, source)

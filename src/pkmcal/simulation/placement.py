@@ -1,7 +1,7 @@
-"""Where machine and cameras stand for a session: configurations and stations.
+"""Placement of machine and cameras in a session: configurations and station poses.
 
 Configurations are within the joints' ranges, reachable, and away from singular poses. Cameras stand
-round the machine, or in its middle for a mirror.
+round the machine, or in its middle if they are panoramic.
 """
 
 from __future__ import annotations
@@ -26,48 +26,57 @@ from pkmcal.simulation.drives import ball_of, drives_of, legs_space, reaches
 from pkmcal.wording import listed
 
 FARTHEST_TILT = np.deg2rad(35)
-"""More than universal joints of this kind allow."""
+"""Largest tilt of the platform, in rad; more than the universal joints of such machines allow."""
 FARTHEST_TURN = 7 / 9
-"""Of an articulated platform about z, in the turn at which its own parts are in the way."""
+"""Largest turn of an articulated platform about z, relative to the turn at which its parts collide.
+"""
 LEAST_SINGULAR = 0.12
-"""Smallest singular value of the scaled inverse Jacobian: a reading's error grows by eight."""
+"""Smallest singular value of the scaled inverse Jacobian; here a reading's error grows by eight."""
 GUIDE_SIDE_ROOM = 4.0
-"""What a guide and its carriage need on the side of the leg, in radii of the leg on it."""
+"""Clearance beside a guide for rail and carriage, in radii of the leg on it."""
 SIDE_BY_SIDE = 0.9
-"""Cosine of the angle between two guides' backs above which they lie side by side."""
+"""Cosine of the angle between two guides' backs above which the guides lie side by side."""
 READING_RANGE_SHARES = (0.03, 0.97)
-"""Share of a range from which readings are drawn: a drive at its stop reads nothing new."""
+"""Shares of a joint's range between which readings are drawn, away from the stops."""
 PANORAMIC_HALF_VIEW = np.deg2rad(95)
-"""A camera that sees more than this off its axis sees all legs from their middle."""
+"""Half angle of view, in rad, above which a camera is placed between the legs and sees all of them.
+"""
 NEAREST_HALF_VIEW = np.deg2rad(35)
-"""Half the angle under which the machine is seen at most; nearer, legs hide each other."""
+"""Largest half angle, in rad, under which a camera sees the machine; nearer, legs occlude each
+other."""
 CAMERA_PLACES_TRIED = 24
-"""Places round the machine of which a single camera takes the best."""
+"""Number of candidate poses round the machine for a single camera."""
 HOME_LEG_GAP = 0.03
-"""Gap to another leg at home, in image widths, that keeps a leg free of it elsewhere."""
+"""Gap between two legs in an image at home, in image widths, with which they stay apart elsewhere.
+"""
 BOARD_CAMERAS_ARC = np.deg2rad(80)
-"""Between the first and the last camera that see the same face of a board."""
+"""Angle, in rad, between the first and the last of the cameras that see the same face of a board.
+"""
 WITH_BOARD = {False: 1.45, True: 1.6}
-"""Distance that leaves room for a board, in the machine's own, upright and flat."""
+"""Factor on the distance that leaves room for a board beside the machine, by whether it is flat."""
 HOME_DISTANCE_FACTOR = 1.18
-"""Distance in the machine's own at home: platforms move, and plates reach beyond joints."""
+"""Factor on the distance for a space known at home only: platforms move, and plates are wider than
+the joints."""
 MOVED_DISTANCE_FACTOR = 1.1
-"""The same where the machine's own takes in where its motors move it."""
+"""Factor on the distance for a space that includes the motors' stops."""
 NARROWEST_HALF_VIEW = 1e-6
-"""Half a view (rad) below which a lens sees nothing from anywhere."""
+"""Least half angle of view, in rad, that a distance is computed with."""
 
 HANDHELD_ELEVATIONS = (np.deg2rad(5), np.deg2rad(45))
-"""Lowest and highest view of a person who walks about a machine with a telephone."""
+"""Lowest and highest elevation, in rad, of a person who walks about a machine with a phone."""
 HANDHELD_DISTANCES = (1.0, 1.35)
-"""Nearest and furthest, in the distance at which the machine fills the picture."""
+"""Least and largest distance of a phone, relative to the distance at which the machine fills the
+image."""
 MOST_HANDHELD_ROLL = np.deg2rad(15)
-"""Roll at most, of the telephone upright or on its side."""
+"""Largest roll, in rad, of a phone held upright or on its side."""
 UPRIGHT_PHOTOGRAPH_SHARE = 1 / 3
-"""Share of the photographs for which the telephone is held upright: the sensor lies on its side."""
+"""Share of images for which the phone is held upright, so that its sensor lies on its side."""
 
 
 def check_drawable(machine: Machine) -> None:
-    """Raise `InputError` for a machine whose poses do not tell how all its parts stand."""
+    """Raise `InputError` for a machine whose parts' positions do not follow from the pose and
+    readings.
+    """
     layout, legs = machine.layout, machine.document.legs
     hinged = {legs[j].platform.joint for j in np.flatnonzero(layout.internal >= 0)}
     if hinged:
@@ -82,10 +91,11 @@ def check_drawable(machine: Machine) -> None:
 def draw_configurations(
     machine: Machine, count: int, extreme: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Usable poses (n, 4, 4) with their exact readings (n, m), n >= count where possible.
+    """Usable poses (n, 4, 4) with their exact readings (n, m), n >= count.
 
-    extreme : share with every leg near one of its ends, which measure offsets best; the other
-    configurations are spread evenly over the ranges.
+    extreme : share of configurations with every leg near an end of its range, which determine
+    offsets best; the others are spread evenly over the ranges. Raises InputError if too few
+    candidates are usable.
     """
     value, tried = 0, 0
     for attempt in range(6):
@@ -95,7 +105,7 @@ def draw_configurations(
         value = int(np.count_nonzero(keep))
         if value >= count:
             return poses[keep], joints[keep]
-        if attempt and not value:  # a thousand in vain: more would only keep the user waiting
+        if attempt and not value:  # a thousand candidates failed: more only make the user wait
             break
     raise InputError(
         what=f"mechanism {machine.name!r} has too few usable configurations in its joint ranges",
@@ -106,13 +116,15 @@ def draw_configurations(
 
 
 def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
-    """(n,) True where closed, in the home's assembly, not tilted far, legs clear of each other."""
+    """(n,) True where closed, in home's assembly mode, not singular, not tilted far, and legs are
+    apart.
+    """
     layout, values, home = machine.layout, machine.values, machine.home()
     c = closure(layout, values, joints, T_base_platform)
     at_home = closure(layout, values, machine.inverse(home[None])[0], home)
     rows, home_rows = scaled_rows(c), scaled_rows(at_home)
     good = np.abs(c.rows.value).max(axis=-1) < 1e-9
-    # a machine that is weak at home is weak everywhere; it is not refused for that
+    # a machine that is close to singular at home is so everywhere, and is not refused for that
     good &= singularity_of(layout, rows) > min(
         LEAST_SINGULAR, 0.4 * float(singularity_of(layout, home_rows))
     )
@@ -123,7 +135,9 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
 
 
 def platform_unfolded(machine: Machine, T_base_platform: Array) -> Booleans:
-    """(n,) True where the parts of an articulated platform, if it is one, stand apart."""
+    """(n,) True where the parts of an articulated platform do not collide; True for a rigid
+    platform.
+    """
     turn = np.arctan2(T_base_platform[..., 1, 0], T_base_platform[..., 0, 0])
     return np.abs(turn) < FARTHEST_TURN * machine.most_turn[0]
 
@@ -131,7 +145,7 @@ def platform_unfolded(machine: Machine, T_base_platform: Array) -> Booleans:
 def _candidates(
     machine: Machine, n: int, extreme: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Poses and readings that close the machine, usable or not."""
+    """Poses and readings that satisfy the closure equations, usable or not."""
     ranges = machine.joint_ranges
     share = rng.uniform(*READING_RANGE_SHARES, (n, machine.n_joints))
     ends = np.where(rng.random(share.shape) < 0.5, *READING_RANGE_SHARES)
@@ -140,7 +154,7 @@ def _candidates(
     if ranges.size and np.isfinite(ranges).all():
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
         fk = machine.forward_result(wanted)
-        # no pose has the readings wanted of more than its freedoms: what comes nearest to them
+        # readings of a redundantly driven machine cannot be chosen freely: take the nearest pose
         near = fk.converged | machine.layout.overdetermined
         poses = fk.T_base_platform[near]
     else:
@@ -153,9 +167,10 @@ def _candidates(
 
 
 def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
-    """Poses near home, for machines whose file gives no ranges: 15 degrees, an eighth of size.
+    """Poses near home for machines without joint ranges.
 
-    Only those that constant rods and joints' axes allow.
+    Within 15 degrees and an eighth of the machine's size; only poses that constant rods and joint
+    axes allow.
     """
     a, b = (ends[0] for ends in reaches(machine))
     size = float(np.linalg.norm(np.concatenate([a, b]) - a.mean(axis=0), axis=1).max())
@@ -167,14 +182,15 @@ def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
 
 
 def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
-    """(n,) True where no two legs come nearer than their tubes are thick, nor a leg to a guide of
-    another. Legs that meet in a joint, as in drawings that know no more of a platform than a point,
-    come near each other nowhere else.
+    """(n,) True where no two legs come nearer than their radii, nor a leg near another leg's guide.
+
+    Legs with a common joint are exempt, as in nominal models that reduce the platform to a point:
+    such legs come near each other nowhere else.
     """
     ends = machine.ends_at(joints, T_base_platform)
     along = np.linspace(0.06, 0.97, 24)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
-    # components slowest: every point of a leg meets every point of another, long rows of numbers
+    # components first: every sample of a leg is compared with every sample of another in long rows
     on_leg = np.ascontiguousarray(np.moveaxis(points, (-1, 1), (0, 1)))
     widths = np.array([r.max() if len(r) else 0.0 for r in machine.radii()])
     drives = drives_of(machine)
@@ -189,7 +205,7 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
             ]
             nearest = np.sqrt((gap[0] + gap[1] + gap[2]).min(axis=(-1, -2)))
             apart &= (nearest > thick) | meet[0] | meet[1]
-        # carriages side by side on one guide have their own legs beside it
+        # the legs of carriages side by side on one guide are beside that guide
         if j != i and drives.guides[j] and drives.away[i] @ drives.away[j] <= SIDE_BY_SIDE:
             for start, stop in pairwise(drives.ways[j]):
                 axis = (stop - start) / np.linalg.norm(stop - start)
@@ -203,7 +219,7 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
 
 @dataclass(frozen=True)
 class StationPlace:
-    """A camera's place as people give it, base frame, m: as ``pose`` in session.yaml."""
+    """Camera pose as a user gives it, base frame, m: the ``pose`` of a station in session.yaml."""
 
     position: Vector
     look_at: Vector
@@ -211,22 +227,25 @@ class StationPlace:
 
     @classmethod
     def of(cls, T_camera_base: Array) -> StationPlace:
-        """A camera at a pose (4, 4), looking at a point one metre before it."""
+        """Pose of a camera from T_camera_base (4, 4), looking at a point one metre ahead."""
         T = inverse(T_camera_base)
         position, forward, up = T[:3, 3], T[:3, 2], -T[:3, 1]
         return cls(*(tuple(v.tolist()) for v in (position, position + forward, up)))
 
     def rounded(self, digits: int) -> dict[str, list[float]]:
-        """Its fields with so many decimals, never -0.0."""
+        """Fields of session.yaml, rounded to decimals, without -0.0."""
         return {name: [round(x, digits) + 0.0 for x in part] for name, part in vars(self).items()}
 
     def T_camera_base(self) -> Array:
-        """(4, 4), base to camera coordinates."""
+        """(4, 4) transformation from base to camera coordinates."""
         return look_at(np.array(self.position), np.array(self.look_at), np.array(self.up))
 
 
 def one_a_station(camera: Camera | Sequence[Camera], n_stations: int) -> tuple[Camera, ...]:
-    """A camera for each station, of one for all or one for each. Raises InputError for others."""
+    """One camera for each station, from one for all or one for each.
+
+    Raises InputError for any other number.
+    """
     cameras = (camera,) * n_stations if isinstance(camera, Camera) else tuple(camera)
     if len(cameras) != n_stations or n_stations == 0:
         raise InputError(
@@ -246,13 +265,15 @@ def default_stations(
     distance: float | None = None,
     elevation: float | None = None,
 ) -> tuple[StationPlace, ...]:
-    """One place for each camera: evenly round the machine, not quite regular, as by hand.
+    """One pose for each camera: spaced evenly round the machine with random deviations.
 
-    A camera that is alone goes where it sees most of every leg, unless it sees a board on the base.
-    board : what a board is fixed to that all see: they stand to one side of a machine that stands,
-    round one that lies flat, and with room beside the machine for a board on the base. distance :
-    from the machine's middle, m, instead of where it fills the picture. elevation : rad above the
-    level, instead of the usual. Neither moves a camera that stands inside.
+    A single camera takes the candidate from which every leg is seen best, unless it sees a board on
+    the base.
+
+    board : body that carries a board which all cameras see. Cameras then stand to one side of a
+    machine, but round one that lies flat; with a board on the base they leave room for it. distance
+    : from the machine's middle, m; by default such that the machine fills the image. elevation :
+    rad above the horizontal; random by default. Neither applies to a camera between the legs.
     """
     space = legs_space(machine)
     start = rng.uniform(0, 2 * np.pi)
@@ -281,10 +302,12 @@ def default_stations(
 def places_by_hand(
     machine: Machine, cameras: tuple[Camera, ...], rng: np.random.Generator
 ) -> tuple[StationPlace, ...]:
-    """A place for each photograph of someone who walks round the machine, evenly but for a step."""
+    """One pose for each image of a person who walks round the machine, evenly with random
+    deviations.
+    """
     centre, radius = ball_of(legs_space(machine))
     start, out = rng.uniform(0, 2 * np.pi), list[StationPlace]()
-    # three turns about the machine, so that photographs of one configuration are not side by side
+    # three turns about the machine, so that images of one configuration are not side by side
     turn = 2 * np.pi * 3 / len(cameras) * (1 + 1 / (3 * len(cameras)))
     for k, camera in enumerate(cameras):
         azimuth = start + turn * (k + rng.uniform(-0.3, 0.3))
@@ -307,7 +330,9 @@ def places_by_hand(
 
 
 def fitting_distance(machine: Machine, camera: Camera, board: BoardBody | None = None) -> float:
-    """From which the machine, and the board, fill the camera's picture, in the machine's radius."""
+    """Distance from which machine and board fill the camera's image, in radii of the machine's
+    space.
+    """
     if len(reaches(machine)[0]) > 1 and board != "base":
         share = MOVED_DISTANCE_FACTOR
     else:
@@ -324,8 +349,9 @@ def _clearest(
     rng: np.random.Generator,
     elevation: float | None,
 ) -> StationPlace:
-    """The place on the ring, ``away`` from the machine in its own radius, from which the leg that
-    is seen least is seen best.
+    """Candidate on the ring, ``away`` from the machine in its own radius, with the best worst leg.
+
+    The score of a candidate is the visible share of the leg that is seen least at home.
     """
     space = legs_space(machine)
     azimuths = start + 2 * np.pi * np.arange(CAMERA_PLACES_TRIED) / CAMERA_PLACES_TRIED
@@ -334,7 +360,7 @@ def _clearest(
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     legs = legs_in_camera(machine, T_camera_base, home, machine.inverse(home))
     points = edge_points(machine, camera, legs, tubes, 12)
-    # legs move: what comes near another one at home is behind it elsewhere
+    # legs move: a leg that is close to another in the image at home is hidden by it elsewhere
     clear = HOME_LEG_GAP * camera.image_size[0]
     visible = unobstructed(machine, camera, legs, tubes, points, clear).mean(axis=-1)
     share = np.stack([visible[:, tubes.leg == j].mean(axis=1) for j in np.unique(tubes.leg)])
@@ -342,12 +368,14 @@ def _clearest(
 
 
 def _is_flat(points: Array) -> bool:
-    """Whether joints (n, 3) lie in about one level."""
+    """Whether points (n, 3) lie in about one horizontal plane."""
     return bool(np.ptp(points[:, 2]) < 0.25 * ball_of(points)[1])
 
 
 def view_angle(camera: Camera) -> float:
-    """Smallest angle (rad) from the image's middle to its border, or to the field's rim."""
+    """Smallest angle, in rad, from the image's middle to its border, or to the rim of a lens's
+    field.
+    """
     width, height = camera.image_size
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     borders = np.array([[0, middle[1]], [width - 1, middle[1]], [middle[0], 0]])
@@ -361,15 +389,15 @@ def view_angle(camera: Camera) -> float:
 def rough_pose(
     T_camera_base: Array, distance: float, shift: float, turn: float, rng: np.random.Generator
 ) -> StationPlace:
-    """A pose by hand: off by ``shift`` (m) and ``turn`` (rad) in random directions.
+    """Hand-measured pose: off by ``shift`` (m) and ``turn`` (rad) in random directions.
 
-    distance : from the camera to what it looks at, m.
+    distance : from the camera to its target, m.
     """
     T_base_camera = inverse(T_camera_base)
     axis, direction = rng.normal(size=(2, 3))
     rot = rotation(turn * axis / np.linalg.norm(axis)) @ T_base_camera[:3, :3]
     position = T_base_camera[:3, 3] + shift * direction / np.linalg.norm(direction)
-    # nobody writes more digits than a tenth of a millimetre by hand
+    # a pose measured by hand has no digits below a tenth of a millimetre
     return StationPlace(
         _rounded(position), _rounded(position + distance * rot[:, 2]), _rounded(-rot[:, 1])
     )
@@ -387,7 +415,7 @@ def _outside(
     rng: np.random.Generator,
     elevation: float | None,
 ) -> StationPlace:
-    """On a ring round the machine's points (n, 3), low, or high for a flat machine."""
+    """Pose on a ring round the machine's points (n, 3), low, or high for a flat machine."""
     centre, radius = ball_of(points)
     usual = np.deg2rad(rng.uniform(42, 55) if _is_flat(points) else rng.uniform(7, 17))
     above = usual if elevation is None else elevation
@@ -401,7 +429,7 @@ def _outside(
 
 
 def _inside(machine: Machine, rng: np.random.Generator) -> StationPlace:
-    """Between the legs, a little above the base joints, looking at the platform."""
+    """Pose between the legs, a little above the base joints, looking at the platform."""
     a, b = (ends.reshape(-1, 3) for ends in reaches(machine))
     middle, rise = a.mean(axis=0), b.mean(axis=0) - a.mean(axis=0)
     width = float(np.linalg.norm(a - middle, axis=1).max())
@@ -415,9 +443,10 @@ def _inside(machine: Machine, rng: np.random.Generator) -> StationPlace:
 def in_picture(
     machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
 ) -> Booleans:
-    """(K,) whether a photograph of each configuration, poses (K, 4, 4) and readings (K, m), shows
-    the machine: a leg may lose its end to the border; a picture with half a machine is a bad
-    photograph.
+    """(K,) whether an image of each configuration shows the machine.
+
+    T_base_platform : (K, 4, 4). joints : (K, m). The end of a leg may lie outside the image; an
+    image with half a machine is not usable.
     """
     ends = machine.ends_at(joints, T_base_platform)
     along = np.linspace(0.06, 0.96, 12)[:, None]

@@ -1,4 +1,4 @@
-"""A plan rehearsed: what a simulated session needs to be what ``pkmcal plan`` asked for."""
+"""Rehearsal of a plan: the inputs with which a session is simulated as ``pkmcal plan`` asks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PLAN_FILE = "plan.json"
 
 
 class _Part(Schema):
-    """Fields that are needed here."""
+    """Part of the plan's document; fields that the rehearsal does not need are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -50,7 +50,7 @@ class _Plan(_Part):
 
 
 class Rehearsal(NamedTuple):
-    """The planned machine, cameras and their places, configurations, and the board, if any."""
+    """Planned machine, cameras and their poses, configurations, and the board, if any."""
 
     machine: Machine
     cameras: tuple[Camera, ...]
@@ -60,7 +60,11 @@ class Rehearsal(NamedTuple):
 
 
 def rehearsal_of(plan: Path | str) -> Rehearsal:
-    """What a plan asked for; plan : its folder, or its plan.json. Raises InputError for others."""
+    """Rehearsal of a plan.
+
+    plan : the plan's folder, or its plan.json. Raises InputError if there is no plan, or if its
+    readings do not fit its machine.
+    """
     path = Path(plan) / PLAN_FILE if Path(plan).is_dir() else Path(plan)
     if not path.is_file():
         raise InputError(

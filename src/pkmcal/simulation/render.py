@@ -1,14 +1,14 @@
-"""Photographs of a scene by any central camera: exact silhouettes, sub-pixel borders, noise.
+"""Ray-cast images of a scene by any central camera: exact silhouettes, sub-pixel borders, noise.
 
-Rays come in bundles of neighbours, (3, bundles, rays). A bundle lies in a narrow cone, and only
-shapes with a bounding ball in that cone are tried: a leg costs what it covers. What a ray meets
-first is lit by what the point sees of the lamp.
+Rays are cast in bundles of neighbours, (3, bundles, rays). A bundle lies in a narrow cone, and only
+shapes with a bounding ball in that cone are tested: the cost of a leg is proportional to its area
+in the image. The first hit is lit by the share of the lamp that the point sees.
 
-Each pixel is first looked at once, through its centre. Where the label (shape, face, shadow) of a
-pixel differs from a neighbour's, the pixel is looked at again, so that its grey level is the mean
-over its area: through its corners where these show what its centre shows, for no border that is
-straight over a pixel passes between them, and through points spread over the area where they do
-not. Then follow the lens's blur, the sensor's noise and 8 bits, linear in the light.
+Each pixel is sampled once through its centre. Where the label (shape, face, shadow) of a pixel
+differs from a neighbour's, the pixel is sampled again, so that its grey level is the mean over its
+area: through its corners if these have the centre's label, because no border that is straight over
+a pixel passes between them, and otherwise through points spread over the area. Lens blur, sensor
+noise and quantization to 8 bits follow, all linear in the light.
 """
 
 from __future__ import annotations
@@ -27,18 +27,19 @@ from pkmcal.simulation.surfaces import Lamp, Lighting, Material, radiance
 RAY_BUNDLE_SIDE = 16
 """Pixels along the side of a bundle of neighbouring rays."""
 BORDER_PIXEL_SAMPLES = 32
-"""Points in a border pixel. They stand on as many different rows and columns, and are shifted at
+"""Samples in a border pixel. They stand on as many different rows and columns, and are shifted at
 random from pixel to pixel: a straight edge is then right to 0.02 px in each row of pixels, and
-without bias along the edge, upright ones included."""
+without bias along the edge, upright edges included."""
 LEAST_STEP = 0.004
-"""Steps in light below this (a grey level) need no second look: soft shadows have them."""
+"""Step in light (about a grey level) below which a border is not sampled again, as in soft shadows.
+"""
 RAY_BUNDLES_AT_ONCE = 256
-"""Bundles at a time: 65 thousand rays, whose arrays stay in the processor's cache."""
+"""Bundles processed together: 65 thousand rays, whose arrays fit the processor's cache."""
 
 
 @dataclass(frozen=True)
 class ScenePart:
-    """A shape with its surface; ``solid`` ones cast shadows."""
+    """Shape with its surface; ``solid`` parts cast shadows."""
 
     shape: Shape
     material: Material
@@ -53,7 +54,7 @@ class Scene:
     lighting: Lighting
 
     def having(self, parts: Sequence[ScenePart]) -> Scene:
-        """The same with further parts."""
+        """The scene with further parts."""
         return Scene((*parts, *self.parts), self.lighting)
 
 
@@ -67,7 +68,7 @@ class Bounds:
 
     @classmethod
     def of(cls, shapes: Sequence[Shape]) -> Bounds:
-        """The shapes' own balls in a row."""
+        """Bounding balls of the shapes, one shape after the other."""
         balls = [shape.balls() for shape in shapes]
         counts = [len(radius) for _, radius in balls]
         return cls(
@@ -77,7 +78,7 @@ class Bounds:
         )
 
     def reached(self, origin: Array, rays: Array, grow: float = 0.0) -> Booleans:
-        """(bundles, p) True where a ray of a bundle may come within ``grow`` of a shape."""
+        """(bundles, p) True where a ray of a bundle may come within ``grow`` (m) of a shape."""
         middle = rays.mean(axis=2)
         middle = middle / np.sqrt(np.einsum("ib,ib->b", middle, middle))
         spread = np.einsum("ibr,ib->br", rays, middle).min(axis=1)
@@ -87,10 +88,10 @@ class Bounds:
         cosine = np.einsum("ik,ib->kb", middle, to_ball) / np.maximum(distance, 1e-12)
         radius = self.radius + grow
         width = np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1.0))
-        # a ball round the origin is met by every ray
+        # every ray meets a ball round the origin
         width = np.where(distance <= radius, np.pi, width)
         angle = np.arccos(np.clip(cosine, -1, 1))
-        # arccos is coarse near one: a rounding error there is worth 1e-7 rad
+        # arccos is ill-conditioned near one: a rounding error there is worth 1e-7 rad
         near = angle <= half[:, None] + width + 1e-6
         return np.logical_or.reduceat(near, self.first, axis=1)
 
@@ -98,7 +99,9 @@ class Bounds:
 def first_hits(
     shapes: Sequence[Shape], bounds: Bounds, origin: Array, rays: Array
 ) -> tuple[Array, Integers]:
-    """Distance (bundles, rays) to the nearest shape, inf where none, and its number, -1."""
+    """Distance (bundles, rays) to the nearest shape, inf if none, and the shape's number, -1 if
+    none.
+    """
     distance = np.full(rays.shape[1:], np.inf)
     owner = np.full(rays.shape[1:], -1, dtype=np.int16)
     reached = bounds.reached(origin, rays)
@@ -117,10 +120,10 @@ def first_hits(
 def lamp_visibility(
     parts: Sequence[ScenePart], bounds: Bounds, lamp: Lamp, points: Array, owner: Integers
 ) -> Array:
-    """Part of the lamp (bundles, rays) that surface points (3, bundles, rays) see.
+    """Share of the lamp (bundles, rays) that surface points (3, bundles, rays) see.
 
-    A convex shape does not shadow its own lit points, so ``owner`` is left out; that needs no
-    tolerance at the surface.
+    A convex shape casts no shadow on its own lit points, so the shape ``owner`` of each point is
+    skipped; no tolerance at the surface is needed.
     """
     rays = points - lamp.place[:, None, None]
     distance = np.sqrt(np.einsum("ibr,ibr->br", rays, rays))
@@ -140,9 +143,10 @@ def lamp_visibility(
 
 
 class RayHits(NamedTuple):
-    """What rays meet, (bundles, rays) each: light, labels that change at every visible border, and
-    the part of the lamp that the place sees. A label counts the shape, its face, and whether it
-    lies in shadow.
+    """First hits of rays, (bundles, rays) each.
+
+    light : radiance. label : integer that changes at every visible border; it encodes the shape,
+    its face, and whether the point is in shadow. visible : share of the lamp that the point sees.
     """
 
     light: Array
@@ -151,7 +155,7 @@ class RayHits(NamedTuple):
 
 
 def ray_hits(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> RayHits:
-    """What rays (3, bundles, rays) meet."""
+    """First hits of rays (3, bundles, rays) from an origin (3,)."""
     distance, owner = first_hits([part.shape for part in scene.parts], bounds, origin, rays)
     lost = owner < 0
     points = origin[:, None, None] + np.where(lost, 1.0, distance) * rays
@@ -170,8 +174,9 @@ def ray_hits(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> RayHit
 def light_of(
     scene: Scene, origin: Array, rays: Array, distance: Array, owner: Integers, visibility: Array
 ) -> Array:
-    """Light (bundles, rays) along rays (3, bundles, rays) from what each meets first; visibility :
-    of the lamp.
+    """Light (bundles, rays) along rays (3, bundles, rays) from their first hits.
+
+    visibility : share of the lamp that each hit sees.
     """
     flat, far, lit = rays.reshape(3, -1), distance.ravel(), visibility.ravel()
     light = np.zeros(owner.size)
@@ -185,7 +190,7 @@ def light_of(
 
 
 def _by_owner(owner: Integers) -> Iterator[tuple[int, Integers]]:
-    """Each shape that any ray meets, and those rays, by their numbers in a row."""
+    """Each shape that any ray hits, with the flat indices of those rays."""
     numbers = owner.ravel()
     order = np.argsort(numbers, kind="stable")
     values, starts = np.unique(numbers[order], return_index=True)
@@ -195,14 +200,15 @@ def _by_owner(owner: Integers) -> Iterator[tuple[int, Integers]]:
 
 
 def _mirrored(scene: Scene, number: int, points: Array, to_camera: Array) -> Array:
-    """Light (n,) that a polished shape's points (3, n) mirror towards the camera: what their rays
-    meet first of all else, in full light, mirroring nothing itself.
+    """Light (n,) that a polished shape's points (3, n) reflect towards the camera.
+
+    One reflection: the first hit among the other shapes, fully lit and itself not reflecting.
     """
     n = scene.parts[number].shape.normal(points)
     d = 2 * np.einsum("in,in->n", n, to_camera) * n - to_camera
     nearest, owner = np.full(points.shape[1], np.inf), np.full(points.shape[1], -1)
     for k, part in enumerate(scene.parts):
-        if k != number:  # it is convex
+        if k != number:  # a convex shape does not reflect itself
             values = part.shape.enter(points, d)
             owner = np.where(values < nearest, k, owner)
             nearest = np.minimum(values, nearest)
@@ -215,7 +221,7 @@ def _mirrored(scene: Scene, number: int, points: Array, to_camera: Array) -> Arr
 
 
 def _flat(rays: Array, rows: Integers) -> Array:
-    """The rays of some bundles in one row, (3, n); a view where all are wanted."""
+    """Rays of some bundles as (3, n); a view if all bundles are selected."""
     wanted = rays if rows.size == rays.shape[1] else rays[:, rows]
     return wanted.reshape(3, -1)
 
@@ -225,8 +231,8 @@ class Sensor:
     """Lens blur and sensor.
 
     blur : standard deviation of the point spread, px. exposure : grey levels for light 1.
-    read_noise : grey levels. shot_noise : variance a grey level, so that the noise at level g
-    has the variance read_noise^2 + shot_noise g.
+    read_noise : grey levels. shot_noise : variance for each grey level; the noise at level g has
+    the variance read_noise^2 + shot_noise g.
     """
 
     blur: float = 0.6
@@ -237,8 +243,8 @@ class Sensor:
 
 @dataclass(frozen=True)
 class PixelRays:
-    """A camera's rays, worked out once: (3, H, W) through pixel centres and (3, H+1, W+1)
-    through their corners, camera frame; NaN where no ray meets the pixel.
+    """Rays of a camera, computed once: (3, H, W) through pixel centres and (3, H+1, W+1) through
+    pixel corners, camera frame; NaN for pixels outside the field of view.
     """
 
     centre: Array
@@ -246,7 +252,7 @@ class PixelRays:
 
     @classmethod
     def of(cls, camera: Camera) -> PixelRays:
-        """All rays of a camera."""
+        """Rays through all pixel centres and corners."""
         width, height = camera.image_size
         return cls(
             _rays(camera, np.arange(width) * 1.0, np.arange(height) * 1.0),
@@ -257,7 +263,7 @@ class PixelRays:
 def render_light(
     scene: Scene, view: PixelRays, T_camera_base: Array, rng: np.random.Generator
 ) -> Array:
-    """Light (H, W) that falls on each pixel, mean over its area, before blur; 1 is white."""
+    """Light (H, W) on each pixel, mean over the pixel's area, before blur; 1 is white."""
     rot = T_camera_base[:3, :3].T
     origin = -rot @ T_camera_base[:3, 3]
     bounds = Bounds.of([part.shape for part in scene.parts])
@@ -271,7 +277,7 @@ def render_light(
 
 
 def photograph(light: Array, sensor: Sensor, rng: np.random.Generator) -> Integers:
-    """8-bit picture (H, W) of the light on each pixel."""
+    """8-bit image (H, W) of the light on each pixel."""
     from scipy.ndimage import gaussian_filter
 
     level = light * sensor.exposure
@@ -283,7 +289,7 @@ def photograph(light: Array, sensor: Sensor, rng: np.random.Generator) -> Intege
 
 
 def _rays(camera: Camera, x: Array, y: Array) -> Array:
-    """(3, len(y), len(x)) rays, in strips: lens models need many numbers a pixel."""
+    """(3, len(y), len(x)) rays, computed in strips: lens models use much memory for each pixel."""
     out = np.empty((3, y.size, x.size))
     for rows in np.array_split(np.arange(y.size), max(1, y.size * x.size // 30_000)):
         u, v = np.meshgrid(x, y[rows])
@@ -294,7 +300,7 @@ def _rays(camera: Camera, x: Array, y: Array) -> Array:
 def _through_centres(
     scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: PixelRays, blind: Booleans
 ) -> RayHits:
-    """One ray a pixel, (H, W); meaningless in blind pixels."""
+    """Hits of one ray through each pixel's centre, (H, W); undefined in blind pixels."""
     shape = blind.shape
     light, label = np.zeros(blind.size), np.full(blind.size, -2, dtype=np.int16)
     visible = np.ones(blind.size)
@@ -317,7 +323,7 @@ def _over_area(
     """Mean light (n,) over the area of each border pixel, in the order of the mask.
 
     hits : (H, W) through the pixels' centres. Where a pixel and all its neighbours see the same
-    whole lamp, or none of it, so does every point between; most borders are such.
+    whole lamp, or none of it, so does every point between them; that holds for most borders.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -330,20 +336,23 @@ def _over_area(
     corner = view.corner.reshape(3, -1)
     first = at // width * (width + 1) + at % width
     label, around = _through_corners(scene, bounds, origin, rot, corner, first, width)
-    # of light that bends evenly over a pixel, a third of what its corners have more is its mean's
+    # light quadratic over the pixel: its mean is the centre's plus a third of the corners' excess
     out = hits.light.ravel()[at]
     bend = (around.mean(axis=1) - out) / 3
     out += bend
+    # pixels whose corners have the centre's label need no further samples
     whole = np.all(label == hits.label.ravel()[at, None], axis=1) & (np.abs(bend) < LEAST_STEP)
     visible = hits.visible
     same = (maximum_filter(visible, 3) == minimum_filter(visible, 3)).ravel()[at]
+    # random samples over the area of the others; shadows are cast only where the lamp's share
+    # varies
     for valid in (True, False):
         part = np.flatnonzero(~whole & (same == valid))
         for rows in _chunks(_grouped(part, RAY_BUNDLE_SIDE)):
             fx, fy = offsets[rows][..., 0], offsets[rows][..., 1]
             c = [corner[:, first[rows] + s][..., None] for s in (0, 1, width + 1, width + 2)]
             d = (c[0] * (1 - fx) + c[1] * fx) * (1 - fy) + (c[2] * (1 - fx) + c[3] * fx) * fy
-            # at the rim of the field a corner may see nothing where the centre still does
+            # at the rim of the field a corner may have no ray although the centre has one
             if not all(np.isfinite(one).all() for one in c):
                 centre = view.centre.reshape(3, -1)[:, at[rows]][..., None]
                 d = np.where(np.isfinite(d).all(axis=0), d, centre)
@@ -364,11 +373,11 @@ def _through_corners(
     scene: Scene, bounds: Bounds, origin: Array, rot: Array, corner: Array, first: Integers,
     width: int,
 ) -> tuple[Integers, Array]:  # fmt: skip
-    """Labels and light (n, 4) at the corners of pixels, -2 where a corner sees nothing.
+    """Labels and light (n, 4) at the corners of pixels; label -2 for a corner without a ray.
 
-    corner : (3, (H + 1) (W + 1)) rays. first : (n,) each pixel's upper left one of these.
+    corner : (3, (H + 1) (W + 1)) rays. first : (n,) index of each pixel's upper left corner.
     """
-    # each once, in the order of the pixels that have it first
+    # each corner once, in the order of the first pixel that has it
     numbers, begins, which = np.unique(
         first[:, None] + (0, 1, width + 1, width + 2), return_index=True, return_inverse=True
     )
@@ -383,7 +392,7 @@ def _through_corners(
 
 
 def _grouped(numbers: Integers, size: int) -> Integers:
-    """Numbers in rows of so many; the last one is repeated until its row is full."""
+    """Numbers in rows of this size; the last number is repeated until its row is full."""
     if not numbers.size:
         return numbers.reshape(0, size)
     full = np.arange(numbers.size + -numbers.size % size).clip(max=numbers.size - 1)
@@ -391,9 +400,7 @@ def _grouped(numbers: Integers, size: int) -> Integers:
 
 
 def _pattern() -> Array:
-    """(BORDER_PIXEL_SAMPLES, 2) Hammersley points: every row and column once, and even over the
-    square.
-    """
+    """(BORDER_PIXEL_SAMPLES, 2) Hammersley points in the unit square: each row and column once."""
     k = np.arange(BORDER_PIXEL_SAMPLES)
     bits = BORDER_PIXEL_SAMPLES.bit_length() - 1
     mirrored = sum(((k >> b) & 1) << (bits - 1 - b) for b in range(bits))
@@ -403,7 +410,7 @@ def _pattern() -> Array:
 
 
 def _borders(label: Integers, light: Array) -> Booleans:
-    """Pixels with a neighbour, diagonals included, of another label and light; (H, W)."""
+    """(H, W) pixels with a neighbour, diagonals included, of another label and light."""
     border = np.zeros(label.shape, dtype=bool)
     for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
         here = (slice(0, label.shape[0] - dy), slice(max(0, -dx), label.shape[1] - max(0, dx)))
@@ -416,7 +423,9 @@ def _borders(label: Integers, light: Array) -> Booleans:
 
 
 def _tiles(height: int, width: int) -> Integers:
-    """Pixel numbers (tiles, pixels of one) of square tiles; the last ones repeat the border's."""
+    """Pixel indices (tiles, pixels of one) of square tiles; the last tiles repeat the border's
+    pixels.
+    """
     side = RAY_BUNDLE_SIDE
     y = np.arange(height + -height % side).clip(max=height - 1).reshape(-1, side)
     x = np.arange(width + -width % side).clip(max=width - 1).reshape(-1, side)
@@ -428,7 +437,7 @@ def _chunks(rows: Integers) -> list[Integers]:
 
 
 def _seeing(d: Array) -> Array:
-    """Rays (3, tiles, n) with those that see nothing replaced by one of their tile that does."""
+    """Rays (3, tiles, n), with NaN rays replaced by a valid ray of the same tile."""
     good = np.isfinite(d).all(axis=0)
     if good.all():
         return d

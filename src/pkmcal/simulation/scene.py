@@ -1,7 +1,7 @@
-"""The scene of a session: the machine as its drawing shows it, in a room with a table.
+"""Scene of a session: the machine with its nominal shapes in a room with a table.
 
-The room, the lamps and the surfaces are drawn from one seed and stay for the whole session, as
-in a laboratory; only the machine moves. Sizes follow the machine's own.
+Room, lamps and surfaces are drawn at random from one seed and stay the same for the whole session,
+as in a laboratory; only the machine moves. Sizes are relative to the machine's.
 """
 
 from __future__ import annotations
@@ -34,46 +34,49 @@ from pkmcal.simulation.surfaces import (
 
 Z_AXIS = np.array([0.0, 0.0, 1.0])
 MOTOR_RADIUS = 0.17
-"""Radius of a motor, in its arm's length; three radii of the joint at least."""
+"""Radius of a motor relative to its arm's length; at least 2.2 radii of the joint."""
 CARRIAGE_HALF_SIZE = (2.4, 1.4, 0.6)
 """Half a carriage's size along, across and from its guide, in radii of the joint on it."""
 RAIL_HALF_WIDTH = 1.2
 """Half a guide's width, in radii of the joint on its carriage."""
 PLANAR_POST_HEIGHTS = 3.5, 7.5
 """Heights of the posts on a planar machine's plates, platform and base, in radii of a joint. A
-plate over the legs would hide them; one close below them would show their shadows for edges."""
+plate above the legs would hide them; the shadows on a plate close below them would look like edges.
+"""
 HANGING_COLUMN_SIZE = 0.12, 12.0
-"""Radius and length of what a hanging machine hangs on, in radii of its base; the room ends it."""
+"""Radius and length of the column above a hanging machine, in radii of its base; it ends in the
+ceiling."""
 GUIDE_BED_DEPTH = 4.0
-"""Height of what guides stand on below the platform's lowest joints, in the platform's radius:
-a tool or a board has room under the platform."""
+"""Distance of the plate that guides stand on below the platform's lowest joints, in radii of the
+platform: room for a tool or a board under the platform."""
 SKY_AND_GROUND_LIGHT = {False: (0.26, 0.13), True: (0.42, 0.28)}
 SOFT_LAMP_SHARE = 0.7
-"""Light from above and below, and the share of the lamps' that is left where it is soft, round
-machines with thin rods: in hard light these end, for a camera, where their lit side does."""
+"""Light from above and below, by whether the base carries motors, and the remaining share of the
+lamps' power for such machines. Their rods are thin; in hard light a rod's edge in the image would
+be the border of its lit side."""
 KINDS_OF_LIGHT: dict[Light, tuple[float, float, float]] = {
     "usual": (1.0, 1.0, 1.0),
     "soft": (2.5, 0.5, 1.8),
     "hard": (0.3, 1.3, 0.4),
 }
-"""How wide and how strong the lamps are, and how strong the light from everywhere, in kinds of
-light: under a white ceiling, and in the sun or under a spot."""
+"""Factors on the lamps' radius and power and on the ambient light, by kind of light: under a white
+ceiling (soft), in the sun or under a spot (hard)."""
 BOARD_LAMP_ANGLE = 1.2
-"""rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
+"""Largest angle, in rad, between the cameras' azimuth and a lamp that lights a board."""
 MOTOR_SHARE, RING_AT, CABLE_PIECES = 0.5, 0.7, 8
-"""Length of a leg's motor and place of its ring, in the length of its first tube; straight pieces
-of the motor's cable."""
+"""Length of a leg's motor and position of its ring, relative to the length of the leg's first tube;
+straight pieces of the motor's cable."""
 TOOL_FLANGE_RADIUS = 0.3
-"""Radius of an articulated platform's tool flange, in that of a rigid one's plate."""
+"""Radius of an articulated platform's tool flange, relative to a rigid platform's plate."""
 
 
 @dataclass(frozen=True)
 class Discs:
-    """The two plates that carry the joints, and what moves the legs' ends on the base.
+    """Plates that carry the joints, and the actuators of the legs' ends on the base.
 
     base, platform : (3,) centre of the face towards the joints; base frame, platform frame.
-    base_radius, platform_radius : m. side : +1 where the platform stands above the base along
-    the frames' z, -1 below. platform_side : the same for the platform's plate and its joints.
+    base_radius, platform_radius : m. side : +1 where the platform stands above the base along the
+    frames' z, -1 below. platform_side : the same for the platform's plate relative to its joints.
     thickness : m.
     """
 
@@ -88,9 +91,9 @@ class Discs:
 
 
 def discs_of(machine: Machine) -> Discs:
-    """Plates outside the joints, along the frames' z, as wide as the joints need.
+    """Plates beyond the joints along the frames' z, as wide as the joints need.
 
-    A planar machine's plates both lie below its legs, the platform's over the base's.
+    Both plates of a planar machine lie below its legs, the platform's above the base's.
     """
     ends = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
     a, b = np.array(ends.a), np.array(ends.b)
@@ -119,10 +122,10 @@ def discs_of(machine: Machine) -> Discs:
 
 
 def _held(machine: Machine, drives: Drives, balls: Array) -> tuple[Array, float]:
-    """Points (n, 3) beyond which the base plate lies, and by how much at least, m.
+    """Points (n, 3) beyond which the base plate lies, and the least distance from them, m.
 
-    Of joints and arms' motors where they are; of guides all that their carriages and the platform
-    reach.
+    For fixed joints and arms' motors these points are their feet; for guides, all points that their
+    carriages and the platform reach.
     """
     if drives.guides.any():
         a, b = reaches(machine)
@@ -142,8 +145,9 @@ def machine_parts(
     joints: Array,
     as_built: bool = False,
 ) -> list[ScenePart]:
-    """The machine at one pose (4, 4) and its readings (m,); as built, with what hangs on its legs
-    and is on no drawing.
+    """Parts of the machine at one pose (4, 4) with readings (m,).
+
+    as_built : with motors, rings and cables on the legs that are not in the nominal model.
     """
     ends = machine.ends_at(joints, T_base_platform)
     balls = _ball_radii(machine)
@@ -162,7 +166,7 @@ def machine_parts(
 
 
 def _base(discs: Discs, balls: Array, finish: Finish) -> list[ScenePart]:
-    """The base plate, and what it hangs on; or beams in its place, for guides that lie."""
+    """Base plate and the column that it hangs from; or beams in its place for horizontal guides."""
     up = discs.side * Z_AXIS
     parts = beams(discs.drives, balls, finish)
     if not parts:
@@ -177,7 +181,7 @@ def _base(discs: Discs, balls: Array, finish: Finish) -> list[ScenePart]:
 
 
 def _base_end(discs: Discs, j: int, chain: Array, balls: Array, finish: Finish) -> list[ScenePart]:
-    """What holds leg j's end on the base, the last point of its chain (k, 3)."""
+    """Parts that hold leg j's end on the base, the last point of its chain (k, 3)."""
     drives, up, a = discs.drives, discs.side * Z_AXIS, chain[-1]
     if drives.arms[j]:
         return arm_parts(drives, j, chain, balls, discs.base, up, finish)
@@ -194,7 +198,7 @@ def _platform(
     T_base_platform: Array,
     finish: Finish,
 ) -> list[ScenePart]:
-    """The platform's plate with the tool's holder, and its joints b (L, 3) or the bars to them."""
+    """Platform's plate with a tool holder, and its joints b (L, 3) or the side bars to them."""
     up = discs.platform_side * T_base_platform[:3, 2]
     centre = apply(T_base_platform, discs.platform)
     radius = discs.platform_radius * (TOOL_FLANGE_RADIUS if bars else 1.0)
@@ -216,7 +220,7 @@ def _platform(
 def _joint(
     centre: Array, direction: Array, height: float, radius: float, finish: Finish
 ) -> list[ScenePart]:
-    """A ball, and the post from it to its plate."""
+    """Ball joint, and the post from the ball to its plate."""
     post = Cylinder(centre, direction, 0.6 * radius, height)
     return [ScenePart(Ball(centre, radius), finish.joint), ScenePart(post, finish.joint)]
 
@@ -224,9 +228,9 @@ def _joint(
 def _leg(
     machine: Machine, j: int, a: Array, b: Array, finish: Finish, bare: Material
 ) -> list[ScenePart]:
-    """The leg's tubes, cut off where the leg ends, and the neck between joint and first tube.
+    """Tubes of a leg, cut off at the leg's end, and the neck between joint and first tube.
 
-    bare : of all but the first of several tubes.
+    bare : material of all but the first of several tubes.
     """
     length = float(np.linalg.norm(b - a))
     u = (b - a) / length
@@ -247,7 +251,7 @@ def _leg(
 def _hung_on(
     machine: Machine, j: int, a: Array, b: Array, discs: Discs, finish: Finish
 ) -> list[ScenePart]:
-    """A motor beside the leg's first tube, outside, a ring about it, and the motor's cable."""
+    """Motor beside the leg's first tube, a ring round the tube, and the motor's cable."""
     tubes, radii = machine.document.legs[j].tubes, machine.radii()[j]
     if not tubes:
         return []
@@ -263,7 +267,7 @@ def _hung_on(
         ScenePart(Cylinder(foot, u, wide, long), finish.joint),
         ScenePart(Cylinder(ring, u, 1.12 * radius, 0.5 * radius), finish.joint),
     ]
-    # a cable from the motor's upper end, in a slack bow, to the base's rim
+    # slack cable from the motor's upper end to the base's rim
     rim = discs.base + discs.base_radius * (foot - discs.base) / np.linalg.norm(foot - discs.base)
     t = np.linspace(0.0, 1.0, CABLE_PIECES + 1)[:, None]
     top = foot + long * u + wide * out
@@ -275,7 +279,9 @@ def _hung_on(
 
 
 def _ball_radii(machine: Machine) -> Array:
-    """Joint balls a little wider than the tube that they hold, (L, 2) m at A and at B."""
+    """Radii (L, 2), in m, of the joint balls at A and at B, a little wider than the tube between
+    them.
+    """
     spare = 0.01
     return np.array(
         [[1.2 * r[0], 1.5 * r[-1]] if len(r) else [spare, spare] for r in machine.radii()]
@@ -283,22 +289,27 @@ def _ball_radii(machine: Machine) -> Array:
 
 
 def motor_radius(arm: float, ball: float) -> float:
-    """Of an arm's motor, m."""
+    """Radius of an arm's motor, m."""
     return max(MOTOR_RADIUS * arm, 2.2 * ball)
 
 
 def arm_parts(
     drives: Drives, j: int, chain: Array, balls: Array, plate: Array, up: Array, finish: Finish
 ) -> list[ScenePart]:
-    """The arm of leg j, the hub, the motor beside it, and its bracket.
+    """Arm of leg j with its hub, the motor beside it, and the motor's bracket.
 
     chain : (k, 3) along the arm, from its motor to the leg's end. balls : (L,) radii of the joints.
-    plate : (3,) on the base plate's face; up : unit, to the legs.
+    plate : (3,) on the base plate's face. up : unit vector towards the legs.
     """
     foot, v, ball = drives.foot[j], drives.axis[j], float(balls[j])
     wide = motor_radius(float(np.linalg.norm(chain[-1] - foot)), ball)
-    length = min(2.4 * wide, 0.6 * _room(drives.foot, j))
-    sense = _motor_side(drives, j) * v
+    # length by the distance to the nearest other motor; arms that share one have the same foot
+    apart = np.linalg.norm(np.delete(drives.foot, j, axis=0) - foot, axis=1)
+    apart = apart[apart > 1e-2 * apart.max(initial=0.0)]
+    length = min(2.4 * wide, 0.6 * float(apart.min(initial=np.inf)))
+    # on the side away from the other arms, if the sides differ
+    off = foot - drives.foot[drives.arms].mean(axis=0)
+    sense = -v if off @ v < -0.1 * np.linalg.norm(off) else v
     first = foot + 1.1 * ball * sense
     post = float((foot - plate) @ up)
     middle = first + 0.5 * length * sense
@@ -315,7 +326,7 @@ def arm_parts(
 
 
 def _web(start: Array, stop: Array, v: Array, ball: float) -> Box:
-    """A straight piece of an arm, flat along its motor's axis v."""
+    """Straight piece of an arm, flat along its motor's axis v."""
     length = float(np.linalg.norm(stop - start))
     e = (stop - start) / length
     across = v - float(v @ e) * e
@@ -326,28 +337,13 @@ def _web(start: Array, stop: Array, v: Array, ball: float) -> Box:
     return Box((start + stop) / 2, np.stack([e, across, np.cross(e, across)]), half)
 
 
-def _room(feet: Array, j: int) -> float:
-    """Distance to the nearest other motor, m."""
-    apart = np.linalg.norm(np.delete(feet, j, axis=0) - feet[j], axis=1)
-    # arms on one motor stand in one place
-    apart = apart[apart > 1e-2 * apart.max(initial=0.0)]
-    return float(apart.min(initial=np.inf))
-
-
-def _motor_side(drives: Drives, j: int) -> float:
-    """+1 or -1: along the axis or against it, away from the other arms where that says much."""
-    off = drives.foot[j] - drives.foot[drives.arms].mean(axis=0)
-    outward = float(off @ drives.axis[j])
-    return -1.0 if outward < -0.1 * np.linalg.norm(off) else 1.0
-
-
 def guide_parts(
     drives: Drives, j: int, a: Array, balls: Array, plate: Array, finish: Finish
 ) -> list[ScenePart]:
-    """The guide of leg j and the carriage with the leg's end ``a`` (3,); as :func:`arm_parts`.
+    """Guide of leg j and the carriage with the leg's end ``a`` (3,).
 
-    A straight guide that stands reaches down, or up, to the base plate; a bent one is drawn in
-    straight pieces.
+    The other arguments are those of :func:`arm_parts`. A straight upright guide reaches to the base
+    plate; a bent guide consists of straight pieces.
     """
     foot, away, ball = drives.foot[j], drives.away[j], float(balls[j])
     along, across, deep = (ball * size for size in CARRIAGE_HALF_SIZE)
@@ -385,7 +381,9 @@ def guide_parts(
 
 
 def _turned_along(piece: Array, away: Array) -> Array:
-    """Rows (3, 3) along a piece of a guide, across it, and from it, nearest to ``away``."""
+    """Axes as rows (3, 3): along a piece of a guide, across it, and the normal nearest to
+    ``away``.
+    """
     v = piece / np.linalg.norm(piece)
     back = away - (away @ v) * v
     back = back / np.linalg.norm(back)
@@ -393,8 +391,8 @@ def _turned_along(piece: Array, away: Array) -> Array:
 
 
 def beams(drives: Drives, balls: Array, finish: Finish) -> list[ScenePart]:
-    """Two beams across guides that lie side by side, and one that joins them; none where the
-    guides are not parallel.
+    """Two beams across parallel horizontal guides, and one that joins them; none for
+    other guides.
     """
     rows = np.flatnonzero(drives.guides & ~drives.upright)
     if rows.size < 2 or np.abs(drives.axis[rows] @ drives.axis[rows[0]]).min() < 0.99:
@@ -403,7 +401,7 @@ def beams(drives: Drives, balls: Array, finish: Finish) -> list[ScenePart]:
     away = away - (away @ u) * u
     away = away / np.linalg.norm(away)
     side, ball = np.cross(u, away), float(balls[rows].max())
-    # on the far side of the guides, whose own depth is that of carriage and rail
+    # behind the guides: beyond the depth of carriage and rail
     clear = ball * (1 + 2 * CARRIAGE_HALF_SIZE[2] + 2 * RAIL_HALF_WIDTH)
     points = drives.ends[rows].reshape(-1, 3)
     t, s, h = points @ u, points @ side, (points @ away).max() + clear
@@ -422,8 +420,8 @@ def nacelle_parts(
 ) -> list[ScenePart]:
     """Side bars between the joints of their legs, each on a pivot, and the bar that joins them.
 
-    bars : legs of each. b : (L, 3) legs' ends. centre : (3,) of the tool's flange, m; up : unit,
-    away from the joints.
+    bars : legs of each bar. b : (L, 3) legs' ends. centre : (3,) of the tool's flange, m. up : unit
+    vector away from the joints.
     """
     ball = float(balls.max())
     parts: list[ScenePart] = []
@@ -459,9 +457,9 @@ def room_of(
     lit_from: float | None = None,
     light: Light = "usual",
 ) -> Scene:
-    """A room around a machine; cameras stand within ``reach`` (m) of the base disc's centre.
+    """Room around a machine; cameras stand within ``reach`` (m) of the base plate's centre.
 
-    lit_from : azimuth (rad) about which the key lamp stands, where a plate would shade a board.
+    lit_from : azimuth, in rad, about which the key lamp stands, if a plate would shade a board.
     """
     size = max(discs.base_radius, discs.platform_radius)
     reach = max(reach, 2.5 * size)
@@ -503,7 +501,7 @@ def _table(
 def _walls(
     middle: Array, floor: float, reach: float, noise: SmoothNoise, rng: np.random.Generator
 ) -> list[ScenePart]:
-    """Floor, ceiling and four walls, none of them plain."""
+    """Floor, ceiling and four walls, all with patterns."""
     patterns = [
         Slats(0.17 * reach, np.inf, 0.35),
         Clouds(noise, 0.045 * reach, 0.30),
@@ -540,7 +538,7 @@ def _furniture(
     noise: SmoothNoise,
     rng: np.random.Generator,
 ) -> ScenePart:
-    """A box or a post behind the cameras' ring, which the camera opposite sees."""
+    """Box or post behind the ring of cameras, in view of the opposite camera."""
     distance = reach * rng.uniform(1.45, 2.3)
     place = middle + distance * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     height = middle[2] - floor + size * rng.uniform(0.1, 2.6)
@@ -569,7 +567,7 @@ def _lamps(
     lit_from: float | None,
     soft: bool,
 ) -> tuple[Lamp, ...]:
-    """A key lamp with shadows, a weaker one across, one from above and behind."""
+    """Key lamp with shadows, a weaker lamp from the side, and one from above and behind."""
     azimuth = rng.uniform(0, 2 * np.pi)
     if lit_from is not None:
         azimuth = lit_from + BOARD_LAMP_ANGLE * (azimuth / np.pi - 1)

@@ -1,4 +1,4 @@
-"""A whole session on disk, as a user would make it, with the truth beside it."""
+"""Simulated session on disk, with the files that a user would write and a file of the truth."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from pkmcal.simulation.truth import (
 
 PhotographProgress = Callable[[int, int], None]
 HANDHELD_JPEG_QUALITY = 95
-"""Of JPEG files by hand, as telephones write them."""
+"""Quality of the JPEG files of a hand-held camera, as phones write them."""
 
 
 def simulate_session(
@@ -50,10 +50,12 @@ def simulate_session(
     workers: int = 2,
     progress: PhotographProgress | None = None,
 ) -> Truth:
-    """Write a session into a new folder, whole or not at all; the truth goes to truth.json.
+    """Write a simulated session into a new folder, completely or not at all.
 
-    camera : one for all stations, or one a station. workers : threads that render; the result
-    does not depend on their number. progress : called with photographs done and in all.
+    The truth is written to truth.json. camera : one for all stations, or one for each. workers :
+    threads that render; the result does not depend on their number. progress : called with the
+    number of finished images and of all. Raises InputError if the folder is not empty or the
+    machine cannot be rendered.
     """
     settings = settings or Settings()
     folder = Path(folder)
@@ -71,16 +73,17 @@ def simulate_session(
 
 
 def _breathed(camera: Camera, scale: float) -> Camera:
-    """The camera with other focal lengths."""
+    """The camera with scaled focal lengths."""
     focal = [name.startswith("focal.") for name in camera.parameter_names]
     return replace(camera, parameters=np.where(focal, scale, 1.0) * camera.parameters)
 
 
 @dataclass(frozen=True)
 class Studio:
-    """Everything that photographs of one session share; cameras : by station; views : of each
-    camera that has more than one photograph, by its id; fixed : to the base;
-    as_built : with motors, rings and cables on the legs.
+    """Everything that the images of one session share.
+
+    cameras : by station. views : rays of each camera with more than one image, by the camera's id.
+    fixed : parts that are fixed to the base. as_built : with motors, rings and cables on the legs.
     """
 
     truth: Truth
@@ -96,7 +99,7 @@ class Studio:
 
     @classmethod
     def of(cls, truth: Truth, cameras: Sequence[Camera], settings: Settings) -> Studio:
-        """Draw the room, and work out each camera's rays once."""
+        """Build the room, and compute each camera's rays once."""
         seeds = stream(truth.seed, "room").spawn(2)
         noise = SmoothNoise.from_rng(np.random.default_rng(seeds[0]))
         discs = discs_of(truth.machine)
@@ -119,10 +122,10 @@ class Studio:
         return cls(truth, discs, finish, room, eyes, views, settings.sensor, fixed, board, built)
 
     def photographs(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
-        """The repeats (8 bits, (H, W)) of the session's photograph number ``index``.
+        """Repeats, 8 bits (H, W) each, of the session's image number ``index``.
 
-        A camera that stands still receives the same light each time, and only the noise differs;
-        shake : standard deviations of its motion, m and rad.
+        Images of a camera at rest receive the same light and differ by noise only. shake : standard
+        deviations of the camera's motion between repeats, m and rad.
         """
         seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.photographs))[index]
         children = (seeds, *seeds.spawn(self.truth.repeats - 1))
@@ -131,12 +134,16 @@ class Studio:
         if not any(shake):
             light = self._light(index, still, rngs[0])
             return [photograph(light, self.sensor, rng) for rng in rngs]
-        shifted = [_shaken(shake, rng) @ still for rng in rngs]
-        lights = [self._light(index, T, rng) for T, rng in zip(shifted, rngs, strict=True)]
+        # a camera that shakes about its own position
+        lights: list[Array] = []
+        for rng in rngs:
+            turn, move = rng.standard_normal((2, 3))
+            motion = pose(rotation(shake[1] * turn), shake[0] * move)
+            lights.append(self._light(index, motion @ still, rng))
         return [photograph(x, self.sensor, rng) for x, rng in zip(lights, rngs, strict=True)]
 
     def _light(self, index: int, T_camera_base: Array, rng: np.random.Generator) -> Array:
-        """Light (H, W) on a camera at a pose, of photograph number ``index``."""
+        """Light (H, W) on a camera at T_camera_base for image number ``index``."""
         station, k = self.truth.photographs[index]
         poses, joints = self.truth.T_base_platform, self.truth.joints
         parts = machine_parts(
@@ -152,14 +159,8 @@ class Studio:
         return render_light(scene, view, T_camera_base, rng)
 
 
-def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
-    """Motion (4, 4) of a camera about its own place; shake : standard deviations, m and rad."""
-    turn, move = rng.standard_normal((2, 3))
-    return pose(rotation(shake[1] * turn), shake[0] * move)
-
-
 def _check(folder: Path, drawing: Machine) -> None:
-    """Raise InputError for what would waste the work."""
+    """Raise InputError before any work for a session that cannot be simulated."""
     if entries(folder):
         raise InputError(
             what="the folder for the simulated session is not empty",
@@ -175,14 +176,14 @@ def _check(folder: Path, drawing: Machine) -> None:
     check_drawable(drawing)
     try:
         drawing.home()
-    except GeometryError as error:  # the drawing is the user's: it is at fault
+    except GeometryError as error:  # the nominal model is input
         raise error.as_input("mechanism") from None
 
 
 def _write_texts(
     stage: Path, drawing: Machine, cameras: Sequence[Camera], settings: Settings, truth: Truth
 ) -> None:
-    """Everything but the photographs."""
+    """Write all files but the images."""
     same = all(camera is cameras[0] for camera in cameras)
     files = {
         name: "cameras/camera.yaml" if same else f"cameras/{name}.yaml" for name in truth.stations
@@ -248,7 +249,7 @@ def _write_photographs(
     workers: int,
     progress: PhotographProgress | None,
 ) -> None:
-    """Render and write all photographs; NumPy releases the interpreter, so threads are enough."""
+    """Render and write all images; NumPy releases the interpreter lock, so threads suffice."""
     studio = Studio.of(truth, cameras, settings)
     for name in [HANDHELD_STATION_NAME] if settings.handheld else truth.stations:
         (stage / "images" / name).mkdir(parents=True)
@@ -275,7 +276,7 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
         name = truth.stations[station].removeprefix(f"{HANDHELD_STATION_NAME}-")
         path = stage / "images" / HANDHELD_STATION_NAME / f"{name}.jpg"
         camera, T_camera_base = studio.cameras[station], truth.T_camera_base[station]
-        if truth.focal_scale is not None:  # telephones write one focal length, however they focus
+        if truth.focal_scale is not None:  # phones write one focal length, however they focus
             camera = _breathed(camera, 1 / float(truth.focal_scale[station]))
         path.write_bytes(_as_by_telephone(picture, camera, T_camera_base))
         return
@@ -289,8 +290,8 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
 
 
 def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) -> bytes:
-    """A JPEG file, coded to be looked at, with EXIF: how the telephone was held, and its focal
-    length in whole mm.
+    """JPEG file with sRGB levels and EXIF: the phone's orientation, and its focal length in whole
+    mm.
     """
     import cv2
 
@@ -299,7 +300,7 @@ def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) ->
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, HANDHELD_JPEG_QUALITY])
     if not ok:
         raise OSError("a photograph could not be encoded as JPEG")
-    # where up is in the picture as stored: viewers turn it so that it is above
+    # direction of up in the stored image: viewers rotate the image by it
     right, down = T_camera_base[:2, 2]
     upright, lying = 1 if down < 0 else 3, 6 if right < 0 else 8
     orientation = upright if abs(down) >= abs(right) else lying
@@ -309,5 +310,5 @@ def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) ->
 
 
 def _repeat_part(settings: Settings, text: str) -> str:
-    """What stands after the configuration in a photograph's name."""
+    """Suffix of an image's name for its repeat; empty for a single repeat."""
     return f"_{text}" if settings.repeats > 1 else ""

@@ -1,4 +1,4 @@
-"""How surfaces look: patterns on them, and the light that they send to the camera."""
+"""Appearance of surfaces: patterns, materials, and their radiance towards the camera."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ Style = Literal["mixed", "matte", "dark", "metal"]
 Light = Literal["usual", "soft", "hard"]
 NOISE_SIZE = 256
 BRUSH_ACROSS, BRUSH_ALONG = 0.13, 0.75
-"""Ward roughness of turned steel across and along the axis."""
+"""Roughness of turned steel across and along the axis, in Ward's model."""
 
 
 @dataclass(frozen=True)
 class SmoothNoise:
-    """Smooth random values that repeat after ``NOISE_SIZE`` cells; table (size, size), sd 1."""
+    """Smooth noise with period ``NOISE_SIZE`` cells; table (size, size), standard deviation 1."""
 
     table: Array
 
     @classmethod
     def from_rng(cls, rng: np.random.Generator) -> SmoothNoise:
-        """White noise whose amplitude falls with frequency, as in clouds and stains."""
+        """White noise filtered so that its amplitude falls with frequency, as in clouds
+        and stains.
+        """
         k = np.fft.fftfreq(NOISE_SIZE) * NOISE_SIZE
         scale = np.hypot(k[:, None], k[None, :]) / (NOISE_SIZE / 4)
-        # nothing is left at the cell's size, where bilinear interpolation would show
+        # no power remains at the cell's size, where bilinear interpolation would be visible
         gain = np.exp(-2 * scale**2) / (0.02 + scale) ** 1.2
         white = np.fft.fft2(rng.normal(size=(NOISE_SIZE, NOISE_SIZE)))
         table = np.fft.ifft2(white * gain).real
@@ -37,14 +39,14 @@ class SmoothNoise:
         return cls((table / table.std()).astype(np.float32))
 
     def at(self, u: Array, v: Array) -> Array:
-        """Bilinear values (n,) at positions (n,) in cells."""
+        """Bilinear interpolation (n,) at positions (n,), in cells."""
         from scipy.ndimage import map_coordinates
 
         return map_coordinates(self.table, (u, v), output=float, order=1, mode="grid-wrap")
 
 
 class Pattern(ABC):
-    """A factor on the albedo, by the place on the surface in the shape's own frame."""
+    """Factor on the albedo as a function of the point in the shape's own frame."""
 
     @abstractmethod
     def factor(self, q: Array) -> Array:
@@ -54,14 +56,14 @@ class Pattern(ABC):
 @final
 @dataclass(frozen=True)
 class Clouds(Pattern):
-    """Stains: smooth noise of a cell size (m) and contrast."""
+    """Stains: smooth noise with a cell size (m) and a contrast."""
 
     noise: SmoothNoise
     cell: float
     contrast: float
 
     def factor(self, q: Array) -> Array:
-        """Slanted coordinates, so that no face of a box is without variation."""
+        """Noise at slanted coordinates, so that it varies on every face of a box."""
         value = self.noise.at(
             (q[0] + 0.6 * q[2]) / self.cell + 31.7, (q[1] - 0.45 * q[2]) / self.cell + 8.3
         )
@@ -71,14 +73,14 @@ class Clouds(Pattern):
 @final
 @dataclass(frozen=True)
 class WavyStripes(Pattern):
-    """Stripes of a period (m) with soft wandering borders, as light through blinds or wood."""
+    """Stripes of a period (m) with soft irregular borders, as light through blinds or wood."""
 
     noise: SmoothNoise
     period: float
     contrast: float
 
     def factor(self, q: Array) -> Array:
-        """Phase shifted by noise."""
+        """Square wave with soft borders, its phase shifted by noise."""
         wander = self.noise.at(q[0] / self.period * 5 + 3.1, q[1] / self.period * 5 + 7.9)
         wave = np.sin(2 * np.pi * (0.9 * q[0] + 0.43 * q[1]) / self.period + 1.4 * wander)
         return 1 + self.contrast * np.tanh(1.8 * wave)
@@ -87,13 +89,13 @@ class WavyStripes(Pattern):
 @final
 @dataclass(frozen=True)
 class Checks(Pattern):
-    """Checks of a size (m); dark ones at ``dark`` of the light ones; borders soft over a tenth."""
+    """Checks of a size (m), dark ones with the factor ``dark``; borders are soft over a tenth."""
 
     size: float
     dark: float
 
     def factor(self, q: Array) -> Array:
-        """Product of square waves, offset so that a face at a border is not all border."""
+        """Product of square waves, shifted so that a face on a border is not all border."""
         wave = np.ones(q.shape[1])
         for axis in range(3):
             wave = wave * np.tanh(12 * np.cos(np.pi * (q[axis] / self.size + 0.21)))
@@ -103,14 +105,16 @@ class Checks(Pattern):
 @final
 @dataclass(frozen=True)
 class Slats(Pattern):
-    """Boards with narrow dark joints, as panels or tiles: widths (m) both ways."""
+    """Boards with narrow dark joints, as panels or tiles: widths (m) in both directions."""
 
     width: float
     height: float
     dark: float
 
     def factor(self, q: Array) -> Array:
-        """A joint is a twelfth of the width, with soft borders: thinner ones would flicker."""
+        """Factor of joints a twelfth of the width, with soft borders: thinner joints
+        would alias.
+        """
         seam = np.zeros(q.shape[1])
         for axis, size in ((0, self.width), (1, self.height)):
             if np.isfinite(size):
@@ -121,13 +125,13 @@ class Slats(Pattern):
 
 @dataclass(frozen=True)
 class Material:
-    """A surface.
+    """Surface properties.
 
-    albedo : diffuse reflectance. pattern : factor on it. gloss, sharpness : strength and
-    exponent of a Blinn-Phong highlight. brushed : the highlight is drawn out along a cylinder's
-    axis, narrow across (turned steel; Ward's model). mirror : share of the surroundings that a
-    rough surface reflects, all blurred. polish : share that a polished one does, each thing in its
-    place: at the limb it shows what lies behind, and its contrast vanishes. emission : light of its
+    albedo : diffuse reflectance. pattern : factor on the albedo. gloss, sharpness : strength and
+    exponent of a Blinn-Phong highlight. brushed : the highlight is elongated along a cylinder's
+    axis and narrow across (turned steel; Ward's model). mirror : share of the blurred surroundings
+    that a rough surface reflects. polish : share of a sharp reflection; at its limb a polished
+    shape reflects the background, and the contrast of its edge vanishes. emission : light of its
     own.
     """
 
@@ -145,7 +149,7 @@ class Material:
 class Finish:
     """Materials of the machine's parts; telescopic tubes from the base end to the platform end.
 
-    forearm : of rods that a motor on the base moves, dull as drawn aluminium or glass fibre are.
+    forearm : rods moved by a motor on the base, dull as drawn aluminium or glass fibre.
     """
 
     paint: Material
@@ -159,7 +163,7 @@ class Finish:
     def from_noise(cls, noise: SmoothNoise, flat: bool = False, style: Style = "mixed") -> Finish:
         """Tubes, rods and forearms of a style, blackened joints, a stained base, a milled platform.
 
-        flat : the legs lie open to the lamps above, and white ones would be overexposed. style :
+        flat : the legs lie open to the lamps above, where white paint would be overexposed. style :
         ``mixed`` is white paint and turned steel, ``matte`` and ``dark`` are paint throughout,
         ``metal`` is polished aluminium and chrome.
         """
@@ -197,8 +201,8 @@ class Finish:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A round lamp: place (3,) and radius (m), radiance given to a white surface facing it at
-    distance ``reach`` (m), and whether it casts shadows.
+    """Round lamp: place (3,) and radius, in m; power, the radiance of a white surface that faces
+    the lamp at distance ``reach`` (m); and whether it casts shadows.
     """
 
     place: Array
@@ -210,7 +214,7 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Lighting:
-    """Lamps, and the light from everywhere: from above (+z) and from below."""
+    """Lamps and ambient light: from above (+z) and from below."""
 
     lamps: tuple[Lamp, ...]
     sky: float
@@ -220,9 +224,9 @@ class Lighting:
 def radiance(
     shape: Shape, material: Material, points: Array, to_camera: Array, lit: Array, light: Lighting
 ) -> Array:
-    """Light (n,) from one shape's points (3, n) towards the camera, 1 being white in full light.
+    """Light (n,) from one shape's points (3, n) towards the camera; 1 is white in full light.
 
-    to_camera : unit (3, n). lit : (n,) visible part of the lamp that casts shadows.
+    to_camera : unit (3, n). lit : (n,) visible share of the lamp that casts shadows.
     """
     n = shape.normal(points)
     albedo = np.full(points.shape[1], material.albedo)
@@ -250,7 +254,9 @@ def radiance(
 def _highlight(
     material: Material, axis: Array | None, n: Array, to_lamp: Array, to_camera: Array
 ) -> Array:
-    """Blinn-Phong's lobe (n,), or Ward's without its constant factor where brushed."""
+    """Blinn-Phong's lobe (n,), or Ward's lobe without its constant factor for a brushed
+    cylinder.
+    """
     h = to_lamp + to_camera
     h /= np.sqrt(np.maximum(np.einsum("in,in->n", h, h), 1e-12))
     hn = np.maximum(np.einsum("in,in->n", h, n), 1e-3)
@@ -262,7 +268,7 @@ def _highlight(
 
 
 def _surroundings(n: Array, to_camera: Array, light: Lighting) -> Array:
-    """What polished steel mirrors (n,): a dark floor, a bright ceiling, two windows."""
+    """Blurred reflection (n,) of a room: a dark floor, a bright ceiling, two windows."""
     cosine = np.einsum("in,in->n", n, to_camera)
     x, y, z = 2 * cosine * n - to_camera
     up = 1 / (1 + np.exp(-6 * z))

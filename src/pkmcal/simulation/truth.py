@@ -1,8 +1,8 @@
-"""What is true in a simulated session, and how it is drawn.
+"""True values of a simulated session, and how they are drawn.
 
-The same seed and settings give the same truth. Streams of random numbers are separate for the
-machine, the stations, the configurations, the readings, the room and each photograph, so that
-changing one setting does not reshuffle the rest.
+Equal seeds and settings give equal truths. Machine, stations, configurations, readings, room,
+images, board and focal lengths each have their own stream of random numbers, so that a changed
+setting does not change the other draws.
 """
 
 from __future__ import annotations
@@ -43,16 +43,17 @@ RANDOM_STREAMS = (
     "machine", "stations", "configurations", "readings", "room", "photographs", "board", "focal",
 )  # fmt: skip
 READING_ROUNDING = 1e-9
-"""By which readings that were drawn at one end differ from each other, m or rad: rounding."""
+"""Difference, in m or rad, up to which two readings at the end of a range are equal: rounding."""
 HANDHELD_STATION_NAME = "phone"
-"""The name in session.yaml of a station whose camera is held by hand."""
+"""Name in session.yaml of a station with a hand-held camera."""
 
 
 @dataclass(frozen=True)
 class RequestedConfigurations:
-    """Configurations that somebody asks for, as a plan does.
+    """Configurations that a caller requests, for example those of a plan.
 
-    joints : (n, m) readings. pairs : (M, 2) stations and the configurations that they photograph.
+    joints : (n, m) readings. pairs : (M, 2) numbers of a station and of the configuration in its
+    image.
     """
 
     joints: Array
@@ -61,22 +62,21 @@ class RequestedConfigurations:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a simulated session is like.
+    """Properties of a simulated session.
 
-    stations : how many, or where they stand. configurations : photographed by each station.
-    shared : every station photographs the same configurations; otherwise each its own.
-    tolerance : true values differ from the drawing by this many times its tolerances.
-    joint_noise : standard deviation of a reading, m. rough_position, rough_angle : by how much
-    the session's station poses are off, m and rad. extreme : share of configurations with legs
-    near the ends of their ranges, as far as there are that many: no two are of one pose. board :
-    seen by every station, fixed to ``board_on``. observe : what the session says of the stations
-    that see one. repeats : photographs of each configuration from each station, with sensor noise
-    of their own. shake : standard deviations (m, rad) by which the camera moves between them.
-    finish, light : of the legs and of the room. as_built : motors, rings and cables, which no
-    drawing shows, on the legs. asked : these configurations, in place of drawn ones. handheld :
-    each photograph from a place of its own about the machine, ``repeats`` of each configuration,
-    with focal lengths that differ by ``breathing``, one standard deviation; ``stations`` then says
-    nothing.
+    stations : their number, or their poses. configurations : number of images of each station.
+    shared : all stations see the same configurations; by default each has its own. tolerance :
+    standard deviation of the true values about the nominal model, in prior sigmas. joint_noise :
+    standard deviation of a reading, m. rough_position, rough_angle : errors of the session's
+    station poses, m and rad. extreme : share of configurations with every leg near an end of its
+    range, as far as there are that many different poses. board : board that every station sees,
+    fixed to ``board_on``. observe : value of ``observe`` in session.yaml for stations that see a
+    board. repeats : images of each configuration from each station, with independent sensor noise.
+    shake : standard deviations (m, rad) of the camera's motion between repeats. finish, light : of
+    the legs and of the room. as_built : motors, rings and cables on the legs that are not in the
+    nominal model. asked : these configurations instead of random ones. handheld : each image from a
+    pose of its own about the machine, ``repeats`` of each configuration, with focal lengths that
+    vary by ``breathing``, one standard deviation; ``stations`` is then ignored.
     """
 
     stations: int | tuple[StationPlace, ...] = 3
@@ -102,7 +102,7 @@ class Settings:
 
     @property
     def n_stations(self) -> int:
-        """Number of stations."""
+        """Number of stations; of images if the camera is hand-held."""
         if self.handheld:
             return self.configurations * self.repeats
         return self.stations if isinstance(self.stations, int) else len(self.stations)
@@ -110,14 +110,14 @@ class Settings:
 
 @dataclass(frozen=True)
 class Truth:
-    """What a user never has. Frames: the base frame that the true machine's centres stand in.
+    """Values that a user never has, in the base frame of the true machine's centres.
 
     machine : with its true values. stations, configurations : names, S and K.
-    T_camera_base : (S, 4, 4). rough : poses written into the session.
-    T_base_platform : (K, 4, 4). joints : (K, m) exact readings. readings : (K, m) with noise.
-    photographs : (M, 2) station and configuration of each photograph. seed : of everything.
-    T_base_board, T_platform_board : (4, 4) of the board, where there is one. repeats : photographs
-    of each pair. focal_scale : (S,) of photographs by hand, times their camera's focal lengths.
+    T_camera_base : (S, 4, 4). rough : station poses in session.yaml. T_base_platform : (K, 4, 4).
+    joints : (K, m) exact readings. readings : (K, m) with noise. photographs : (M, 2) numbers of
+    the station and the configuration of each image. seed : seed of all random numbers.
+    T_base_board, T_platform_board : (4, 4) pose of the board, if any. repeats : images of each
+    pair. focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
     """
 
     machine: Machine
@@ -139,14 +139,15 @@ class Truth:
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
-    """The seed of one of the session's streams of random numbers."""
+    """Seed of one of the session's streams of random numbers."""
     return np.random.SeedSequence(seed).spawn(len(RANDOM_STREAMS))[RANDOM_STREAMS.index(name)]
 
 
 def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Machine:
-    """A machine as it might be built: normal deviations of ``scale`` tolerances.
+    """Random machine with normal deviations of ``scale`` prior sigmas from the nominal model.
 
-    Fixed parameters keep their drawing value, tied ones move together; an axis is turned.
+    Fixed parameters keep their nominal values, tied ones have a common deviation; axes stay unit
+    vectors.
     """
     table = drawing.parameters
     tolerance = table.tolerances_free()
@@ -157,8 +158,9 @@ def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Ma
 def draw_truth(
     drawing: Machine, cameras: tuple[Camera, ...], settings: Settings, seed: int
 ) -> Truth:
-    """A true machine, stations, configurations and readings; cameras : one a station, by hand
-    without its breathing.
+    """Random true machine, stations, configurations and readings.
+
+    cameras : one for each station; for hand-held images without their breathing.
     """
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
     machine = true_machine(drawing, settings.tolerance, rngs["machine"])
@@ -231,9 +233,10 @@ def _configurations(
     settings: Settings,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Integers]:
-    """Poses, readings, and which station photographs which: legs must be in the picture.
+    """Poses, readings, and (station, configuration) pairs in which the station sees the legs.
 
-    A controller that moves the machine by its drawing only goes where that closes.
+    A controller with the nominal model only moves the machine to poses that the nominal model
+    reaches.
     """
     if settings.asked is not None:
         return _at_requested(drawing, machine, settings.asked)
@@ -250,7 +253,7 @@ def _configurations(
         ]
     )
     groups = [np.asarray(in_view.all(axis=0))] if settings.shared else list(in_view)
-    if settings.handheld:  # each configuration by its own photographs
+    if settings.handheld:  # each configuration has images of its own
         n, groups = 1, list(np.all(in_view.reshape(n, repeats, -1), axis=1, keepdims=True)[:, 0])
     taken = np.zeros(len(poses), dtype=bool)
     chosen: list[Integers] = []
@@ -277,12 +280,12 @@ def _configurations(
 
 
 def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) -> Integers:
-    """The chosen candidates (K,), as many of each group; where one repeats a pose, another instead.
+    """Selected candidates (K,), with repeated poses replaced by other candidates of the same group.
 
-    Poses with every leg near an end are two to the power of the legs, so they are drawn again;
-    another such stands in as long as there are any. The rest keep their places, and with these
-    their names and their noise. groups : of each, the candidates (N,) that its stations see.
-    joints : (N, m).
+    Only two to the power of the number of legs poses have every leg near an end, so random draws
+    repeat them; another such pose is the replacement while there is one. The other candidates keep
+    their positions, and with these their names and their noise. groups : candidates (N,) that the
+    stations of each group see. joints : (N, m).
     """
     rows, pose = rows.copy(), same_pose(joints, READING_ROUNDING)
     ends = (joints < joints.min(axis=0) + READING_ROUNDING) | (
@@ -308,7 +311,7 @@ def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) 
 def _at_requested(
     drawing: Machine, machine: Machine, request: RequestedConfigurations
 ) -> tuple[Array, Array, Integers]:
-    """Poses that the true machine takes at the readings that are asked for."""
+    """Poses of the true machine at the requested readings, the readings and their pairs."""
     by_drawing = drawing.forward_result(request.joints)
     fk = machine.forward_result(request.joints, by_drawing.T_base_platform)
     bad = np.flatnonzero(~(fk.converged & by_drawing.converged))
@@ -322,11 +325,11 @@ def _at_requested(
 
 
 def truth_document(truth: Truth) -> dict[str, Any]:
-    """The content of ``truth.json``; m, rad, frames as in the project's conventions.
+    """Content of ``truth.json``; m, rad, frames as in the project's conventions.
 
     ``parameters`` are the true values by name; ``stations`` hold 4x4 ``T_camera_base``;
     ``configurations`` hold 4x4 ``T_base_platform`` and the exact readings ``joints``;
-    ``photographs`` are pairs of names, each taken ``repeats`` times (once where absent). No
+    ``photographs`` are pairs of names, with ``repeats`` images of each (one by default). No
     estimator reads this file.
     """
     names = truth.machine.parameters.names
@@ -364,10 +367,10 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
 
 def load_truth(folder: Path | str, drawing: Machine | None = None) -> Truth:
-    """Read ``truth.json`` of a simulated session, for scoring; drawing : the session's machine,
-    read from there unless given.
+    """Read ``truth.json`` of a simulated session, for the evaluation of estimates.
 
-    Readings and rough poses are the session's; here the exact readings stand for the former.
+    drawing : the session's machine; read from the session by default. Measured readings and rough
+    poses are in the session's files; here the exact values stand in for both.
     """
     path = Path(folder) / TRUTH_FILE
     data = json.loads(read_text(path))
@@ -375,7 +378,7 @@ def load_truth(folder: Path | str, drawing: Machine | None = None) -> Truth:
         raise InputError("not the truth of a simulated session", where=str(path))
     drawing = drawing or load_session(folder).machine
     reference_values = data["parameters"]
-    # a truth from before readings had scales has readings that are what they say
+    # files from before readings had scales: the scale is one
     values = [
         reference_values[name] if name in reference_values or not name.endswith(".scale") else 1.0
         for name in drawing.parameters.names
