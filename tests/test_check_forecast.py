@@ -337,9 +337,7 @@ def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
 
 
 def test_pictures_whole_or_not_at_all(found, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "pkmcal.check.pictures.CAPTION_BAR_HEIGHT", -1
-    )  # fails in the first image
+    monkeypatch.setattr("pkmcal.check.pictures.CAPTION_BAR_HEIGHT", -1)  # fails in the first image
     with pytest.raises(ValueError, match="negative"):
         write_pictures(found.look, tmp_path / "pictures")
     assert list(tmp_path.iterdir()) == []
