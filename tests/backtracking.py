@@ -19,7 +19,7 @@ from re import _parser as parser
 
 LARGEST_COUNTED = 30
 COPIES = 3
-"""Of a counted repeat's body in the automaton; more have the same cycles."""
+"""Copies of a counted repeat's body in the automaton; more copies have the same cycles."""
 SAMPLES = [chr(code) for code in range(128)] + list("éß٣½\u00a0\u2028€")
 
 

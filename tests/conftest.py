@@ -31,7 +31,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Run:
-    """What one command left: exit code and what it printed."""
+    """Result of one command: exit code and output."""
 
     code: int
     out: str
@@ -71,8 +71,8 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
-    """What was imported stays to the end, so that nobody looks through it for what may go: that
-    took one second in thirty.
+    """Imported modules stay until the end, so the garbage collector need not scan them: that took
+    one second of thirty.
     """
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)
@@ -86,9 +86,9 @@ def unhurried(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def few_looks(request, monkeypatch):
-    """Two looks from machines as likely as the one found, which are half of a calibration's time,
-    do where their scatter is not the question. Where it is, in slow tests and in what tests share,
-    there are as many as for everybody.
+    """Two measurement passes from machines drawn from the covariance, which take half of a
+    calibration's time, suffice unless their scatter is tested. In slow tests and in shared fixtures
+    there are as many as by default.
     """
     if not request.node.get_closest_marker("slow"):
         monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
@@ -96,7 +96,7 @@ def few_looks(request, monkeypatch):
 
 @pytest.fixture
 def all_looks(few_looks, monkeypatch):
-    """As many looks as for everybody."""
+    """As many further measurement passes as by default."""
     monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", ALL_LOOKS)
 
 
@@ -124,7 +124,9 @@ def common(tmp_path_factory) -> Path:
 
 
 def made_once(folder: Path, make: Callable[[], Any]) -> Any:
-    """What ``make`` gives, by the worker that asks first; the others read it from the folder."""
+    """Result of ``make``, computed by the first worker that needs it; other workers read it from
+    the folder.
+    """
 
     def write(part: Path) -> None:
         part.mkdir()
@@ -143,14 +145,14 @@ def demo(common) -> Demo:
 
 @dataclass(frozen=True)
 class Told(Generic[Found]):
-    """What was found in the demonstration's session, and the progress that was told meanwhile."""
+    """Localization of the demonstration's session, and its progress messages."""
 
     found: Found
     told: list[tuple[str, float]]
 
 
 def told_once(folder: Path, find: Callable[..., Found]) -> Told[Found]:
-    """What ``find`` gives and tells, by the worker that asks first."""
+    """Result and messages of ``find``, computed by the first worker that needs them."""
 
     def make() -> Told[Found]:
         progress: list[tuple[str, float]] = []
@@ -170,7 +172,7 @@ def calibrating(demo, common) -> Told[Calibration]:
 
 @pytest.fixture(scope="session")
 def calibrated(calibrating) -> Calibration:
-    """What was found by it."""
+    """The localization without its messages."""
     return calibrating.found
 
 

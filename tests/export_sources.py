@@ -1,4 +1,4 @@
-"""Sources of exports: machines that differ from their drawing, and calibrations on disk."""
+"""Sources of exports: machines that differ from their nominal model, and calibrations on disk."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ CAMERA = Pinhole((640, 480), np.array([600.0, 601.0, 320.5, 239.25, -0.1, 0.05, 
 
 
 def built(name, seed=1, share=0.3):
-    """A catalogue machine off its drawing by a share of its tolerances, readings' scales, cranks'
-    too, by as much of a thousandth.
+    """Catalogue machine that differs from its nominal model by a share of its tolerances, and in
+    its readings' scales, cranks' too, by that share of a thousandth.
     """
     machine = with_scales(load_mechanism(name), 1e-3)
     table = machine.parameters
@@ -28,7 +28,7 @@ def built(name, seed=1, share=0.3):
 
 
 def with_scales(machine, tolerance):
-    """The same machine with all readings' scales for parameters."""
+    """The machine with all readings' scales as parameters."""
     document = machine.document
     values = document.tolerance.model_copy(update={"scale": tolerance})
     return machine_from_document(document.model_copy(update={"tolerance": values}))

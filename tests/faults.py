@@ -1,4 +1,4 @@
-"""Files spoilt in one place, and the sentence that is told of it."""
+"""Files with one fault, and the sentence that reports it."""
 
 import pytest
 

@@ -23,11 +23,11 @@ from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.simulation.board import board_from_fields
 
 LENGTH, ANGLE = 5e-4, np.deg2rad(0.3)
-"""Standard deviations of what a kit's parts differ from the drawing by."""
+"""Standard deviations of a kit's parts about the nominal model."""
 CORNER = 0.15
-"""px, of a corner in a webcam's photograph."""
+"""Noise of a corner in a webcam's image, px."""
 TOUCH = 2e-5
-"""m, of the height at which a probe says that it touches the bed."""
+"""Noise of a probe's touch on the bed, m."""
 JOINT_NOISE = 1e-5
 CAMERA = {"model": "pinhole", "image_size": [1280, 720], "focal": [1000.0, 1000.0],
           "center": [639.5, 359.5]}  # fmt: skip
@@ -41,7 +41,7 @@ NOZZLE = 0.06
 
 @dataclass(frozen=True)
 class Kit:
-    """A session's folder, its drawing and the true machine; what a detector would have found."""
+    """Folder of a session, its nominal model, the true machine, and the corners of a detector."""
 
     name: str
     folder: object
@@ -50,16 +50,18 @@ class Kit:
     detections: tuple = ()
 
     def calibrated(self):
-        """By the program; its detector is replaced by the corners, as there are no pictures."""
+        """Calibration by the program, with the corners in place of a detector's, as there are no
+        images.
+        """
         with patch("pkmcal.boards.stations.detect_in", lambda *_: self.detections):
             return calibrate_session(self.folder)
 
 
 class Error(NamedTuple):
-    """Of the tool over the workspace, root mean square, base frames laid over each other, m.
+    """Errors of the tool over the workspace, root mean square, base frames fitted to each other, m.
 
-    before, after : by the drawing and by the calibration. expected : by the calibration's own
-    covariance. sideways : after, x and y only.
+    before, after : of the nominal model and of the calibration. expected : from the calibration's
+    own covariance. sideways : after, x and y only.
     """
 
     before: float
@@ -96,7 +98,7 @@ def board_kit(folder, name, seed=0, n=25):
     (folder / "cameras" / "webcam.yaml").write_text(yaml_text(CAMERA))
     (folder / "board.yaml").write_text(yaml_text(BOARD))
     camera, board = load_camera(folder / "cameras" / "webcam.yaml"), board_from_fields(BOARD)
-    # leaning from the line of sight: seen straight on, a board hardly tells its tilt
+    # tilted from the line of sight: seen from straight ahead, a board hardly determines its tilt
     facing = inverse(T_camera_base)[:3, :3] @ rotation(np.array([0.4, -0.35, 0.1]))
     T_platform_board = pose(facing, [0.0, 0.0, 0.02] - facing @ board.points.mean(axis=0))
     T = places(name, n, rng)
@@ -152,7 +154,7 @@ def probe_kit(folder, seed=0, n=7, rods=None):
 
 
 def _rods_measured(kit, sigma, rng):
-    """The drawing with the true rods' lengths, measured."""
+    """Nominal model with the true rods' lengths, as measured."""
     values = kit.drawing.values.copy()
     rows = [kit.drawing.parameters.index(f"legs[{j}].length.constant") for j in (1, 2, 3)]
     values[rows] = kit.truth.values[rows] + sigma * rng.normal(size=3)
@@ -199,7 +201,7 @@ def tool(kit, value, n=200):
 
 
 def laid_over(points, there):
-    """What is left of points (n, 3) beside the true ones after the best rigid motion."""
+    """Residuals of points (n, 3) from the true points after the best rigid motion."""
     return apply(register(points, there), points) - there
 
 
@@ -209,8 +211,8 @@ def rms(off):
 
 
 def flatness(kit, machine, n=300):
-    """Deviation (m, rms) of a flat bed as machine commands see it, over the best plane: the true
-    height at readings at which the machine believes itself on one height.
+    """Deviation (m, rms) from the best plane of a bed that the machine takes for flat: the true
+    heights at readings for which the machine computes a common height.
     """
     rng = np.random.default_rng(7)
     angle = rng.uniform(0, 2 * np.pi, n)

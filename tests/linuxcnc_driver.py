@@ -1,12 +1,12 @@
-"""What LinuxCNC starts in place of a user interface: homes, moves, and writes what it saw.
+"""User interface for LinuxCNC that homes, moves, and records the positions.
 
-    linuxcnc_driver.py -ini FILE
+linuxcnc_driver.py -ini FILE
 
 It runs with the Python that has LinuxCNC's own module. Its orders are ``orders.json`` beside the
-INI file, its answer ``answer.json``. Orders: ``joints``, how many; ``poses``, by letter,
-one a move; ``beyond``, coordinates that limits refuse; ``homes``, whether homing is to end well.
-Answers: joints, and commands to motors, before homing and after it; joints at each pose; texts of
-errors.
+INI file, its answer ``answer.json``. Orders: ``joints``, their number; ``poses``, by letter, one
+for each move; ``beyond``, coordinates that limits refuse; ``homes``, whether homing is expected to
+succeed. Answers: joints, and commands to motors, before homing and after it; joints at each pose;
+texts of errors.
 """
 
 import json

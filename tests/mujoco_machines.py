@@ -110,7 +110,8 @@ TURNED = {
     "turned h4-rods": ("h4-rods", "[0.02, 0.0, -0.45]", "[0, 0, 0.2]"),
 }
 BUILT_WRONG = ("3-rps", "delta", "gough-stewart", "h4-rods")
-"""Of either motion and every kind of closure; the other machines, built wrong, are slow tests."""
+"""Machines of either motion and every kind of closure; the other machines, with errors, are slow
+tests."""
 ALL = [
     *CATALOGUE,
     *(pytest.param(f"wrong {n}", marks=() if n in BUILT_WRONG else pytest.mark.slow)

@@ -1,4 +1,4 @@
-"""Board poses of true machines, without photographs: [C]'s session, for tests of estimates."""
+"""Board poses of true machines without images: [C]'s session, for tests of estimates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import kinematics
 
 POSE_SIGMA = np.repeat([np.deg2rad(0.03), 2e-4], 3)
-"""Of a board's pose from a photograph, rad and m ([C] IV.A)."""
+"""Noise of a board's pose from an image, rad and m ([C] IV.A)."""
 JOINT_NOISE = 1e-5
 T_CAMERA_BASE = look_at(np.array([0.92, 0.1, -0.33]), np.array([0.03, 0, -0.45]), np.eye(3)[2])
 T_PLATFORM_BOARD = pose(rotation(np.array([0.3, 1.2, 0.4])), np.array([0.03, 0.02, -0.04]))
@@ -123,7 +123,7 @@ def spread(info):
 
 
 def bound(machine, case, estimate, rng, draws=30):
-    """The same as the estimate's own covariance expects them: Cramer-Rao, with the drawing."""
+    """Expected errors by the estimate's own covariance: Cramer-Rao, with the nominal model."""
     assembled = assemble(machine, case.measurements, default_gauge(machine))
     problem = assembled.problem
     state = batch_of(machine, assembled, estimate.state)

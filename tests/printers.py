@@ -1,4 +1,4 @@
-"""Simulated delta printers: what their firmware says, what they are, and the bed that they feel."""
+"""Simulated delta printers: their firmware's values, the true machine, and the bed's heights."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEP = 40.0 / (200 * 16)
 
 @dataclass(frozen=True)
 class Settings:
-    """What a firmware says of a delta, mm and degrees."""
+    """Firmware's values of a delta, mm and degrees."""
 
     radius: float = 105.0
     angle: tuple = (210.0, 330.0, 90.0)
@@ -117,7 +117,7 @@ BUILT = Settings(radius=105.4, angle=(210.2, 329.9, 90.1), rod=(270.2, 269.9, 27
 
 
 def workshop(n=7):
-    """Carriages of one printer that is off what its firmware says, at n places of its bed."""
+    """Carriages of a printer that differs from its firmware's values, at n points of its bed."""
     true = machine(BUILT, endstops=(0.5, -0.3, 0.2))
     return felt(true, bed(n), 0.015, np.random.default_rng(4))
 
@@ -128,6 +128,6 @@ def calibrated_cfg():
 
 
 def console(n):
-    """What its console says while it probes n places."""
+    """Output of its console while it probes n points."""
     there = 1e3 * machine(Settings()).forward(1e-3 * workshop(n))[:, :3, 3]
     return "".join(f"// probe at {x:.3f},{y:.3f} is z={z:.6f}\n" for x, y, z in there)

@@ -1,8 +1,8 @@
 """Rendered sessions, made once: shared by the workers of a run, and kept for the next run.
 
-A photograph costs a tenth of a second, a session of them seconds. What a session shows is decided
-by its drawing, camera and settings and by the code that renders, so these name the folder that
-keeps it; a change of any of them renders anew.
+An image costs a tenth of a second, a session of images seconds. Nominal model, camera, settings and
+the code that renders determine the content of a session, so these name the folder that keeps it; a
+change of any of them renders anew.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pkmcal.simulation import Settings, simulate_session
 
 KEPT = Path(__file__).parents[1] / ".pytest_cache" / "rendered"
 RENDERING = ("simulation", "mechanisms", "geometry", "cameras", "boards")
-"""Packages whose code decides what a photograph shows."""
+"""Packages whose code determines the content of an image."""
 
 
 def once(folder: Path, make: Callable[[Path], object]) -> Path:

@@ -1,4 +1,4 @@
-"""A machine in a plain room before one camera, photographed at any pose: for closed loops."""
+"""Machine in a plain room in front of one camera, with images at any pose, for closed loops."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WITHIN = look_at(np.array([0.02, 0.0, 0.054]), np.array([0.02, 0.0, 0.41]), np.a
 
 
 class Lab:
-    """Photographs of a machine at any pose, each with noise of its own."""
+    """Images of a machine at any pose, each with noise of its own."""
 
     def __init__(self, machine: Machine, camera: Camera, T_camera_base) -> None:
         self.machine, self.camera, self.T_camera_base = machine, camera, T_camera_base
@@ -45,7 +45,7 @@ class Lab:
         return photograph(light, Sensor(), self.rng)
 
     def painted(self, image, T_base_platform, readings, legs):
-        """A photograph with some legs painted over."""
+        """An image with some legs painted over."""
         import cv2
 
         ends = limb_ends(self.machine.layout, self.machine.values, readings, T_base_platform)

@@ -168,7 +168,7 @@ def test_what_loads_of_a_calibration_can_be_used(tracker, tmp_path, key):
             assert saved.summary()
             assert source.header()
     assert faults
-    # a station's other name is one that the covariance does not know
+    # a station's other name is not in the covariance
     assert all(key[:7] in fault for fault in faults)
 
 

@@ -1,4 +1,6 @@
-"""Assembly modes: all that exist are found, counted, signed, and what may be missing is told."""
+"""Assembly modes: all are found, counted and signed, and the probability of missing one
+is stated.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,7 @@ def search(machine, readings, home, seed, most=100_000):
 
 
 def exhaustive(machine, readings, home, seed, starts, monkeypatch):
-    """The same search, made to go on to its last start."""
+    """The same search without a stopping rule, until its last start."""
     with monkeypatch.context() as patch:
         patch.setattr(assembly_modes, "RAREST_MODE_FINDS", 10**9)
         return search(machine, readings, home, seed, starts)
@@ -82,7 +84,7 @@ def test_every_mode_closes_the_machine_once(name):
     assert np.abs(c.rows.value).max() < CONVERGED_CLOSURE_ERROR
     # home is the first, with its own sign
     np.testing.assert_allclose(values.poses[0], machine.home(), atol=1e-6)
-    if machine.layout.overdetermined:  # no determinant tells its assemblies apart
+    if machine.layout.overdetermined:  # no determinant to compare the assemblies
         assert set(values.sign) == {0}
     else:
         assert values.sign[0] == 1
@@ -118,7 +120,7 @@ def test_a_sign_is_that_of_same_assembly():
 
 
 def test_what_may_be_missing_shrinks_with_the_starts(monkeypatch):
-    """A share p is missed by n starts with (1 - p)^n: a thousandth at what is told."""
+    """n starts miss a share p with probability (1 - p)^n: a thousandth at the stated share."""
     machine, T, readings = random_hexapod(3)
     short = search(machine, readings, T, 0)
     long = exhaustive(machine, readings, T, 0, 10_000, monkeypatch)

@@ -1,4 +1,4 @@
-"""What photographs by hand share of the room: where they were taken from, and how surely."""
+"""Background shared by hand-held images: camera poses from it, and their uncertainty."""
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ def turned(degrees):
 
 
 def looking(azimuth, away=1.0, height=0.35):
-    """T_camera_base of a camera that looks at the machine from an azimuth (degrees)."""
+    """T_camera_base of a camera directed at the machine from an azimuth (degrees)."""
     a = np.radians(azimuth)
     eye = np.array([away * np.cos(a), away * np.sin(a), height])
     z = np.array([0.0, 0.0, 0.15]) - eye
@@ -115,7 +115,7 @@ def test_the_room_tells_a_place_from_its_look_alikes(apart):
 
 
 def test_chance_is_not_taken_for_agreement():
-    """Of pairs that have nothing to do with one another one in e^g gains g at most (Markov)."""
+    """Of unrelated pairs, one in e^g gains g at most (Markov)."""
     gains = []
     for seed in range(300):
         rng = np.random.default_rng(seed)
@@ -183,7 +183,7 @@ def test_a_place_that_is_turned_a_little_is_turned_back():
 
 
 def test_texture_is_found_where_it_is():
-    """A photograph of many patches, moved by 40 pixels: so are its points."""
+    """An image of many patches, shifted by 40 pixels: its points shift with it."""
     rng = np.random.default_rng(3)
     small = rng.integers(0, 255, (60, 80), dtype=np.uint8)
     image = cv2.resize(small, (1200, 900), interpolation=cv2.INTER_CUBIC)

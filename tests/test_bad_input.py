@@ -1,8 +1,8 @@
-"""What people get wrong with a session: each mistake answered by one sentence to act on.
+"""Mistakes of users in a session: each one gets a sentence with a next step.
 
-Every mistake goes through ``pkmcal calibrate``, and most through ``pkmcal check``, which must say
-the same; what loading a session refuses besides is in test_session.py. What photographs betray
-takes a search of many seconds, so ``calibrate`` alone is asked here, ``check`` in test_check.py;
+Every mistake goes through ``pkmcal calibrate``, and most through ``pkmcal check``, which must give
+the same message; further refusals of loading a session are in test_session.py. Mistakes in images
+take a search of many seconds, so only ``calibrate`` is tested here, ``check`` in test_check.py;
 test_diagnose.py has the other mistakes of this kind.
 """
 
@@ -109,7 +109,7 @@ def test_wrong_columns(session):
     )
 
 
-# photographs
+# images
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")

@@ -1,4 +1,4 @@
-"""Photographs of more pixels than their lens resolves are binned, less so where it is sharp."""
+"""Images with more pixels than their lens resolves are binned, less so if the lens is sharp."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TIMES = 2
 
 
 def larger():
-    """Photographs in which each pixel is four, through the camera that takes such."""
+    """Images in which each pixel is repeated 2 by 2, through a camera of that resolution."""
     small = taken()
     images = [np.kron(image, np.ones((TIMES, TIMES), np.uint8)) for image in small.images]
     parameters = small.camera.parameters.copy()
@@ -78,12 +78,14 @@ def test_binned_photographs_give_the_edges_of_small_ones():
 
 
 def test_edges_move_with_the_parameters_of_the_whole_camera():
-    """Against planes through an edge's two ends, held in the picture, as each parameter changes."""
+    """Derivatives by each parameter, against planes through an edge's two ends that are fixed in
+    the image.
+    """
     p = larger()
     station_edges = measure(p, machine(), FRONT, poses(), refine_camera=True)
 
     def normals(camera):
-        """Of the planes through each edge's first and last place (N, 3)."""
+        """Normals of the planes through each edge's first and last sample (N, 3)."""
         first, last = (
             np.array(
                 [
@@ -112,7 +114,9 @@ def test_edges_move_with_the_parameters_of_the_whole_camera():
 
 @pytest.fixture
 def blurred(session):
-    """The demonstration's session, each photograph four times as large and no sharper."""
+    """The demonstration's session with four times as many pixels in each image, without more
+    detail.
+    """
     times = 4
     for file in (session / "cameras").glob("*.yaml"):
         document = yaml.safe_load(file.read_text())
@@ -134,15 +138,15 @@ def away(value, other):
 
 
 def test_photographs_larger_than_sharp(blurred, calibrated):
-    """They give the machine that the sharp small ones give, no further off than if these were other
-    photographs. Edge for edge as they are they lie blurred over three pixels, where hardly one is
-    found.
+    """Binned images give the machine of the sharp small images, to the scatter of other images.
+
+    Without binning their edges are blurred over three pixels, and hardly one is found.
     """
     calibration = calibrate_session(blurred)
     np.testing.assert_array_equal(calibration.observation.binning, 2)
     assert calibration.verdict.usable
     assert np.sqrt(np.mean(away(calibration, calibrated) ** 2)) < np.sqrt(2)
-    # what is said of cameras is in pixels of the photographs
+    # results about cameras are in pixels of the images
     document = calibration_document(calibration)
     assert [station["binning"] for station in document["stations"]] == [2, 2, 2]
     shift = document["cameras"][0]["edge_shift"]
@@ -176,10 +180,10 @@ def test_photographs_out_of_focus(session, calibrated, spread):
 
 @pytest.mark.slow
 def test_sharp_photographs_end_unbinned(session, calibrated, monkeypatch):
-    """Looked at first as if half their pixels were too many; the last looks are at all of them."""
+    """Measured at first with half the resolution; the last measurement passes use all pixels."""
     width = calibrated.session.stations[0].camera.image_size[0]
     monkeypatch.setattr(legs, "USUAL_PICTURE_LENGTH", width // 2)
     calibration = calibrate_session(session)
     np.testing.assert_array_equal(calibration.observation.binning, 1)
-    # looks from elsewhere find some edges a tenth of a pixel beside, as others do
+    # further measurement passes find some edges a tenth of a pixel beside, as elsewhere
     assert away(calibration, calibrated).max() < 1

@@ -1,4 +1,4 @@
-"""Boards on paper: what the PDF says is where the board's points are, and in true size."""
+"""Boards on paper: the PDF has the board's points at their places, in true size."""
 
 from __future__ import annotations
 

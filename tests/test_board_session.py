@@ -54,7 +54,7 @@ def folder(rendered, tmp_path):
 
 @pytest.fixture(scope="module")
 def found(rendered):
-    """The session, its photographs and the boards in them."""
+    """A session, its images and the boards in them."""
     session = load_session(rendered)
     photographs = read_photographs(session)
     return session, photographs, boards_of(session, photographs)
@@ -145,7 +145,7 @@ def test_a_board_is_made_in_proportion_to_the_machine():
     [["station2"], pytest.param(["station1", "station2"], marks=pytest.mark.slow)],
 )
 def test_stations_without_a_pose_are_found_through_the_board(rendered, folder, without):
-    """Where no station has a pose, legs tell where they stand; the board then joins them."""
+    """Without any station's pose, legs determine the stations; the board then joins them."""
     for station in without:
         without_pose(folder, station)
     session = load_session(folder)
@@ -231,7 +231,7 @@ def test_calibrating_with_the_board(folder):
 
 
 def shifted(folder, station, first):
-    """Photographs of a station from the first on, moved by two pixels."""
+    """Images of a station, from a first one on shifted by two pixels."""
     for path in sorted((folder / "images" / station).iterdir())[first:]:
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         assert cv2.imwrite(str(path), np.roll(picture, 2, axis=1))
@@ -270,7 +270,7 @@ def test_another_board_than_described(folder):
 
 def test_a_board_that_is_nowhere(found):
     session, photographs, _ = found
-    # one of it: where no board is, one of every other kind is looked for as well
+    # one of it: if no board is found, one of every other kind is searched as well
     one = replace(session.stations[0], photographs=session.stations[0].photographs[:1])
     session = replace(session, stations=(one, *session.stations[1:]))
     images = {0: [np.full_like(photographs[0].images[0], 90)]}
@@ -282,7 +282,7 @@ def test_a_board_that_is_nowhere(found):
 
 
 def test_one_photograph_of_a_board_is_noted(folder, found):
-    """Three of four photographs show grey where the board was; one station is enough to see it."""
+    """Three of four images are grey at the board's place; one station is enough to detect it."""
     only(folder, "station1")
     board = found[2].stations[0]
     corners = np.nanmean(board.views.views.pixels[0], axis=0)
@@ -303,7 +303,7 @@ def test_a_board_on_the_platform_needs_no_rough_pose(folder):
 
 
 def test_a_board_on_the_platform_gives_a_measurement_a_photograph(found):
-    """What a session with such a board will use; here it does not move, which nobody asks."""
+    """Quantities that a session with such a board uses; here it is at rest, which is not tested."""
     session, photographs, _ = found
     moving = replace(session, board_body="platform")
     boards = find_boards(moving, {p.station: p.images for p in photographs})

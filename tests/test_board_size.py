@@ -1,4 +1,4 @@
-"""A board's size that is known to a tolerance: estimated where data tell it, in sigma where not."""
+"""A board's size with a tolerance: estimated if the data determine it, in sigma otherwise."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ TOLERANCE = 2e-3
 
 
 def seen_by(drawing, rng, size, tolerance, count=20):
-    """A machine within its tolerances, and what a camera measures of a board that is larger than
-    its file says by the share ``size``.
+    """Machine within its tolerances, and a camera's measurements of a board that is larger than its
+    file states by the share ``size``.
     """
     table = drawing.parameters
     free = table.free_matrix()
@@ -136,7 +136,7 @@ def test_a_hint_says_what_size_all_else_would_have(size):
     if size == 0:
         return
     value, sigma = information.facts["value"], information.facts["sigma"]
-    # the file's own deviation is not in it: what all else tells is off by its own alone
+    # the file's own deviation is not in it: the estimate from all other data has its own error only
     assert sigma < TOLERANCE * 1.6
     assert abs(value - size) < 3 * sigma
 

@@ -1,4 +1,4 @@
-"""Boards: their files, their corners in rendered photographs, and what is said of wrong ones."""
+"""Boards: their files, their corners in rendered images, and messages for wrong ones."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def texture(board, per_square=60):
 
 
 def marker_grid(data, words, side=80):
-    """As :func:`texture`; OpenCV's own picture of a grid does not keep a scale."""
+    """As :func:`texture`; OpenCV's own image of a grid does not keep a scale."""
     columns, rows = data["markers"]
     step = round(side * (1 + data["gap"] / data["marker"]))
     image = np.full((rows * step, columns * step), 230, dtype=np.uint8)
@@ -79,9 +79,9 @@ def marker_grid(data, words, side=80):
 
 
 def render(camera, T_camera_board, board, seed=0, noise=2.0, fine=4, hide=None):
-    """A photograph of the board on a white sheet before a grey room, through the camera's rays.
+    """Image of the board on a white sheet in front of a grey room, through the camera's rays.
 
-    hide : (x0, y0, x1, y1) px that something grey covers.
+    hide : (x0, y0, x1, y1) px of a grey patch.
     """
     printed, first, scale = texture(board)
     printed = cv2.copyMakeBorder(
@@ -138,7 +138,7 @@ def shot(request, tmp_path):
 
 
 def test_corners_are_found_where_they_are(shot):
-    """All of them, to a few hundredths of a pixel, and as surely as they say."""
+    """All corners, to a few hundredths of a pixel, with honest standard deviations."""
     board, camera, T_camera_board = shot
     value = detect_board(render(camera, T_camera_board, board), board)
     truth = camera.project(apply(T_camera_board, board.points))
@@ -225,7 +225,7 @@ def photographs(folder, board, count=3, size=None, start=0):
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """Three photographs of each board."""
+    """Three images of each board."""
     folder = tmp_path_factory.mktemp("boards")
     boards = {}
     for kind in FILES:
@@ -286,8 +286,9 @@ def test_gaps_that_are_not_as_described(pictures, tmp_path, gap, advice):
 
 
 def test_a_layout_is_that_of_the_markers_whatever_the_lens(tmp_path):
-    """Of a part of the board, by a fisheye: steps along rows and columns, the gap, and the ids that
-    may be the first; ids in one row are not put into two."""
+    """Part of the board through a fisheye: steps along rows and columns, the gap, and the possible
+    first ids; ids of one row are not put into two.
+    """
     board = board_of(tmp_path, FILES["aruco_grid"])
     words = dictionary(board.document["dictionary"])
     turns = (0.3, -0.3, 0.1), (-0.4, 0.2, 0.0)

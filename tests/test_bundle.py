@@ -51,7 +51,9 @@ def without_noise(rng, scene):
 
 
 def known_radii(scene):
-    """The scene with true radii in the drawing and no edge shift: nothing pulls off the truth."""
+    """Scene with true radii in the nominal model and no edge shift, so that nothing biases the
+    estimate.
+    """
     machine = scene.machine
     radius = machine.parameters.of_kind("radius")
     drawing = machine.parameters.drawing.copy()
@@ -63,7 +65,7 @@ def known_radii(scene):
 @pytest.mark.parametrize("robust", [False, True])
 def test_truth_is_recovered_to_rounding(robust):
     rng = np.random.default_rng(0)
-    # without the drawing nothing tells readings' scales from the size of everything
+    # without the nominal model the readings' scales cannot be separated from the size of everything
     scene = make_scene(rng, machine=exact("gough-stewart"))
     scene = replace(scene, edge_shift=np.zeros(1))
     scene = known_radii(scene)
@@ -115,7 +117,7 @@ def test_uncertainty_is_what_repeats_show():
     assert n == 60 + 12 - 12
     mean_square = np.sum(whitened**2) / (runs * n)
     assert mean_square == pytest.approx(1, abs=4 * np.sqrt(2 / (runs * n)))
-    # no direction is told too surely or too modestly: eigenvalues within what chance leaves
+    # no direction is over- or underestimated: eigenvalues within chance
     values = np.linalg.eigvalsh(whitened.T @ whitened / runs)
     edge = np.sqrt(n / runs)
     assert values.max() < (1 + edge) ** 2 * 1.15
@@ -152,8 +154,9 @@ def shaded(scene, sigma, rng):
 
 @pytest.mark.parametrize("sigma", [0.03, 0.3])
 def test_shading_is_as_large_as_the_edges_say(sigma):
-    """As little as is believed of it, or ten times that, as in hard light on polished metal: it is
-    found, and the deviations are right with either."""
+    """Shading as small as its prior, or ten times that, as in hard light on polished metal: it is
+    estimated, and the standard deviations are right with either.
+    """
     rng = np.random.default_rng(8)
     scene = shaded(make_scene(rng, runs=8, configurations=6, n_stations=2), sigma, rng)
     assembled, truth = scene.batch(rng)
@@ -166,8 +169,9 @@ def test_shading_is_as_large_as_the_edges_say(sigma):
 
 
 def test_a_line_that_is_another_things_edge_is_let_go():
-    """One tube's side shows a highlight's border, 3 px inside, in every photograph: it does not
-    make all others' shading large, and the errors are as stated."""
+    """One tube's side is measured at a highlight's border, 3 px inside, in every image: the shading
+    of all others is not enlarged, and the errors are as stated.
+    """
     rng = np.random.default_rng(8)
     scene = shaded(make_scene(rng, runs=20, configurations=6, n_stations=2), 0.1, rng)
     lines = scene.index[[0, 2, 3, 4]]
@@ -244,7 +248,9 @@ def test_starts_far_away_find_the_same_answer():
 
 
 def test_configurations_that_nobody_photographed():
-    """They stay out of the estimate, and their poses come from the readings."""
+    """Configurations without inliers do not enter the estimate; their poses follow from the
+    readings.
+    """
     rng = np.random.default_rng(6)
     scene = make_scene(rng, configurations=10)
     full = scene.measurements(rng)
@@ -279,7 +285,7 @@ def test_a_station_that_sees_almost_nothing_does_no_harm(edges_left):
     assert np.abs(change).max() < (0.3 if edges_left else 1e-3)
     assert np.isfinite(values.covariance).all()
     width = np.sqrt(np.einsum("sii->si", values.station_covariance)).max(axis=1)
-    assert width[1] > 1.0  # metres or radians: unknown, and said so
+    assert width[1] > 1.0  # metres or radians: unknown
     assert width[[0, 2]].max() < 0.01
 
 
@@ -316,7 +322,9 @@ def test_chi2_of_the_noise_as_stated_tells_that_it_was_stated_seven_times_too_sm
 
 
 def test_what_is_told_of_a_machine_stands_for_what_told_it():
-    """One station's edges with what the other's told of the machine, against both together."""
+    """One station's edges with a marginal prior of the machine from the other's, against both
+    jointly.
+    """
     rng = np.random.default_rng(20)
     scene = make_scene(rng, configurations=12, n_stations=2)
     both = scene.measurements(rng)
@@ -342,12 +350,12 @@ def test_what_is_told_of_a_machine_stands_for_what_told_it():
     assert np.sqrt(np.mean(off**2)) < 0.2 * np.sqrt(np.mean(shifted**2))
     ratio = np.sqrt(np.diag(fit.covariance))[above_limit] / sigma[above_limit]
     np.testing.assert_allclose(ratio, 1, atol=0.05)
-    # the drawing is in what is told: without it that still is what was asked for
+    # with the nominal model as prior; without it the result still has the requested gauge
     without = bundle(
         scene.machine, other, start, marginal_prior=information, use_drawing=False, **plain
     )
     np.testing.assert_array_equal(without.state.theta, fit.state.theta)
-    # what moves by less than its deviations is like before; by the drawing alone it was not
+    # a motion below its standard deviation changes nothing; by the nominal model alone it did
     after = marginalize_to_machine(all_, together)
     assert after.like(after)
     assert not after.like(replace(information, free=np.zeros_like(information.free)))
@@ -460,7 +468,9 @@ def test_wrong_inputs_are_told():
 
 @pytest.mark.parametrize("gauge", [ThreeCentres(), ThreeCentres((1, 3, 5)), BestFit()])
 def test_results_do_not_depend_on_the_gauge(gauge):
-    """Without drawing values the solve itself uses the gauge's rows; distances must not care."""
+    """Without nominal values the solver itself uses the gauge's rows; distances must not depend on
+    them.
+    """
     rng = np.random.default_rng(26)
     scene = make_scene(rng)
     m = scene.measurements(rng)
@@ -502,7 +512,7 @@ def test_measurements_are_not_changed():
 
 
 def test_what_noise_makes_of_a_covariance_is_not_what_was_known_before():
-    """Of least squares with rows that are measured, J, and rows that are known, P."""
+    """Least squares with measured rows J and prior rows P."""
     rng = np.random.default_rng(0)
     J, P = rng.normal(size=(2, 9, 4)), rng.normal(size=(3, 4))
     C = np.linalg.inv(J.mT @ J + P.T @ P)
@@ -527,7 +537,7 @@ def test_what_looks_scatter_by_is_in_the_deviations_and_nowhere_else():
     before, after = (np.diag(e.joint_covariance)[:n] for e in (fit, more))
     values, drawn = fit.data_share > 0.99, (fit.data_share < 0.01) & (before > 0)
     assert values.any()
-    # readings' scales, radii, shading have part in what edges tell, and are drawn in part
+    # readings' scales, radii and shading are determined partly by edges, and are drawn in part
     assert np.all(after[values] > 1.1 * before[values])
     assert np.all(after <= 1.5001 * before)
     np.testing.assert_allclose(after[drawn], before[drawn], rtol=0.02)

@@ -56,7 +56,7 @@ def off(result, truth):
 
 
 def apart(machine, truth):
-    """The same of any machine, after the best fit of both frames."""
+    """Errors of any machine after the best fit of both frames."""
     forward_kinematics, there = machine.forward(truth.joints), truth.T_base_platform
     frames = solve_pairs(forward_kinematics[None], there[None], 0.3)
     error = frames.T_camera_base[0] @ forward_kinematics @ frames.T_mount[0] - there
@@ -121,7 +121,9 @@ def test_the_board_alone(folder, tmp_path):
 
 
 def test_cameras_are_refined_with_the_board(rendered, folder):
-    """A focal length a two-hundredth wrong is drawn back by readings that tell distances."""
+    """A focal length that is wrong by a two-hundredth is corrected by readings, which
+    have lengths.
+    """
     path = folder / "cameras" / "camera.yaml"
     document = yaml.safe_load(path.read_text())
     true = np.array(document["focal"])
@@ -169,8 +171,10 @@ def test_a_missing_board_file_and_another_camera(folder):
 
 
 def test_the_method_of_paper_c_says_nothing_of_the_size(folder, tmp_path, monkeypatch):
-    """It estimates none, so none is told, though board.yaml's tolerance makes it unsure."""
-    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # of its deviations nothing is asked
+    """Without an estimate of the size none is reported, though the tolerance in board.yaml adds to
+    sigma.
+    """
+    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # standard deviations are not tested
     change(folder, lambda station: station.update(observe="board"))
     done = run("calibrate", folder, "-o", tmp_path / "out", "--method", "inverse-kinematic")
     assert done.code in (0, 1)
@@ -185,5 +189,5 @@ def test_inverse_of_a_known_station_is_told(rendered):
     eye = inverse(truth.T_camera_base[0])[:3, 3]
     centre = truth.T_base_platform[:, :3, 3].mean(axis=0)
     board = (truth.T_base_platform @ truth.T_platform_board)[:, :3, 2]
-    # the board's z points into it, away from who looks at it
+    # the board's z axis points into it, away from the viewer
     assert np.all(board @ (centre - eye) > 0)

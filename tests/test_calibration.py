@@ -1,4 +1,4 @@
-"""From photographs to parameters: the whole of `calibrate`, on the demonstration's session."""
+"""From images to parameters: the whole of `calibrate`, on the demonstration's session."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ from rendered import rendered
 
 
 def photographed(folder, seed):
-    """Three stations, six configurations each, 640x480: half as many photographs again as the
-    demonstration's, and larger ones."""
+    """Three stations, six configurations each, 640x480: half as many images again as the
+    demonstration's, and larger ones.
+    """
     parameters = np.array([565.0, 566.0, 322.0, 238.5, -0.1, 0.08, 4e-4, -3e-4, 0.0])
     camera = camera_models()["pinhole"]((640, 480), parameters)
     drawing = pkmcal.load_mechanism("gough-stewart")
@@ -44,7 +45,9 @@ def errors_in_sigmas(calibration, folder):
 
 
 def check_found(value, folder, centre):
-    """The joint centres come from millimetres to ``centre``, and the deviations say how far off."""
+    """The joint centres' errors decrease from millimetres to ``centre``, and match their standard
+    deviations.
+    """
     errors = compare_with_truth(value, folder)
     assert errors.drawing.centre > 1e-3
     assert errors.calibrated.centre < centre
@@ -56,7 +59,7 @@ def check_found(value, folder, centre):
 
 
 def test_the_machine_is_found(demo, calibrated):
-    """Twelve photographs, 480x360: as below, times sqrt(18/12) and 640/480."""
+    """Twelve images, 480x360: as below, times sqrt(18/12) and 640/480."""
     check_found(calibrated, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
 
 
@@ -69,9 +72,9 @@ def test_the_machine_is_found_in_more_and_larger_photographs(tmp_path):
 
 @pytest.mark.slow
 def test_slim_bare_rods_are_told_honestly(tmp_path):
-    """Bare rods nine pixels wide: their edges come out 0.1 px inwards, all alike, which neither
-    the profiles' sigmas nor one edge shift a camera tell; each line's own shading does. Without
-    it errors are 1.25 deviations here, with it 0.87.
+    """Bare rods nine pixels wide: their edges are measured 0.1 px inwards, all of them, which
+    neither the profiles' sigmas nor one edge shift for a camera model; each line's own shading
+    does. Without it errors are 1.25 standard deviations here, with it 0.87.
     """
     folder = photographed(tmp_path / "session", seed=5)
     value = pkmcal.calibrate(folder)
@@ -96,12 +99,14 @@ def test_start_ten_centimetres_and_ten_degrees_off(demo, calibrated, seed):
     values = pkmcal.calibrate(replace(session, stations=tuple(stations)))
     sigma = np.sqrt(np.diag(calibrated.estimate.covariance))
     change = values.machine.values - calibrated.machine.values
-    # another path to the last look moves its profiles by hundredths of a pixel
+    # another path to the last measurement pass moves its profiles by hundredths of a pixel
     assert np.max(np.abs(change) / np.maximum(sigma, 1e-6)) < 1.0
 
 
 def test_start_from_a_bad_drawing(demo, calibrated):
-    """A drawing 5 mm off on every coordinate, and said to be: the same machine is found."""
+    """A nominal model with errors of 5 mm on every coordinate, and a tolerance to match: the same
+    machine.
+    """
     rng = np.random.default_rng(1)
     session = load_session(demo.session)
     table = session.machine.parameters
@@ -128,8 +133,8 @@ def of_twice_the_radii(machine):
 
 @pytest.mark.parametrize("stations", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_diameters_for_radii_are_named_where_the_machine_was_recognised(demo, stations):
-    """Thick legs are found in the photographs, with the camera elsewhere; the estimate tells, or
-    that from one place there is none.
+    """Stations with too thick legs are localized at another distance; the estimate detects the
+    radii, or the message says that one station alone does not.
     """
     session = load_session(demo.session)
     thick = of_twice_the_radii(session.machine)
@@ -141,7 +146,7 @@ def test_diameters_for_radii_are_named_where_the_machine_was_recognised(demo, st
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 def test_diameters_are_named_where_few_edges_happen_to_agree(tmp_path, seed):
-    """Of 384 edges 67 and 55 were found here, which disagreed by no more than is accepted."""
+    """67 and 55 of 384 edges were found here, and disagreed by no more than is accepted."""
     machine = pkmcal.load_mechanism("gough-stewart")
     settings = Settings(stations=2, configurations=8)
     simulate_session(tmp_path, machine, camera_of_size((640, 480)), settings, seed=101)
@@ -152,7 +157,7 @@ def test_diameters_are_named_where_few_edges_happen_to_agree(tmp_path, seed):
 
 
 def test_one_station_alone(demo, calibrated):
-    """Less is seen, so deviations grow, and still tell the truth."""
+    """Fewer edges give larger standard deviations, which are still right."""
     session = load_session(demo.session)
     value = pkmcal.calibrate(replace(session, stations=session.stations[:1]))
     z = errors_in_sigmas(value, demo.session)
@@ -166,8 +171,10 @@ def test_one_station_alone(demo, calibrated):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["four-step", "linear"])
 def test_papers_methods_are_told_apart_from_the_joint_one(demo, calibrated, method):
-    """They run on the same edges and come nowhere near; the verdict names the better method. By
-    the command in test_cli.py; how good they are by themselves in the tests of the papers.
+    """The papers' methods run on the same edges and are far less accurate; the verdict names the
+    better method.
+
+    By the command in test_cli.py; their own accuracy is tested with the papers.
     """
     value = pkmcal.calibrate(demo.session, method=method)
     assert value.method == method
@@ -223,7 +230,7 @@ def test_a_camera_without_covariance_is_refined_from_what_is_usual(demo):
     remainder, sigma = refined.parameters - camera.parameters, np.sqrt(np.diag(refined.covariance))
     assert np.all(np.abs(remainder[:5]) < 3.5 * sigma[:5])
     assert np.all(sigma[:2] < 0.005 * camera.parameters[:2])
-    assert sigma[5:].max() == 0  # nobody said that these are unknown
+    assert sigma[5:].max() == 0  # not stated as unknown
     (values,) = value.verdict.of("camera.no_covariance")
     assert values.facts["centre"] == pytest.approx(0.01)
     assert value.violations == ()

@@ -1,4 +1,6 @@
-"""Camera calibration: synthetic truth comes back, its uncertainty is honest, misuse is told."""
+"""Camera calibration: synthetic truth is recovered, its uncertainty is honest, misuse is
+reported.
+"""
 
 from __future__ import annotations
 
@@ -62,11 +64,11 @@ ONE_MODEL = pytest.mark.parametrize(
     [pytest.param(true, id=name, marks=() if name == "unified" else pytest.mark.slow)
      for name, true in TRUE.items()],
 )  # fmt: skip
-"""What is the same for all of them, however rays go."""
+"""Checks that hold for all models, whatever their rays."""
 
 
 def poses_for(camera, count, seed, tilt=0.6):
-    """Poses with the whole board in the picture, in many directions, tilted to all sides."""
+    """Poses with the whole board in the image, in many directions, tilted to all sides."""
     rng = np.random.default_rng(seed)
     results = []
     while len(results) < count:
@@ -99,7 +101,7 @@ def detections(camera, T_camera_board, seed=0, noise=0.05, reference_values=True
 
 
 def alone(monkeypatch, model):
-    """Fit this model only: of one that is asked for, others tell no more than whether they fit
+    """Fit this model only; for a requested model, other models only show whether they fit
     better.
     """
     monkeypatch.setattr("pkmcal.boards.camera.DISTORTION_CANDIDATES", (model,))
@@ -117,7 +119,7 @@ def wide_views():
 
 @pytest.fixture(scope="module")
 def wide_pool(wide_views):
-    """Every model's fit to these views, which does not depend on the model that is asked for."""
+    """Every model's fit to these views, which does not depend on the requested model."""
     return camera_candidates(thinned(views_of(wide_views, BOARD)), SIZE, tuple(TRUE))
 
 
@@ -160,7 +162,7 @@ def test_the_truth_of_other_models_comes_back(name):
 
 
 def test_photographs_give_the_camera(tmp_path, monkeypatch):
-    """From rendered pictures, corners and all."""
+    """From rendered images, including the corners."""
     alone(monkeypatch, "pinhole")
     camera, board = CAMERAS["pinhole"], chessboard((8, 5), 0.03)
     turns = ((0.5, 0.1, 0.1), (-0.5, 0.2, 0.0), (0.1, 0.6, 0.3), (0.0, -0.6, 0.0), (0.3, 0.4, 1.0))
@@ -237,7 +239,7 @@ def test_corners_with_wrong_numbers_are_no_lens(monkeypatch):
 
 
 def test_corners_at_others_places_in_one_view_are_outliers(monkeypatch):
-    """A detection that failed once says nothing of the board."""
+    """A detection that failed once does not reject the board."""
     alone(monkeypatch, "pinhole")
     true = TRUE["pinhole"]
     calibration = detections(true, poses_for(true, 10, 1), 2)
@@ -266,7 +268,7 @@ def test_no_model_wins_by_giving_up_more():
     pool = camera_candidates(views, SIZE, ("pinhole",))
     best = best_of(pool)
     by_view = best.by_view
-    assert best.robust == pytest.approx(best.left_out, rel=0.02)  # none is given up
+    assert best.robust == pytest.approx(best.left_out, rel=0.02)  # none is rejected
     offset = replace(best, left_out=best.left_out / 2, robust=2 * best.robust, by_view=4 * by_view)
     assert best_of((offset, best)) is best
     assert is_worse(offset, best)
@@ -337,7 +339,7 @@ def test_lines_are_great_circles(true):
     assert 0.1 < np.abs(off).max() < 0.5
 
 
-# What is refused, and what is only said
+# refusals and warnings
 
 
 @pytest.fixture
@@ -366,7 +368,7 @@ def test_too_few_views(wide_views):
 
 
 def test_views_that_are_all_alike(monkeypatch):
-    """Facing the camera at one distance: focal length and distance cannot be told apart."""
+    """All images face the camera at one distance: focal length and distance cannot be separated."""
     alone(monkeypatch, "pinhole")
     true = camera_of("pinhole", 1050, 1052, 515, 378)
     rng = np.random.default_rng(0)

@@ -19,10 +19,10 @@ from pkmcal.errors import InputError
 
 
 class Example(NamedTuple):
-    """A camera and what is known of its field.
+    """Camera and its field of view.
 
-    fields : of its file, without model. imaged : least share of the picture that rays meet.
-    outside : points of the camera frame that it cannot see, inside : ones that it can.
+    fields : of its file, without model. imaged : least share of the image with rays. outside :
+    points of the camera frame that it cannot see, inside : points that it can.
     """
 
     fields: dict
@@ -139,14 +139,14 @@ def test_every_model_has_examples():
 
 
 def picture_pixels(camera, count=60):
-    """A grid over the whole picture, its border included."""
+    """A grid over the whole image, its border included."""
     width, height = camera.image_size
     x, y = np.meshgrid(np.linspace(0, width - 1, count), np.linspace(0, height - 1, count))
     return np.stack([x, y], axis=-1)
 
 
 def seen_points(camera, seed, count=400):
-    """Points of the camera frame whose image lies in the picture, at all depths."""
+    """Points of the camera frame that project into the image, at all depths."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(40 * count, 3)) * np.exp(rng.normal(size=(40 * count, 1)))
     visible = camera.in_image(camera.project(points))
@@ -239,8 +239,10 @@ def agrees(value, oracle, tolerance):
 
 
 class Place(NamedTuple):
-    """Where derivatives are tested: towards the border of picture or field, the fold among them,
-    the inverse's higher derivatives grow, so steps shrink, and rounding takes more of the oracle.
+    """Points where derivatives are tested.
+
+    Towards the border of image or field, the fold among them, the inverse's higher derivatives
+    grow, so steps shrink, and rounding takes more of the oracle.
     """
 
     share: tuple[float, float]
@@ -326,7 +328,7 @@ def test_derivatives_of_ray(case, place):
 
 
 def test_derivatives_of_ray_undo_those_of_project(case, place):
-    """What differences cannot resolve near a fold: one map's derivatives against the other's."""
+    """Near a fold, which differences do not resolve: one map's derivatives against the other's."""
     _, camera = case
     rays = rays_at(camera, place)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -353,7 +355,7 @@ def test_a_binned_camera_sees_the_same_in_larger_pixels(case):
 
 
 def test_a_camera_turned_by_half_takes_the_same_picture_upside_down(case):
-    """With all that its calibration told, and turned twice it is itself."""
+    """With its whole covariance; turned twice the camera is itself."""
     _, camera = case
     camera = replace(camera, covariance=np.diag(np.arange(1.0, len(camera.parameters) + 1)) + 0.1)
     points, turned = seen_points(camera, 0), camera.turned_by_half()
@@ -362,7 +364,7 @@ def test_a_camera_turned_by_half_takes_the_same_picture_upside_down(case):
     again = turned.turned_by_half()
     np.testing.assert_allclose(again.parameters, camera.parameters, atol=1e-12)
     np.testing.assert_array_equal(again.covariance, camera.covariance)
-    # how the picture moves by the parameters, their deviations taken along
+    # displacement of the image by the parameters, with their standard deviations
     (_, own), (_, other) = (
         c.project_jacobians(p) for c, p in ((camera, points * [-1, -1, 1]), (turned, points))
     )
@@ -398,7 +400,7 @@ def test_the_field_ends_where_the_model_does(case):
 
 
 def test_before_its_end_the_field_does_not_fold(case):
-    """Throughout the field the picture keeps its orientation; a mirror image would be a fold."""
+    """Throughout the field the image keeps its orientation; a mirror image would be a fold."""
     _, camera = case
     points = np.random.default_rng(3).normal(size=(4000, 3))
     points = points[np.isfinite(camera.project(points)).all(axis=-1)]
@@ -547,7 +549,7 @@ def test_faults_of_camera_files(tmp_path, line, instead, sentence):
 
 
 def test_a_changed_aspect_leaves_the_mean_focal_length(case):
-    """Of every model: fx / fy grows by the number, and fx fy stays, to first order."""
+    """For every model: fx / fy grows by the number, and fx fy stays, to first order."""
     camera, share = case[1], 1e-4
     other = camera.parameters + share * camera.aspect_part
     ratio = (other[0] / other[1]) / (camera.parameters[0] / camera.parameters[1])

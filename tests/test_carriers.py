@@ -98,7 +98,7 @@ def test_readings_of_a_crank(zero):
     # a rod square to its arm's motion hides the reading: a rounding e of lengths, root of e
     np.testing.assert_allclose(value, q, atol=1e-6)
     assert np.quantile(np.abs(value - q), 0.9) < 1e-12
-    # both solutions, wherever one looks from
+    # both solutions, whatever the viewing direction
     for near in np.linspace(-3, 3, 7):
         other = Crank.reading(parameters, b, length, np.full(200, near))
         away = np.linalg.norm(b - Crank.place(parameters, other)[0], axis=1)
@@ -226,7 +226,7 @@ def test_frames_first_order_and_what_errors_become(carrier, zero):
         lambda d: carrier.reframed(parameters + np.append(d, pad), e, f)[..., :n], n, 1e-4
     )
     carried = carrier.carried(parameters, e, f)[..., :n, :n]
-    if carrier is Crank and zero:  # what the drawing holds has no errors
+    if carrier is Crank and zero:  # fixed nominal values have no errors
         carried, oracle = carried[..., :10, :10], oracle[..., :10, :10]
     np.testing.assert_allclose(np.broadcast_to(carried, oracle.shape), oracle, atol=1e-8)
 
@@ -332,7 +332,7 @@ def test_signs_of_ties_that_share_names():
 
 
 def test_an_axis_that_stays_horizontal():
-    """Its component that the drawing has at zero can be held: one turn is left."""
+    """A component that is nominally zero can be fixed: one rotation remains."""
     table = read(DELTA).parameters
     free = table.with_roles(("legs[1].base.axis.z",)).free_matrix()
     rows = free[[table.index(f"legs[1].base.axis.{c}") for c in "xyz"]]

@@ -166,7 +166,9 @@ def test_jacobians_near_singular_poses(machine):
 
 
 def test_built_machines_move_as_drawn(machine):
-    """Errors of the drawing's size leave usable configurations, closed and in the assembly."""
+    """Errors as large as the nominal model's tolerances leave usable configurations, closed and in
+    home's assembly.
+    """
     for seed in range(3):
         built = true_machine(machine, 1.0, np.random.default_rng(seed))
         assert loads_back(built)
@@ -210,7 +212,7 @@ CAMERA = camera_models()["pinhole"](
 
 
 def simulated(machine, seed, stations=1):
-    """Truth and measurements of a session without photographs."""
+    """Truth and measurements of a session without images."""
     truth = draw_truth(machine, (CAMERA,) * stations, Settings(stations=stations), seed)
     edges, readings = simulate_edges(
         truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
@@ -256,7 +258,7 @@ def in_sigmas(drawing, estimate, truth):
 
 
 def test_a_simulated_session_calibrates(machine):
-    """Errors are as large as the covariance says, over five machines that differ as drawn."""
+    """Errors match the covariance, over five machines with errors as large as the tolerances."""
     z = []
     for seed in range(5):
         truth, measurements = simulated(machine, seed)
@@ -268,17 +270,17 @@ def test_a_simulated_session_calibrates(machine):
     assert np.mean(z**2) == pytest.approx(1, abs=4 * np.sqrt(2 / z.size))
 
 
-# With photographs: three places for machines whose platform hides legs or moves them little
+# with images: three places for machines whose platform hides legs or moves them little
 RENDERED = {name: 1 if name == "3-rpr" else 3 for name in NAMES}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_photographs_calibrate(name, tmp_path):
-    """Fifteen photographs a place, 1024x768: recognised, usable, and as far off as is said.
+    """Fifteen images from each place, 1024x768: localized, usable, and errors as stated.
 
-    Bare rods' edges lie some hundredths of a pixel aside, the same in all photographs of a place,
-    which no deviation tells; hence a bound as in test_calibration.
+    Bare rods' edges are shifted by some hundredths of a pixel, equally in all images from a place,
+    which no standard deviation contains; hence a bound as in test_calibration.
     """
     drawing = load_mechanism(name)
     simulate_session(tmp_path / "s", drawing, CAMERA, Settings(stations=RENDERED[name]), seed=1)

@@ -1,4 +1,4 @@
-"""Edges that chance offers tell no machine."""
+"""Chance matches of edges determine no machine."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from test_observe_measure import taken
 
 
 def turns_of(photographs, keep=1.0):
-    """What a look left, or a share of it; the rest as if it had not been found."""
+    """Result of a measurement pass with a share of its edges; the others count as not found."""
     state = SimpleNamespace(T_camera_base=FRONT[None], T_base_platform=poses())
     station_edges = measure(photographs, machine(), FRONT, poses())
     count = round(keep * len(station_edges.edges))
@@ -42,7 +42,7 @@ def turns_of(photographs, keep=1.0):
 
 
 def aside(photographs, px):
-    """As if the machine were elsewhere in the picture."""
+    """Edges as if the machine were elsewhere in the image."""
     parameters = photographs.camera.parameters.copy()
     parameters[2] += px
     return replace(photographs, camera=replace(photographs.camera, parameters=parameters))
@@ -70,7 +70,9 @@ def test_nothing_is_asked_where_most_were_measured(monkeypatch):
 
 
 def test_repeats_count_once():
-    """Aside as where the machine is: what was measured is told after repeats were averaged."""
+    """As many matches in shifted images as at the machine; the edges count after repeats were
+    averaged.
+    """
     once = aside(taken(), 2.5 * IMAGE_OFFSET)
     twice = once.select(np.repeat(np.arange(len(once.images)), 2))
     turns = turns_of(once)._replace(blur={0: USUAL_BLUR})

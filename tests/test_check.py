@@ -1,4 +1,4 @@
-"""What the check finds in photographs and configurations, and how it judges it."""
+"""Findings of the check in images and configurations, and its verdict."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
 
 
 def changed(session, change, station="*"):
-    """All photographs of a station (or of all), changed by a function of the picture."""
+    """All images of a station (or of all), changed by a function of the image."""
     for path in sorted((session / "images").glob(f"{station}/*.png")):
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         assert cv2.imwrite(str(path), np.clip(change(picture), 0, 255).astype(np.uint8))
@@ -64,7 +64,7 @@ def test_progress_is_told_in_order(checked):
 
 
 def test_a_workspace_blurred_and_overexposed_photographs(session):
-    """Three things that are no mistakes, and leave the rest to be looked at."""
+    """Three cases that are no mistakes, and do not stop the check."""
     with (session / "session.yaml").open("a") as file:
         file.write("workspace: {z: [1.0, 2.0]}\n")
     changed(session, lambda picture: cv2.GaussianBlur(picture, (0, 0), 1.8), "station1")
@@ -104,7 +104,7 @@ def test_all_broken_photographs_are_named(session):
     check = check_session(session)
     assert check.exit_code == 2
     assert [text.partition(";")[0] for text in texts(check, Level.WRONG)] == names
-    assert check.stations[0].recognised  # by its other photographs
+    assert check.stations[0].recognised  # by its other images
 
 
 def test_a_station_whose_photographs_are_all_broken(session):
@@ -204,7 +204,7 @@ def test_a_pose_under_several_names_is_told(demo):
     photos = [p for p in session.stations[0].photographs if p.configuration > 2]
 
     def report(*in_view):
-        """What is said where stations see these of the first three configurations."""
+        """Findings if stations see these of the first three configurations."""
         stations = tuple(
             replace(s, photographs=(*(replace(photos[0], configuration=k) for k in rows), *photos))
             for s, rows in zip(session.stations, in_view, strict=True)

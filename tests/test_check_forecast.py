@@ -1,4 +1,4 @@
-"""What the check foretells of a full capture, what it advises, and the pictures that it draws."""
+"""Forecast of a full capture by the check, its advice, and its pictures."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def found(checked):
 
 @pytest.fixture(scope="module")
 def alone(demo, tmp_path_factory):
-    """Three photographs of one station."""
+    """Three images of one station."""
     folder = tmp_path_factory.mktemp("alone") / "session"
     shutil.copytree(demo.session, folder)
     (folder / "truth.json").unlink()
@@ -62,7 +62,7 @@ def alone(demo, tmp_path_factory):
 
 
 def test_the_forecast_is_what_calibrate_then_states(found, calibrated):
-    """From two photographs of each of three stations, for the four of each that there are."""
+    """From two images of each of three stations, for the four of each that exist."""
     each = len(calibrated.session.stations[0].photographs)
     values = forecast(found.look, each)
     _, tool = centres_and_tool(
@@ -100,7 +100,7 @@ def test_three_photographs_of_one_station(alone):
     assert not [f for f in check.findings if f.level is Level.WRONG]
     rows = check.forecast
     assert [leg.leg for leg in rows.legs] == [1, 2, 3, 4, 5, 6]
-    # from one place the line of sight is told badly
+    # from one place the line of sight is determined badly
     assert rows.second < rows.position
     text = outcome_of(check).parts[-1].terminal_text
     assert "by the edges of 3 photographs" in text[0]
@@ -161,7 +161,7 @@ def test_stations_on_one_side_are_told(found):
 
 
 def test_slim_tubes_are_told(found):
-    """By the width that the drawing has in the photographs; wide ones need no word."""
+    """By the nominal width in the images; wide tubes need no advice."""
     assert words._slim(found.look) == []
     first, *others = found.look.stations
     half_width = np.where(tubes_of(found.look.session.machine).tube == 1, 2.25, 9.0)
@@ -197,7 +197,7 @@ def test_hidden_legs_are_told_where_no_station_sees_them(found):
     ],
 )
 def test_why_edges_are_lost(found, level, behind, code):
-    """Half of all edges lost, which look so; the others are white legs before a grey wall."""
+    """Half of all edges lost for this reason; the other legs are white in front of a grey wall."""
     station = found.look.stations[0]
     shape = station.quality.level.shape
     lost = np.zeros((1, shape[1]), dtype=bool)
@@ -225,7 +225,7 @@ def test_pictures_of_all_photographs(found, tmp_path):
     width, height = station.photographs.camera.image_size
     drawn = cv2.imread(str(tmp_path / "pictures" / names[0]))
     assert drawn.shape == (height + CAPTION_BAR_HEIGHT, 2 * width + PANE_GAP, 3)
-    # beside the lines the photograph is as it was, and all legs' colours are in it
+    # beside the lines the image is unchanged, and all legs' colours are in it
     after = drawn[CAPTION_BAR_HEIGHT:, width + PANE_GAP :]
     plain = cv2.cvtColor(station.photographs.images[0], cv2.COLOR_GRAY2BGR)
     assert np.mean(np.any(after != plain, axis=-1)) < 0.2
@@ -252,7 +252,7 @@ def test_pictures_of_large_photographs_are_binned(found):
 
 
 def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
-    """Under its lines the photograph changes; under those by hand, that are off, it does less."""
+    """Under its lines the image changes; under those at the rough pose, which are off, less."""
     from pkmcal.check.pictures import drawing_over_photograph
 
     def strength(T_camera_base, k):
@@ -337,9 +337,7 @@ def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
 
 
 def test_pictures_whole_or_not_at_all(found, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "pkmcal.check.pictures.CAPTION_BAR_HEIGHT", -1
-    )  # fails in the first picture
+    monkeypatch.setattr("pkmcal.check.pictures.CAPTION_BAR_HEIGHT", -1)  # fails in the first image
     with pytest.raises(ValueError, match="negative"):
         write_pictures(found.look, tmp_path / "pictures")
     assert list(tmp_path.iterdir()) == []

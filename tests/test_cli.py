@@ -117,7 +117,7 @@ def tell() -> int:
 
 sys.exit(cli.main(["tell"]))
 """
-"""A command that says more than a pipe holds of a result that should not be used."""
+"""A command with more output than a pipe holds, for a result that should not be used."""
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
@@ -267,7 +267,7 @@ def test_new_files_load(tmp_path):
 
 @pytest.mark.parametrize("options", [(), ("--machine", "3-rps", "--places", 2)])
 def test_a_new_session_says_nothing_of_where_its_camera_stands(tmp_path, options):
-    """It cannot know; a pose by hand is a comment's mark away."""
+    """It is optional; a rough pose takes one uncommented line."""
     folder = tmp_path / "mine"
     assert run("new", folder, *options).code == 0
     stations = load_session(folder, measured=False).stations
@@ -420,7 +420,7 @@ def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, m
     assert load(out).seed == 5
     (retained,) = tmp_path.glob("result-*")
     assert load(retained).seed == 0
-    # the same again: nothing is kept, and nothing told
+    # the same again: nothing is kept, and no note
     assert "kept" not in run("calibrate", session, "-o", out, "--seed", 5, "--json").json
     assert len(list(tmp_path.glob("result-*"))) == 1
     value = run("calibrate", session, "-o", out, "--json").json
@@ -434,7 +434,7 @@ def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, m
 
 
 def test_calibrate_as_json_in_a_process_of_its_own(tmp_path):
-    """Of poses from a tracker, which takes a second; of photographs above."""
+    """Of poses from a tracker, which takes a second; images are tested above."""
     session, out = make(tmp_path / "session", "gough-stewart").folder, tmp_path / "result"
     done = python("-m", "pkmcal", "calibrate", session, "-o", out, "--json")
     assert (done.returncode, done.stderr) == (0, "")
@@ -445,10 +445,10 @@ def test_calibrate_as_json_in_a_process_of_its_own(tmp_path):
 
 
 def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
-    """Barely enough for them: told apart as comparison, or refused with [A]'s own condition."""
+    """Barely enough for the methods: marked as comparison, or refused with [A]'s own condition."""
     monkeypatch.setattr(
         "pkmcal.papers.methods.SIGMA_REPETITIONS", 3
-    )  # asked: the verdict, no deviation
+    )  # requested: the verdict, no standard deviation
     done = run("calibrate", session, "--method", "four-step", "--json")
     assert done.code == 1
     if (session / "calibration").exists():

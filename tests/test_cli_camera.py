@@ -1,4 +1,4 @@
-"""`pkmcal camera` as a person uses it: photographs of a board in, a camera file out."""
+"""`pkmcal camera` as a user runs it: images of a board in, a camera file out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TRUTH = camera_of("pinhole", 620.0, 622.0, 318.0, 242.0, -0.12, 0.05, 0.0, 0.0, 
 
 @pytest.fixture(scope="module")
 def boards(tmp_path_factory):
-    """A folder with board.yaml and eight photographs of it."""
+    """A folder with board.yaml and eight images of it."""
     folder = tmp_path_factory.mktemp("boards")
     board = board_of(folder, BOARD)
     (folder / "board.yaml").write_text(BOARD)
@@ -33,7 +33,7 @@ def test_a_camera_is_calibrated(boards, tmp_path):
     assert value.model == done.json["camera"]["model"] == "pinhole"
     sigma = np.sqrt(np.diag(value.covariance))
     off = (value.parameters - TRUTH.parameters)[:4] / sigma[:4]
-    # four numbers of eight pictures; beyond four deviations the deviations would be wrong
+    # four numbers from eight images; beyond four standard deviations these would be wrong
     assert np.all(np.abs(off) < 4)
     assert sigma[0] < 1.0
     assert {"camera.html", "camera.json", "camera.opencv.yaml"} <= {
@@ -42,7 +42,7 @@ def test_a_camera_is_calibrated(boards, tmp_path):
 
 
 def test_a_sessions_board_photographs(boards, tmp_path):
-    """A session that observes a board is enough: its photographs and its board are known."""
+    """A session that observes a board is enough: it has the images and the board."""
     folder = tmp_path / "session"
     (folder / "images").mkdir(parents=True)
     for path in boards.glob("*.png"):

@@ -1,4 +1,4 @@
-"""What commands say of their progress where there is no terminal."""
+"""Progress messages of commands without a terminal."""
 
 import re
 import sys
@@ -11,7 +11,7 @@ from pkmcal.commands import console
 
 
 class Heard:
-    """A stream that is no terminal, and tells when it was written to."""
+    """A stream that is no terminal, and records the times of writing."""
 
     encoding = "utf-8"
 

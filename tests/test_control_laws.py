@@ -88,7 +88,9 @@ def test_interaction_is_the_derivative_of_what_is_seen(name, place):
 
 
 def test_interaction_near_a_singular_pose():
-    """The platform turned until the drives hardly hold it: the twist still tells the legs."""
+    """The platform near a pose where the motors hardly hold it: the twist still determines the
+    legs.
+    """
     in_view = before("gough-stewart")
     home = in_view.machine.home()
     angles = np.linspace(0, 2.0, 400)

@@ -24,7 +24,7 @@ def around_home(machine, rng, count=60):
 
 
 def changed(machine, rng, share=0.5):
-    """The machine with errors of half of its drawing's tolerances."""
+    """Machine with errors of half of its nominal model's tolerances."""
     table = machine.parameters
     step = share * table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
     return machine.with_values(machine.values + table.free_matrix() @ step)
@@ -76,8 +76,8 @@ def test_readings_in_and_out(name):
 
 @pytest.mark.parametrize("name", ["delta", "6-rus"])
 def test_home_is_found_without_being_told(name):
-    """Mid-range readings close a machine with cranks on the side to which they reach; guides do
-    not tell on which side of them a platform is.
+    """Mid-range readings close a machine with cranks on the side to which they reach; for guides
+    the side of the platform is undetermined.
     """
     machine = load_mechanism(name)
     silent = type(machine)(

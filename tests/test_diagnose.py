@@ -1,5 +1,5 @@
-"""What photographs show when the session says something else: named where it is one of the usual
-mix-ups, refused where it is not, and nothing said of a session that is right.
+"""Images that contradict the session: named for the usual hypotheses, refused for others, and no
+finding for a session that is right.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def pictures(count=6):
 
 
 def said(*words, seed=0, **more):
-    """What is said of one station; see :func:`looked_for`."""
+    """Findings on one station; see :func:`looked_for`."""
     rng = np.random.default_rng(seed)
     return mistake([looked_for(rng, *words, **more)], rng)
 
 
 def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None, by_hand=None):
-    """A station as it is found; the drawing is 1 mm wrong, as drawings are."""
+    """A station's localization; the nominal model is 1 mm wrong, as usual."""
     mechanism = mechanism or redrawn(3, 0.001)
     readings = machine().inverse(poses()) if readings is None else readings
     view = StationView(
@@ -67,7 +67,7 @@ def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None,
 
 
 def b_again():
-    """The pictures and readings of a to f, and of a seventh that is b once more but for noise."""
+    """Images and readings of a to f, and of a seventh that repeats b with other noise."""
     picture, _ = draw(tubes_at(machine(), poses()[1]), seed=6)
     readings = machine().inverse(np.concatenate([poses(), poses()[1:2]]))
     readings += 3e-6 * np.random.default_rng(0).normal(size=readings.shape)
@@ -90,8 +90,9 @@ def given(by_hand):
 @pytest.mark.slow
 @pytest.mark.parametrize("by_hand", [True, False])
 def test_nothing_is_said_of_what_is_right(by_hand):
-    """Though its drawing is 2 mm wrong. Whole sessions that are right are calibrated in many tests,
-    one without a pose by hand in test_check.py.
+    """With a nominal model that is 2 mm wrong.
+
+    Whole right sessions are calibrated in many tests, one without a rough pose in test_check.py.
     """
     rng = np.random.default_rng(0)
     station = looked_for(rng, pictures(), by_hand=given(by_hand), mechanism=redrawn(1, 0.002))
@@ -104,8 +105,8 @@ def test_nothing_is_said_of_what_is_right(by_hand):
     [((0, 3), True, 1), also((0, 3), True, 0), also((2, 4), True, 0), also((0, 3), False, 0)],
 )
 def test_two_columns_exchanged(pair, by_hand, seed):
-    """By seed 1 the machine is recognised all the same, by the other four legs. Without a pose by
-    hand six photographs leave it to chance, once in 62 times.
+    """With seed 1 the station is localized all the same, by the other four legs. Without a rough
+    pose six images leave it to chance, once in 62 times.
     """
     order, count = np.arange(6), 6 if by_hand else 9
     order[list(pair)] = order[list(pair)[::-1]]
@@ -120,7 +121,7 @@ def test_two_columns_exchanged(pair, by_hand, seed):
 
 @pytest.mark.parametrize("motor", [2, also(5)])
 def test_a_motor_that_counts_the_other_way(motor):
-    """Its readings are a constant less its lengths, and nobody knows which."""
+    """Its readings are a constant minus its lengths, with an unknown constant."""
     readings = machine().inverse(poses())
     constant = readings[:, motor].min() + readings[:, motor].max() + 0.004
     readings[:, motor] = constant - readings[:, motor]
@@ -138,7 +139,7 @@ def test_a_motor_that_counts_the_other_way(motor):
     ],
 )
 def test_columns_turned_round(turn, or_else):
-    """A hexapod turned by a third looks the same, and only the pose by hand can tell."""
+    """A hexapod turned by a third looks the same, and only the rough pose decides."""
     error = said(pictures(), readings_with(np.roll(np.arange(6), turn)), by_hand=given(True))
     assert str(error) == (
         "joints.csv: the legs are numbered differently in the readings and in the drawing; found"
@@ -180,7 +181,7 @@ def test_two_photographs_exchanged(by_hand):
 
 
 def test_photographs_of_one_configuration_are_not_taken_for_exchanged():
-    """Though another search ends where photographs fit better: as it does, under any names."""
+    """Another search may end where images fit better: as here, under any names."""
     rng = np.random.default_rng(1)
     images, readings = b_again()
     station = looked_for(rng, images, readings, by_hand=given(True))
@@ -203,7 +204,7 @@ def test_two_photographs_exchanged_beside_two_of_one_configuration():
 
 @pytest.mark.slow
 def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely():
-    """Of the right one the machine is a little less sure, as with many photographs it may be."""
+    """The right name has a slightly lower likelihood, as may happen with many images."""
     rng = np.random.default_rng(0)
     wrong = looked_for(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
     right = looked_for(rng, pictures(), by_hand=given(True))
@@ -225,7 +226,9 @@ def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely
     ])],
 )  # fmt: skip
 def test_mirrored_photographs(by_hand):
-    """A hexapod with its legs numbered backwards is its own mirror image: both should be said."""
+    """A hexapod with its legs numbered backwards is its own mirror image: both should be
+    reported.
+    """
     mirrored = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures()]
     assert "the photographs of front are mirrored" in str(said(mirrored, by_hand=given(by_hand)))
 
@@ -255,8 +258,8 @@ def test_names_are_assigned_for_the_largest_sum():
 
 @pytest.mark.slow
 def test_diameters_for_radii():
-    """Legs twice as thick may still be recognised, and then the estimate tells, as in
-    test_calibration.py; where they are not, their radii are asked too.
+    """Legs twice as thick may still be localized, and then the estimate decides, as in
+    test_calibration.py; otherwise their radii are tested too.
     """
     mechanism = redrawn(3, 0.001)
     radii = np.unique(tubes_of(mechanism).radius)
@@ -295,7 +298,7 @@ def test_another_machine_is_not_surely_recognised_and_nothing_is_renamed():
 def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
     monkeypatch, by_chance, named
 ):
-    """Of two photographs in which the machine was not recognised, chance confirms one of thirty."""
+    """From two images without localization, chance confirms one hypothesis of thirty."""
     rng, readings = np.random.default_rng(0), machine().inverse(poses())
     localization = LocalizedPose(rough_pose(4), 0.5, 1.0, 0.02, has_prior=True)
     two = looked_for(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(
@@ -319,8 +322,8 @@ def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
 
 @pytest.mark.slow
 def test_configurations_that_are_alike_do_not_change_names(tmp_path):
-    """Three legs, a drawing some millimetres wrong: two photographs fit each other's readings
-    better by 12 in log odds, where a photograph of that station tells 125.
+    """Three legs, a nominal model with errors of some millimetres: two images fit each other's
+    readings better by 12 in log odds, where an image of that station contributes 125.
     """
     drawing, settings = load_mechanism("3-rps"), Settings(stations=1, configurations=10)
     simulate_session(tmp_path / "s", drawing, camera_of_size((640, 480)), settings, seed=7)

@@ -1,4 +1,4 @@
-"""What differs between two machines: the spread by chance, its frames, the tool, the command."""
+"""Difference of two machines: its distribution by chance, its frames, the tool, the command."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def changes(pairs):
 
 @pytest.mark.parametrize("kind", ["new data", "half of the data", "all data of the smaller"])
 def test_the_stated_spread_is_that_of_unchanged_machines(pairs, kind):
-    """Of 8 pairs with 47 degrees of freedom chi-square over those has a deviation of 0.07."""
+    """Over 8 pairs with 47 degrees of freedom the mean of chi-square has a deviation of 0.07."""
     value = changes(pairs[kind])
     dof = sum(c.dof for c in value)
     assert sum(c.chi2 for c in value) / dof == pytest.approx(1, abs=0.2)
@@ -151,7 +151,7 @@ def changed(saved, name, by):
 
 
 def test_after_a_crash(saved):
-    """The same deviations, another zero of leg 3, and photographs of its own."""
+    """The same standard deviations, another offset of leg 3, and images of its own."""
     k = saved.machine.parameters.index("legs[3].length.offset")
     after = changed(saved, "legs[3].length.offset", 8e-3)
     document = json.loads(json.dumps(saved.document))
@@ -186,7 +186,7 @@ def test_shared_photographs_are_counted(saved):
 
 
 def test_photographs_are_counted_however_they_are_grouped(saved):
-    """Three photographs under one name or under three are as much in common."""
+    """Three images under one name or under three have as much in common."""
     each = [{"photographs": {f"{k}.png"}} for k in range(6)]
     grouped = [{"photographs": {f"{k}.png" for k in row}} for row in ((0, 1, 2), (6, 7, 8))]
 
@@ -232,7 +232,7 @@ def test_two_drawings():
 
 
 def test_a_fixed_number_that_differs_is_told():
-    """It has no deviation, and no frame can take it up."""
+    """It has no standard deviation, and no frame can absorb it."""
     drawing = load_mechanism("gough-stewart")
     name = "legs[2].length.offset"
     held = replace(drawing, parameters=drawing.parameters.with_roles(fixed=(name,)))

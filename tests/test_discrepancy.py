@@ -34,7 +34,7 @@ FEW = 14
 
 
 def session_estimate(seed, change=None, count=30):
-    """Drawing, measurements, estimate and its problem at its end, of a session whose readings a
+    """Nominal model, measurements, estimate and its final problem, of a session whose readings a
     function has changed.
     """
     if change is None:
@@ -48,7 +48,7 @@ def session_estimate(seed, change=None, count=30):
 
 @lru_cache(4)
 def right_session(seed, count):
-    """The same of a session whose readings are as they were."""
+    """Session with unchanged readings."""
     drawing, data, where = measured(seed, count=count)
     return drawing, data, bundle(drawing, data, start_state(drawing, data, where)), data.joints
 
@@ -242,8 +242,8 @@ def test_one_pose_has_no_smooth_functions():
 
 
 def through_lens(calibrated, change, stations):
-    """What is not modelled where some stations' images were taken by a camera whose parameters
-    differ by ``change`` (n,) from the file's.
+    """Discrepancy if some stations' images were taken by a camera whose parameters differ by
+    ``change`` (n,) from the file's.
     """
     session, observation = calibrated.session, calibrated.observation
     edges = calibrated.measurements.edges

@@ -168,7 +168,7 @@ def test_too_few_distances_to_show_a_wrong_one(true, tmp_path, found):
 
 
 def test_what_is_exported_has_the_bed_at_zero_and_the_size_right(kit, true):
-    """Klipper's values by heights and distances: flat, level, at Z 0, and as large as told."""
+    """Klipper's values by heights and distances: flat, level, at Z 0, and of the measured size."""
     done = run("calibrate", kit, "--force")
     assert done.code == 0, done.out + done.err
     (text,) = make_export(load_source(kit / "calibration"), "klipper").files.values()

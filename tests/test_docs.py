@@ -41,7 +41,7 @@ def blocks(text: str, kind: str) -> list[str]:
 
 
 def anchors(text: str) -> set[str]:
-    """What GitHub makes of a page's headings."""
+    """Anchors that GitHub makes of a page's headings."""
     headings = re.findall(r"^#+ (.+)$", prose(text), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
 
@@ -228,7 +228,7 @@ def test_keys_of_a_truth_are_explained(demo):
 
 
 def test_options_that_commands_share_are_theirs():
-    """What docs/commands.md says of all commands, or of some: which have --json, and --quiet."""
+    """Options that docs/commands.md states for all commands, or for some: --json, and --quiet."""
     from typer.main import get_command
 
     group = get_command(app)

@@ -1,4 +1,4 @@
-"""Drawings that cannot be a machine's: one sentence each, with the place in the file."""
+"""Nominal models that cannot be a machine's: one sentence each, with the place in the file."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def test_an_axis_of_any_length_is_a_direction(tmp_path):
     np.testing.assert_array_equal(values.base_axes()[0], [-1, 0, 0])
 
 
-# Drawings that pass these checks and still cannot be assembled
+# nominal models that pass these checks and still cannot be assembled
 
 SHORT = [("constant: 0.415", "constant: 0.1")] * 2
 UNASSEMBLED = (

@@ -1,4 +1,4 @@
-"""The edges' and the lines' noise as the data show it, and what edges that err alike count for."""
+"""Noise of edges and lines estimated from the data, and the effect of correlated edges."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ LINE = 0.05
 
 
 def alike(rng, line, normal):
-    """Draws of unit variance (B, n) that edges with normals (B, n, 3) of a line have alike where
-    these are near."""
+    """Correlated draws of unit variance (B, n) for edges with normals (B, n, 3) of a line, by the
+    distance of their normals.
+    """
     out = np.zeros(normal.shape[:2])
     for run, number in np.ndindex(len(normal), line.max() + 1):
         mine = np.flatnonzero(line == number)
@@ -44,8 +45,9 @@ def alike(rng, line, normal):
 
 
 def shaded(rng, own, runs=8, configurations=8, n_stations=2, tilt=0.0, reach=1.0):
-    """A scene whose edges are shaded line by line, and each by ``own`` px beside, alike where
-    normals are near; and tilted, by ``tilt`` standard deviations alike in the same way."""
+    """Scene whose edges have shading common to their line, and ``own`` px each, correlated by the
+    distance of normals; and tilts with ``tilt`` standard deviations, correlated in the same way.
+    """
     scene = make_scene(rng, runs, configurations, n_stations, reach=reach)
     line = np.unique(scene.index[[0, 2, 3, 4]], axis=1, return_inverse=True)[1].ravel()
     shift = (LINE * rng.normal(size=(runs, line.max() + 1)))[:, line]
@@ -71,7 +73,7 @@ def off(result, truth):
     "factor", [0.8, *(pytest.param(factor, marks=pytest.mark.slow) for factor in (1.0, 3.0))]
 )
 def test_scale_and_shading_are_found(factor):
-    """Of noise that is stated a quarter too large or three times too small, beside shading."""
+    """Stated noise a quarter too large or three times too small, with shading."""
     rng = np.random.default_rng(4)
     assembled, truth = shaded(rng, 0.15).batch(rng)
     data = assembled.problem.data
@@ -107,7 +109,7 @@ def test_heavy_tails_are_found_and_deviations_hold():
 
 
 def test_the_same_edge_many_times_tells_its_shading_once():
-    """Of each edge eight times, each has eight times the variance of what it is shaded by."""
+    """Eight copies of each edge, each with eight times the variance of its shading."""
     rng = np.random.default_rng(10)
     scene = shaded(rng, 0.1, runs=1)
     one = scene.measurements(rng)
@@ -163,7 +165,7 @@ def test_a_crowd_is_the_sum_over_its_line():
 
 
 def test_what_edges_have_in_common_is_in_the_covariance():
-    """Against the whole covariance of all edges' errors, told edge by edge."""
+    """Against the full covariance of all edges' errors, edge by edge."""
     rng = np.random.default_rng(12)
     scene = shaded(rng, 0.15, runs=1, configurations=5)
     measurements = scene.measurements(rng)
@@ -198,7 +200,7 @@ def test_what_edges_have_in_common_is_in_the_covariance():
         for tilts in [across.T @ (near - np.eye(n)) @ across]
     }
     value = covariance_of_correlated(info)[0] - inverse
-    # one number is free, how alike tilts are
+    # one parameter is free, the correlation of tilts
     part = np.sum((value - shifted[0]) * (shifted[1] - shifted[0])) / np.sum(
         (shifted[1] - shifted[0]) ** 2
     )
@@ -240,7 +242,7 @@ def integrated(shift, covariance, sigma, least):
 
 @pytest.mark.parametrize(("told", "n"), [(0.01, 60), (0.3, 5)])
 def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
-    """Near the true one where the data tell it; where they hardly do, well above the least."""
+    """Near the true value if the data determine it; if hardly, well above the least."""
     monkeypatch.setattr(line_shading, "SHADING_FREEDOM", 1e9)
     rng = np.random.default_rng(14)
     true = rng.normal(0, 0.1, n)

@@ -1,4 +1,4 @@
-"""The error family: what a message says, and what a program gets."""
+"""The error family: content of messages, and their form for programs."""
 
 import json
 import pickle

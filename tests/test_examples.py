@@ -65,7 +65,7 @@ def test_a_calibration_is_held_beside_its_truth(demo):
 
 
 def test_a_drawing_that_cannot_take_the_readings_has_no_figures(demo, tmp_path):
-    """Of the machine's pose; NaN is for programs."""
+    """Outside the machine's pose; NaN for programs."""
     session = shutil.copytree(demo.session, tmp_path / "session")
     path = session / "mechanism.yaml"
     path.write_text(path.read_text().replace("[0.2693, 0.02,", "[0.9, 0.02,"))
@@ -101,7 +101,7 @@ BOOK = json.loads((EXAMPLES / "calibration.ipynb").read_text(encoding="utf-8"))
 
 
 def text_of(source) -> str:
-    """Of a notebook's strings, which may be lists of lines."""
+    """Text of a notebook's strings, which may be lists of lines."""
     return "".join(source)
 
 
@@ -119,8 +119,8 @@ def test_the_notebook_is_small_and_names_no_place_of_one_computer():
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_plans")
 def test_the_notebook_runs(tmp_path, monkeypatch):
-    """Its cells one after the other, as Jupyter would, on smaller photographs; what they show is
-    not compared to the digit, for that differs from one computer to the next.
+    """The notebook's cells in order, as Jupyter would run them, on smaller images; outputs are not
+    compared to the digit, as they differ between computers.
     """
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")

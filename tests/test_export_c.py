@@ -94,7 +94,7 @@ def inverse(c, T):
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
-    """A catalogue machine's library, off its drawing, compiled once."""
+    """Library of a catalogue machine with errors, compiled once."""
     if COMPILER is None:
         pytest.skip("NO C COMPILER (gcc or cc): the exported C source is not tested")
     reference_values = {}
@@ -281,7 +281,9 @@ def test_controllers_compilers_take_the_source(name, tmp_path):
 
 @needs_compiler
 def test_the_files_of_the_repository_compile_as_they_stand(tmp_path):
-    """They are a built-in machine's export, so that the C is read and compiled where it lies."""
+    """The examples are a built-in machine's export, so that the C is read and compiled in its
+    place.
+    """
     program = tmp_path / "selftest"
     flags = [flag for flag in FLAGS if flag not in ("-shared", "-fPIC")]
     sources = sorted(C_SOURCE_FOLDER.glob("*.c"))

@@ -1,4 +1,6 @@
-"""Settings of firmwares: ideal deltas recovered, others told how far off, programs' formulas."""
+"""Settings of firmwares: ideal deltas are recovered, errors of others reported, formulas of
+programs.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +115,7 @@ def test_a_machine_off_its_drawing_is_followed_as_far_as_said(name, to):
     difference = made.differences[0]
     assert "off by" in made.notes[0].text
     assert not difference.beyond
-    # what is said is what happens, not a multiple of it
+    # the stated error is the actual one, not a multiple of it
     assert difference.largest > 0.9 * (difference.limit - 2e-6) / 1.02
     drawn = make_export(source_of(load_mechanism(name)), to)
     assert drawn.differences[0].largest < 5e-5
@@ -151,7 +153,7 @@ def klipper_config(text):
 
 
 def test_the_print_radius_is_the_printers_own(tmp_path):
-    """Of the reachable radius, 162 mm of this machine's, nothing stands in any file."""
+    """The reachable radius, 162 mm for this machine, is in no file."""
     machine = load_mechanism("linear-delta")
     g = exporters()["reprap"].files(source_of(machine))["pkmcal_delta.g"]
     assert "665B" not in reprap.read_words(g)

@@ -126,7 +126,7 @@ def ran(folder, machine, **orders):
     (folder / "orders.json").write_text(json.dumps(orders))
     own = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "PYTHONPATH")}
     own |= {"HOME": str(folder), "RTAPI_FIFO_PATH": str(folder / "fifo")}
-    if os.getuid() == 0:  # LinuxCNC asks for another user
+    if os.getuid() == 0:  # LinuxCNC needs another user
         own["RTAPI_UID"] = "65534"
         for above in (folder, *folder.parents[: len(folder.parents) - 2]):
             above.chmod(above.stat().st_mode | 0o055)
@@ -237,7 +237,7 @@ def test_linuxcnc_homes_without_a_move_and_is_right_at_thirty_poses(name, tmp_pa
     hal = files.get("pkmcal_kinematics.hal", "")
     legs = [int(leg) - 1 for leg in re.findall(r"Motor \d is leg \d, joint (\d)", hal)]
     joints = joints_of(ini, readings[:, legs] if legs else readings)
-    # LinuxCNC's linear delta follows the drawing's machine to 0.035 mm
+    # LinuxCNC's linear delta follows the nominal machine to 0.035 mm
     limit = 0.1 if name == "linear delta" else JOINT_AGREEMENT
     assert len(answer["poses"]) == 30
     np.testing.assert_allclose(answer["poses"], joints, atol=limit, rtol=0)
@@ -358,7 +358,7 @@ def compiled_module(machine, folder):
 
 
 def turned_home(name):
-    """A machine whose home is turned about z, as no coordinate of its platform can say."""
+    """Machine whose home is turned about z, which no coordinate of its platform can represent."""
     machine = load_mechanism(name)
     home = machine.document.home.model_copy(update={"rotation_vector": (0.0, 0.0, 0.1)})
     return machine_from_document(machine.document.model_copy(update={"home": home}))

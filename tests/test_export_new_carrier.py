@@ -1,7 +1,7 @@
-"""A carrier that no export knows, one Python file: C and MuJoCo are made of what it says of itself.
+"""A carrier that no export knows, in one Python file: C and MuJoCo follow from its members.
 
-Its module stands in a temporary folder and is named in the environment, as a user's own would be;
-so the commands run as programs of their own.
+Its module is in a temporary folder and is named in the environment, as a user's own would be; so
+the commands run as programs of their own.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""URDF and SDF: read by others, and again by ourselves; what they say that they cannot hold."""
+"""URDF and SDF: read by other programs, and again by pkmcal; statements of what they
+cannot hold.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,7 @@ def solved(model, machine):
 
 
 def in_mujoco(text):
-    """A URDF in MuJoCo, which wants masses and so is told to take some."""
+    """A URDF in MuJoCo, which needs masses and therefore gets some."""
     mujoco = pytest.importorskip("mujoco", reason=LOUD)
     retained = '<compiler fusestatic="false" boundmass="0.001" boundinertia="0.001" />'
     text = re.sub(r"(<robot [^>]*>)", rf"\1<mujoco>{retained}</mujoco>", text, count=1)
@@ -116,7 +118,9 @@ def test_home_stands_in_the_loops_file(name):
 
 
 def test_a_urdf_is_one_a_robot_state_publisher_takes():
-    """One root, every link held once, and of each type what the specification asks for."""
+    """One root, each link held once, and the elements that the specification requires for each
+    type.
+    """
     _, files, _ = exported("h4", "urdf")
     root = fromstring(files["h4.urdf"])
     links = [node.attrib["name"] for node in root.findall("link")]
@@ -221,7 +225,7 @@ def test_an_sdf_closes_by_screws(name):
                 own = own @ expm(value * screw)
             if node.get("type") != "ball":
                 assert np.abs(own - child).max() < CLOSED
-    # readings as the text tells them are those of these poses
+    # the readings in the text are those of these poses
     readings = source.machine.inverse(poses)
     for k, items in enumerate(drawn.readings):
         home, scale = float(items["home"]), float(items["scale"])
@@ -231,7 +235,7 @@ def test_an_sdf_closes_by_screws(name):
 
 
 def test_an_sdf_declares_the_lowest_version_that_has_what_it_uses():
-    """By SDFormat's list of changes; readers refuse models of later versions than they know."""
+    """By SDFormat's list of changes; readers refuse models of later versions than their own."""
     first = {"relative_to": "1.7", "attached_to": "1.7", "expressed_in": "1.7", "mimic": "1.11"}
     later = {"rotation_format", "degrees", "merge", "placement_frame"}  # of 1.8 and later
     actual_names = set()
@@ -363,7 +367,7 @@ def test_roll_pitch_yaw_is_the_rotation(straight):
     rng = np.random.default_rng(3)
     for _ in range(50):
         rot = rotation(3 * rng.normal(size=3))
-        if straight:  # straight up or down: yaw and roll cannot be told apart
+        if straight:  # straight up or down: yaw and roll cannot be separated
             angles = rng.uniform(-3, 3, 3)
             angles[1] = rng.choice([-1, 1]) * np.pi / 2
             rot = from_roll_pitch_yaw(angles)

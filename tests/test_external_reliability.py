@@ -1,4 +1,4 @@
-"""What wrong edges that go unnoticed add to the deviations."""
+"""Contribution of undetected wrong edges to the standard deviations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from test_identify_scene import make_scene
 
 
 def by_hand(rng, wrong, photographs=8, in_view=0.6, runs=1):
-    """A scene of two photographs a configuration, each from its own place."""
+    """Scene of two images of each configuration, each from its own place."""
     scene = shaded(rng, 0.1, runs, photographs // 2, photographs)
     station, configuration = scene.index[:2]
     keep = (configuration == station // 2) & (rng.random(len(station)) < in_view)
@@ -42,14 +42,14 @@ def on_tripods(rng, wrong, runs=1, own=0.3):
 
 
 def with_wrong(rng, scene, share):
-    """A share of all edges anywhere within the reach of a look."""
+    """A share of all edges anywhere within the reach of a measurement pass."""
     off = rng.uniform(-WRONG_EDGE_REACH, WRONG_EDGE_REACH, scene.shading.shape)
     wrong = rng.random(scene.shading.shape) < share
     return replace(scene, shading=np.where(wrong, off, scene.shading))
 
 
 def edge_by_edge(assembled, result, run):
-    """The same by all rows of all unknowns at once, from the module's formulas."""
+    """Reference with all rows of all unknowns at once, from the module's formulas."""
     info, at = result.info, assembled.places.edges
     linear, data = info.linear, info.problem.data
     n_configurations, n_rows, na = linear.by_shared.shape[1:]

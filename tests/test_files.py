@@ -1,4 +1,4 @@
-"""YAML files and schemas: lines kept, every fault told."""
+"""YAML files and schemas: lines kept, every fault reported."""
 
 import math
 from pathlib import Path

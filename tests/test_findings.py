@@ -114,7 +114,9 @@ STARTS = {"initial_guess", "_tracker_starts"}
 
 
 def test_no_failure_is_dropped():
-    """What catches an error of ours raises again, or uses it: for a finding, a reason, a page."""
+    """Each handler of a pkmcal error raises again, or uses the error: for a finding, a reason, a
+    page.
+    """
     for folder in ("calibration", "check", "judge"):
         for path in (SOURCE / folder).rglob("*.py"):
             tree = ast.parse(path.read_text(encoding="utf-8"))

@@ -12,7 +12,7 @@ from pkmcal.mechanisms.follower import POSES_BETWEEN_SQUARINGS, rods_of
 from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR
 
 SLOW = {"3-rps", "3-upu", "four-belt", "h4-rods"}
-"""Axes' equations, a hinge, more rows than freedoms: for these the search is asked."""
+"""Machines with axes' equations, a hinge, or more rods than degrees of freedom use the search."""
 
 
 def path(machine, count, size=0.02):
@@ -44,7 +44,7 @@ def test_a_path_is_followed(name):
 
 
 def test_one_of_other_values_and_another_start():
-    """A calibrated machine's values, not the drawing's; started where it stands."""
+    """With a calibrated machine's values, not the nominal ones; started at its pose."""
     drawing = load_mechanism("gough-stewart")
     rng = np.random.default_rng(0)
     values = drawing.values + drawing.parameters.tolerance * rng.normal(size=drawing.values.size)

@@ -39,7 +39,7 @@ JOINT_NOISE = 3e-6
 
 @dataclass(frozen=True)
 class Scene:
-    """The drawing, the true machine, all true unknowns, and what was measured of them."""
+    """Nominal model, true machine, all true unknowns, and their measurements."""
 
     drawing: Machine
     truth: State
@@ -56,8 +56,11 @@ class Scene:
 
 
 def true_machine(drawing: Machine, rng, size: float = 1.0, parallel: bool = True) -> Machine:
-    """Errors of ``size`` tolerances on all but the radii. ``parallel`` : both axes of a
-    universal-universal leg turn alike, so that the machine translates."""
+    """Errors of ``size`` tolerances on all but the radii.
+
+    parallel : both axes of a universal-universal leg are rotated equally, so that the machine
+    translates.
+    """
     table = drawing.parameters
     free = table.free_matrix()
     z = size * table.tolerances_free() * rng.normal(size=free.shape[1])
@@ -70,7 +73,7 @@ def true_machine(drawing: Machine, rng, size: float = 1.0, parallel: bool = True
 
 
 def stations(machine: Machine, n: int, distance: float = 0.9) -> np.ndarray:
-    """Cameras on a circle that look at the machine from above."""
+    """Cameras on a circle, directed at the machine from above."""
     middle = 0.5 * machine.home()[:3, 3] + np.array([0, 0, 0.05])
     angles = 0.3 + np.arange(n) * 2 * np.pi / n
     places = distance * np.stack([np.cos(angles), np.sin(angles), 0.7 + 0 * angles], axis=-1)
@@ -90,9 +93,11 @@ def readings_of(machine: Machine, rng, n: int) -> tuple[np.ndarray, np.ndarray]:
 def make_scene(
     name, rng, configurations=12, n_stations=3, shared=True, joints=None, **errors
 ) -> Scene:
-    """``shared`` : all stations photograph every configuration, else each its own."""
+    """Images of the session; shared : all stations have images of every configuration, else each
+    its own.
+    """
     drawing = name if isinstance(name, Machine) else load_mechanism(name)
-    # the four steps know no scales
+    # the four steps have no scales
     drawing = machine_from_document(with_exact_scales(drawing.document))
     machine = true_machine(drawing, rng, **errors)
     if joints is None:
@@ -204,7 +209,9 @@ def test_three_upu():
 
 
 def test_three_upu_whose_platform_turns():
-    """Axes that are not parallel turn the platform a little, and without noise that tells all."""
+    """Axes that are not parallel rotate the platform a little, and without noise that determines
+    all.
+    """
     scene = make_scene("3-upu", np.random.default_rng(5), 40, parallel=False)
     assert_same(four_step(scene.drawing, scene.measurements), scene.truth, atol=1e-6)
 
@@ -306,7 +313,7 @@ def test_a_planar_machine_whose_legs_and_frames_stand_at_different_heights(tmp_p
 
 
 def test_a_machine_that_translates(tmp_path):
-    """Motion by definition: each photograph may then show a single leg."""
+    """Motion by definition: each image may then have a single leg."""
     drawing = variant("3-upu", tmp_path, ("motion: spatial", "motion: translation"))
     scene = make_scene(drawing, np.random.default_rng(8), 24)
     assert_same(four_step(scene.drawing, scene.measurements), scene.truth)
@@ -318,7 +325,9 @@ def test_a_machine_that_translates(tmp_path):
 
 
 def test_stations_that_see_two_legs_of_a_planar_machine():
-    """Two centres and the plane's normal fix a planar station; its side is told by the drawing."""
+    """Two centres and the plane's normal determine a planar station; the nominal model determines
+    its side.
+    """
     scene = make_scene("3-rpr", np.random.default_rng(9), 24)
     edges = scene.measurements.edges
     for hidden in ([0, 1, 2], [2, 0, 1]):
@@ -375,7 +384,9 @@ def test_given_poses_join_stations_that_share_no_legs():
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_the_bundle_starts_from_the_steps(name):
-    """With noise the steps are a start: better than a drawing gone astray, and not NaN."""
+    """With noise the steps are a start: better than a nominal model with large errors,
+    and not NaN.
+    """
     rng = np.random.default_rng(13)
     scene = make_scene(name, rng, 24)
     measurements = noisy(scene.measurements, rng)

@@ -126,7 +126,7 @@ def test_legs_that_are_never_seen_together(hexapod):
 
 
 def test_photographs_of_one_configuration_by_several_stations_are_at_once(hexapod):
-    """The printed form, which looks at each photograph alone, refuses what the corrected takes."""
+    """The printed form, which uses each image alone, refuses what the corrected form accepts."""
     rng = np.random.default_rng(3)
     scene = make_scene("gough-stewart", rng, 24)
     keep = seen_by(scene, THREE_BY_TWO)
@@ -160,7 +160,7 @@ def test_lengths_that_the_distances_do_not_tell():
     """A platform that only shifts with parallel legs: a common length is free (errata)."""
     scene = make_scene("constant-legs", np.random.default_rng(6), 12)
     legs = legs_as_drawn(scene.drawing)
-    # a parallelogram: all legs alike in every configuration, platform and base congruent
+    # a parallelogram: all legs parallel in every configuration, platform and base congruent
     rng = np.random.default_rng(7)
     u = np.array([0.0, 0, 1]) + 0.3 * rng.normal(size=(12, 3))
     u = u / np.linalg.norm(u, axis=-1, keepdims=True)

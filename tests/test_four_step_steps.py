@@ -122,7 +122,7 @@ def test_normal_of_a_plane_from_all_legs_together():
 
 
 def base_views(rng, in_view, directions_visible, noise=0.0):
-    """Items of views with every third direction told with the other sign, and the truth."""
+    """Items of views with every third direction of the other sign, and the truth."""
     n_views, n = in_view.shape
     d = directions_visible.shape[1]
     drawn = rng.normal(size=(n, 3))
@@ -208,7 +208,7 @@ def test_products_leave_the_depth_of_coplanar_centres_open_and_axes_close_it():
 
 
 def test_one_sign_over_all_views():
-    """Errata, A 9: unturned, an axis told with either sign spoils the registration."""
+    """Errata, A 9: without a common sign, an axis with either sign biases the registration."""
     rng = np.random.default_rng(8)
     items, T, _, directions = base_views(rng, np.ones((3, 4), dtype=bool), np.ones((3, 2), bool))
     turned = (T[:, :, None, :3, :3] @ directions[:, None, :, :, None])[..., 0]
@@ -320,8 +320,10 @@ def constant_legs(rng):
 
 
 def test_constant_lengths_and_their_false_minimum():
-    """[A] 14 with q = 0: the drawing's length leads to the true one. Both struts at length zero
-    fit the distance between them exactly, wherever the legs go (errata)."""
+    """[A] 14 with q = 0: the nominal length leads to the true one.
+
+    Both struts at length zero fit the distance between them exactly, wherever the legs go (errata).
+    """
     machine, axes, a = constant_legs(np.random.default_rng(13))
     rod = machine.layout.rod
     start = machine.parameters.drawing[rod]
@@ -336,7 +338,7 @@ def test_constant_lengths_and_their_false_minimum():
 
 
 def test_printed_differences_collapse_on_a_smooth_path():
-    """Errata, A 14: consecutive differences are all noise where neighbours are alike."""
+    """Errata, A 14: consecutive differences are all noise if neighbours are similar."""
     rng = np.random.default_rng(14)
     axes, base, body, _, q0 = body_axes(rng, runs=40, photos=60)
     step = np.linspace(0, 1, 60)[None, :, None]
@@ -472,7 +474,7 @@ def universal_legs(rng, turn, runs=2, photos=30, legs=3):
 
 
 def test_universal_axes_of_a_platform_that_turns():
-    """All four freedoms of each leg, from a drawing 5 mrad off."""
+    """All four degrees of freedom of each leg, from a nominal model with errors of 5 mrad."""
     rng = np.random.default_rng(20)
     v, w, rot, u = universal_legs(rng, 0.5)
     drawn = tuple(unit(a + 5e-3 * rng.normal(size=a.shape)) for a in (v, w))
@@ -483,7 +485,7 @@ def test_universal_axes_of_a_platform_that_turns():
 
 
 def test_universal_axes_of_a_platform_that_does_not_turn():
-    """v = v': the difference is found, the common turn is the drawing's to the last digit."""
+    """v = v': the difference is estimated, the common rotation is nominal to the last digit."""
     rng = np.random.default_rng(21)
     v = unit(rng.normal(size=(2, 3, 3)))
     rot = np.broadcast_to(np.eye(3), (2, 30, 3, 3))
@@ -512,7 +514,7 @@ def test_noise_leaves_weak_directions_to_the_drawing():
 
 
 def test_several_photographs_of_one_configuration_count_as_one():
-    """The direction that all see best: each knows it across its line of sight only."""
+    """Weighted mean direction: each station determines it across its line of sight only."""
     rng = np.random.default_rng(23)
     T = random_poses(rng, 1, 2, turn=1.0)
     truth = unit(rng.normal(size=(1, 3, 2, 3)))

@@ -1,7 +1,7 @@
-"""Malformed sessions: each refused in a sentence that says where, or used, and nothing harmed.
+"""Malformed sessions: each refused in a sentence with the place, or used, without harm.
 
-`fuzz` says what is done to them and what is asked of every one; here it is run as a program of its
-own, from which each case is forked with bounds of memory and time.
+`fuzz` has the changes and the rules; here it is run as a program of its own, from which each case
+is forked with bounds of memory and time.
 """
 
 from __future__ import annotations

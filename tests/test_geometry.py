@@ -27,7 +27,7 @@ def test_rotation_vector_round_trip(omega):
     rot = rigid.rotation(omega)
     np.testing.assert_allclose(rot @ rot.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(rot) == pytest.approx(1)
-    # the same turn, told with an angle of at most pi
+    # the same rotation with an angle of at most pi
     back = rigid.rotation_vector(rot)
     assert np.linalg.norm(back) <= np.pi + 1e-12
     np.testing.assert_allclose(rigid.rotation(back), rot, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Grey levels between pixels: as of the whole photograph, though only a part of it is looked at."""
+"""Grey levels between pixels: those of the whole image, though only a part of it is used."""
 
 from __future__ import annotations
 

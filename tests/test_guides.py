@@ -48,7 +48,7 @@ def typed(command: str):
 
 
 def test_a_delta_printer_with_its_probe(workplace):
-    """Every command says what the page shows, figures aside."""
+    """Every command prints what the page shows, figures aside."""
     commands = recipe("A delta printer with its probe")
     assert [command.split()[1] for command, _ in commands] == ["new", "calibrate", "export"]
     for command, display in commands:
@@ -82,8 +82,8 @@ def photograph(board, camera, T_camera_board, rng):
 
 
 def photographed(kit):
-    """What a person adds where the page says so: the camera's file, 25 photographs, and readings as
-    Klipper tells them.
+    """A user's part of the recipe: the camera's file, 25 images, and readings as Klipper prints
+    them.
     """
     rng = np.random.default_rng(1)
     (kit / "cameras" / "front.yaml").write_text(yaml_text(CAMERA))
@@ -93,7 +93,7 @@ def photographed(kit):
     middle = np.array([0.0, 0.0, 0.1])
     T = pose(np.eye(3), np.stack([r * np.cos(a), r * np.sin(a), rng.uniform(0.02, 0.18, 25)], 1))
     T_camera_base = look_at(middle + np.array([0.2, -0.25, 0.22]), middle, np.array([0, 0, 1.0]))
-    # leaning from the line of sight: seen straight on, a board hardly tells its tilt
+    # tilted from the line of sight: seen from straight ahead, a board hardly determines its tilt
     facing = inverse(T_camera_base)[:3, :3] @ rotation(np.array([0.4, -0.35, 0.1]))
     T_platform_board = pose(facing, [0.0, 0.0, 0.02] - facing @ board.points.mean(axis=0))
     T_camera_board = T_camera_base @ T @ T_platform_board

@@ -176,7 +176,7 @@ def test_rods_that_differ_tilt_the_nacelle():
     fk = machine.forward_result(readings)
     assert fk.converged.all()
     np.testing.assert_allclose(fk.T_base_platform, poses, atol=1e-10)
-    # a pose that the rods do not allow is moved, and told as not theirs
+    # a pose that the rods do not allow is retracted, and reported as such
     assert (
         not kinematics.forward(
             machine.layout, machine.values, machine.inverse(papers_poses()), papers_poses()
@@ -246,7 +246,7 @@ def test_closure_derivatives_of_the_rods():
 def rank(columns):
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     s = np.linalg.svd(columns, compute_uv=False)
-    assert not ((s < 1e-6 * s[0]) & (s > 1e-11 * s[0])).any(), s  # no doubtful value
+    assert not ((s < 1e-6 * s[0]) & (s > 1e-11 * s[0])).any(), s  # no uncertain value
     return int(np.sum(s > 1e-6 * s[0]))
 
 
@@ -290,7 +290,7 @@ def test_what_the_rods_can_tell():
     assert values.n_frames == 12 + 4
     assert values.rank == 66
     assert values.unidentified == ()
-    # as well or better known than a 1 mm, 2 degree drawing; errata has about 59 with the frames
+    # as well or better than a 1 mm, 2 degree nominal model; errata has about 59 with the frames
     assert 50 <= values.rank - len(values.weak) + 12 <= 66
 
 
@@ -338,7 +338,7 @@ def test_the_right_model_is_as_good_as_noise_allows(model, truth, position):
 
 
 def test_model_12_is_too_poor_for_a_model_31_machine():
-    """Errata: 0.25 mm and 2.8 mrad, and chi2 says so in every run."""
+    """Errata: 0.25 mm and 2.8 mrad, and chi2 rejects them in every run."""
     fits = several(model_31, design(), 8)
     errors = rms([score(e, t, np.random.default_rng(1)) for t, _, e in fits])
     assert 0.15e-3 < errors[0] < 0.5e-3
@@ -364,7 +364,7 @@ def test_truth_is_found_without_noise():
     ):
         case = papers_case(truth, rng, noise=1e-5)
         value = estimated(load_mechanism("h4", model=model), case, rng, use_drawing=True)
-        # the drawing pulls where the data are weak, by as little as they let it
+        # the prior biases weak directions, by as little as the data let it
         assert score(value, truth, rng)[0] < 2e-5
         camera = value.state.T_camera_base[0] @ case.poses @ value.state.T_mount[0]
         assert np.abs(camera - T_CAMERA_BASE @ case.poses @ T_PLATFORM_BOARD).max() < 0.2
@@ -379,8 +379,8 @@ def test_steps_are_few():
 
 
 def test_a_board_does_not_drift_away_along_the_axis():
-    """Of a machine that hardly tilts, nothing but that tilt tells how high its board sits: with the
-    drawing six of its tolerances off, it once was found at 31 m.
+    """On a machine that hardly tilts, only that tilt determines the height of its board: with the
+    nominal model six tolerances off, it once was estimated at 31 m.
     """
     rng = np.random.default_rng(5)
     case = papers_case(model_31(rng, 5e-3, 1e-2), rng)
@@ -392,7 +392,7 @@ def test_a_board_does_not_drift_away_along_the_axis():
 
 
 def test_where_a_board_sits_is_no_knowledge_of_the_machine():
-    """What is known of the board's height beforehand is not counted as told of the machine."""
+    """The prior of the board's height is not counted as information on the machine."""
     rng = np.random.default_rng(1)
     machine = load_mechanism("h4", model="calibration")
     case = papers_case(model_31(rng), rng)

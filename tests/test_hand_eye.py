@@ -87,7 +87,7 @@ def off(state, poses):
 @pytest.mark.parametrize("name", MACHINES)
 @pytest.mark.parametrize("seed", range(3))
 def test_every_machine_with_a_drawing_2_mm_and_2_degrees_off(name, seed):
-    """Prediction as good as the drawing allows; a wrong branch would be off by a radian."""
+    """Prediction as good as the nominal model allows; a wrong branch would be off by a radian."""
     rng = np.random.default_rng(seed)
     drawing = exact(name)
     truth = true_machine(drawing, rng)
@@ -129,7 +129,7 @@ def test_what_the_motion_does_not_tell_stays_zero():
     assert abs(one_axis.T_mount[0, 2, 3]) < 1e-9
     np.testing.assert_allclose(one_axis.T_mount[0, :2, 3], mount[:2, 3], atol=1e-4)
     for pair in (still, one_axis):
-        # the turns are told in full, by the positions
+        # the rotations are fully determined, by the positions
         np.testing.assert_allclose(pair.T_camera_base[0, :3, :3], camera[:3, :3], atol=2e-3)
 
 
