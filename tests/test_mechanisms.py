@@ -54,7 +54,7 @@ def test_catalogue_machines_can_be_assembled(machine):
 
 
 def test_catalogue_tubes_are_as_long_as_the_legs(machine):
-    """A leg that an edge is looked for on is there over the whole range of its length."""
+    """A leg whose edges are measured exists over the whole range of its length."""
     for leg in machine.document.legs:
         for tube in leg.tubes:
             assert tube.radius < 0.1
@@ -94,7 +94,7 @@ def built(machine, steps):
 
 
 def at_path(document, name):
-    """What stands in a file's fields at a parameter's name, by the rule of docs/files.md."""
+    """Value of a file's fields at a parameter's name, by the rule of docs/files.md."""
     node = document
     for key, number in re.findall(r"([a-z]+)|\[(\d+)\]", name):
         if number:

@@ -78,7 +78,7 @@ def test_the_simulated_machines():
 
 
 def test_rods_alone_tilt_the_nacelle():
-    """With rods alike the model with rods is a machine of four freedoms."""
+    """With equal rods the model with rods is a machine of four degrees of freedom."""
     tilt = []
     for rods in (0.0, 3e-4):
         setting = H4ByBoard(deviations=Deviations(rods=rods))
@@ -145,7 +145,7 @@ def test_noise_twice_as_large_is_not_a_reproduction():
 
 
 def test_better_methods_are_better(short):
-    """As printed, whitened, joint: and the last is not better than the bound says."""
+    """As printed, whitened, joint: and the last is not better than the bound."""
     for kind, printed in (("design", EQ3_AS_PRINTED), ("calibration", EQ5_AS_PRINTED)):
         a = {
             m: short.of(kind, kind, m)["shift"].value

@@ -35,7 +35,7 @@ LONGEST = 500
 
 @pytest.fixture(scope="module")
 def result(demo, calibrated) -> pkmcal.api.calibrate.CalibrationResult:
-    """What Python gives of the calibration that these tests share."""
+    """Python's result of the calibration that these tests share."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pkmcal.api.calibrate.run", lambda *_, **_more: calibrated)
         return pkmcal.calibrate(demo.session)

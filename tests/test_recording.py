@@ -18,8 +18,8 @@ from pkmcal.report.recording import RECORDED_GREY, VIEWER_PIXEL_CORNER, recorded
 
 LOUD = "NO RERUN: recordings were not written and read by it (pip install '.[rerun]')"
 NEAR, MIDDLE = 1.0, 0.15
-"""px, of any edge and of the middle one: shading moves single edges by half a pixel, most by less
-than 0.1. A picture's corner taken for a pixel's centre moves all of them by 0.35 and more."""
+"""px, of any edge and of the median one: shading moves single edges by half a pixel, most by less
+than 0.1. An image's corner taken for a pixel's centre moves all of them by 0.35 and more."""
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def entries(calibrated):
 
 
 def of(entries, *path, at=None):
-    """What was logged at a path, the newest up to a configuration, as a viewer shows it."""
+    """The newest log entry of a path up to a configuration, as a viewer shows it."""
     results = [e for e in entries if e.path == path and (e.at is None or at is None or e.at <= at)]
     return results[-1]
 
@@ -68,12 +68,12 @@ def test_a_station_without_a_photograph_shows_nothing_of_the_last_one(calibrated
     for name, at in absent:
         for part in ("edges", "aside", "contour"):
             assert of(entries, *image(name, part), at=at).kind == "clear"
-        # black, since rerun's viewer goes on showing coded pictures that were cleared
+        # black, since rerun's viewer continues to show encoded images that were cleared
         assert not decoded(of(entries, *image(name, "photograph"), at=at)).any()
 
 
 def seen(calibrated, entries, name, points):
-    """Places in a picture of points (n, 3), base frame, by the camera's place as it was logged."""
+    """Pixels of points (n, 3), base frame, by the camera's logged pose."""
     (station,) = (s for s in calibrated.session.stations if s.name == name)
     T = of(entries, "machine", "cameras", name).values["T"]
     return station.camera.project(apply(inverse(T), points)) + 0.5
@@ -155,7 +155,7 @@ def test_poses_and_numbers_are_the_calibrations(calibrated, entries):
 
 
 def test_the_drawing_lies_beside_the_machine(calibrated, entries):
-    """Laid over by all joint centres: millimetres off, as the tolerances say, and not elsewhere."""
+    """Fitted by all joint centres: millimetres off, as the tolerances allow, and not elsewhere."""
     new = np.array(of(entries, "machine", "calibrated", at=1).values["strips"])
     old = np.array(of(entries, "machine", "drawing", at=1).values["strips"])
     off = np.linalg.norm(new - old, axis=-1)

@@ -302,7 +302,7 @@ EDITS = [
      ["line 2, board: there is no such file"]),
     ("cameras/front.yaml", "focal: [9.0, 9.0]", "focal: [9.0, -9.0]",
      ["cameras/front.yaml, line 3, focal[2]", "a number above 0"]),
-    # pictures' pattern
+    # pattern of the images
     ("session.yaml", "{configuration}", "0000",
      ["line 7, stations.front.images: the pattern does not say", "'images/front/0000.png'"]),
     ("session.yaml", "{configuration}", "{configration}",

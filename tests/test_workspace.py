@@ -75,7 +75,7 @@ def test_poses_of_readings_in_range_are_inside_and_others_are_not(machine):
 def test_the_reasons_in_words():
     machine = hexapod()
     low = yawed(0, 0.25)
-    length = float(machine.inverse(low)[0])  # all six alike
+    length = float(machine.inverse(low)[0])  # all six equal
     assert machine.reachable(low).why() == tuple(
         f"motor {j} would stand at {length:.4g} m, below its range, which begins at 0.345 m"
         for j in range(1, 7)
