@@ -1,6 +1,6 @@
-"""What a kit gains: deltas half a millimetre off, measured by a webcam or by a probe on the bed.
+"""Gain of a calibration for kits: deltas half a millimetre off, measured by a webcam or a probe.
 
-python tools/kits.py [MACHINES]      tool error before and after, and beside its own deviation
+python tools/kits.py [MACHINES]      tool error before and after, and in its own deviations
 """
 
 from __future__ import annotations

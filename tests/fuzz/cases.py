@@ -99,15 +99,17 @@ TASKS = (
 )  # fmt: skip
 """Most often those that are quick, where most malformed files are refused."""
 FORMATS = ("c", "json", "mujoco", "yaml")
-"""That take every machine."""
+"""Commands that take every machine."""
 ALONE = ("machines/", "cameras/", "printers/")
 """Bases of which a task takes one file only."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What was made. words : the command. out : where it may write. spoilt : (file, how, words of
-    which the message of a refusal should hold one, none where there is no such place).
+    """Case that was made.
+
+    words : the command. out : where it may write. spoilt : (file, how, words of which the message
+    of a refusal should have one, none where there is no such place).
     """
 
     number: int
@@ -121,9 +123,7 @@ class Case:
 
     @property
     def news(self) -> set[tuple[str, str]]:
-        """What one case may try before others: a way of spoiling a kind of file, and a file of a
-        command.
-        """
+        """Novelty of a case: a fault in a kind of file, and a file of a command."""
         actual_names = set()
         for file, how, _ in self.spoilt:
             path = Path(file)
@@ -187,9 +187,9 @@ def make(number: int, bases: Path, place: Path) -> Case:
 def spoil(
     path: Path, bases: Path, place: Path, rng: Random, fresh: bool
 ) -> tuple[str, tuple[str, ...]]:
-    """One fault into one file; returns what it is, and the words that tell where.
+    """Put one fault into one file; returns its name, and the words of its place.
 
-    fresh : whether the file is whole; what is spoilt already can be spoilt as bytes only.
+    fresh : whether the file is whole; a damaged file can be damaged further as bytes only.
     """
     if rng.random() < 0.07:
         return _as_entry(path, place, rng), ()

@@ -4,12 +4,12 @@ The error is e_j = u_j x u*_j of the legs' directions, or e_ij = n_ij x n*_ij of
 normals; measured and wanted (*), camera frame. Its derivative by the platform's twist is N_j =
 -[u*_j]x L_j, where L_j is the direction's interaction matrix, and the motors follow
 
-q' = -gain D N+ e,        D the inverse Jacobian, [B] eq. 6-7.
+    q' = -gain D N+ e,        D the inverse Jacobian, [B] eq. 6-7.
 
 [B] eq. 9 holds for fixed base centres. Here the base's end of a leg depends on its reading as well,
 A_j(q_j), which covers cranks and sliders: with q' = D twist,
 
-du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
+    du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
 
 which is [B] eq. 9 where dA_j / dq_j = 0. Machines with fewer than six degrees of freedom are
 restricted to the twists that they can make. The wanted values are measured as well (the machine was

@@ -98,9 +98,9 @@ class ImplicitProblem:
 
     Jacobian of one pose (own columns are eliminated by the Schur complement):
 
-                     z      stations   mounts  | own (hinges)
-    closure rows   [ X         X         X     |     X       ]
-    deviations     [           X         X     |             ]
+                         z      stations   mounts  | own (hinges)
+        closure rows   [ X         X         X     |     X       ]
+        deviations     [           X         X     |             ]
     """
 
     layout: LimbLayout

@@ -13,10 +13,10 @@ keep their nominal values and prior sigmas.
 
 Rows of the system:
 
-               machine z   stations   edge shifts (cameras, lines)
-edges       [      X           X             X      ]   n.A + R = 0
-priors      [      1                                ]   nominal model
-            [                                1      ]   shifts
+                   machine z   stations   edge shifts (cameras, lines)
+    edges       [      X           X             X      ]   n.A + R = 0
+    priors      [      1                                ]   nominal model
+                [                                1      ]   shifts
 """
 
 from __future__ import annotations

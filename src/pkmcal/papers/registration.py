@@ -48,9 +48,9 @@ class BodyProblem:
 
     Jacobian of frame k (own columns are eliminated by the Schur complement):
 
-                 items   | own (pose k)
-    frame k    [   X     |     X       ]
-    gauge      [   X     |             ]
+                     items   | own (pose k)
+        frame k    [   X     |     X       ]
+        gauge      [   X     |             ]
     """
 
     measured: Array
