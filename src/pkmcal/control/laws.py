@@ -128,10 +128,12 @@ def edge_interaction(
     with J = -(A x n) n^T / (u . (A x n)) and the direction's L; [B] 12-13 differentiated.
     """
     by_a, by_b = moving(view, legs, rates(view, legs) if rate is None else rate)
+    # ends of the legs and their derivatives, camera frame
     T = view.T_camera_base[..., None, :, :]
     a, b = (apply(T, p[..., view.legs, :])[..., None, :] for p in (legs.a, legs.b))
     by_a, by_b = (T[..., :3, :3] @ by for by in (by_a, by_b))
     side_a, side_b = cross(b, normals), cross(normals, a)
+    # [a b n]^T dn = (-n.da, -n.db, 0) by cross products
     with np.errstate(divide="ignore", invalid="ignore"):
         volume = dot(cross(a, b), normals)[..., None, None]
         along_a, along_b = (normals @ by for by in (by_a, by_b))
