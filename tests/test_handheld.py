@@ -221,7 +221,9 @@ def test_the_sensors_picture_is_the_size_of_most(tmp_path):
 
 @pytest.mark.parametrize(("orientation", "quarters"), [(None, 1), (6, -1), (8, 1)])
 def test_a_turned_photograph_is_turned_back(tmp_path, orientation, quarters):
-    """By its EXIF; by default a portrait image of a landscape sensor was turned clockwise."""
+    """Orientation by EXIF; by default a portrait image of a landscape sensor was turned
+    clockwise.
+    """
     portrait = np.rot90(PICTURE, -1)
     exif = None if orientation is None else Exif(orientation, 26.0)
     path = jpeg(tmp_path / "a.jpg", exif, portrait)
@@ -457,8 +459,8 @@ def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
 
 
 def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
-    """Where each edge is its station's only one, no unknown stands for its shading: what a line's
-    edges have in common is as much noise of its own as what they have not.
+    """If each edge is its station's only one, its shading is no unknown: the common part of a
+    line's edges is noise like the rest.
     """
     calibration, _ = breathed
     machine = calibration.session.machine
@@ -540,7 +542,7 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
 
 
 def test_a_board_on_the_base_serves_photographs_by_hand(folder):
-    """Each is from a place of its own, so one entry is many stations."""
+    """Each image has a pose of its own, so one entry is many stations."""
     board = SESSION.replace("observe: legs", "observe: [legs, board]")
     text = board + "board: {file: board.yaml, fixed_to: base}\n"
     (folder / "session.yaml").write_text(text)
@@ -746,7 +748,9 @@ def evidence_there(reference_values, view):
 
 
 def test_photographs_join_what_is_known(looked):
-    """One of the same machine costs the others little; with another's readings it is elsewhere."""
+    """A board of the same machine costs the other images little; with another's readings it does
+    not fit.
+    """
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     places = dict(enumerate(truth.T_camera_base[:2]))

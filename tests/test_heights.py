@@ -1,4 +1,4 @@
-"""Heights of a delta printer's bed: what they are accepted for, and what is refused."""
+"""Heights of a delta printer's bed: accepted and refused results."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def kit(true, tmp_path_factory):
 
 
 def flat(true, values, describe=SAYS):
-    """Heights (n,) mm over places that nobody probed, where a firmware with values commands Z 0."""
+    """Heights (n,) mm at other points, where a firmware with values commands Z 0."""
     rng = np.random.default_rng(9)
     r, a = 90 * np.sqrt(rng.uniform(size=200)), rng.uniform(0, 2 * np.pi, 200)
     points = np.column_stack([r * np.cos(a), r * np.sin(a), np.zeros(200)])
@@ -101,7 +101,7 @@ def test_it_is_accepted_for_the_bed_and_says_what_it_is_not_good_for(kit):
 
 
 def test_what_is_pasted_puts_z_0_on_the_bed(kit, true):
-    """Flat where nobody probed, and neither tilted nor high: as well as the noise lets it be."""
+    """The bed at other points is flat, without tilt and height, within the noise."""
     made = make_export(load_source(kit / "calibration"), "klipper")
     (text,) = made.files.values()
     before, after = flat(true, SAYS), flat(true, pasted(text))
@@ -217,7 +217,7 @@ def session_of(folder, off, n, *, wrong=(), bed=None, noise=0.008):
 
 
 def with_tolerance(kit, centre):
-    """Another tolerance of the towers, mm."""
+    """Set another tolerance of the towers, mm."""
     text = (kit / "mechanism.yaml").read_text()
     other = re.sub(r"center: \S+ mm, offset", f"center: {centre} mm, offset", text)
     assert other != text
@@ -295,7 +295,7 @@ def test_an_uneven_bed_is_no_population_of_outliers(tmp_path):
 
 
 def flat_of_small(off, value):
-    """Heights (n,) mm over the bed of such a printer with what is exported of a result."""
+    """Heights (n,) mm over the bed of such a printer with the exported values of a result."""
     true = printers.machine(replace(SMALL, radius=SMALL.radius + off))
     (text,) = Klipper().files(MachineSource(value.machine, bed=value.findings.bed.z)).values()
     points = np.column_stack([printers.bed(60, 75.0), np.zeros(60)])

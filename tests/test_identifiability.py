@@ -104,7 +104,7 @@ def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():
 
 
 def common_turns(machine):
-    """Both turns of each leg's pair of axes, (P, 6)."""
+    """Both rotations of each leg's pair of axes, (P, 6)."""
     columns = []
     for leg in range(machine.n_legs):
         for turn in np.linalg.svd(machine.base_axes()[leg][None])[2][1:]:
@@ -116,7 +116,7 @@ def common_turns(machine):
 
 
 def test_one_camera_sees_four_legs_of_six():
-    """Readings of all six, and the pose from the four, fix the two that are never seen."""
+    """Readings of all six, and the pose from the four, determine the two without images."""
     machine = hexapod()
     session = Session(machine, stations=1, configurations=20)
     measurements = seen_by(session, [[0, 1, 2, 3]])
@@ -175,7 +175,7 @@ def normalised_steps(machine, state, truth):
 
 
 def measured(machine, poses, T_camera_base, seed=0):
-    """A true machine in given poses, seen from given places; its measurements and state."""
+    """A true machine in given poses, with cameras at given places; its measurements and state."""
     rng = np.random.default_rng(seed)
     true = true_machine(machine, 1.0, rng)
     noise = EdgeNoise(shift=0.1, tilt=0.1)

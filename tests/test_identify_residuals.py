@@ -127,7 +127,7 @@ def test_jacobian_of_edges_that_are_whitened_in_pairs():
 
 
 def test_jacobian_of_stations_whose_focal_lengths_breathe():
-    """Each by an unknown of its own, which its edges alone answer to."""
+    """Outward shift of each edge by an unknown of its own, in its rows only."""
     rng = np.random.default_rng(5)
     scene = make_scene(rng, configurations=3)
     case = scene.measurements(rng)

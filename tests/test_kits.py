@@ -47,7 +47,7 @@ def test_a_board_and_a_webcam_calibrate_a_kit(by_board):
 
 
 def test_the_report_promises_what_is_kept(by_board):
-    """The card about the platform's pose, by the poses and not by joints that nobody saw."""
+    """The card about the platform's pose, by the poses, as no leg was observed."""
     kit, result = by_board
     cards = report_of(result).figures
     questions = [card.question for card in cards]

@@ -1,4 +1,4 @@
-"""Names with control characters: what is printed and what is written stays what it is."""
+"""Names with control characters: spelt out in output and files."""
 
 import json
 import re

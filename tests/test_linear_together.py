@@ -75,7 +75,7 @@ def together(measurements):
 
 @pytest.fixture(scope="module")
 def scenes():
-    """Machines, cameras and tubes off by what is stated of them, each once."""
+    """Machines, cameras and tubes with errors of their stated standard deviations, each once."""
     made = []
     for seed in range(12):
         rng = np.random.default_rng(seed)

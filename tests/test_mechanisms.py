@@ -107,7 +107,7 @@ def at_path(document, name):
 
 
 def test_parameter_names_are_paths_in_the_file(machine):
-    """Each value at its own place, seen by giving every parameter another value."""
+    """Each value is at its own place: every parameter gets another value."""
     unlike = machine.parameters.unit_axes(
         machine.values + 1e-3 * np.arange(1, len(machine.values) + 1)
     )

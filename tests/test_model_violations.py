@@ -236,8 +236,9 @@ def test_right_sessions_have_chances_like_dice():
 
 
 def test_errors_of_whole_configurations_are_no_departure():
-    """One reading of each configuration off by chance, by far more than noise, along what a scale
-    would do: without asking how that scatters over the configurations a scale would be named."""
+    """Random errors of one reading, far larger than its noise, along a scale's column: without the
+    scatter over configurations in the test, a scale would be reported.
+    """
     named = np.zeros(2, dtype=int)
     for seed in range(6):
         drawing, data, where = measured(40 + seed, count=20)

@@ -136,7 +136,7 @@ LEAN = 0.02
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where the carriers' file and the mechanisms are; the carriers are known while it lasts."""
+    """Folder of the carriers' file and the mechanisms; the carriers are registered meanwhile."""
     folder = tmp_path_factory.mktemp("carriers")
     (folder / "my_carriers.py").write_text(CARRIERS)
     sys.path.insert(0, str(folder))
@@ -314,7 +314,7 @@ def test_jacobians_against_complex_steps(machine):
 
 @pytest.fixture(scope="module")
 def calibrated(machine):
-    """Truth of a simulated session of edges, and what the data give."""
+    """Truth of a simulated session of edges, and its estimate."""
     truth, measurements = test_catalogue.simulated(machine, 1, stations=3)
     rough = np.stack([pose.T_camera_base() for pose in truth.rough])
     start = start_state(machine, measurements, rough)

@@ -118,8 +118,9 @@ def test_noise_of_edges_that_poses_take_up_is_not_that_of_readings():
 
 @pytest.mark.parametrize(("true", "stated"), [(3e-6, 3e-3), (3e-4, 3e-6), (3e-4, 3e-2)])
 def test_a_noise_that_is_stated_wrong_is_found(true, stated):
-    """By a hundred or a thousand, either way: estimates are as good as with the right one, and as
-    honest, and edges are not blamed."""
+    """Stated noise wrong by a hundred or a thousand, either way: estimates are as accurate and as
+    honest as with the right one, and edges are not reported.
+    """
     problem, truth = batch(2, true, stated)
     right = replace(problem, joint_noise=np.array([true]))
     value, best = (solve_batch(p, truth) for p in (problem, right))

@@ -75,7 +75,7 @@ def meet(tube, T_camera_base, rays):
 
 
 def light_on(tubes, T_camera_base, rays, background):
-    """Light (...) seen along rays (N, 3) and the leg that it comes from, -1 for none."""
+    """Light (...) along rays (N, 3) and the leg that it comes from, -1 for none."""
     level, leg = np.array(background, dtype=float), np.full(len(rays), -1)
     nearest = np.full(len(rays), np.inf)
     lamp = T_camera_base[:3, :3] @ LAMP
@@ -183,7 +183,7 @@ def true_normals(legs, tubes, sides, configurations):
 
 
 def outward_to(normal, pixel, outward, camera):
-    """How far along ``outward`` (px) from a pixel the plane n . x = 0 is met, by secants.
+    """Distance along ``outward`` (px) from a pixel to the plane n . x = 0, by secants.
 
     normal : (..., 3) against pixel and outward (..., n, 2).
     """

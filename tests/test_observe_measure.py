@@ -88,8 +88,8 @@ def test_edges_are_measured_to_hundredths_of_a_pixel(seed, spread):
 
 
 def test_profiles_are_one_a_pixel_of_what_is_clear():
-    """Each segment's mean is that of profiles taken one by one; an end of an edge that has no image
-    makes the rest no poorer.
+    """Each segment's mean is that of profiles taken one by one; an end of an edge outside the image
+    does not affect the rest.
     """
     mechanism, camera = redrawn(0, 0.0005), camera_of()
     visible = PhotographWindow.of([Placed(taken(), FRONT, poses())])
@@ -217,7 +217,9 @@ def fitted(position, sigma=0.1, value=None):
 
 
 def positions_of(mechanism):
-    """Where a mechanism's edges cross the outward lines of the predicted points, (K, E, n) px."""
+    """Intersections of a mechanism's edges with the outward lines of the predicted points,
+    (K, E, n) px.
+    """
     tubes, points = predicted()
     legs = legs_in_camera(mechanism, FRONT, poses(), machine().inverse(poses()))
     normal = edge_points(mechanism, camera_of(), legs, tubes, 2).normal

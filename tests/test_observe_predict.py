@@ -203,7 +203,9 @@ def test_obstructed_points_are_those_behind_or_beside_other_legs(clearance):
 
 
 def test_a_leg_before_another_is_clear_where_it_crosses():
-    """The nearer leg's edges are seen against the middle of the other; the other's are hidden."""
+    """The nearer leg's edges are visible in front of the middle of the other; the other's are
+    hidden.
+    """
     legs, tubes, points = predicted()
     clear = unobstructed(machine(), camera_of(), legs, tubes, points, 0.0)
     before, behind = 0, 0

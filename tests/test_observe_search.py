@@ -175,7 +175,7 @@ def inconsistent_poses(T_camera_base):
 
 
 def often(*values):
-    """One more draw of what others prove already: a search of a second or more."""
+    """Another draw of a test above: a search of a second or more."""
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
@@ -206,7 +206,7 @@ def test_the_station_is_found_from_ten_degrees_and_ten_centimetres_or_from_nothi
 
 @pytest.mark.parametrize("turn", [often(90), often(180), 270])
 def test_turned_photographs_are_found_from_nothing(turn):
-    """By a camera that was turned about its line of sight: the same pixels in another order."""
+    """A camera rotated about its line of sight: the same pixels in another order."""
     turned = pose(rotation(np.array([0.0, 0.0, np.radians(turn)])), np.zeros(3))
     cosine, sine = np.round([np.cos(np.radians(turn)), np.sin(np.radians(turn))])
     camera = camera_of()

@@ -129,7 +129,7 @@ def test_photographs_by_hand_without_a_machine(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_photographs_by_hand(tmp_path, seed):
-    """Those that are left out are so in both, for the same reason."""
+    """Rejected images are the same in both, with the same reason."""
     folder = tmp_path / "session"
     settings = Settings(configurations=3, repeats=2, handheld=True)
     machine = load_mechanism("gough-stewart")

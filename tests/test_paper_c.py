@@ -1,4 +1,4 @@
-"""[C] IV computed again: what is expected, that each expectation can fail, page and command."""
+"""[C] IV computed again: its expectations, that each of them can fail, page and command."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_better_methods_are_better(short):
 
 
 def test_another_seed_draws_anew():
-    """In every batch of every truth; what is drawn is all that chance decides."""
+    """Draws differ in every batch of every truth, and nothing else is random."""
     setting = H4ByBoard()
     for first, again, other in zip(
         *(engine.batches(setting, 2, s) for s in (1, 1, 2)), strict=True

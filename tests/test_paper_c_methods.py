@@ -145,7 +145,7 @@ def test_jacobians(name, form):
 
 
 def test_whitened_rows_have_unit_variance():
-    """Rows at the truth, divided by what the noise makes of them."""
+    """Rows at the truth, whitened by the noise."""
     truth = H4ByBoard().simulated("calibration", 30, np.random.default_rng(0))
     machine, n = truth.machine, truth.count
     problem, state = pose_problem(
@@ -288,7 +288,7 @@ def test_runs_do_not_touch_one_another():
 
 
 def boards(turns, rng, sigma=5e-4):
-    """Poses with these turns, seen with noise."""
+    """Poses with these rotations, with noise."""
     n = len(turns)
     whiten = np.diag(1 / np.repeat([sigma, 2e-4], 3))
     exact = anywhere(rng, 1.0) @ pose(rotation(turns), rng.normal(size=(n, 3)) * 0.1)

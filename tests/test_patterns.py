@@ -30,11 +30,11 @@ BOUNDED = {
 }  # fmt: skip
 """Patterns with an example, for texts that are no longer than a file's name: may be polynomial."""
 METHOD_BY_OWNER = {"files/documents.py: f'(?:{_pattern})\\\\Z'": "match"}
-"""How patterns are used that go to another library: PyYAML's resolver."""
+"""Uses of patterns that are passed to another library: PyYAML's resolver."""
 
 
 class Use(NamedTuple):
-    """One use of a pattern. key : its file and what is written as its argument."""
+    """One use of a pattern; key : its file and the text of its argument."""
 
     key: str
     line: int

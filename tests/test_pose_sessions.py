@@ -43,7 +43,7 @@ POSITION, TURN = 2e-5, 1e-4
 
 @dataclass(frozen=True)
 class Made:
-    """A session's folder and what is true of it."""
+    """A session's folder and its truth."""
 
     folder: object
     drawing: object

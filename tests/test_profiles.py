@@ -295,7 +295,7 @@ def test_a_highlight_is_not_taken_for_the_limb():
 
 
 def test_what_lies_beyond_a_highlights_middle_is_left_out():
-    """Where it stands out less than the limb itself, the profile is good for that."""
+    """If the highlight has less contrast than the limb itself, the profile is used."""
     dark = {"albedo": (20, 30), "ground": (30, 60), "light": FRONTAL, "least_contrast": 2}
     made = make(8, half_width=(7, 14), lamp=3.0, **dark)
     less, highlight = without_highlights(made.profiles, {0: 0.7})

@@ -322,7 +322,7 @@ def test_configurations_are_planned(demo, result, planned):
 RENAMED = {("plan", "configurations"): "count"}
 """Options whose argument has another name."""
 FOR_FILES = {"out", "as_json", "quiet", "force", "rrd", "table", "model"}
-"""Options of what is written, or of which file is loaded."""
+"""Options of outputs, or of loaded files."""
 OTHERWISE = {
     ("plan", "size"): ("camera", "1280x960"),
     ("simulate", "size"): ("camera", "800x600"),

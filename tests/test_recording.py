@@ -1,4 +1,4 @@
-"""A calibration as a recording: what is in it, by itself; and in rerun's own reader."""
+"""A calibration as a recording: its content, by itself, and in rerun's own reader."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def seen(calibrated, entries, name, points):
 
 
 def apart(strip, line):
-    """How far (px) a strip's ends and middle are from the nearest part of a line of many points."""
+    """Distance (px) of a strip's ends and middle from the nearest part of a line of many points."""
     points = strip[[0, len(strip) // 2, -1]][:, None]
     start, direction = line[:-1], np.diff(line, axis=0)
     share = np.sum((points - start) * direction, axis=-1) / np.sum(direction**2, axis=-1)
@@ -89,7 +89,7 @@ def apart(strip, line):
 
 
 def test_tubes_in_space_lie_on_their_edges_in_the_photographs(calibrated, entries):
-    """By nothing but what was logged: the camera's place and lens, the tubes, the edges."""
+    """From logged data only: the camera's pose and lens, the tubes, the edges."""
     off: list[float] = []
     for e in entries:
         if e.path[-1] != "edges" or e.kind != "lines2d" or "cameras" not in e.path:

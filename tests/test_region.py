@@ -1,4 +1,4 @@
-"""Regions of a workspace: poses spread over what a machine can take of them."""
+"""Regions of a workspace: poses spread over the reachable part of them."""
 
 from __future__ import annotations
 

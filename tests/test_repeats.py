@@ -62,7 +62,7 @@ def poses(machine):
 
 
 def edges_of(machine, poses, T_camera_base=STATION, shift=0.1):
-    """All edges of a station; those of one seed differ only by what the machine does."""
+    """All edges of a station; those of one seed differ only by the machine's motion."""
     noise = EdgeNoise(shift=shift, tilt=shift)
     rng = np.random.default_rng(3)
     return simulate_edges(machine, T_camera_base[None], CAMERA, poses, noise, rng)[0]

@@ -251,7 +251,7 @@ def fine(document: str, console: str) -> dict[str, str | None]:
 
 
 def loaded(page: str, *acts: str) -> str:
-    """The page with what is done as soon as it is there."""
+    """The page with a script that runs as soon as it is loaded."""
     did = "\n".join(f'addEventListener("load", () => {{{act}\n}});' for act in acts)
     return page.replace("</body>", f"<script>{did}</script></body>")
 

@@ -62,7 +62,7 @@ def test_the_file_says_how_sure_scales_are(tmp_path, name, tolerance, count):
 
 
 def test_a_scale_that_is_exact_still_counts(tmp_path):
-    """tolerance 0: it is no parameter, and readings are what it makes of them."""
+    """tolerance 0: the scale is no parameter, and readings are scaled by it."""
     rod = f"{ROD}\n    scale: 1.002"
     changes = [(ROD, rod), ("tolerance: {", "tolerance: {scale: 0, ")]
     machine, plain = load_mechanism(drawn(tmp_path, "gough-stewart", *changes)), load_mechanism(

@@ -1,4 +1,4 @@
-"""The servoing loop in simulation, its ends, and the analysis of what the legs show."""
+"""The servoing loop in simulation, its ends, and the analysis of visibility and equilibria."""
 
 from __future__ import annotations
 

@@ -379,7 +379,9 @@ def test_lengths_in_millimetres(folder):
 
 
 def test_motors_in_degrees(folder):
-    """Only what turns can be in degrees; a leg's length as large is merely out of range."""
+    """Only rotary readings can be in degrees; a leg's length of that size is merely out
+    of range.
+    """
     (folder / "joints.csv").write_text(scaled(180 / np.pi))
     assert "this reading is outside the machine's range" in fault(load_session, folder)
     table = read_csv(folder / "joints.csv", label="joints.csv")

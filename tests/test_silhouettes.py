@@ -60,8 +60,8 @@ def views(folder):
 
 
 def off_truth(view, T, edges):
-    """How far edges lie outward of where they truly are (n, 2): in the middle and at the end, in
-    what each states.
+    """Outward errors (n, 2) of edges, in the middle and at the end, in their standard
+    deviations.
     """
     legs = legs_in_camera(view.machine, T, view.poses, view.joints)
     points = edge_points(view.machine, view.camera, legs, view.tubes, 2)

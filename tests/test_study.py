@@ -1,4 +1,4 @@
-"""pkmcal study: what can be varied, what is simulated, and the command."""
+"""pkmcal study: varied settings, the simulation, and the command."""
 
 from __future__ import annotations
 

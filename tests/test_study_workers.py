@@ -1,4 +1,4 @@
-"""A study that is stopped goes on where it was: on other processes, and on a cluster."""
+"""A stopped study continues from its finished batches: on other processes, and on a cluster."""
 
 from __future__ import annotations
 
@@ -185,7 +185,9 @@ def test_what_is_kept_is_what_was_done(tmp_path):
 
 
 def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, one_process):
-    """Neither another one nor the same again; once the first has ended, its command goes on."""
+    """Neither another study nor the same again can start; once the first has ended, its command
+    continues.
+    """
     first = started(tmp_path, LONGER)
     deadline = time.monotonic() + 120
     while not (tmp_path / "batches" / "000-00000.npz").exists():  # requested below

@@ -1,4 +1,4 @@
-"""CSV tables: what is taken as it comes, and every fault with its line."""
+"""CSV tables: accepted variants, and every fault with its line."""
 
 import numpy as np
 import pytest

@@ -62,7 +62,7 @@ def drawn_poses(case, draws=1500):
 
 
 def test_sigma_is_the_scatter_of_machines_drawn_by_the_covariance(small):
-    """Each drawn machine is laid over by all joint centres, with no word of derivatives."""
+    """Each drawn machine is fitted by all joint centres, without derivatives."""
     values = tool_error(
         small.drawing, small.machine, free_of_gauge(small.machine, small.covariance), small.poses
     )
@@ -261,7 +261,7 @@ def test_a_machine_without_a_map_says_why():
 
 
 def test_frames_are_no_error(small):
-    """Those by three joints in place of the truth's: other numbers, the same machine."""
+    """Frames by three joints instead of the truth's: other numbers, the same machine."""
     state = State(small.machine.values, np.eye(4)[None], small.poses, np.zeros(1))
     values = in_gauge(small.machine, state, ThreeCentres((0, 2, 4)))
     other = small.machine.with_values(values.theta)

@@ -156,7 +156,7 @@ def test_a_bed_that_moved_has_no_numbers_that_heights_do_not_determine(dropped):
 
 
 def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
-    """Neither in a verdict nor in any table of the report."""
+    """The surface is neither in a verdict nor in any table of the report."""
     for item in (dropped, uneven[2]):
         verdict, parts = item.verdict, report_of(item).parts
         texts = [verdict.headline, *verdict.reasons, *verdict.warnings, *verdict.advice]
@@ -168,7 +168,7 @@ def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
 
 
 def test_a_bed_stands_nowhere_along_itself(uneven, tmp_path):
-    """Neither the bed's x, y and turn nor the tool's are numbers with a deviation."""
+    """Neither the bed's x, y and turn nor the tool's are numbers with a standard deviation."""
     _, _, value = uneven
     document = json_value(calibration_document(value))
     (station,), (target,) = document["stations"], document["targets"]

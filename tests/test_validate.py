@@ -1,4 +1,4 @@
-"""Validation: promises that hold, changes that are found, paths, hold-outs, and what is refused."""
+"""Validation: right calibrations, detected changes, paths, hold-outs, and refusals."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_residuals_scatter_as_promised(hexapod):
 
 
 def test_own_readings_have_no_part_in_a_pose(hexapod, new):
-    """A reading that is wrong by 5 mm shows as 5 mm, and moves no seen pose."""
+    """A reading that is wrong by 5 mm shows as 5 mm, and moves no estimated pose."""
     estimate = hexapod[2]
     stations, data = new
     start = start_state(estimate.machine, data, stations)
@@ -218,7 +218,9 @@ def test_better_than_the_drawing(hexapod, new):
 
 
 def test_rows_that_contradict_the_verdict_are_explained(hexapod):
-    """One station sees depth badly: plain root mean squares are its noise, the weighed ones not."""
+    """One station determines depth badly: plain root mean squares are its noise, the weighted ones
+    not.
+    """
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)

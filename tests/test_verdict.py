@@ -1,4 +1,4 @@
-"""Whether a result may be used: what data leave open counts where it moves the platform."""
+"""Verdict on a result: unidentifiable directions count if they move the platform."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
 
 
 def test_a_result_that_is_no_gain_is_refused(whole):
-    """Legs are judged as heights are: half of what the tolerances let expect is too much."""
+    """Legs are judged as heights are: half of what the prior sigmas let expect is too much."""
     observation, estimate, findings, _ = whole
     sigma = platform_sigma(estimate)
     for share, usable in ((0.9, True), (1.1, False)):

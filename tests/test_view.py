@@ -215,7 +215,7 @@ def test_a_defect_is_told_as_one(page, monkeypatch):
 
 
 def test_the_overlay_is_where_the_machine_is(page, truth):
-    """By the true pose, the joints are where the camera sees them."""
+    """At the true pose, the joints are at their pixels."""
     T = truth.T_camera_base[0]
     answer = page.ask("overlay", pose=T.tolist())
     pane = page.subject.drawn(0, 0)
@@ -577,7 +577,7 @@ async function pulled(target, from, to) {
 @pytest.mark.skipif(CHROMIUM is None, reason="NO CHROMIUM: the page was not opened in a browser")
 @pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch, width):
-    """One walks, pulls, takes back, pulls two joints to their places, and the machine snaps."""
+    """A user walks, pulls, undoes, pins two joints, and the machine snaps to its pose."""
     template, before = server._template, (session / "session.yaml").read_text()
     with server.listening_socket(0) as socket_:
         port = socket_.getsockname()[1]

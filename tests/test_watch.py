@@ -68,7 +68,7 @@ def made_calibration():
 
 
 def photographs_of(machine):
-    """One camera and thirty poses, of which those that watch take some."""
+    """One camera and thirty poses, of which the watches use some."""
     settings = Settings(stations=1, configurations=30, tolerance=0.0)
     return draw_truth(machine, (CAMERA,), settings, 5)
 
@@ -198,8 +198,8 @@ def test_false_alarms_of_all_tests_together(unchanged, watched):
 
 
 def test_the_calibrations_errors_must_be_in_the_noise(watched):
-    """Held against a calibration that were exact, an unchanged machine is flagged again and again:
-    what the covariance of the calibration is for.
+    """Against a calibration without errors, an unchanged machine is flagged again and again, which
+    the calibration's covariance prevents.
     """
     every, factor = whole_machine(watched.true), []
     for k in range(8):
@@ -356,7 +356,7 @@ def test_what_is_not_seen_is_not_detected(watched):
 
 
 def flat(n=6, p=3):
-    """Evidence of p parameters, each seen in a row of its own."""
+    """Evidence of p parameters, each determined by a row of its own."""
     return Evidence(np.zeros(n), np.eye(n, p) * 1e6)
 
 

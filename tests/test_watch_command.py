@@ -241,7 +241,9 @@ def test_stations_are_numbered_without_photographs_that_were_not_placed(demo, st
 
 
 def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
-    """Decimetres away, so far beyond what is linear: found anew, and no leg is blamed."""
+    """A camera decimetres away, far beyond the linear range: localized again, and no leg is
+    reported.
+    """
     done = run(
         "watch", demo.calibration, later.same, "--same-place", stayed.name, "-o", tmp_path / "w",
         "--json",

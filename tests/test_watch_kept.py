@@ -43,8 +43,8 @@ class Left:
         self.poses = photographs_of(self.true).T_base_platform
 
     def looked(self, machine, rng, by=None, few=FEW):
-        """A calibration with errors, held on what the first camera sees of a machine; by : how the
-        camera turned and moved before, (6,) of T_camera_base.
+        """A calibration with errors, fixed against the first camera's data of a machine; by :
+        motion of the camera before, (6,) of T_camera_base.
         """
         errors = self.half @ rng.standard_normal(len(self.half))
         calibrated = self.true.with_values(self.true.values + errors[: self.n])
@@ -111,8 +111,8 @@ def test_without_its_stations_it_is_the_evidence_of_a_machine_alone(left, unchan
 
 
 def test_frames_of_machine_and_camera_together_change_nothing(left, unchanged):
-    """A turn of the base frame moves the base joints and the camera, and shows in no residual; of
-    the joints alone it is seen now.
+    """A rotation of the base frame moves the base joints and the camera, and shows in no residual;
+    of the joints alone it is detected now.
     """
     held, retained = unchanged[2]
     value, basis = change_evidence(held, retained), freedoms(left.true)

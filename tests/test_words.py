@@ -52,8 +52,8 @@ def heaved(machine, n=8):
 
 
 def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3, machine=None) -> Scene:
-    """A machine with errors, of exact readings unless another is given, seen whole by cameras
-    around it.
+    """A machine with errors, with exact readings by default, and cameras around it that see all
+    legs.
     """
     rng = np.random.default_rng(seed)
     machine = machine or exact(name)
@@ -204,7 +204,9 @@ def test_a_passive_leg_nobody_sees_moves_nothing():
 
 
 def test_common_turns_of_parallel_axes_move_nothing():
-    """The 3-UPU as drawn: six of twelve axis directions cannot be seen (errata)."""
+    """The 3-UPU with nominal geometry: six of twelve axis directions are unidentifiable
+    (errata).
+    """
     machine = load_mechanism("3-upu")
     poses = moved(machine, np.random.default_rng(1), 15, turn=0.0)
     _, _, sentences = told_of(make("3-upu", poses=poses, errors=0.0))

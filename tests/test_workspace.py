@@ -193,7 +193,7 @@ def test_extents_end_where_something_stands_against_them(machine):
 
 
 def test_a_rod_of_constant_length_bends_the_way():
-    """Its end runs on a sphere; the way along the direction is kept all the same."""
+    """The leg's end runs on a sphere; the distance along the direction is kept all the same."""
     machine = tripod()
     own = np.linalg.svd(machine.forward_jacobian(machine.home()))[0][:, 0]
     value = machine.extents([own])

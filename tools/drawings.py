@@ -36,7 +36,7 @@ REACH = 1.4
 
 
 def frames(truth: Truth) -> str:
-    """The machine with base, platform and camera frames, seen from outside."""
+    """The machine with base, platform and camera frames, from outside."""
     eye = look_at(np.array([1.6, -1.25, 1.0]), np.array([0.0, -0.02, 0.2]), np.array([0, 0, 1.0]))
     rgb = (CALIBRATED, GOOD, DRAWING)
 

@@ -34,7 +34,7 @@ EXPORTS = ("json", "klipper", "linuxcnc", "mujoco", "reprap", "ros", "yaml")
 
 
 def pkmcal(*words: Any, expect: tuple[int, ...] = (0, 1)) -> tuple[int, str]:
-    """One command; its exit code and what it printed."""
+    """One command; its exit code and its output."""
     done = subprocess.run(
         [sys.executable, "-m", "pkmcal", *map(str, words)],
         capture_output=True,

@@ -25,7 +25,7 @@ CASES: dict[str, Callable[[Path, int], object]] = {
 
 
 def main(machines: int) -> None:
-    """One row a case, root mean squares over the machines, mm."""
+    """One row for each case, root mean squares over the machines, mm."""
     heads = ("tool before", "after", "worst", "sideways", "error/sigma", "bed before", "after")
     print(f"{'':36}" + "".join(f"{head:>12}" for head in heads) + "  usable")
     for title, make in CASES.items():

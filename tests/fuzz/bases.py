@@ -100,7 +100,9 @@ def by_exif(folder: Path) -> None:
 
 
 def measured(folder: Path, seed: int, count: int) -> None:
-    """A hexapod seen by a laser tracker, with distances between places of its tool's point."""
+    """A hexapod measured by a laser tracker, with distances between positions of its
+    tool's point.
+    """
     rng, drawing = np.random.default_rng(seed), load_mechanism("gough-stewart")
     built = np.random.default_rng(0).normal(size=len(drawing.values))
     truth = drawing.with_values(drawing.values + 0.5 * drawing.parameters.tolerance * built)

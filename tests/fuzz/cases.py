@@ -19,11 +19,11 @@ PICTURES = (".png", ".jpg")
 
 @dataclass(frozen=True)
 class Task:
-    """A command, and which files it reads.
+    """A command, and the files that it reads.
 
     words : SESSION, CALIBRATION and the like name copies of the bases; OUT the output folder, FILE
-    the spoilt file, where there is one by itself. files : patterns of what is spoilt.
-    before : the base whose files stand in OUT beforehand. often : its weight.
+    the damaged file, if there is one by itself. files : patterns of files to damage. before : the
+    base whose files are in OUT beforehand. often : its weight.
     """
 
     words: str
@@ -133,7 +133,7 @@ class Case:
 
 
 def telling(numbers: Iterable[int], bases: Path, scratch: Path) -> list[int]:
-    """Those cases that try something which none before them does."""
+    """Cases that try something which none before them does."""
     met, chosen = set(), []
     for number in numbers:
         place = scratch / f"case-{number}"

@@ -70,7 +70,7 @@ class Result:
 
 
 def run(number: int, bases: Path, scratch: Path, keep: bool = False) -> Result:
-    """Make a case, run its command, judge what it left."""
+    """Make a case, run its command, judge its results."""
     odd = number % ODD_FOLDERS_EACH == 0
     place = scratch / (f"case-{number}" + ODD_FOLDER_NAME * odd)
     shutil.rmtree(place, ignore_errors=True)
