@@ -50,7 +50,7 @@ def true_radii(folder: Path, drawing: Any, edges: Any) -> np.ndarray:
 
 
 def edges_at(edges: Any, normal: np.ndarray, turn: np.ndarray) -> Any:
-    """The edges where normals (n, 3) say, turned by ``turn`` (n, 2) in their bases."""
+    """Edges with normals (n, 3), rotated by ``turn`` (n, 2) in their bases."""
     normal = normal + (edges.basis @ turn[..., None])[..., 0]
     normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     basis = edges.basis - normal[..., None] * (normal[:, None] @ edges.basis)
@@ -84,7 +84,7 @@ def allowed(folder: Path, draws: int, seed: int) -> tuple[float, ...]:
     if isinstance(truth, str):
         raise SystemExit(f"{folder.name}: {truth}")
     edges = measurements.edges
-    # the truth lists photographs station by station, as the session does
+    # the truth lists images station by station, as the session does
     photographs = [(k, p.configuration) for k, s in enumerate(session.stations)
                    for p in s.photographs]  # fmt: skip
     number = {key: row for row, key in enumerate(photographs)}

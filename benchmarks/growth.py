@@ -42,16 +42,16 @@ from test_pose_sessions import make
 FROM = 300
 """Configurations from which on what does not depend on their number hardly counts."""
 SOON = 0.02
-"""Seconds at the largest size below which a step's growth is not told from its beginning."""
+"""Seconds at the largest size below which a step's exponent is not estimated."""
 MOST = 1.2
-"""A step that grows faster would be said to grow with a square one day; n log n, and a cache that
+"""Exponent above which a step fails: it would become quadratic one day; n log n, and a cache that
 is full, stay below."""
 
 Step = tuple[str, Callable[[], Any]]
 
 
 def of_edges(count: int) -> Iterator[Step]:
-    """The steps after the photographs of a hexapod's legs."""
+    """The steps after the images of a hexapod's legs."""
     rng = np.random.default_rng(0)
     scene = make_scene(rng, configurations=count)
     measurements, machine = scene.measurements(rng), scene.machine

@@ -46,15 +46,15 @@ KINDS = (
 )
 """Name, whether of a kit, mm by which one touch is wrong, noises."""
 IDEAL, KIT = "axis: 0.0001 deg, scale: 0 %", "axis: 0.1 deg, scale: 0.03 %"
-"""Tolerances of the drawing for what no firmware holds: as large as the printers have it."""
+"""Prior sigmas of parameters that no firmware has: as large as the printers' errors."""
 THRESHOLD, ROUNDS, GROW, SHRINK = 1e-5, 10000, 1.1, 0.9
-"""Of Klipper's descent."""
+"""Stopping rule of Klipper's descent."""
 NAMES: tuple[str, ...] = ("radius", "angle_a", "angle_b", "endstop_a", "endstop_b", "endstop_c")
 
 
 @dataclass(frozen=True)
 class Truth:
-    """A printer: what its firmware says, what it would have to say, and the machine."""
+    """A printer: its firmware's values, the right values, and the machine."""
 
     says: printers.Settings
     right: printers.Settings
@@ -100,7 +100,7 @@ def position(settings: printers.Settings, carriages: Array) -> Array:
 
 
 def by_klipper(describe: printers.Settings, readings: Array) -> printers.Settings:
-    """Klipper's values from carriages (n, 3) mm, by what its firmware says, on the bed."""
+    """Klipper's values from carriages (n, 3) mm, by its firmware's values, on the bed."""
     travel = describe.homed - readings
     at = dict(zip(NAMES, (describe.radius, *describe.angle[:2], *describe.endstop), strict=True))
 
@@ -139,10 +139,10 @@ def calibrated(
     tolerance: str = "",
     centre_tolerance: float = 0.0,
 ) -> Calibration:
-    """The calibration of a printer whose firmware says so, from its carriages (n, 3) mm on the bed.
+    """Calibration of a printer with its firmware's values, from its carriages (n, 3) mm on the bed.
 
-    noise : mm, of the probe, tolerance : of what no firmware holds, centre_tolerance : mm, of the
-    towers; in the place of those that the session is made with.
+    noise : mm, of the probe, tolerance : of parameters that no firmware has, centre_tolerance : mm,
+    of the towers; instead of those that the session is made with.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -162,7 +162,7 @@ def calibrated(
 
 
 def exported(calibration: Calibration) -> printers.Settings:
-    """What is exported for the firmware."""
+    """Values exported for the firmware."""
     bed = calibration.findings.bed
     source = MachineSource(calibration.machine, bed=bed.z if bed else None)
     (text,) = make_export(source, "klipper").files.values()
@@ -195,8 +195,8 @@ def moved(
 
 
 def errors(truth: Truth, pasted: printers.Settings) -> tuple[float, float, float, float]:
-    """Of radius, mean rod (mm), towers (degrees, rms, their common turn aside) and end switches
-    (mm, rms, their mean aside).
+    """Errors of radius, mean rod (mm), towers (degrees, rms, their common turn aside) and end
+    switches (mm, rms, their mean aside).
     """
     turned = np.array(pasted.angle) - np.array(truth.right.angle)
     ends = np.array(pasted.homed) - np.array(truth.right.homed)

@@ -69,7 +69,7 @@ def shown(name: str, call: Callable[[], object], calls: int) -> None:
 
 
 def photographed() -> tuple[Truth, Camera, Integers]:
-    """The truth of a session with one photograph, its camera, and the photograph."""
+    """The truth of a session with one image, its camera, and the image."""
     camera = camera_of_size((640, 480))
     settings = Settings(stations=1, configurations=1, tolerance=0.0, extreme=0.0)
     truth = draw_truth(load_mechanism("gough-stewart"), (camera,), settings, 5)

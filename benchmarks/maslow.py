@@ -36,11 +36,11 @@ from pkmcal.session.load import load_session
 
 BELTS = ("bl", "br", "tr", "tl")
 NOISE = 1e-3
-"""m, what a person would say of a belt's length; the data tell what it is."""
+"""m, a person's statement of a belt's noise; the data determine the actual one."""
 APART = 1e-6
 """m, a stated noise so small that no two rows are of one pose."""
 LOOSE = 0.5
-"""m, tolerance of the drawing's anchors: the frame is known to be some three metres wide."""
+"""m, prior sigma of the nominal anchors: the frame is some three metres wide."""
 
 
 def runs_of(path: Path) -> list[np.ndarray]:

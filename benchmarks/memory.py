@@ -69,7 +69,7 @@ print({name: len(text) for name, text in files.items()})
 
 
 class Cost(NamedTuple):
-    """Of one process: processor seconds, seconds by the clock, greatest memory in MB."""
+    """Costs of one process: processor seconds, seconds by the clock, greatest memory in MB."""
 
     processor: float
     clock: float
@@ -157,7 +157,7 @@ def repeated(base: Path, folder: Path, configurations: int, noise: float = 3e-6)
 
 
 def cost(command: list[str]) -> Cost:
-    """What a process costs; its exit code does not matter."""
+    """Costs of a process; its exit code does not matter."""
     begin = time.perf_counter()
     with subprocess.Popen(command) as process:
         _, status, used = os.wait4(process.pid, 0)

@@ -22,7 +22,7 @@ def best_of(run: Callable[[], float], times: int = 3) -> float:
 
 
 def decode_and_canny(paths: list[Path]) -> float:
-    """Seconds to decode the photographs one after the other and find Canny's edges in each."""
+    """Seconds to decode the images one after the other and find Canny's edges in each."""
     import cv2
 
     begin = time.perf_counter()
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def simulated(folder: Path) -> Path:
-    """A session of 45 photographs, 1024x768."""
+    """A session of 45 images, 1024x768."""
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.simulation.demo import demo_camera
     from pkmcal.simulation.session import Settings, simulate_session

@@ -64,9 +64,9 @@ RADII_ALONG = 48
 
 @dataclass
 class Deformed:
-    """What an error changes of a true session of K configurations and L legs.
+    """Effect of an error on a true session of K configurations and L legs.
 
-    readings : (K, m) added to what is read. base : (K, 4, 4) motion of the base against the
+    readings : (K, m) added to the readings. base : (K, 4, 4) motion of the base against the
     stations. camera : (K, 6) motion of the first station, left perturbation. bend : (K, L, n, 3) m,
     displacement of the axis of each leg at n places from A to B, base frame. radius : (L, n) m.
     lens : by station, true intrinsics over the stated ones.
@@ -187,7 +187,7 @@ def bow(metres: float) -> Error:
 
 
 def taper(metres: float) -> Error:
-    """Legs that are thicker at one end, all alike."""
+    """Legs that are thicker at one end, all equally."""
 
     def make(_s: Scene, d: Deformed, rng: np.random.Generator) -> None:
         d.radius += metres * (np.linspace(0, 1, d.radius.shape[1]) - 0.5) * rng.choice([-1, 1])
@@ -282,7 +282,7 @@ LENSES: dict[str, tuple[Error, tuple[str, ...]]] = {
     "focal .3 % at one station": (lens(range(1), fx=1.003, fy=1.003), ("legs",)),
     "centre .5 % at one station": (lens(range(1), cx=1.005), ("legs",)),
 }
-"""Lenses that are not as their file says."""
+"""Lenses that differ from their files."""
 ERRORS |= LENSES
 
 
@@ -298,7 +298,7 @@ class Made(NamedTuple):
 
 
 def truth_of(observer: str, seed: int) -> tuple[Any, Any, Any]:
-    """Drawing, truth and camera."""
+    """Nominal model, truth and camera."""
     drawing = with_forearms(load_mechanism("gough-stewart"))
     camera = camera_of_size(IMAGE_SIZE)
     count = CONFIGURATIONS if observer == "legs" else POSES
@@ -348,7 +348,7 @@ def made(error: str, observer: str, seed: int, folder: Path) -> Made:
 def edges_of(
     camera: Any, true: Any, scene: Scene, d: Deformed, T: np.ndarray, rows: np.ndarray, rng: Any
 ) -> tuple[Any, np.ndarray]:
-    """Edges of the photographs of one station, and (N, n, 2) pixels along each.
+    """Edges in the images of one station, and (N, n, 2) pixels along each.
 
     true : the camera that took them, for which the session states another.
     """
@@ -455,9 +455,10 @@ def write_poses(folder: Path, scene: Scene, d: Deformed, T: np.ndarray, rng: Any
 
 
 class Outcome(NamedTuple):
-    """What became of a session. what : refused, warned or silent. z : error of the tool in standard
-    deviations, root mean square over the poses. sigma : m, that standard deviation. findings :
-    sentences.
+    """Result of a session.
+
+    what : refused, warned or silent. z : error of the tool in standard deviations, root mean square
+    over the poses. sigma : m, that standard deviation. findings : sentences.
     """
 
     what: str

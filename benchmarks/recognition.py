@@ -31,16 +31,16 @@ NEAR, TURNED = 0.1, np.radians(6.0)
 """Share of the camera's distance, and rad, within which a place is right."""
 SIZE = (640, 480)
 PHOTOGRAPHS = 10
-"""Of each station of the catalogue's machines."""
+"""Images of each station of the catalogue's machines."""
 MISTAKEN = (2, 8)
-"""Stations, and photographs of each, of a session with a mistake."""
+"""Stations, and images of each, of a session with a mistake."""
 HINGED = ("h4-rods",)
 """Machines that cannot be simulated: how far their side bars turn is not known."""
 
 
 class Outcome(NamedTuple):
-    """What became of a session: right, refused or wrong; what was said; processor's seconds; the
-    code of what it was refused for.
+    """Result of a session: right, refused or wrong; its message; processor's seconds; the code of
+    the refusal.
     """
 
     what: str
@@ -50,8 +50,8 @@ class Outcome(NamedTuple):
 
 
 class Mistake(NamedTuple):
-    """A usual mistake: how a session's folder gets it, and the code by which it is named; none
-    where the session is as good as before.
+    """A usual mistake: the function that puts it into a session's folder, and the code of its
+    finding; none if the session is as good as before.
     """
 
     make: Callable[[Path, np.random.Generator], None]
@@ -73,8 +73,8 @@ def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) ->
 
 
 def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
-    """Where the cameras stand by a session's photographs, against its truth; upside down, they are
-    turned about their line of sight.
+    """Stations localized in a session's images, against its truth; upside down, they are turned
+    about their line of sight.
     """
     from pkmcal.calibration.calibrate import calibrate_session
     from pkmcal.calibration.localization import (
@@ -126,7 +126,7 @@ def _near(values: np.ndarray, true: np.ndarray) -> tuple[bool, str]:
 
 
 def calibrated(folder: Path, seed: int) -> Outcome:
-    """Whether a session in whose photographs the machine was recognised is refused in the end."""
+    """Whether a session whose stations were localized is refused in the end."""
     from pkmcal.calibration.calibrate import calibrate_session
     from pkmcal.errors import PkmcalError
 
@@ -158,7 +158,7 @@ def readings(folder: Path, order: Callable[[list[str]], list[str]]) -> None:
 
 
 def pictures(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
-    """All photographs changed."""
+    """All images changed."""
     import cv2
 
     for path in sorted(folder.glob("images/*/*.png")):
@@ -166,7 +166,7 @@ def pictures(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
 
 
 def renamed(folder: Path, order: Callable[[list[Path]], list[Path]]) -> None:
-    """Each station's photographs under each other's names."""
+    """Each station's images under each other's names."""
     for station in sorted((folder / "images").iterdir()):
         paths = sorted(station.iterdir())
         data = [path.read_bytes() for path in order(paths)]
@@ -269,7 +269,7 @@ MISTAKES: dict[str, Mistake] = {
 
 
 def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
-    """A session with a mistake: named, refused otherwise, or not noticed."""
+    """A session with a mistake: named, refused otherwise, or not detected."""
     mistake = MISTAKES[name]
     with tempfile.TemporaryDirectory() as temporary:
         copy = Path(temporary) / folder.name
@@ -287,7 +287,7 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
     return value._replace(what="named" if value.code == mistake.code else "refused")
 
 
-# ------------------------------------------------------------------ told
+# ------------------------------------------------------------------ results
 
 
 def of_catalogue(

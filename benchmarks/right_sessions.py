@@ -46,7 +46,7 @@ FINDINGS = ("refused", "departure", "outvoted", "noise", "rejected")
 class Session(NamedTuple):
     """A session's folder; the true machine, poses (K, 4, 4) and readings (K, m), None where they
     are not compared; factor of the readings' true noise on the stated one; corners in place of
-    photographs.
+    images.
     """
 
     folder: Path
@@ -57,8 +57,8 @@ class Session(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What was said of a session, by kind of finding; the interval of the readings' noise; z of the
-    tool, NaN where it is not compared; seconds.
+    """Findings on a session, by kind; the interval of the readings' noise; z of the tool, NaN if it
+    is not compared; seconds.
     """
 
     findings: dict[str, list[str]]
@@ -69,7 +69,7 @@ class Outcome(NamedTuple):
 
 
 def written(folder: Path, drawing: Any, readings: Any, noise: float, **more: Any) -> None:
-    """Files of a session without photographs."""
+    """Files of a session without images."""
     from pkmcal.files import csv_text, yaml_text
     from pkmcal.mechanisms import mechanism_text
 
@@ -90,7 +90,7 @@ def written(folder: Path, drawing: Any, readings: Any, noise: float, **more: Any
 def photographed(
     machine: str, stations: int, count: int, size: tuple[int, int], *, handheld: bool = False
 ) -> Callable[[Path, int], Session]:
-    """A session of legs in rendered photographs."""
+    """A session of legs in rendered images."""
 
     def make(folder: Path, seed: int) -> Session:
         from pkmcal.mechanisms import load_mechanism
@@ -227,7 +227,7 @@ def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
         inside = np.hypot(*grid.T) <= 90.5
         touched, goal, heights = grid[inside], grid[inside], np.zeros(0)
         noise = int(rng.integers(2**32))
-        for _ in range(4):  # to where the firmware believes to be at the grid's points
+        for _ in range(4):  # to the firmware's positions of the grid's points
             readings = printers.felt(true, touched, HEIGHT_SIGMA, np.random.default_rng(noise))
             points = 1e3 * describe.forward(1e-3 * readings)[:, :3, 3]
             touched, heights = touched + goal - points[:, :2], points[:, 2]
@@ -242,7 +242,7 @@ def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
         folder.parent.mkdir(parents=True, exist_ok=True)
         file, probed = folder.parent / "config.g", folder.parent / "heightmap.csv"
         s = printers.Settings()
-        height = s.endstop[0]  # all three are alike in these settings
+        height = s.endstop[0]  # all three are equal in these settings
         file.write_text(
             f"M669 K3\nM665 L{s.rod[0]}:{s.rod[1]}:{s.rod[2]} R{s.radius} H{height} B95 X0 Y0 Z0\n"
             "M666 X0 Y0 Z0\nM92 X80 Y80 Z80\n"

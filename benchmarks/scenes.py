@@ -38,7 +38,7 @@ import yaml
 
 TRUTH = "truth.json"
 POSES = 200
-"""Poses at which the tool is looked at."""
+"""Number of poses at which the tool is evaluated."""
 NOTHING = 1e-10
 """Share of the largest variance below which a direction is one that the frames decide."""
 WIDTH = 190
@@ -47,10 +47,10 @@ WIDTH = 190
 
 @dataclass(frozen=True)
 class TrueMachine:
-    """What is true of a machine with read rods, in frames of its own; m.
+    """Truth of a machine with read rods, in frames of its own; m.
 
     a, b : (L, 3) joint centres on base and platform. offset : (L,) length less reading.
-    T_camera_base : (S, 4, 4) of the stations. T_base_platform : (M, 4, 4) of the photographs.
+    T_camera_base : (S, 4, 4) of the stations. T_base_platform : (M, 4, 4) of the images.
     """
 
     a: np.ndarray
@@ -62,8 +62,10 @@ class TrueMachine:
 
 @dataclass(frozen=True)
 class Errors:
-    """What an estimate is off by; m, rad. nees, dof : of the whitened error. worst : sigmas of its
-    worst direction. tool, tool_stated : root mean squares. tool_z : the former in the latter.
+    """Errors of an estimate; m, rad.
+
+    nees, dof : of the whitened error. worst : sigmas of its worst direction. tool, tool_stated :
+    root mean squares. tool_z : the former in the latter.
     """
 
     a: float
@@ -267,7 +269,7 @@ def read_truth(folder: Path, drawing: Any) -> TrueMachine | str:
         return f"the truth has no {', '.join(missing)}"
     images = data["images"]
     stations = np.array(data["T_camera_base"])
-    if data.get("handheld"):  # every photograph from a place of its own, in the photographs' order
+    if data.get("handheld"):  # every image has a pose of its own, in the images' order
         stations = stations[[image["camera"] for image in images]]
     return TrueMachine(
         *(np.array(data[key]) for key in ("A_base", "B_platform", "joint_offsets")),
@@ -295,7 +297,7 @@ def parts_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def score(calibration: Any, folder: Path) -> Errors | str:
-    """Errors of a calibration by the truth in a folder, or why they cannot be told."""
+    """Errors of a calibration by the truth in a folder, or the reason why they are unknown."""
     truth = read_truth(folder, calibration.session.machine)
     if isinstance(truth, str):
         return truth
@@ -368,7 +370,7 @@ def run(folder: Path, options: argparse.Namespace) -> Row:
 
 
 def decode_and_canny(paths: list[Path]) -> float:
-    """Processor's seconds to decode photographs and find Canny's edges in them."""
+    """Processor's seconds to decode images and find Canny's edges in them."""
     import cv2
 
     begin = time.process_time()
@@ -377,7 +379,7 @@ def decode_and_canny(paths: list[Path]) -> float:
     return time.process_time() - begin
 
 
-# ------------------------------------------------------------------ told
+# ------------------------------------------------------------------ results
 
 
 def honest(dof: int, share: float) -> tuple[float, float]:
@@ -443,7 +445,7 @@ def tell(rows: list[Row]) -> None:
 
 
 def document(rows: list[Row]) -> dict[str, Any]:
-    """The same for programs; m, rad."""
+    """Errors for programs; m, rad."""
     whitened, dof = together(rows)
 
     def one(row: Row) -> dict[str, Any]:

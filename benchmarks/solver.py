@@ -60,7 +60,7 @@ CERES = (
     ("Ceres, block an edge", "1e10", "edge"),
     ("Ceres, block a view", "1e10", "view"),
 )
-"""How Ceres is set: first trust region, and what is a block of residuals. Its default region, 1e4,
+"""Settings of Ceres: first trust region, and the blocks of residuals. Its default region, 1e4,
 takes eight times the steps."""
 MANY = 1000
 """Configurations from which on a measurement is not repeated within a process."""

@@ -28,7 +28,7 @@ import numpy as np
 import yaml
 
 SESSIONS = {"legs": (3, 12, (640, 480)), "board": (1, 24, (1280, 960))}
-"""Stations, photographs of each, and their size."""
+"""Stations, images of each, and their size."""
 DISTORTION = -0.08
 """k1 of the lens."""
 FAR = 3.0
@@ -36,8 +36,10 @@ FAR = 3.0
 
 
 class Fact(NamedTuple):
-    """What is wrong: how a session's folder gets it, codes of findings of which one names it, and
-    in which sessions it can be wrong. codes : none where it is enough that the result is right.
+    """A wrong fact: the function that puts it into a session's folder, codes of findings of which
+    one names it, and the sessions in which it can be wrong.
+
+    codes : none where it is enough that the result is right.
     """
 
     make: Callable[[Path, np.random.Generator], None]
@@ -46,8 +48,8 @@ class Fact(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of it: named, refused, warned or silent; z of the tool, NaN after an error; what
-    was said.
+    """Result of a session: named, refused, warned or silent; z of the tool, NaN after an error; its
+    messages.
     """
 
     what: str
@@ -197,7 +199,7 @@ def frozen(folder: Path, rng: np.random.Generator) -> None:
 
 
 def moved(metres: float, radians: float) -> Any:
-    """The first station's camera elsewhere in the second half of its photographs."""
+    """The first station's camera elsewhere in the second half of its images."""
 
     def make(folder: Path, rng: np.random.Generator) -> None:
         import cv2
@@ -224,7 +226,7 @@ def moved(metres: float, radians: float) -> Any:
 
 
 def sleeve(metres: float) -> Any:
-    """A sleeve over a tube, which the drawing does not have."""
+    """A sleeve over a tube that the nominal model does not have."""
 
     def make(folder: Path, rng: np.random.Generator) -> None:
         def change(document: dict[str, Any]) -> None:
@@ -238,7 +240,7 @@ def sleeve(metres: float) -> Any:
 
 
 def exchanged(folder: Path, rng: np.random.Generator) -> None:
-    """Two photographs of a station under each other's names: of configurations that differ."""
+    """Two images of a station under each other's names, of configurations that differ."""
     paths = sorted(sorted((folder / "images").iterdir())[0].iterdir())
     rows = list(csv.reader((folder / "joints.csv").read_text().splitlines()))[1:]
     joints = {row[0]: np.array([float(x) for x in row[1:]]) for row in rows}
@@ -282,7 +284,7 @@ FACTS: dict[str, Fact] = {
 
 
 def ingredients(in_view: str, seed: int) -> tuple[Any, Any, Any, Any]:
-    """Truth, cameras, settings and drawing of a session."""
+    """Truth, cameras, settings and nominal model of a session."""
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.simulation import Settings, board_for, with_forearms
     from pkmcal.simulation.demo import camera_of_size
@@ -311,7 +313,7 @@ def simulated(in_view: str, seed: int, keep: Path) -> Path:
     if not folder.exists():
         _, cameras, settings, drawing = ingredients(in_view, seed)
         simulate_session(folder, drawing, cameras, settings, seed=seed)
-        if in_view == "board":  # a print is not exact, as a simulated board says of itself
+        if in_view == "board":  # a print is not exact, unlike a simulated board
             edited(folder / "board.yaml", lambda document: document.pop("tolerance"))
     return folder
 

@@ -20,13 +20,13 @@ from pkmcal.simulation import load_truth
 
 
 def cell(values: np.ndarray, unit: str, summary: Callable[[np.ndarray], float] = np.mean) -> str:
-    """The mean, or another summary, of the values that are finite; a dash where none is."""
+    """Mean, or another summary, of the finite values; a dash without any."""
     finite = values[np.isfinite(values)]  # a machine has no pose at readings that it cannot take
     return f"{summary(finite):.3f} {unit}" if finite.size else "–"
 
 
 def main() -> int:
-    """Print the errors of the drawing and of the calibrated machine."""
+    """Print the errors of the nominal model and of the calibrated machine."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("session", type=Path)
     parser.add_argument("calibration", type=Path)

@@ -23,13 +23,13 @@ from pkmcal.errors import InputError, PkmcalError
 
 def read_encoders(frame: int, saved: SavedCalibration) -> np.ndarray:
     """The motors' readings (m,), m or rad, taken at the same moment as the frame."""
-    # HERE: ask your controller. Until then, the readings of the calibration, one after the other.
+    # HERE: read your controller. Until then, the readings of the calibration, one after the other.
     return saved.joints[frame % len(saved.joints)]
 
 
 def send(velocities: np.ndarray) -> None:
     """Velocities (m,) per second to the motors."""
-    # HERE: tell your controller. It must stop by itself when no new velocities arrive in time.
+    # HERE: command your controller. It must stop by itself when no new velocities arrive in time.
     raise InputError(
         "there is no controller to send velocities to",
         found=f"{len(velocities)} velocities",
@@ -44,7 +44,7 @@ def opened(source: str) -> cv2.VideoCapture:
             "the source of pictures cannot be opened", found=source,
             expected="the number of a camera that is plugged in, a film, or images/%04d.png",
         )  # fmt: skip
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not one that waited
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest image, not one that waited
     return capture
 
 

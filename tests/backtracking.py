@@ -185,7 +185,7 @@ class Automaton:
         return False
 
     def _spelling(self, state: int, sense) -> list[int]:
-        """States with signs, once for each way there that goes along no arrow twice."""
+        """States with signs, once for each path there that uses no arrow twice."""
         out = [state] if self.signs[state] else []
         for after in self.empty[state]:
             if (state, after) not in sense:

@@ -102,7 +102,7 @@ def all_looks(few_looks, monkeypatch):
 
 @dataclass(frozen=True)
 class Demo:
-    """A finished demonstration: its folders, and what it printed. Nobody writes into them."""
+    """A finished demonstration: its folders, and its output; tests must not write into them."""
 
     folder: Path
     run: Run
@@ -137,7 +137,7 @@ def made_once(folder: Path, make: Callable[[], Any]) -> Any:
 
 @pytest.fixture(scope="session")
 def demo(common) -> Demo:
-    """One demonstration a run of the tests."""
+    """One demonstration for a run of the tests."""
     out = common / "demo"
     words = ("demo", "-o", out, "--fast", "--no-open", "--json")
     return Demo(out, made_once(common / "said", lambda: run(*words)))
@@ -186,7 +186,7 @@ def checked(demo, common) -> Told[SessionCheck]:
 
 @pytest.fixture(scope="session", autouse=True)
 def one_core_a_worker():
-    """Where the tests take all cores, a study takes one: another process is a second to start."""
+    """A study uses one core where the tests take all: another process takes a second to start."""
     with pytest.MonkeyPatch.context() as patch:
         if "PYTEST_XDIST_WORKER" in os.environ:
             patch.setattr("pkmcal.studies.workers.cores", lambda: 1)

@@ -56,7 +56,7 @@ def add_distances(kit, true, rng, describe, caliper=CALIPER, pairs=None):
 
 
 def stretch(true, value):
-    """By how much larger than commanded a calibrated machine makes the bed, a share."""
+    """Size of the bed by a calibrated machine relative to the commanded one, minus one."""
     xy = printers.bed(30)
     T = np.broadcast_to(np.eye(4), (30, 4, 4)).copy()
     T[:, :2, 3] = 1e-3 * xy

@@ -1,5 +1,7 @@
-"""Kits of deltas whose parts are half a millimetre and a third of a degree off, and what people can
-measure of them: a board seen by a webcam, or the bed felt by a probe. Nothing is rendered.
+"""Kits of deltas with errors of half a millimetre and a third of a degree, and their measurements:
+a board in a webcam's images, or heights of the bed by a probe.
+
+Nothing is rendered.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def allowed(machine, poses):
 
 
 def measured(truth, poses, rng, noise=1.0):
-    """The board seen by one camera, and the readings."""
+    """Board poses in one camera, and the readings."""
     poses = allowed(truth, poses)
     n = len(poses)
     in_view = T_CAMERA_BASE @ poses @ T_PLATFORM_BOARD
@@ -95,7 +95,9 @@ def predicted(machine, T_camera_base, T_platform_board, joints):
 
 
 def errors(truth, value, joints):
-    """Root mean square of position (m) and orientation (rad) at readings, no frame left open."""
+    """Root mean square of position (m) and orientation (rad) at readings, after fitting
+    the frames.
+    """
     expected = T_CAMERA_BASE @ truth.forward(joints)
     off = pose_difference(value, expected)
     return np.sqrt([np.mean(np.sum(part**2, axis=1)) for part in (off[:, 3:], off[:, :3])])

@@ -123,7 +123,7 @@ def workshop(n=7):
 
 
 def calibrated_cfg():
-    """Its printer.cfg after DELTA_CALIBRATE."""
+    """The printer's printer.cfg after DELTA_CALIBRATE."""
     return printer_cfg(Settings(), workshop())
 
 

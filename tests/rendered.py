@@ -25,7 +25,7 @@ RENDERING = ("simulation", "mechanisms", "geometry", "cameras", "boards")
 
 
 def once(folder: Path, make: Callable[[Path], object]) -> Path:
-    """The folder, filled by ``make`` where nobody has filled it yet; others wait meanwhile."""
+    """The folder, filled by ``make`` if it is empty; other workers wait meanwhile."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with (folder.parent / f"{folder.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -138,7 +138,7 @@ OPTIONAL = ("tool", "bed", "residuals", "statistics", "session", "rejected", "wa
 @pytest.mark.slow
 @pytest.mark.parametrize("key", OPTIONAL)
 def test_what_loads_of_a_calibration_can_be_used(tracker, tmp_path, key):
-    """Each of its values as something else: refused, naming it, or no matter."""
+    """Each of a document's values replaced by another type: refused by name, or without effect."""
     path = tmp_path / "calibration.json"
     plain = json.loads((tracker / "calibration" / "calibration.json").read_text())
     plain |= {

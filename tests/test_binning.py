@@ -154,7 +154,7 @@ def test_photographs_larger_than_sharp(blurred, calibrated):
 
 
 def test_stations_of_one_camera_are_binned_alike(calibrated):
-    """One that shows no legs, too: the camera's edge shift is in these pixels."""
+    """A leg without images, too: the camera's edge shift is in binned pixels."""
     c = calibrated
     taken = [Photographs(0, c.session.stations[0].camera, *[np.zeros(0, int)] * 2, [], binning=2)]
     count = observation_of(c.session, [], Boards(), c.measurements, c.estimate, taken)

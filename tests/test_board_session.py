@@ -38,7 +38,7 @@ from test_bad_input import only
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """Two stations of four configurations each, by the command; nobody writes into it."""
+    """Two stations of four configurations each, by the command; tests must not write into it."""
     folder = tmp_path_factory.mktemp("board") / "session"
     words = ("--board", "--stations", "2", "--configurations", "4", "--size", "640x480")
     return by_command(folder, *words)

@@ -96,8 +96,8 @@ def test_readings_of_carriages_tell_how_large_the_board_is():
 
 
 def errors_at_the_tool(name, runs, tolerance, assumed):
-    """z of the tool's displacement, by run and tolerance assumed: root mean square over the
-    workspace of what is left when frames are laid over each other, over its stated deviation.
+    """z of the tool's displacement, by run and assumed tolerance: RMS over the workspace after
+    fitting the frames, over its stated standard deviation.
     """
     drawing = load_mechanism(name)
     work = poses_in(drawing.limits(), Region(), 30)

@@ -1,4 +1,4 @@
-"""The user's cache folder: what it keeps, and that nothing depends on it."""
+"""The user's cache folder: its contents, and that nothing depends on it."""
 
 import base64
 import gzip

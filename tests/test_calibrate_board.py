@@ -27,7 +27,7 @@ from rendered import by_command
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """One station, twelve configurations, by the command; nobody writes into it."""
+    """One station, twelve configurations, by the command; tests must not write into it."""
     folder = tmp_path_factory.mktemp("platform") / "session"
     words = ("--on-platform", "--stations", "1", "--configurations", "12", "--size", "640x480")
     return by_command(folder, *words)

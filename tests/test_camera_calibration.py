@@ -250,7 +250,7 @@ def test_corners_at_others_places_in_one_view_are_outliers(monkeypatch):
 
 
 def test_too_many_corners_off_are_refused(monkeypatch):
-    """Fourteen of forty-eight some 5 px off: what is left of a board would be its own witness."""
+    """Fourteen of forty-eight corners some 5 px off: the rest of a board would confirm itself."""
     alone(monkeypatch, "pinhole")
     true = TRUE["pinhole"]
     values, rng = detections(true, poses_for(true, 10, 1), 2), np.random.default_rng(3)

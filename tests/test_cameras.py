@@ -1,7 +1,7 @@
 """One conformance test for every camera model, and the camera files.
 
-A new model is found by itself; it needs example cameras in `EXAMPLES`, and in `OPENCV` the same
-mathematics from cv2, where cv2 has it.
+A new model is found by enumeration; it needs example cameras in `EXAMPLES`, and in `OPENCV` the
+same mathematics from cv2, if cv2 has it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def pinhole(*distortion, imaged=1.0, outside=(), inside=()):
 
 
 def wide(*distortion, imaged=1.0, behind=(0.0, 0.0, -1.0), beyond=(0.5, 0.1, 1.0), **fields):
-    """A model that may reach beyond 90 degrees: ``beyond`` is seen, ``behind`` is not."""
+    """A model that may reach beyond 90 degrees: ``beyond`` is in its field, ``behind`` is not."""
     size = {"image_size": (1024, 768), "center": (515.5, 380.5)}
     outside = (behind, (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), (np.nan, 0, 1))
     inside = (*Example({}).inside, beyond)
@@ -292,7 +292,7 @@ def test_derivatives_of_project(case, place):
 
 
 def test_the_projection_with_its_motion_along_directions(case, place):
-    """To rounding: a model may have all from one pass through its lens."""
+    """To rounding: a model may compute value and derivatives in one pass through its lens."""
     _, camera = case
     points = np.concatenate([rays_at(camera, place), [[0.0, 0.0, 0.0]]])
     directions = np.random.default_rng(0).normal(size=(2, *points.shape))

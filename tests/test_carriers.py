@@ -135,7 +135,9 @@ def test_a_bar_keeps_its_direction():
 
 
 def test_a_hinged_bar_turned_back_is_a_bar():
-    """By minus the platform's turn, the hinged bar stands as one that keeps its direction."""
+    """Turned back by the platform's rotation, the hinged bar stands as one that keeps its
+    direction.
+    """
     T = perturb(np.eye(4), np.array([0, 0, 0.3, 0.02, -0.03, -0.4]))
     center, hinge = np.array([0.01, -0.05, 0.02]), np.array([-0.06, 0.01, 0.0])
     turned = HingedBar.place(np.concatenate([center, hinge, [0, 0, 2.0]]), T, np.array(-0.3))[0]

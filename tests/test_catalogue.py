@@ -145,7 +145,7 @@ def test_jacobians_at_home(machine):
 
 
 def test_jacobians_at_random(machine):
-    """Machines, readings and poses that need not close: a solver goes there, too."""
+    """Machines, readings and poses that need not close, as in a solver's steps."""
     rng = np.random.default_rng(0)
     for T in wide_poses(machine, 5, 1):
         changed = machine.with_values(machine.values + 0.02 * rng.normal(size=len(machine.values)))

@@ -246,7 +246,9 @@ def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
     [("gough-stewart", [2, 4]), ("3-rps", [1, 2]), ("delta", [1, 2]), ("hexaglide", [])],
 )
 def test_numberings_that_nothing_tells_apart(name, firsts):
-    """Their machines differ by one turn of everything, tubes and unlike joints do not."""
+    """The machines of the two configurations differ by one rotation of everything, except for tubes
+    and unequal joints.
+    """
     machine = load_mechanism(name)
     joints = machine.inverse(poses_in(machine.limits(), Region(), 8))
     assert [order[0] for order in equal_numberings(machine, joints)] == firsts

@@ -161,7 +161,7 @@ def test_stations_on_one_side_are_told(found):
 
 
 def test_slim_tubes_are_told(found):
-    """By the nominal width in the images; wide tubes need no advice."""
+    """Advice by the nominal width in the images; wide tubes need none."""
     assert words._slim(found.look) == []
     first, *others = found.look.stations
     half_width = np.where(tubes_of(found.look.session.machine).tube == 1, 2.25, 9.0)

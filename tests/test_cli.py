@@ -164,7 +164,7 @@ def test_nobody_needs_to_hear_of_a_mistake():
 
 
 def shell(words, end):
-    """One command as a shell runs it, its streams sent elsewhere."""
+    """One command as a shell runs it, with redirected streams."""
     line = shlex.join([sys.executable, "-m", "pkmcal", *words]) + " " + end
     return subprocess.run(line, shell=True, capture_output=True, text=True, check=False)
 
@@ -269,7 +269,7 @@ def test_new_files_load(tmp_path):
 
 @pytest.mark.parametrize("options", [(), ("--machine", "3-rps", "--places", 2)])
 def test_a_new_session_says_nothing_of_where_its_camera_stands(tmp_path, options):
-    """It is optional; a rough pose takes one uncommented line."""
+    """The pose is optional; a rough one takes one uncommented line."""
     folder = tmp_path / "mine"
     assert run("new", folder, *options).code == 0
     stations = load_session(folder, measured=False).stations
@@ -437,7 +437,7 @@ def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, m
 
 
 def test_calibrate_as_json_in_a_process_of_its_own(tmp_path):
-    """Of poses from a tracker, which takes a second; images are tested above."""
+    """Poses from a tracker, which takes a second; images are tested above."""
     session, out = make(tmp_path / "session", "gough-stewart").folder, tmp_path / "result"
     done = python("-m", "pkmcal", "calibrate", session, "-o", out, "--json")
     assert (done.returncode, done.stderr) == (0, "")

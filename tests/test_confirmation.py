@@ -35,7 +35,7 @@ def found(tmp_path_factory):
 
 
 def test_hypotheses_weigh_as_their_solutions_do(found):
-    """Each is solved anew, not to first order, with the nominal model five times as wide."""
+    """Solutions of each hypothesis, not to first order, with prior sigmas five times as wide."""
     measurements, estimate = found.measurements, found.estimate
     assert np.flatnonzero(estimate.pose_weights < 0.5).tolist() == [WRONG]
     assembled, info = linearize_at_solution(measurements, estimate)

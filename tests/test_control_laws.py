@@ -250,7 +250,7 @@ def test_control_by_image_needs_no_platform():
     "name", ["gough-stewart", "6-rus", "delta", "3-rps", "h4", "constant-legs", "3-rpr"]
 )
 def test_rates_lead_to_a_goal_nearby(name, law):
-    """To first order the readings' rates are gain times their difference from the goal's."""
+    """Velocities of the readings: to first order gain times their difference from the goal's."""
     in_view = before(name)
     poses, joints = poses_of(in_view, 3)
     aim = joints + 1e-5 * np.random.default_rng(1).standard_normal(joints.shape)
@@ -318,7 +318,7 @@ def test_batches_are_single_calls_together():
 
 
 def test_unseen_motion_stays_at_rest():
-    """Sliders that move together keep all directions of a hexaglide: nothing goes that way."""
+    """Sliders that move together keep all directions of a hexaglide: no motion is commanded."""
     in_view = before("hexaglide")
     poses, joints = poses_of(in_view, 3)
     n, wanted = true_edges(in_view, poses), true_edges(in_view, poses[[1, 2, 0]])

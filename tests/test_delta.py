@@ -116,7 +116,7 @@ def test_frames_change_no_reading(name):
 
 @pytest.mark.parametrize("name", DRIVEN)
 def test_errors_are_as_large_as_they_say(name):
-    """Board poses of 0.2 mm and 0.03 degrees: the predicted board is off by what is expected."""
+    """Board poses of 0.2 mm and 0.03 degrees: the predicted board has the expected error."""
     machine = load_mechanism(name)
     ratios, chi2 = [], []
     for seed in range(3):

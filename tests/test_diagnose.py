@@ -79,7 +79,7 @@ def readings_with(order, count=6):
 
 
 def also(*values):
-    """One more case of what another proves already: a search of many seconds."""
+    """Another case of a test above: a search of many seconds."""
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
@@ -282,7 +282,7 @@ def test_photographs_of_nothing_are_refused():
 
 @pytest.mark.slow
 def test_another_machine_is_not_surely_recognised_and_nothing_is_renamed():
-    """Each leg ends in its neighbour's joint: no mix-up of the session explains that."""
+    """Each leg ends in its neighbour's joint: no hypothesis of the session explains that."""
     values = machine().values.copy()
     rows = [k for k, name in enumerate(machine().parameters.names) if ".platform." in name]
     values[rows] = np.roll(values[rows].reshape(6, 3), 1, axis=0).ravel()

@@ -108,8 +108,8 @@ def test_frames_make_no_difference(pairs):
     ("name", "times"), [("legs[3].length.offset", 7.0), ("legs[5].platform.center.z", 14.0)]
 )
 def test_what_changed_is_found_where_it_changed(pairs, name, times):
-    """By seven standard deviations, of which chance may take two; of the height of one of six
-    joints a frame takes half, as a plane fitted to six points does.
+    """A change of seven standard deviations, of which chance may take two; a frame absorbs half of
+    the height of one of six joints, as a plane fitted to six points does.
     """
     hits = 0
     for a, b, _ in pairs["new data"]:
@@ -288,7 +288,7 @@ def test_what_cannot_be_compared(words, said, tmp_path, monkeypatch):
 
 
 def test_an_earlier_difference_is_kept_beside_the_calibration(demo, tmp_path, monkeypatch):
-    """Not written over, and not into wherever one happens to be."""
+    """An existing file is not overwritten, and nothing is written into the current folder."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     shutil.copytree(demo.calibration, tmp_path / "machine" / "calibration")

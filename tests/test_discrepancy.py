@@ -152,7 +152,7 @@ def loads(drawing, data, estimate):
 
 
 def tool_in_sigmas(truth, estimate, joints):
-    """How far the tool is off at true poses and readings, in its standard deviations."""
+    """Error of the tool at true poses and readings, in its standard deviations."""
     machine = estimate.machine
     covariance = free_of_gauge(machine, estimate.covariance)
     off = tool_error(truth[0], machine, covariance, truth[1], joints)
@@ -160,7 +160,7 @@ def tool_in_sigmas(truth, estimate, joints):
 
 
 def test_legs_that_give_way_are_found_and_contained():
-    """By a right session's own estimate as truth: readings that are short by the legs' load."""
+    """Session with a right one's estimate as truth, and readings shortened by the legs' load."""
     drawing, data, right, true = session_estimate(1)
     sag = 2e-4 * loads(drawing, data, right)
     truth = right.machine, right.state.T_base_platform

@@ -211,8 +211,8 @@ def test_what_edges_have_in_common_is_in_the_covariance():
 
 @pytest.mark.parametrize("tilt", [pytest.param(0.0, marks=pytest.mark.slow), 2.0])
 def test_deviations_hold_where_edges_err_alike(tilt):
-    """Where tilts do, the inverse of the normal matrix alone promises too much; where only shading
-    does, it does not, as the tests above have it.
+    """With correlated tilts the inverse of the normal matrix alone is too small; with correlated
+    shading only it is not, as in the tests above.
     """
     rng = np.random.default_rng(13)
     assembled, truth = shaded(rng, 0.1, runs=16, configurations=20, tilt=tilt, reach=0.15).batch(

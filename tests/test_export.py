@@ -1,4 +1,4 @@
-"""pkmcal export: every format with every machine, refusals, what is written, and what is not."""
+"""pkmcal export: every format with every machine, refusals, and written files."""
 
 from __future__ import annotations
 

@@ -381,7 +381,9 @@ def test_cranks_and_sliders_out_of_reach(library):
 
 @needs_compiler
 def test_a_singular_pose_is_told(tmp_path):
-    """Where the lines of a 3-RPR's three legs meet in a point, its plate can turn."""
+    """A 3-RPR at a pose where the lines of its three legs meet in a point, so that its plate can
+    turn.
+    """
     machine = load_mechanism("3-rpr")
     machine = machine.with_values(_radial(machine))
     c = compiled(machine, tmp_path)

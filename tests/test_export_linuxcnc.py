@@ -75,7 +75,7 @@ def leaning_delta():
 
 
 def settings(folder, machine, changes=(), hal=""):
-    """An export with what a simulated machine needs around it; returns its texts."""
+    """An export in the environment of a simulated machine; returns its texts."""
     files = make_export(source_of(machine), "linuxcnc").files
     for name, text in files.items():
         (folder / name).write_text(text)
@@ -249,7 +249,7 @@ def test_linuxcnc_homes_without_a_move_and_is_right_at_thirty_poses(name, tmp_pa
 @pytest.mark.slow
 @needs_linuxcnc
 def test_values_for_encoders_move_nothing_where_there_are_none(tmp_path):
-    """What a user may forget to change: HOME_OFFSET, and velocities for a switch."""
+    """Words that a user may forget to change: HOME_OFFSET, and velocities for a switch."""
     machine = built("gough-stewart")
     settings(tmp_path, machine, [("HOME_ABSOLUTE_ENCODER = 2", "HOME_ABSOLUTE_ENCODER = 0")])
     answer = ran(tmp_path, machine, homes=False)

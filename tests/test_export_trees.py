@@ -153,7 +153,7 @@ class Drawn:
         self.readings = [dict(n.attrib) for n in model.findall("{urn:pkmcal}reading")]
 
     def at(self, name):
-        """Where something is drawn (4, 4)."""
+        """Pose (4, 4) of a visual."""
         node = self.links[name] if name in self.links else self.frames[name]
         values = node.find("pose")
         if values is None:
@@ -185,7 +185,7 @@ class Drawn:
             yield out
 
     def moved(self, link, values, platform):
-        """Where a link has moved to from where it is drawn (4, 4); values by joint, a list each."""
+        """Motion (4, 4) of a link from its drawn pose; values by joint, a list each."""
         if link == "world":
             return np.eye(4)
         for name, node in self.joints.items():

@@ -67,7 +67,7 @@ def test_rounding_does_not_add_up():
 
 
 def test_a_leap_is_searched():
-    """To the other end of the range: the same as the search from the pose before."""
+    """A jump to the other end of the range: equal to the search from the pose before."""
     machine = load_mechanism("gough-stewart")
     follow = machine.follower()
     before = follow(machine.inverse(machine.home()))

@@ -279,7 +279,7 @@ def test_revolute_axes_on_the_platform(tmp_path):
 
 @pytest.mark.parametrize("name", ["3-rpr", "3-rps", "3-spr"])
 def test_a_passive_leg_on_machines_with_axes(name, tmp_path):
-    """A fourth leg that nobody drives, on a machine of three."""
+    """A fourth leg without a motor, on a machine of three."""
     fourth = (
         "  - base: {joint: spherical, center: [0.05, 0.02, 0.0]}\n"
         "    platform: {joint: universal, center: [0.02, -0.05, 0.0]}\n"

@@ -1,4 +1,4 @@
-"""Where the data do not allow a step, a sentence that names the legs; [A]'s counts beside it."""
+"""Refusals of [A]'s steps: a sentence that names the legs, with [A]'s counts."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_one_station_that_sees_four_legs_of_six(hexapod):
 
 
 def test_too_few_legs_at_once(hexapod):
-    """Every leg is seen often, but never three of them in one configuration."""
+    """Every leg is visible often, but never three of them in one configuration."""
     edges = hexapod.measurements.edges
     pair = edges.configuration % 3
     part = hexapod.select((edges.leg // 2) == pair)

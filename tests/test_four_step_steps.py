@@ -107,7 +107,7 @@ def test_revolute_axes_weigh_the_line_of_sight():
 
 
 def test_normal_of_a_plane_from_all_legs_together():
-    """One direction of each of two legs fixes it, which neither leg alone would."""
+    """One direction of each of two legs determines the axis, which neither leg alone would."""
     rng = np.random.default_rng(4)
     n = unit(rng.normal(size=(5, 3)))
     u = unit(np.cross(n[:, None, None], rng.normal(size=(5, 1, 2, 3))))
@@ -138,7 +138,7 @@ def base_views(rng, in_view, directions_visible, noise=0.0):
 
 
 def laid_on(value, truth, T_found, T_true):
-    """Both forms fix the base only up to its frame: compare after laying one on the other."""
+    """Both forms determine the base up to its frame: compare after fitting one to the other."""
     e = poses_laying_items(value, truth, np.ones(value.shape[:2]))
     np.testing.assert_allclose(T_true @ e[:, None], T_found, atol=1e-8)
     return e, apply(e[:, None], value)

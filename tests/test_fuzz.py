@@ -33,7 +33,7 @@ def fuzzed(count, *options):
 
 
 def test_malformed_sessions_of_every_way():
-    """Those of the first 90 that spoil a kind of file, or a command's file, as none before."""
+    """Those of the first 90 cases with a new fault in a kind of file, or in a command's file."""
     text = fuzzed(FEW, "--telling")
     assert int(text.split(" cases")[0].split()[-1]) > 60
     assert "with faults 0" in text

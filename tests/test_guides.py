@@ -21,7 +21,7 @@ from test_docs import blocks, text_of
 
 
 def recipe(heading: str) -> list[tuple[str, str]]:
-    """The commands of a recipe in their order, each with what the page shows of it."""
+    """Commands of a recipe in their order, each with its output on the page."""
     text = text_of("docs/howto.md").partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
     display = [part for block in blocks(text, "console") for part in block.split("$ ")[1:]]
     return [(part.partition("\n")[0], part.partition("\n")[2]) for part in display]

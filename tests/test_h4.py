@@ -211,7 +211,9 @@ def test_limbs_are_drawn_where_the_hinges_turn_them():
 
 
 def test_closure_derivatives_of_the_rods():
-    """By every parameter, the pose, the internal coordinates and the shared readings."""
+    """Derivatives by every parameter, the pose, the internal coordinates and the shared
+    readings.
+    """
     machine = with_rods(np.random.default_rng(3))
     layout, theta = machine.layout, machine.values
     poses = papers_poses()[17]
@@ -251,7 +253,7 @@ def rank(columns):
 
 
 def ranks(machine, poses):
-    """By joint residuals and by full board poses, with both of the board's transforms."""
+    """Rank by joint residuals and by full board poses, with both of the board's transforms."""
     layout, readings = machine.layout, machine.inverse(poses)
     c = closure(layout, machine.values, readings, poses)
     by_theta = dense(c, len(machine.values)) @ machine.parameters.free_matrix()
@@ -278,7 +280,7 @@ def test_what_71_poses_can_tell():
 
 
 def test_what_the_rods_can_tell():
-    """78 unknowns, where a hinge begins not counted; frames aside, 66 are seen by the data."""
+    """78 unknowns, without the origins of hinges; frames aside, the data determine 66."""
     rng = np.random.default_rng(6)
     machine = load_mechanism("h4-rods")
     case = papers_case(with_rods(rng), rng)

@@ -1,4 +1,4 @@
-"""Photographs by hand: the format, EXIF, and a session in which each has a place of its own."""
+"""Hand-held images: the format, EXIF, and a session in which each image has a pose of its own."""
 
 import json
 import re
@@ -80,7 +80,7 @@ configuration,leg1,leg2,leg3,leg4,leg5,leg6
 0001,0.46,0.45,0.44,0.43,0.42,0.40
 """
 EASIEST = 0
-"""The simulated photograph that shows its legs best."""
+"""The simulated image with the most visible legs."""
 NONE = np.zeros((0, 4, 4))
 PICTURE = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
 
@@ -95,7 +95,7 @@ def jpeg(path, exif=None, picture=PICTURE):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two configurations, one of them photographed from two places."""
+    """Two configurations, one of them with images from two places."""
     (tmp_path / "cameras").mkdir()
     (tmp_path / "session.yaml").write_text(SESSION)
     (tmp_path / "cameras" / "phone.yaml").write_text(CAMERA)
@@ -180,7 +180,7 @@ def test_two_stations_of_one_name(folder):
     assert "two stations, or photographs by hand, have the same name; found phone-0001-1" in message
 
 
-# cameras by EXIF, and turned photographs
+# cameras by EXIF, and rotated images
 
 
 def test_a_camera_by_exif(folder):
@@ -188,7 +188,7 @@ def test_a_camera_by_exif(folder):
     station = load_session(folder).stations[0]
     assert station.from_exif
     assert station.camera.image_size == (8, 6)
-    # a 26 mm lens sees as much along its picture's diagonal as on film of 36 x 24 mm
+    # a 26 mm lens has the same view along its image's diagonal as on film of 36 x 24 mm
     np.testing.assert_allclose(station.camera.parameters[:2], 26 * 10 / np.hypot(36, 24))
     np.testing.assert_allclose(station.camera.parameters[2:4], [3.5, 2.5])
     sigma = np.sqrt(np.diag(station.camera.covariance))
@@ -221,7 +221,9 @@ def test_the_sensors_picture_is_the_size_of_most(tmp_path):
 
 @pytest.mark.parametrize(("orientation", "quarters"), [(None, 1), (6, -1), (8, 1)])
 def test_a_turned_photograph_is_turned_back(tmp_path, orientation, quarters):
-    """By its EXIF; without, a portrait picture of a landscape sensor was turned clockwise."""
+    """Orientation by EXIF; by default a portrait image of a landscape sensor was turned
+    clockwise.
+    """
     portrait = np.rot90(PICTURE, -1)
     exif = None if orientation is None else Exif(orientation, 26.0)
     path = jpeg(tmp_path / "a.jpg", exif, portrait)
@@ -243,7 +245,9 @@ SETTINGS = Settings(configurations=3, repeats=1, handheld=True, tolerance=0.0)
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
-    """Three photographs by hand of a machine as drawn, with focal lengths that breathe."""
+    """Three hand-held images of a machine with nominal geometry, with focal lengths that
+    breathe.
+    """
     folder = tmp_path_factory.mktemp("byhand") / "session"
     machine = load_mechanism("gough-stewart")
     rendered(folder, machine, camera_of_size((640, 480)), SETTINGS, seed=7)
@@ -261,10 +265,10 @@ def test_a_simulated_session_by_hand_loads(simulated):
 
 
 def test_simulated_photographs_say_how_they_were_held(simulated):
-    """What EXIF asks viewers to do puts the platform above the base."""
+    """After the rotation that EXIF requests the platform is above the base."""
     session = load_session(simulated)
     truth = load_truth(simulated, session.machine)
-    query = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}  # where up is in the stored picture
+    query = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}  # direction of up in the stored image
     for station, T in zip(session.stations, truth.T_camera_base, strict=True):
         exif = read_exif(station.photographs[0].path.read_bytes())
         assert T[:2, 2] @ query[exif.orientation] > np.cos(np.pi / 4) * np.linalg.norm(T[:2, 2])
@@ -273,7 +277,7 @@ def test_simulated_photographs_say_how_they_were_held(simulated):
 
 
 def test_places_by_hand_are_drawn_apart_and_rolled():
-    """With few photographs too: one to three of a configuration, all from places of their own."""
+    """With few images too: one to three of a configuration, each from its own place."""
     machine, camera = load_mechanism("gough-stewart"), camera_of_size((400, 300))
     places = places_by_hand(machine, (camera,) * 24, np.random.default_rng(0))
     at = np.array([place.position for place in places])
@@ -287,7 +291,7 @@ def test_places_by_hand_are_drawn_apart_and_rolled():
 
 
 def at_truth(monkeypatch, folder, off=2e-3):
-    """Let photographs by hand be placed where they were taken, nearly."""
+    """Let hand-held images be localized nearly where they were taken."""
     rng = np.random.default_rng(1)
 
     def place(session, photographs, boards, _rng, _told):
@@ -301,8 +305,9 @@ def at_truth(monkeypatch, folder, off=2e-3):
 
 @pytest.fixture(scope="module")
 def breathed(simulated, tmp_path_factory):
-    """The calibration of a machine that is known exactly, so that photographs tell all they can of
-    their focal lengths."""
+    """Calibration of a machine that is known exactly, so that images determine their focal lengths
+    as well as possible.
+    """
     folder = tmp_path_factory.mktemp("breathed") / "session"
     shutil.copytree(simulated, folder)
     text = (folder / "mechanism.yaml").read_text()
@@ -379,7 +384,9 @@ def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):
 
 @pytest.mark.slow
 def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
-    """The estimate without them gives up all of their edges, and says nothing of where they are."""
+    """The estimate without silhouettes rejects all of their edges, and does not determine their
+    poses.
+    """
     settings = replace(SETTINGS, configurations=4)
     folder, machine = tmp_path / "session", load_mechanism("gough-stewart")
     rendered(folder, machine, camera_of_size((480, 360)), settings, seed=7)
@@ -401,7 +408,7 @@ def test_focal_lengths_are_found_within_their_deviations(breathed):
 
 
 def test_normals_turn_with_the_focal_length_as_stated(looked):
-    """The same photograph measured with a camera whose focal lengths are larger by a thousandth."""
+    """The same image measured with a camera whose focal lengths are larger by a thousandth."""
     session, photographs, _, truth = looked
     p, excess = photographs[EASIEST], 1e-3
     T, pose = truth.T_camera_base[EASIEST], truth.T_base_platform[[EASIEST]]
@@ -430,7 +437,7 @@ def test_normals_turn_with_the_focal_length_as_stated(looked):
 
 
 def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
-    """The chain from a photograph's focal length to the rows, against differences of the rows."""
+    """Derivatives of the rows by an image's focal length, against differences of the rows."""
     calibration, _ = breathed
     assembled = assemble(
         calibration.session.machine,
@@ -452,8 +459,8 @@ def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
 
 
 def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
-    """Where each edge is its station's only one, no unknown stands for its shading: what a line's
-    edges have in common is as much noise of its own as what they have not.
+    """If each edge is its station's only one, its shading is no unknown: the common part of a
+    line's edges is noise like the rest.
     """
     calibration, _ = breathed
     machine = calibration.session.machine
@@ -475,20 +482,22 @@ def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
 
 @pytest.fixture(scope="module")
 def looked(simulated):
-    """The session, its photographs, the platform's poses and the truth."""
+    """The session, its images, the platform's poses and the truth."""
     session = load_session(simulated)
     truth = load_truth(simulated, session.machine)
     return session, read_photographs(session), platform_poses(session), truth
 
 
 def view_of(session, p, poses):
-    """What a search looks at in one photograph."""
+    """Inputs of a search in one image."""
     tables = distance_tables(p.images)
     return StationView(session.machine, p.camera, p.configuration, session.joints, poses, tables)
 
 
 def found_with(monkeypatch, truth, faults, textured=False):
-    """Photographs are found where they were taken, with doubts; textured: the room tells too."""
+    """Images are localized where they were taken, with uncertainty; textured : with a
+    background.
+    """
 
     def measure(_session, photograph, _before, _found, _others, _asked):
         T, fault = truth.T_camera_base[photograph.station], faults[photograph.station]
@@ -506,14 +515,14 @@ def found_with(monkeypatch, truth, faults, textured=False):
 
 
 def placed(remeasured, monkeypatch, faults, textured=False):
-    """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
+    """Poses of images that are localized right, with uncertainty; none : localized elsewhere."""
     session, photographs, _, truth = remeasured
     found_with(monkeypatch, truth, faults, textured)
     return handheld.localize_case(session, photographs, Boards(), np.random.default_rng(0))
 
 
 def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
-    """All photographs show some of the same points about the machine."""
+    """All images show some of the same points about the machine."""
     _, photographs, _, truth = looked
     rng = np.random.default_rng(2)
     world = rng.uniform(-1.2, 1.2, (6000, 3))
@@ -533,7 +542,7 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
 
 
 def test_a_board_on_the_base_serves_photographs_by_hand(folder):
-    """Each is from a place of its own, so one entry is many stations."""
+    """Each image has a pose of its own, so one entry is many stations."""
     board = SESSION.replace("observe: legs", "observe: [legs, board]")
     text = board + "board: {file: board.yaml, fixed_to: base}\n"
     (folder / "session.yaml").write_text(text)
@@ -546,7 +555,7 @@ def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
     assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert [p.station for p in results.photographs] == [0, 1]
     off = pose_difference(results.scene.T_camera_base, looked[3].T_camera_base[[0, 2]])
-    # as the joint estimate has them: two photographs tell little of a machine
+    # as in the joint estimate: two images hardly determine a machine
     assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
     (warning,) = results.session.warnings
@@ -557,7 +566,7 @@ def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
 
 
 def test_places_are_believed_while_all_together_leave_little_doubt():
-    """Of those that are asked, their share of the doubt that a session may leave."""
+    """The scored images' share of the probability of error that a session may have."""
     one = {
         k: PoseHypotheses(np.stack([np.eye(4)] * 2), np.array([np.log(1 / fault - 1), 0.0]), 1.0)
         for k, fault in enumerate([0.02, 0.3, 0.001, 0.02, 0.012])
@@ -568,7 +577,7 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
 
 
 def test_a_photograph_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
-    """However well its silhouettes lie on something: it tells no machine."""
+    """However well its silhouettes match something: it determines no machine."""
     rows = []
 
     def bare(scene, photograph):
@@ -581,7 +590,7 @@ def test_a_photograph_in_which_no_leg_can_be_measured_is_left_out(looked, monkey
     assert sorted(results.scene.edges) == [0, 1]
     (warning,) = results.session.warnings
     assert warning.startswith("images/phone/0001-1.jpg: left out, for too few of its edges agree")
-    assert len(rows) < 12  # it is not asked for ever
+    assert len(rows) < 12  # the scoring ends
 
 
 def test_legs_are_measured_where_a_photograph_is_and_not_elsewhere(looked):
@@ -618,7 +627,7 @@ def test_photographs_of_one_configuration_are_recognised(looked, monkeypatch):
 
 
 def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
-    """One whose edges the estimate gives up, or that it moves away, is left out."""
+    """An image whose edges the estimate rejects, or whose camera it moves away, is rejected."""
     calibration, _ = breathed
     session, measurements = calibration.session, calibration.measurements
     estimate, T = calibration.estimate, calibration.estimate.state.T_camera_base
@@ -636,7 +645,7 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     assert inconsistent_poses(session, replace(measurements, edges=fewer), of_three, T) == {
         2: EDGES_DISAGREE_REASON
     }
-    # a board that agrees tells its place
+    # a consistent board determines its pose
     visible = SimpleNamespace(
         edges=measurements.edges, poses=SimpleNamespace(station=np.array([1]))
     )
@@ -660,7 +669,7 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
 
 
 def test_tubes_stand_out_of_a_chart():
-    """A bright bar is a pair of its width and direction, and the rarest thing in the picture."""
+    """A bright bar is a pair of its width and direction, and the rarest structure in the image."""
     image = np.full((300, 400), 60, np.uint8)
     cv2.line(image, (100, 220), (300, 80), 200, 10, cv2.LINE_AA)
     chart = tube_chart(image, camera_of_size((400, 300)))
@@ -672,7 +681,7 @@ def test_tubes_stand_out_of_a_chart():
 
 
 def test_one_photograph_is_found_from_nothing(looked):
-    """Ten seconds: all places about the machine, of the easiest of the three photographs."""
+    """Ten seconds: all poses about the machine, for the easiest of the three images."""
     session, photographs, poses, truth = looked
     k = EASIEST
     p = photographs[k]
@@ -685,7 +694,7 @@ def test_one_photograph_is_found_from_nothing(looked):
 
 
 def test_turns_of_a_machine_onto_itself(looked):
-    """A hexapod has equal thirds: two other places from which it looks alike."""
+    """A hexapod has equal thirds: two other poses with the same appearance."""
     session, photographs, poses, truth = looked
     p = photographs[0]
     view = view_of(session, p, poses)
@@ -716,7 +725,7 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     # one place alone is weighed against chance
     one = PoseHypotheses(true[None], np.array([20.0]), equal.unit)
     alone, _ = rescore_poses(session, p, drawn, one, NONE)
-    # a place that others tell of is asked about as well
+    # a pose from other images is scored as well
     values, _ = rescore_poses(
         session,
         p,
@@ -729,7 +738,7 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
 
 
 def evidence_there(reference_values, view):
-    """Evidence of the third photograph's place by what is known."""
+    """Score of the third image's pose by the marginal prior."""
     here = replace(
         view, machine=reference_values.machine, all_poses=reference_values.T_base_platform
     )
@@ -739,7 +748,9 @@ def evidence_there(reference_values, view):
 
 
 def test_photographs_join_what_is_known(looked):
-    """One of the same machine costs the others little; with another's readings it is elsewhere."""
+    """A board of the same machine costs the other images little; with another's readings it does
+    not fit.
+    """
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     places = dict(enumerate(truth.T_camera_base[:2]))
@@ -751,7 +762,7 @@ def test_photographs_join_what_is_known(looked):
     right, paid = evaluate_pose(session, names, 2, T, view)
     assert sorted(right.edges) == [2]
     assert len(right.edges[2]) > 6
-    # half the squares of what its edges tell, two numbers each
+    # half the squares of its edges' residuals, two numbers each
     assert paid < len(right.edges[2])
     other = replace(view, configuration=at[0].configuration)
     wrong, _ = evaluate_pose(session, names, 2, T, other)
@@ -762,7 +773,7 @@ def test_photographs_join_what_is_known(looked):
 
 
 def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
-    """It is an estimate of one photograph; and no place is asked about twice."""
+    """Scoring is an estimate of one image, and no pose is scored twice."""
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     estimated = []
@@ -787,7 +798,9 @@ def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
 
 
 def test_a_board_on_the_base_weighs_places_together(looked):
-    """Two photographs prefer look-alikes, each another one; the board stands in one place only."""
+    """Two images prefer poses with the same appearance, each another one; the board is in one place
+    only.
+    """
     truth = looked[3].T_camera_base
     turns = [
         pose(rotation(np.radians(a) * np.array([0.0, 0.0, 1.0])), np.zeros(3)) for a in (120, 240)
@@ -806,7 +819,7 @@ def test_a_board_on_the_base_weighs_places_together(looked):
     for k, one in rows.items():
         assert one.rival_probability < 1e-6
         assert angle_between(one.T_camera_base[0], truth[k]) < 1e-6
-    # a photograph in which nothing was found gets its place from the board
+    # an image without edges gets its pose from the board
     hypotheses[1] = PoseHypotheses(truth[1:2] @ turns[0], np.array([-5.0]), 1.0)
     assert (
         angle_between(handheld._on_board(hypotheses, boards)[1].T_camera_base[1], truth[1]) < 1e-6

@@ -1,4 +1,4 @@
-"""Heights of a delta printer's bed: what they are accepted for, and what is refused."""
+"""Heights of a delta printer's bed: accepted and refused results."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def kit(true, tmp_path_factory):
 
 
 def flat(true, values, describe=SAYS):
-    """Heights (n,) mm over places that nobody probed, where a firmware with values commands Z 0."""
+    """Heights (n,) mm at other points, where a firmware with values commands Z 0."""
     rng = np.random.default_rng(9)
     r, a = 90 * np.sqrt(rng.uniform(size=200)), rng.uniform(0, 2 * np.pi, 200)
     points = np.column_stack([r * np.cos(a), r * np.sin(a), np.zeros(200)])
@@ -101,7 +101,7 @@ def test_it_is_accepted_for_the_bed_and_says_what_it_is_not_good_for(kit):
 
 
 def test_what_is_pasted_puts_z_0_on_the_bed(kit, true):
-    """Flat where nobody probed, and neither tilted nor high: as well as the noise lets it be."""
+    """The bed at other points is flat, without tilt and height, within the noise."""
     made = make_export(load_source(kit / "calibration"), "klipper")
     (text,) = made.files.values()
     before, after = flat(true, SAYS), flat(true, pasted(text))
@@ -163,7 +163,7 @@ def test_deviations_of_the_bed_hold(tmp_path):
 
 
 def test_a_crumb_under_the_nozzle_does_not_bend_the_bed(true, tmp_path):
-    """One touch 0.3 mm too high of nineteen is given up, and the bed is as flat as without it."""
+    """One touch of nineteen, 0.3 mm too high, is rejected, and the bed is as flat as without it."""
     readings = printers.felt(true, printers.bed(19), NOISE, np.random.default_rng(1))
     readings[9] += 0.3
     (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
@@ -177,7 +177,7 @@ def test_a_crumb_under_the_nozzle_does_not_bend_the_bed(true, tmp_path):
 
 
 def test_heights_that_are_no_gain_are_refused(true, tmp_path):
-    """Seven points within a centimetre in one corner: nothing is told of the bed's edge."""
+    """Seven points within a centimetre in one corner do not determine the bed's edge."""
     places = np.array([60.0, 0.0]) + printers.bed(7, 8.0)
     readings = printers.felt(true, places, NOISE, np.random.default_rng(2))
     cfg = printers.printer_cfg(SAYS, readings)
@@ -198,7 +198,8 @@ SMALL = printers.Settings(radius=118.0, rod=(240.0,) * 3, endstop=(260.0,) * 3)
 
 
 def session_of(folder, off, n, *, wrong=(), bed=None, noise=0.008):
-    """A session of n heights of a printer whose radius is ``off`` mm larger than its firmware says.
+    """Session of n heights of a printer whose radius is ``off`` mm larger than its firmware's
+    value.
 
     wrong : (which, mm) heights that are too high. bed : mm, heights (n,) at places (n, 2).
     """
@@ -216,7 +217,7 @@ def session_of(folder, off, n, *, wrong=(), bed=None, noise=0.008):
 
 
 def with_tolerance(kit, centre):
-    """Another tolerance of the towers, mm."""
+    """Set another tolerance of the towers, mm."""
     text = (kit / "mechanism.yaml").read_text()
     other = re.sub(r"center: \S+ mm, offset", f"center: {centre} mm, offset", text)
     assert other != text
@@ -294,7 +295,7 @@ def test_an_uneven_bed_is_no_population_of_outliers(tmp_path):
 
 
 def flat_of_small(off, value):
-    """Heights (n,) mm over the bed of such a printer with what is exported of a result."""
+    """Heights (n,) mm over the bed of such a printer with the exported values of a result."""
     true = printers.machine(replace(SMALL, radius=SMALL.radius + off))
     (text,) = Klipper().files(MachineSource(value.machine, bed=value.findings.bed.z)).values()
     points = np.column_stack([printers.bed(60, 75.0), np.zeros(60)])
@@ -304,8 +305,8 @@ def flat_of_small(off, value):
 
 
 def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
-    """A crumb under one of seven touches bends the bed more than the drawing did, and nothing in
-    the residuals shows it; of thirteen it is given up.
+    """A crumb under one of seven touches bends the bed more than the nominal model did, and no
+    residual shows it; of thirteen it is rejected.
     """
     true = printers.machine(BUILT, endstops=ENDS)
     bent: dict[int, float] = {}
@@ -330,7 +331,7 @@ def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
     assert bent[7] > 2 * bent[13]
 
 
-# ------------------------------------------------------------------ what printers say
+# ------------------------------------------------------------------ output of printers
 
 
 def said(folder, text, name="console.txt"):
@@ -350,8 +351,9 @@ Z = np.linspace(-0.3, 0.4, 8)
 
 
 def test_points_of_klippers_console(cfg):
-    """Both of its sentences tell the same points; several touches of one place count by their
-    mean."""
+    """Both of its sentences give the same points; several touches of one place count by
+    their mean.
+    """
     printer, folder = read_printer(cfg), cfg.parent
     old = [f"// probe at {x:.3f},{y:.3f} is z={z + 1.25 + d:.6f}"
            for (x, y), z in zip(PLACES, Z, strict=True) for d in (-0.01, 0.01)]  # fmt: skip
@@ -385,7 +387,7 @@ def test_saved_lines_that_klipper_would_drop_are_told(tmp_path, old, new, told):
     with pytest.raises(InputError, match="Klipper drops all that SAVE_CONFIG wrote") as error:
         read_printer(said(tmp_path, spoilt, "printer.cfg"))
     assert told in str(error.value)
-    # of a header that is gone the line after it is told
+    # for a missing header the following line is reported
     above = spoilt[: spoilt.index(new)].count("\n") + new.startswith("# <")
     assert f"line {above + 1}:" in str(error.value)
 
@@ -415,7 +417,7 @@ def test_a_board_on_a_printer(cfg):
 
 
 def test_the_drawing_of_a_printer_is_simulated(cfg):
-    """Its rods meet in one point, all that a firmware knows of the platform."""
+    """Its rods meet in one point, all that a firmware has of the platform."""
     run("new", cfg.parent / "kit", "--printer", cfg, "--board")
     drawing = load_mechanism(cfg.parent / "kit" / "mechanism.yaml")
     poses, joints = draw_configurations(
@@ -529,14 +531,14 @@ def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
 
 
 def test_heights_predict_no_readings(kit):
-    """Of a pose that only its height was measured of, the rest is its readings' own."""
+    """Of a pose of which only the height was measured, the rest follows from its readings."""
     done = run("calibrate", kit, "-o", kit.parent / "held", "--holdout", "5")
     assert done.code == 1
     assert "heights tell none" in done.err
 
 
 def test_a_board_on_a_printers_tool(cfg):
-    """The drawing is the printer's; all that a board tells is free."""
+    """The nominal model is the printer's; all parameters that a board determines are free."""
     done = run("new", cfg.parent / "kit", "--printer", cfg, "--board")
     assert done.code == 0, done.err
     text = (cfg.parent / "kit" / "mechanism.yaml").read_text()
@@ -588,7 +590,7 @@ def test_a_printers_file_that_tells_too_little(text, tmp_path):
     "print_radius: 90", "full_steps_per_rotation: 200", "gear_ratio: 1:1", "gear_ratio: 2:1, 1:2",
 ])  # fmt: skip
 def test_what_no_printer_has_is_refused_with_its_line(name, value, tmp_path):
-    """Of the first tower, whose values stand for all."""
+    """Values of the first tower, for all."""
     key, _, right = name.partition(": ")
     lines = [line for line in CFG.splitlines() if not line.startswith(key)]
     section = "[printer]" if key in ("delta_radius", "print_radius") else "[stepper_a]"

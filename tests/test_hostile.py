@@ -1,7 +1,7 @@
 """Sessions from other people: no command changes anything outside its output.
 
-A home folder stands beside sessions that hold links of every kind into it, and what looks like our
-own unfinished work. Every command runs on them, and the whole tree is compared before and after.
+A home folder is beside sessions with links of every kind into it, and with fake unfinished work of
+pkmcal. Every command runs on them, and the whole tree is compared before and after.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def tree(root, but=()):
 
 @pytest.fixture(scope="module")
 def world(demo, tmp_path_factory):
-    """A home, a tracker's session with its calibration, another one, and one with photographs."""
+    """A home, a tracker's session with its calibration, another one, and one with images."""
     root = tmp_path_factory.mktemp("world")
     session = tracked(root / "tracked")
     tracked(root / "later", seed=1)
@@ -102,7 +102,7 @@ def with_the_issues_example(home):
 
 
 def with_unfinished_results(home):
-    """The same in the results, where commands read and write."""
+    """Links in the results, where commands read and write."""
     with_the_issues_example(home)
     for folder in sessions(home)[:2]:
         for name in RESULTS:
@@ -112,7 +112,7 @@ def with_unfinished_results(home):
 
 
 def with_links(home):
-    """Links under the name of whatever is written, and what looks like another process's work."""
+    """Links under the names of outputs, and fake work of another process."""
     tracked, later, photographed = sessions(home)
     empty = home / "empty"
     for name in RESULTS:

@@ -1,7 +1,8 @@
-"""What data can tell and what not: too few legs, cameras without shared legs, poor motions.
+"""Identifiable and unidentifiable directions: too few legs, cameras without shared legs, poor
+motions.
 
-Never a confident wrong answer: either the truth lies within the stated deviations, however large,
-or the verdict refuses, with the reason in words.
+Never a confident wrong result: either the truth is within the stated standard deviations, however
+large, or the verdict refuses, with the reason in words.
 """
 
 from __future__ import annotations
@@ -82,10 +83,10 @@ def verdict(measurements, value):
 
 
 def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():
-    """Errata: a common turn of each leg's v = v'; with free radii their scale is the seventh.
+    """Errata: a common rotation of each leg's v = v'; with free radii their scale is the seventh.
 
-    The seventh: a platform that only translates tells nothing of where its legs stand, only of
-    their directions; so distances follow from the tubes' radii.
+    The seventh: a platform that only translates determines the legs' directions, not their
+    positions; so distances follow from the tubes' radii.
     """
     machine = exact("3-upu")
     for radii, lost in ((False, 6), (True, 7)):
@@ -103,7 +104,7 @@ def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():
 
 
 def common_turns(machine):
-    """Both turns of each leg's pair of axes, (P, 6)."""
+    """Both rotations of each leg's pair of axes, (P, 6)."""
     columns = []
     for leg in range(machine.n_legs):
         for turn in np.linalg.svd(machine.base_axes()[leg][None])[2][1:]:
@@ -115,12 +116,12 @@ def common_turns(machine):
 
 
 def test_one_camera_sees_four_legs_of_six():
-    """Readings of all six, and the pose from the four, fix the two that are never seen."""
+    """Readings of all six, and the pose from the four, determine the two without images."""
     machine = hexapod()
     session = Session(machine, stations=1, configurations=20)
     measurements = seen_by(session, [[0, 1, 2, 3]])
     value = told(machine, measurements, session.state())
-    # of the two legs in no photograph only the tubes are unknown, two each
+    # for the two legs without images only the tubes are unidentified, two parameters each
     names = {n for d in value.unidentified for n in d.names}
     assert len(value.unidentified) == 4
     assert names == {f"legs[{j}].tubes[{t}].radius" for j in (5, 6) for t in (1, 2)}
@@ -174,7 +175,7 @@ def normalised_steps(machine, state, truth):
 
 
 def measured(machine, poses, T_camera_base, seed=0):
-    """A true machine in given poses, seen from given places; its measurements and state."""
+    """A true machine in given poses, with cameras at given places; its measurements and state."""
     rng = np.random.default_rng(seed)
     true = true_machine(machine, 1.0, rng)
     noise = EdgeNoise(shift=0.1, tilt=0.1)
@@ -216,7 +217,7 @@ def around(machine):
 
 
 def along_a_leg(machine):
-    """A camera on the first leg's line: that leg is a disc in its pictures."""
+    """A camera on the first leg's line: that leg is a disc in its images."""
     home = machine.home()
     ends = limb_ends(machine.layout, machine.values, machine.inverse(home[None])[0], home)
     eye = ends.a[0] + 3 * (ends.b[0] - ends.a[0])
@@ -224,7 +225,7 @@ def along_a_leg(machine):
 
 
 def upright(document):
-    """Legs upright, so parallel to the pictures' columns while the platform only heaves."""
+    """Legs upright, so parallel to the images' columns while the platform only heaves."""
     for k, leg in enumerate(document["legs"]):
         place = [0.2 * np.cos(k * np.pi / 3), 0.2 * np.sin(k * np.pi / 3), 0.0]
         leg["base"]["center"] = leg["platform"]["center"] = [float(x) for x in place]

@@ -68,7 +68,7 @@ def test_three_centres_as_the_design_says():
 
 
 def test_best_fit_is_the_least_squares_fit():
-    """No small motion of either frame brings the centres nearer to the drawing."""
+    """No small motion of either frame reduces the distance of the centres from the nominal ones."""
     rng = np.random.default_rng(2)
     scene = make_scene(rng)
     values = in_gauge(scene.machine, moved_state(rng, scene), BestFit())
@@ -135,7 +135,7 @@ def test_errors_are_carried_by_a_finite_frame_change():
 
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_transformation_is_the_derivative_of_apply(gauge):
-    """Errors told in the gauge, by central differences through the whole of ``in_gauge``."""
+    """Errors in the gauge, by central differences through the whole of ``in_gauge``."""
     rng = np.random.default_rng(5)
     scene = make_scene(rng)
     machine = scene.machine
@@ -151,14 +151,16 @@ def test_transformation_is_the_derivative_of_apply(gauge):
         np.testing.assert_allclose(numeric, (s @ d)[unknowns.stations], atol=1e-11)
         numeric = 0.5 * pose_difference(plus.T_mount, minus.T_mount).ravel()
         np.testing.assert_allclose(numeric, (s @ d)[unknowns.mounts], atol=1e-11)
-    np.testing.assert_allclose(s @ s, s, atol=1e-10)  # told twice is told once
+    np.testing.assert_allclose(s @ s, s, atol=1e-10)  # the transformation is idempotent
     np.testing.assert_allclose(gauge.constraints(machine) @ s[unknowns.machine], 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("first", GAUGES)
 @pytest.mark.parametrize("second", GAUGES)
 def test_covariance_transformed_equals_covariance_recomputed(first, second):
-    """Solved with one gauge's rows and told in another, or solved with the other's at once."""
+    """Solved with one gauge's rows and transformed to another, or solved with the other's
+    directly.
+    """
     rng = np.random.default_rng(6)
     scene = make_scene(rng, configurations=8)
     machine, m = scene.machine, scene.measurements(np.random.default_rng(7))

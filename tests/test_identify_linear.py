@@ -20,12 +20,12 @@ METHODS = ["plain", "huber", "tukey", "least-median", "robust", "errors-in-varia
 
 
 def make_scene(rng, **options):
-    """The papers' methods know no scales of readings."""
+    """The papers' methods have no scales of readings."""
     return scene_of(rng, **{"machine": exact("gough-stewart"), **options})
 
 
 def true_radii(scene):
-    """The drawing with the run's true radii and no edge shift, as [B] assumes."""
+    """Nominal model with the run's true radii and no edge shift, as [B] assumes."""
     radius = scene.machine.parameters.of_kind("radius")
     values = scene.machine.values.copy()
     values[radius] = scene.theta[0, radius]
@@ -111,7 +111,7 @@ def test_legs_that_were_not_seen_are_nan():
 
 
 def test_scale_of_the_radius():
-    """[B] 16: a radius told 2 % too large scales all centres by 1.02; both forms find it."""
+    """[B] 16: a stated radius 2 % too large scales all centres by 1.02; both forms find it."""
     scene, machine, truth, m = setup(5, noise=0)
     radius = machine.parameters.of_kind("radius")
     values = machine.values.copy()
@@ -121,7 +121,7 @@ def test_scale_of_the_radius():
     base = scene.theta[0][centre_index(machine.layout)[0]]
     assert scale_ratio(value, base) == pytest.approx(1.02)
     assert procrustes_scale(value, base) == pytest.approx(1.02)
-    # the pairs 40 mm apart dominate the mean of ratios once the drawing is a little wrong
+    # the pairs 40 mm apart dominate the mean of ratios once the nominal model is a little wrong
     rng = np.random.default_rng(6)
     drawings = base + 5e-4 * rng.normal(size=(200, 6, 3))
     spread = [np.std([f(value, d) for d in drawings]) for f in (scale_ratio, procrustes_scale)]
@@ -143,7 +143,7 @@ def test_four_steps_are_exact_without_noise():
 
 
 def test_products_of_distances_leave_depth_open():
-    """Errata, A 9 and 16: as printed, the noise-free answer keeps the drawing's error in z."""
+    """Errata, A 9 and 16: as printed, the noise-free solution keeps the nominal error in z."""
     scene, machine, _, m = setup(8, noise=0)
     value = four_step(machine, m, form="printed")
     truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
@@ -204,7 +204,7 @@ def test_a_leg_that_no_station_sees_is_told():
 
 
 def test_answers_do_not_depend_on_where_the_camera_frame_lies():
-    """The same scene told with the cameras' axes turned: the centres turn along."""
+    """The same scene with rotated cameras' axes: the centres rotate along."""
     _, machine, _, m = setup(13)
     turn = perturb(np.eye(4), np.array([0.4, -0.8, 1.1, 0, 0, 0]))[:3, :3]
     turned = replace(m.edges, normal=m.edges.normal @ turn.T, basis=turn @ m.edges.basis)

@@ -127,7 +127,7 @@ def test_jacobian_of_edges_that_are_whitened_in_pairs():
 
 
 def test_jacobian_of_stations_whose_focal_lengths_breathe():
-    """Each by an unknown of its own, which its edges alone answer to."""
+    """Outward shift of each edge by an unknown of its own, in its rows only."""
     rng = np.random.default_rng(5)
     scene = make_scene(rng, configurations=3)
     case = scene.measurements(rng)
@@ -142,7 +142,7 @@ def test_jacobian_of_stations_whose_focal_lengths_breathe():
 
 @pytest.mark.parametrize("name", ["h4", "delta"])
 def test_jacobian_of_cranks_with_the_noise_that_a_search_holds(name, tmp_path):
-    """Away from where the closures are zero, where the noise's own slope would tell."""
+    """Away from the closures' zero, where the derivative of the noise matters."""
     make(tmp_path / "session", name, n=6)
     session = load_session(tmp_path / "session")
     measurements = measurements_of(session, Boards())
@@ -216,7 +216,7 @@ def moved_outward(normal, middle, pixels):
 
 
 def test_an_edge_that_cannot_be_predicted_counts_for_nothing():
-    """A station inside a leg of the drawing: its edges are NaN, all else is solved."""
+    """A station inside a leg of the nominal model: its edges are NaN, all else is solved."""
     rng = np.random.default_rng(8)
     scene = make_scene(rng, configurations=6)
     measurements = scene.measurements(rng)

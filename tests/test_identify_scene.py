@@ -1,7 +1,7 @@
-"""The scene that the identification's tests share, made here from first principles.
+"""Scene that the identification's tests share, made here from first principles.
 
-A batch of B machines with errors drawn from the drawing's tolerances, seen by cameras around
-them: edges with correlated noise, readings with noise. Importable by the other test modules.
+A batch of B machines with errors drawn from the prior sigmas, and cameras around them: edges with
+correlated noise, readings with noise. Importable by the other test modules.
 """
 
 from __future__ import annotations
@@ -31,10 +31,13 @@ JOINT_NOISE = 3e-6
 
 @dataclass(frozen=True)
 class Scene:
-    """machine : the drawing. theta (B, P), T_camera_base (S, 4, 4), poses (B, K, 4, 4), joints
-    (B, K, 6), edge_shift (B,). index : station, configuration, leg, tube, side, (5, N).
-    normal (B, N, 3), basis (B, N, 3, 2), covariance (N, 2, 2), shift (N, 2). shading (B, N) px.
-    turned (B, N, 2) what else turns the normals, in that basis."""
+    """Batch of true machines and their measurements.
+
+    machine : nominal model. theta (B, P), T_camera_base (S, 4, 4), poses (B, K, 4, 4), joints
+    (B, K, 6), edge_shift (B,). index : station, configuration, leg, tube, side, (5, N). normal
+    (B, N, 3), basis (B, N, 3, 2), covariance (N, 2, 2), shift (N, 2). shading (B, N) px. turned
+    (B, N, 2) further rotations of the normals, in that basis.
+    """
 
     machine: Machine
     theta: np.ndarray
@@ -127,7 +130,7 @@ def stations(n: int, distance: float = 0.9) -> np.ndarray:
 
 
 def exact(name):
-    """A built-in machine whose readings are what they say."""
+    """Built-in machine with exact readings' scales."""
     return machine_from_document(with_exact_scales(load_mechanism(name).document))
 
 
@@ -142,8 +145,9 @@ def make_scene(
     noise: float = 1.0,
     reach: float = 1.0,
 ) -> Scene:
-    """Machines with errors of ``tolerance`` times the drawing's, in random poses; reach : how far
-    from home, in times of 0.25 rad and 40 mm."""
+    """Machines with errors of ``tolerance`` times the prior sigmas, in random poses; reach :
+    distance from home, in times of 0.25 rad and 40 mm.
+    """
     machine = machine or load_mechanism("gough-stewart")
     table = machine.parameters
     free = table.free_matrix()

@@ -1,4 +1,4 @@
-"""Photographs that a program has turned by half, against a camera file of before."""
+"""Images that a program has rotated by half a turn, with a camera file from before."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from pkmcal.report.calibration import save
 from test_calibration import check_found
 
 CUT = (32, 20)
-"""Columns and rows that are cut from the pictures, which puts the camera's centre beside the
-middle."""
+"""Columns and rows that are cut from the images, which puts the camera's centre beside the middle.
+"""
 
 
 @pytest.fixture(scope="module")
 def turned(demo, tmp_path_factory):
-    """The demonstration's session, its pictures cut and turned by half and no pose told."""
+    """The demonstration's session, with images cut and rotated by half a turn, and no poses."""
     folder = shutil.copytree(demo.session, tmp_path_factory.mktemp("turned") / "session")
     for path in (folder / "images").rglob("*.png"):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -47,7 +47,7 @@ def turned(demo, tmp_path_factory):
 
 @pytest.fixture
 def turned_calibration(calibrated):
-    """The demonstration's calibration as if its photographs had been upside down."""
+    """The demonstration's calibration as if its images had been upside down."""
     session, file = calibrated.session, "cameras/camera.yaml"
     camera = session.stations[0].camera.turned_by_half()
     one = UpsideDown(file, tuple(station.entry for station in session.stations), camera, 20.0)
@@ -56,8 +56,9 @@ def turned_calibration(calibrated):
 
 @pytest.mark.slow
 def test_upside_down_photographs_are_known_by_their_cameras_centre(turned):
-    """As good as upright ones, and told what file would be theirs. How sure it has to be is tested
-    below.
+    """As accurate as upright images, and the right camera file is reported.
+
+    The required certainty is tested below.
     """
     values = pkmcal.calibrate(turned)
     check_found(values, turned, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
@@ -83,7 +84,7 @@ def test_upright_photographs_are_left_as_they_are(calibrated):
 
 @pytest.mark.slow
 def test_where_it_is_likely_it_is_said(demo, monkeypatch):
-    """And the photographs are measured as they are."""
+    """And the images are measured as they are."""
 
     def likely(session, turns):
         station = session.stations[0]
@@ -113,7 +114,7 @@ def test_odds_that_are_too_few_are_said_with_what_to_do(calibrated):
 
 
 def lens(session, centre, covariance=None):
-    """A session whose camera's centre is so many px beside the middle, as its file would say."""
+    """Session whose camera's centre is so many px beside the middle, as in its file."""
     file, camera = session.stations[0].camera_file, session.stations[0].camera
     parameters = camera.parameters.copy()
     parameters[2:4] = (np.array(camera.image_size) - 1) / 2 + centre
@@ -164,7 +165,9 @@ def test_a_file_may_be_wrong_by_what_it_says(calibrated, monkeypatch, centre, si
 
 
 def test_the_file_that_is_told_is_the_one_that_is_written(turned_calibration, tmp_path):
-    """Beside the result, where what loads a calibration looks for it; and said to programs."""
+    """Beside the result, where every loader of a calibration finds it; and as a fact for
+    programs.
+    """
     folder = tmp_path / "calibration"
     save(turned_calibration, folder)
     own = turned_calibration.session.stations[0].camera

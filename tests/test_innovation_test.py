@@ -36,8 +36,7 @@ def rejected_pose(readings_off):
 
 @pytest.mark.parametrize("readings_off", [0.0, 20 * COARSE])
 def test_the_innovation_is_what_the_pose_would_cost(readings_off):
-    """Where the readings are only noisy, and where they are wrong; in the pose's own noise both
-    look wrong."""
+    """With noisy readings, and with wrong ones; in the pose's own noise both look wrong."""
     whole, without, weight, value = rejected_pose(readings_off)
     plain = norms(whole, whole.unweighted(value.state)).poses
     info = Information(without, value.state)

@@ -33,7 +33,7 @@ def camera():
 
 
 class Session:
-    """Measurements of a true machine, without photographs; boards where asked for."""
+    """Measurements of a true machine without images; boards optionally."""
 
     def __init__(
         self, machine, seed=0, stations=2, configurations=8, boards=(), noise=1.0, settings=None
@@ -109,7 +109,8 @@ def test_jacobian_with_boards(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_truth_is_found_without_noise(name):
-    # of a platform that only translates, readings and radii tell what is far: the drawing decides
+    # for a platform that only translates, distances follow from readings and radii: the prior
+    # decides
     machine = exact(name) if name == "3-upu" else load_mechanism(name)
     session = Session(machine, boards=("base",), noise=1e-4)
     fit = bundle(
@@ -122,7 +123,7 @@ def test_truth_is_found_without_noise(name):
     truth = in_gauge(session.drawing, session.state(), default_gauge(session.drawing))
     error = fit.machine.values - session.drawing.parameters.unit_axes(truth.theta)
     sigma = np.sqrt(np.diag(fit.covariance))
-    # micrometres where photographs leave tens of them; the drawing pulls on what they do not tell
+    # micrometres where images leave tens of them; the prior biases what they do not determine
     assert np.all(np.abs(error) < 1e-5 + 4 * sigma)
     values = fit.data_share > 0.9
     assert values.sum() > 0.5 * len(error)

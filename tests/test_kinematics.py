@@ -275,7 +275,7 @@ def test_nearness_to_a_singular_pose_is_told():
 
 @pytest.mark.parametrize("short", [1.0, 0.1, 1e-2, 1e-4, 0.0])
 def test_forward_near_a_singular_pose_is_honest(short):
-    """Two solutions merge; whichever is found closes the machine, and is told to be uncertain."""
+    """Two solutions merge; either closes the machine, and is reported as uncertain."""
     machine, T = hexapod(), yawed(90 - short)
     readings = machine.inverse(T)
     steps = 0.02 * np.random.default_rng(0).normal(size=(30, 6))

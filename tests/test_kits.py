@@ -47,7 +47,7 @@ def test_a_board_and_a_webcam_calibrate_a_kit(by_board):
 
 
 def test_the_report_promises_what_is_kept(by_board):
-    """The card about the platform's pose, by the poses and not by joints that nobody saw."""
+    """The card about the platform's pose, by the poses, as no leg was observed."""
     kit, result = by_board
     cards = report_of(result).figures
     questions = [card.question for card in cards]
@@ -103,7 +103,7 @@ def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
 
 
 def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
-    """Rods and radius changed as told: the heights stay, x and y stretch as told."""
+    """Rods and radius changed as stated: the heights stay, x and y stretch as stated."""
     _, value = by_heights
     text = next(
         s.text
@@ -151,8 +151,9 @@ def bed_readings(machine):
 
 
 def test_the_firmwares_model_holds_what_no_firmware_can(tmp_path):
-    """Of a kit whose towers lean by a third of a degree: the bed flat all the same, all deviations
-    larger by what the model leaves out, and nothing lost in the firmware's values."""
+    """Kit whose towers lean by a third of a degree: the bed flat all the same, all standard
+    deviations larger by the discrepancy, and nothing lost in the firmware's values.
+    """
     kit = probe_kit(tmp_path / "session", n=25)
     calibration = calibrate_session(load_session(tmp_path / "session", model="firmware"))
     table = calibration.machine.parameters

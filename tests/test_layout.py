@@ -47,7 +47,7 @@ def imports(path: Path) -> set[Path]:
 
 @cache
 def arrows() -> dict[Path, set[Path]]:
-    """What every file imports; parsed when first asked for, not when tests are collected."""
+    """Imports of every file; parsed when first needed, not when tests are collected."""
     return {path: imports(path) for path in SOURCE.rglob("*.py")}
 
 
@@ -85,8 +85,8 @@ def is_private(name: str) -> bool:
 
 
 def test_private_names_are_used_in_their_own_file_and_nowhere_else():
-    """Neither the type checker nor ruff looks for these two: a function that nobody calls any more,
-    and one of another file's inside.
+    """Two checks that neither the type checker nor ruff has: a function without a caller, and the
+    use of another file's private names.
     """
     wrong: list[str] = []
     for path in SOURCE.rglob("*.py"):

@@ -1,4 +1,4 @@
-"""Names with control characters: what is printed and what is written stays what it is."""
+"""Names with control characters: spelt out in output and files."""
 
 import json
 import re
@@ -127,7 +127,7 @@ def test_no_name_becomes_a_line_of_an_export(name):
 
 
 def code_of(file, text):
-    """What a program reads of a file, without the machine's name."""
+    """Content of a file as a program reads it, without the machine's name."""
     kind = file.rpartition(".")[2]
     if kind in ("c", "h"):
         text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)

@@ -33,14 +33,14 @@ MIRROR = camera_models()["unified"](
 
 
 def true_machine(rng, share=1.0):
-    """A machine off its drawing by the tolerances."""
+    """Machine with errors as large as the prior sigmas."""
     table = DRAWING.parameters
     off = share * table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
     return DRAWING.with_values(table.drawing + table.free_matrix() @ off)
 
 
 def seen(machine, rng, noise, configurations=12, shading=0.0):
-    """What the mirror sees of a machine; shading (px) of each side of a tube by Student's t."""
+    """Edges in the mirror; shading (px) of each side of a tube by Student's t."""
     spread = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.04])
     poses = perturb(machine.home(), rng.uniform(-1, 1, (configurations, 6)) * spread)
     edges, joints = simulate_edges(machine, STATION[None], MIRROR, poses, noise, rng)
@@ -75,7 +75,7 @@ def together(measurements):
 
 @pytest.fixture(scope="module")
 def scenes():
-    """Machines, cameras and tubes off by what is stated of them, each once."""
+    """Machines, cameras and tubes with errors of their stated standard deviations, each once."""
     made = []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -86,7 +86,7 @@ def scenes():
 
 
 def test_exact_edges_give_the_base_and_the_edge_shift():
-    """Where the drawing is no more than a hint, and radii are exact, data alone decide."""
+    """With a weak prior and exact radii the data alone decide."""
     rng = np.random.default_rng(1)
     truth = true_machine(rng)
     radii = truth.parameters.of_kind("radius")
@@ -110,7 +110,7 @@ def test_exact_edges_give_the_base_and_the_edge_shift():
 
 
 def test_better_than_leg_by_leg(scenes):
-    """Radii and shading of single legs, which no scale takes out, are weighed with the drawing."""
+    """Radii and shading of single legs, which no scale absorbs, are weighted against the prior."""
     errors = np.array(
         [
             [missed(f(m), machine.base_centers()) for f in (together, leg_by_leg)]
@@ -124,7 +124,7 @@ def test_better_than_leg_by_leg(scenes):
 
 
 def test_a_leg_that_is_lost_alone_is_not_lost_together():
-    """A third of wrong edges in twelve photographs: legs fall into the mirror one by one."""
+    """A third of wrong edges in twelve images: legs collapse towards the mirror one by one."""
     alone, both = [], []
     for seed in range(4):
         rng = np.random.default_rng(50 + seed)
@@ -163,7 +163,7 @@ def chi2(values, value, covariance, machine):
 
 
 def test_deviations_are_true_for_base_platform_and_lengths(scenes):
-    """As large as errors are; what stays as drawn has the drawing's."""
+    """Standard deviations match the errors; nominal parameters keep their prior sigmas."""
     squares, shifts, count = [], [], 0
     for machine, measurements in scenes:
         estimate = linear_estimate(DRAWING, measurements)
@@ -178,7 +178,7 @@ def test_deviations_are_true_for_base_platform_and_lengths(scenes):
 
 
 def _laid_on(machine, value):
-    """The machine's values (P,) told in the frames that lay its centres on those found."""
+    """Values (P,) of the machine in the frames that fit its centres to the estimated ones."""
     values = machine.values.copy()
     for index, old, new in zip(
         centre_index(machine.layout),
@@ -191,7 +191,7 @@ def _laid_on(machine, value):
 
 
 def test_verdict_says_how_far_the_method_goes(scenes):
-    """Base joints by edges, by the drawing and by both: figures, and the better method."""
+    """Base joints by edges, by the nominal model and by both: figures, and the better method."""
     machine, measurements = scenes[0]
     estimate = linear_estimate(DRAWING, measurements)
     observation = Observation(

@@ -350,7 +350,7 @@ def test_the_tool_point_of_a_machine_that_turns_is_estimated(machine):
 
 
 def test_without_links_a_configuration_is_eliminated(machine, case):
-    """The same data without links: no unknown is shared, and the estimate is another."""
+    """The same data without links: no unknown is shared, and the estimate differs."""
     _, _, data = case
     plain = assemble(machine, replace(data, links=()), default_gauge(machine)).problem
     assert plain.unknowns.n_linked == 0

@@ -39,7 +39,7 @@ def stopped(step) -> bool:
 
 
 def camera_before(machine, readings):
-    """A camera that looks at the machine from the side, three times as far as it is wide."""
+    """Camera at the side of the machine, at three times its width."""
     ends = limb_ends(machine.layout, machine.values, readings, machine.home())
     points = np.concatenate([ends.a, ends.b])
     middle = points.mean(axis=0)
@@ -177,7 +177,7 @@ def test_a_motor_at_its_end_stops_what_leads_further_and_not_what_leads_back():
     direction = np.sign(moving.joint_velocities[k])
     readings = READINGS.copy()
     readings[k] = MACHINE.joint_ranges[k, 0 if direction < 0 else 1] - 1e-4 * direction
-    # the photograph is another one's, but what is asked here is the reading
+    # the image is another one's, but the reading is under test
     loop = servo(period=0.1)
     loop._started = True
     step = loop.step_edges(edges(), readings)
@@ -264,13 +264,15 @@ def test_samples_that_cannot_be_are_refused():
         loop.step_image(np.zeros((480, 640), np.uint8), READINGS)
 
 
-# ------------------------------------------------------------------ photographs
+# ------------------------------------------------------------------ images
 
 
 @pytest.mark.parametrize("view", ["perspective", pytest.param("mirror", marks=pytest.mark.slow)])
 def test_photographs_lead_to_the_goal_and_past_a_painted_leg(view):
-    """Rendered photographs close the loop: in seven samples from 22 mm and 6 degrees to what one
-    photograph tells. A mirror image of that size has a third of the pixels a radian.
+    """Rendered images close the loop: in seven samples from 22 mm and 6 degrees to the accuracy of
+    one image.
+
+    A mirror image of that size has a third of the pixels per radian.
     """
     camera, T = (PERSPECTIVE, BESIDE) if view == "perspective" else (MIRROR, WITHIN)
     lab = Lab(MACHINE, camera, T)
@@ -298,7 +300,7 @@ def test_a_photograph_is_a_goal_and_a_wrong_start_is_said():
     image = lab.photograph(HOME, READINGS)
     loop = VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalPhotograph(image, READINGS))
     step = loop.step_image(image, READINGS)
-    assert np.abs(step.remaining).max() < 1e-9  # the same photograph
+    assert np.abs(step.remaining).max() < 1e-9  # the same image
     assert step.converged
     loop.reset()
     elsewhere = perturb(HOME, np.array([0.1, 0.1, 0.3, 0.03, 0, 0.03]))

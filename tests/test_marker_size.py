@@ -1,4 +1,4 @@
-"""A ChArUco board whose markers are not of the size that its file says."""
+"""A ChArUco board whose markers differ in size from its file."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def poses_of(machine, count, rng):
 
 
 def of_targets(whiten, level=False):
-    """A target on the platform, seen from one station; whiten (6, 6)."""
+    """A target on the platform, from one station; whiten (6, 6)."""
 
     def example(rng):
         machine = load_mechanism("gough-stewart")

@@ -54,7 +54,7 @@ def test_catalogue_machines_can_be_assembled(machine):
 
 
 def test_catalogue_tubes_are_as_long_as_the_legs(machine):
-    """A leg that an edge is looked for on is there over the whole range of its length."""
+    """A leg whose edges are measured exists over the whole range of its length."""
     for leg in machine.document.legs:
         for tube in leg.tubes:
             assert tube.radius < 0.1
@@ -94,7 +94,7 @@ def built(machine, steps):
 
 
 def at_path(document, name):
-    """What stands in a file's fields at a parameter's name, by the rule of docs/files.md."""
+    """Value of a file's fields at a parameter's name, by the rule of docs/files.md."""
     node = document
     for key, number in re.findall(r"([a-z]+)|\[(\d+)\]", name):
         if number:
@@ -107,7 +107,7 @@ def at_path(document, name):
 
 
 def test_parameter_names_are_paths_in_the_file(machine):
-    """Each value at its own place, seen by giving every parameter another value."""
+    """Each value is at its own place: every parameter gets another value."""
     unlike = machine.parameters.unit_axes(
         machine.values + 1e-3 * np.arange(1, len(machine.values) + 1)
     )

@@ -1,6 +1,6 @@
 """One camera that sees an H4's forearms and the board on its platform, in one estimate.
 
-Without photographs; with them in test_simulate_driven.
+Without images; with images in test_simulate_driven.
 """
 
 from __future__ import annotations

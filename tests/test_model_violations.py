@@ -1,4 +1,4 @@
-"""What a session takes for granted and is not so is named, with its size, and nothing else."""
+"""A wrong fact of a session is reported with its size, and nothing else is."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ NOISE = EdgeNoise(0.1, 0.1)
 
 
 def measured(seed, *, scale=None, turned=None, play=None, machine=None, count=30):
-    """A hexapod's edges and readings, from one place, with a departure; of readings that are what
-    they say, unless a machine is given.
+    """Edges and readings of a hexapod, from one place, with a model violation; with exact readings'
+    scales by default.
     """
     rng = np.random.default_rng(seed)
     drawing = machine or exact("gough-stewart")
@@ -122,7 +122,7 @@ def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate()
 
 
 def test_a_scale_beyond_its_tolerance_is_found_whole():
-    """Freed beside its tolerance it leaves the parameter to the drawing, and is all there is."""
+    """Freed beside its prior the violation leaves the parameter nominal, and is the only one."""
     drawing = load_mechanism("gough-stewart")
     drawing, data, where = measured(1, scale=(2, 1e-2), machine=drawing)
     estimate, tests = score_tests(drawing, data, where, scales(data), False)
@@ -236,8 +236,9 @@ def test_right_sessions_have_chances_like_dice():
 
 
 def test_errors_of_whole_configurations_are_no_departure():
-    """One reading of each configuration off by chance, by far more than noise, along what a scale
-    would do: without asking how that scatters over the configurations a scale would be named."""
+    """Random errors of one reading, far larger than its noise, along a scale's column: without the
+    scatter over configurations in the test, a scale would be reported.
+    """
     named = np.zeros(2, dtype=int)
     for seed in range(6):
         drawing, data, where = measured(40 + seed, count=20)
@@ -267,7 +268,7 @@ def test_right_sessions_have_chances_like_dice_often():
 def test_what_no_data_see_is_not_tested():
     drawing, data, where = measured(5, count=12)
     nothing = np.zeros((*data.joints.shape, 1))
-    # off by the same everywhere is its offset, an unknown of which the drawing alone says more
+    # a common error is its offset, an unknown that only the nominal model determines better
     offset = nothing.copy()
     offset[:, 1] = 1.0
     _, tests = score_tests(drawing, data, where, [nothing, offset], False)
@@ -320,8 +321,8 @@ def test_boards_of_another_size_show_where_readings_give_the_scale():
 
 
 def outlined(seed, lines_off):
-    """What is told of tubes whose edges are moved by {(leg, tube, station, side): px} outward, and
-    by how many mm that is, median of all.
+    """Findings on tubes whose edges are moved by {(leg, tube, station, side): px} outward, and that
+    shift in mm, median of all.
     """
     drawing, data, where = measured(seed, count=20)
     edges = data.edges
@@ -373,7 +374,7 @@ def test_right_tubes_are_not_named():
     assert [outlined(seed, {})[0] for seed in (13, 14)] == [[], []]
 
 
-# ------------------------------------------------------------------ on photographs
+# ------------------------------------------------------------------ on images
 
 
 @pytest.mark.slow
@@ -457,7 +458,7 @@ def test_a_frozen_reading_is_named(session):
 
 
 def test_readings_that_never_change_are_frozen(demo):
-    """As calibrate says it of a session whose data fit nothing: the test above."""
+    """The findings of calibrate on a session whose data fit nothing: the test above."""
     session = load_session(demo.session)
     assert frozen_in(session) is None
     joints = session.joints.copy()

@@ -1,5 +1,5 @@
-"""A carrier that the program does not have: written as docs/machines.md says, in a file outside the
-package, it loads, moves, calibrates, is drawn, described and exported like any other.
+"""A carrier outside the package, as in docs/machines.md: it loads, moves, calibrates, is rendered,
+described and exported like any other.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ LEAN = 0.02
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where the carriers' file and the mechanisms are; the carriers are known while it lasts."""
+    """Folder of the carriers' file and the mechanisms; the carriers are registered meanwhile."""
     folder = tmp_path_factory.mktemp("carriers")
     (folder / "my_carriers.py").write_text(CARRIERS)
     sys.path.insert(0, str(folder))
@@ -186,7 +186,7 @@ def test_it_is_a_machine_with_the_carriers_parameters(machine, folder):
     own = [n for n in machine.parameters.names if n.startswith("legs[1].base")]
     assert own == [f"legs[1].base.{f}.{c}" for f in ("center", "axis", "arm") for c in "xyz"]
     assert machine.joint_units == ("rad",) * 6
-    parts = {cause.part for cause in single_causes(machine)}  # what a watch can tell apart
+    parts = {cause.part for cause in single_causes(machine)}  # distinguishable by a watch
     assert parts == {"base", "arm", "rod", "platform", "scale"}
     (folder / "again.yaml").write_text(mechanism_text(machine))
     np.testing.assert_array_equal(load_mechanism(folder / "again.yaml").values, machine.values)
@@ -203,7 +203,7 @@ def test_faults_of_its_fields_are_told_as_others_are(machine, folder):
 
 
 def test_commands_find_it_by_the_environment(machine, folder):
-    """``PKMCAL_CARRIERS`` names modules that stand where Python looks for them."""
+    """``PKMCAL_CARRIERS`` names modules on Python's path."""
     code = "import pkmcal, sys; print(pkmcal.load_mechanism(sys.argv[1]).name)"
     path = os.pathsep.join([str(folder), *sys.path])
 
@@ -314,7 +314,7 @@ def test_jacobians_against_complex_steps(machine):
 
 @pytest.fixture(scope="module")
 def calibrated(machine):
-    """Truth of a simulated session of edges, and what the data give."""
+    """Truth of a simulated session of edges, and its estimate."""
     truth, measurements = test_catalogue.simulated(machine, 1, stations=3)
     rough = np.stack([pose.T_camera_base() for pose in truth.rough])
     start = start_state(machine, measurements, rough)

@@ -56,7 +56,7 @@ def test_variances_are_as_their_shares_say(factor):
     result = solve_batch(problem, truth, robust=False, scale_noise=False)
     value, shares = components(result.info, result.weight), result.reading_noise
     real = shares.fixed < 1  # no padding
-    assert np.sum(shares.own**2, axis=1).mean() > LEAST_NOISE_FREEDOM  # something is told
+    assert np.sum(shares.own**2, axis=1).mean() > LEAST_NOISE_FREEDOM  # there is a warning
     u = shares.z / np.sqrt(factor**2 * shares.own + shares.others + shares.fixed)
     assert np.mean(u[real] ** 2) == pytest.approx(1, abs=4 * np.sqrt(2 / real.sum()))
     for part in (shares.own < 0.2, shares.own > 0.8):  # of each kind by itself
@@ -69,8 +69,9 @@ def test_variances_are_as_their_shares_say(factor):
 
 
 def coverage(configurations, true, chance, runs):
-    """Shares of runs in which the interval of the readings' noise holds the truth, and in which
-    each of its ends is told."""
+    """Shares of runs in which the interval of the readings' noise contains the truth, and in which
+    each of its ends is finite.
+    """
     problem, truth = batch(7, true, true, runs=runs, configurations=configurations)
     value = solve_batch(problem, truth, robust=False, scale_noise=False)
     low, high = value.reading_noise.interval(chance)
@@ -88,8 +89,10 @@ def test_an_interval_of_95_per_cent_holds_the_truth_as_often():
 @pytest.mark.parametrize("configurations", [6, 15])
 @pytest.mark.parametrize("true", [3e-6, 3e-5, 1e-4, 3e-4, 3e-3])
 def test_intervals_hold_the_truth_as_often_as_they_state(configurations, true):
-    """Beside edges that know a pose to some 0.1 mm: readings far better, alike, and worse. Where
-    the interval begins at nothing it may hold the truth more often: there is no end to be below."""
+    """With edges that determine a pose to some 0.1 mm: readings far better, equal, and worse.
+
+    An interval that begins at zero may contain the truth more often: there is no lower end.
+    """
     share, low, _ = coverage(configurations, true, 0.05, 400)
     assert share > 0.92
     assert share < (0.98 if low > 0.5 else 1.0)
@@ -97,10 +100,12 @@ def test_intervals_hold_the_truth_as_often_as_they_state(configurations, true):
 
 
 def test_noise_of_edges_that_poses_take_up_is_not_that_of_readings():
-    """Edges that err alike, so that poses take up half or twice of what each by itself would make:
-    in each pose as if its edges were as much sharper or worse, while their own residuals show
-    nothing of it. Readings a hundred times sharper than poses are seen do not show their noise
-    there, and nothing is claimed of it."""
+    """Correlated edges, so that poses absorb half or twice of the error of independent ones.
+
+    In each pose as if its edges were as much sharper or worse, while their own residuals show
+    nothing of it. Readings a hundred times sharper than poses do not show their noise there, and
+    nothing is concluded about it.
+    """
     rng = np.random.default_rng(8)
     own = np.exp(rng.uniform(np.log(1e-5), np.log(0.05), (40, 90)))
     for factor in (0.5, 2.0):
@@ -113,8 +118,9 @@ def test_noise_of_edges_that_poses_take_up_is_not_that_of_readings():
 
 @pytest.mark.parametrize(("true", "stated"), [(3e-6, 3e-3), (3e-4, 3e-6), (3e-4, 3e-2)])
 def test_a_noise_that_is_stated_wrong_is_found(true, stated):
-    """By a hundred or a thousand, either way: estimates are as good as with the right one, and as
-    honest, and edges are not blamed."""
+    """Stated noise wrong by a hundred or a thousand, either way: estimates are as accurate and as
+    honest as with the right one, and edges are not reported.
+    """
     problem, truth = batch(2, true, stated)
     right = replace(problem, joint_noise=np.array([true]))
     value, best = (solve_batch(p, truth) for p in (problem, right))
@@ -130,15 +136,16 @@ def test_a_noise_that_is_stated_wrong_is_found(true, stated):
 
 
 def test_a_noise_that_is_stated_right_is_left_alone():
-    """One in a hundred may be doubted; among forty no more than two."""
+    """One in a hundred may be flagged; among forty no more than two."""
     problem, truth = batch(3, JOINT_NOISE, JOINT_NOISE, runs=40)
     values = solve_batch(problem, truth)
     assert np.sum(values.reading_scale != 1) <= 2
 
 
 def test_where_the_data_cannot_tell_nothing_is_claimed():
-    """Edges see the platform to some ten micrometres: whether readings are off by three or by three
-    hundredths, they do not know, and it makes no difference."""
+    """Edges determine the platform to some ten micrometres: they do not show whether readings have
+    errors of three micrometres or of three hundredths, and it makes no difference.
+    """
     problem, truth = batch(4, 3e-6, 3e-8)
     values = solve_batch(problem, truth)
     np.testing.assert_array_equal(values.reading_scale, 1.0)
@@ -156,7 +163,7 @@ def test_too_few_degrees_of_freedom_tell_nothing():
 
 
 def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
-    """But not used: what all of a tracker's measurements share does not scatter."""
+    """But not used: errors common to all of a tracker's measurements do not scatter."""
     folder = make(tmp_path / "session", "gough-stewart", "poses").folder
     text = (folder / "session.yaml").read_text(encoding="utf-8")
     wrong = text.replace("position: 2.0e-05", "position: 2.0e-4").replace(
@@ -194,8 +201,9 @@ def pose_problem(name, pairs=()):
 
 @pytest.mark.parametrize("name", ["edges", "h4", "h4-rods", "h4 with distances"])
 def test_traces_are_those_of_the_hat_matrix(name):
-    """Of all rows as one dense matrix; h4-rods has two rods a motor, of which half a row each is
-    the reading's and the rest of no kind."""
+    """All rows as one dense matrix; h4-rods has two rods for a motor, of which half a row each is
+    the reading's and the rest of no kind.
+    """
     if name == "edges":
         problem, state = batch(4, 1e-4, 1e-4, runs=1)
     else:
@@ -242,4 +250,4 @@ def test_traces_are_those_of_the_hat_matrix(name):
         distance = (turn[:, some].T @ z) ** 2 / size[some]
         assert np.sum(shares.z**2) == pytest.approx(distance.sum(), rel=1e-3)
         np.testing.assert_allclose(shares.own + shares.others + shares.fixed, 1, atol=1e-12)
-    assert freedom[READING_ROWS_KIND] > 1e-3  # the data do say something of each kind
+    assert freedom[READING_ROWS_KIND] > 1e-3  # the data contain information on each kind

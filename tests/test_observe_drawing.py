@@ -1,7 +1,8 @@
-"""Pictures of legs for the tests of observation, drawn without pkmcal's own geometry or simulation.
+"""Images of legs for the tests of observation, rendered without pkmcal's geometry or simulation.
 
-Every pixel's ray is met with every tube (a quadratic equation); pixels at borders are looked at
-through 36 points. Lens blur, noise and 8 bits follow. The tests below are of the drawing itself.
+Every pixel's ray is intersected with every tube (a quadratic equation); pixels at borders are
+sampled at 36 points. Lens blur, noise and 8 bits follow. The tests below are of the rendering
+itself.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.mechanisms import load_mechanism
 
 BLUR = 0.6
-"""Lens, px; with the pixel's own 0.29 and the interpolation, pictures have about 0.7."""
+"""Lens blur, px; with the pixel's own 0.29 and the interpolation, images have about 0.7."""
 LAMP = np.array([-0.5, -0.7, 0.5]) / np.linalg.norm([-0.5, -0.7, 0.5])
 """Towards the light, base frame: from the camera's left, and above."""
 FRONT = look_at(np.array([0.1, -0.85, 0.32]), np.array([0.0, 0.0, 0.18]), np.array([0.0, 0.0, 1.0]))
@@ -74,7 +75,7 @@ def meet(tube, T_camera_base, rays):
 
 
 def light_on(tubes, T_camera_base, rays, background):
-    """Light (...) seen along rays (N, 3) and the leg that it comes from, -1 for none."""
+    """Light (...) along rays (N, 3) and the leg that it comes from, -1 for none."""
     level, leg = np.array(background, dtype=float), np.full(len(rays), -1)
     nearest = np.full(len(rays), np.inf)
     lamp = T_camera_base[:3, :3] @ LAMP
@@ -116,7 +117,7 @@ def shown(tubes):
 
 
 def draw(tubes, T_camera_base=FRONT, *, distorted=True, background=200.0, noise=1.0, seed=0):
-    """A photograph (480, 640) uint8 and which leg each pixel's centre shows."""
+    """An image (480, 640) uint8 and the leg at each pixel's centre."""
     middle, by_x, by_y = pixel_rays(distorted)
     flat = np.broadcast_to(background, (480, 640)).reshape(-1)
     level, leg = light_on(tubes, T_camera_base, middle, flat)
@@ -125,7 +126,7 @@ def draw(tubes, T_camera_base=FRONT, *, distorted=True, background=200.0, noise=
     for axis in (0, 1):
         step = np.diff(grid, axis=axis) != 0
         border |= np.insert(step, 0, False, axis) | np.insert(step, step.shape[axis], False, axis)
-    # tubes of one leg differ in radius: their common end is a border too, but nobody looks there
+    # tubes of one leg differ in radius: their common end is a border too, but is not tested
     again = np.flatnonzero(border)
     place = (np.arange(6) + 0.5) / 6 - 0.5
     dx, dy = (v.ravel()[:, None, None] for v in np.meshgrid(place, place))
@@ -152,7 +153,7 @@ def poses(count=6):
 
 @cache
 def photographs(distorted=True):
-    """Pictures of the machine as drawn, from FRONT, and the legs that their pixels show."""
+    """Images of the machine with nominal geometry, from FRONT, and the legs at their pixels."""
     made = [
         draw(tubes_at(machine(), T), distorted=distorted, seed=k) for k, T in enumerate(poses())
     ]
@@ -182,7 +183,7 @@ def true_normals(legs, tubes, sides, configurations):
 
 
 def outward_to(normal, pixel, outward, camera):
-    """How far along ``outward`` (px) from a pixel the plane n . x = 0 is met, by secants.
+    """Distance along ``outward`` (px) from a pixel to the plane n . x = 0, by secants.
 
     normal : (..., 3) against pixel and outward (..., n, 2).
     """
@@ -201,7 +202,7 @@ def outward_to(normal, pixel, outward, camera):
     return now
 
 
-# The drawing itself
+# the rendering itself
 
 
 @pytest.mark.parametrize("distorted", [False, True])

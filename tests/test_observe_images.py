@@ -1,4 +1,4 @@
-"""Photographs decoded: whole ones as their camera gave them; others named with what is wrong."""
+"""Decoded images: complete ones as the camera wrote them; faulty ones named with their fault."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def chunk(kind, body):
 
 
 def png_of(width, height):
-    """A PNG of well-formed chunks that states a size and holds no such picture."""
+    """PNG of well-formed chunks that states a size and contains no such image."""
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     parts = [(b"IHDR", header), (b"IDAT", zlib.compress(b"0" * 100)), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
@@ -77,7 +77,7 @@ def test_twelve_bits_in_sixteen_are_told_as_such(tmp_path, suffix, bits, times):
     assert f"a 16-bit file whose grey levels fill {bits} bits" in str(caught.value)
     assert f"found levels up to {2**bits - 1}, expected levels up to 65535" in str(caught.value)
     assert f"measures {bits} bits, multiply by {times} when" in str(caught.value)
-    assert cv2.imwrite(str(path), levels * times)  # as the sentence says
+    assert cv2.imwrite(str(path), levels * times)  # as in the sentence
     assert decode(path, (8, 6), path.name).max() > 250
 
 
@@ -88,7 +88,7 @@ def test_a_dark_photograph_of_eight_bits_is_no_fault_of_its_file(tmp_path):
 
 
 def test_a_turned_jpeg_stays_as_the_sensor_gave_it(tmp_path):
-    """EXIF orientation 6 asks viewers for a quarter turn; the camera model knows none."""
+    """EXIF orientation 6 requests a quarter turn from viewers; the camera model ignores it."""
     entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
     exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
     plain = encoded(".jpg")

@@ -1,4 +1,4 @@
-"""Edges to sub-pixel: planes fitted to positions, and photographs to planes with covariances."""
+"""Edges to sub-pixel: planes fitted to positions, and images to planes with covariances."""
 
 from __future__ import annotations
 
@@ -60,15 +60,16 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-# Photographs to edges
+# images to edges
 
 
 @pytest.mark.parametrize(("seed", "spread"), [(0, 0.0), (0, 0.0005), (1, 0.0005), (1, 0.001)])
 def test_edges_are_measured_to_hundredths_of_a_pixel(seed, spread):
-    """From a drawing whose joints are wrong by up to a millimetre (half a pixel to a whole one).
+    """From a nominal model whose joints are wrong by up to a millimetre (half a pixel to a whole
+    one).
 
-    0.03 px an edge, of which 0.02 are common to all: blur and edge shift stand for one another,
-    and the identification has an edge shift for what is left.
+    0.03 px for an edge, of which 0.02 are common to all: blur and edge shift are interchangeable,
+    and the identification has an edge shift for the rest.
     """
     value = measure(taken(), redrawn(seed, spread), FRONT, poses())
     edges = value.edges
@@ -87,8 +88,8 @@ def test_edges_are_measured_to_hundredths_of_a_pixel(seed, spread):
 
 
 def test_profiles_are_one_a_pixel_of_what_is_clear():
-    """Each segment's mean is that of profiles taken one by one; an end of an edge that has no image
-    makes the rest no poorer.
+    """Each segment's mean is that of profiles taken one by one; an end of an edge outside the image
+    does not affect the rest.
     """
     mechanism, camera = redrawn(0, 0.0005), camera_of()
     visible = PhotographWindow.of([Placed(taken(), FRONT, poses())])
@@ -159,7 +160,7 @@ def test_the_points_lie_on_the_true_edges():
 
 def test_a_photograph_that_shows_no_leg_leaves_the_others_as_they_are():
     beside = poses().copy()
-    beside[2] = np.nan  # readings that the drawing cannot take have no pose
+    beside[2] = np.nan  # readings outside the nominal model's range have no pose
     usual = measure(taken(), machine(), FRONT, poses(), 0.7).edges
     value = measure(taken(), machine(), FRONT, beside, 0.7)
     assert 2 not in value.edges.configuration
@@ -216,7 +217,9 @@ def fitted(position, sigma=0.1, value=None):
 
 
 def positions_of(mechanism):
-    """Where a mechanism's edges cross the outward lines of the predicted points, (K, E, n) px."""
+    """Intersections of a mechanism's edges with the outward lines of the predicted points,
+    (K, E, n) px.
+    """
     tubes, points = predicted()
     legs = legs_in_camera(mechanism, FRONT, poses(), machine().inverse(poses()))
     normal = edge_points(mechanism, camera_of(), legs, tubes, 2).normal
@@ -247,8 +250,8 @@ def test_a_common_shift_of_all_points_is_what_shift_says():
 
 
 def test_turns_are_those_of_weighted_least_squares():
-    """Against NumPy's, edge by edge, from all places down to none; of one or two nothing is told,
-    and nothing is spoilt.
+    """Against NumPy's, edge by edge, from all places down to none; one or two places give no edge,
+    and spoil nothing.
     """
     rng = np.random.default_rng(0)
     _, points = predicted()

@@ -111,7 +111,8 @@ def test_across_is_the_outward_motion_by_the_point():
 @pytest.mark.parametrize("distorted", [False, True])
 def test_by_normal_tells_where_a_turned_edge_passes(distorted):
     """Against cylinders moved and widened by hundredths of a millimetre: up to 0.05 px, found on
-    the picture by secants; the second order is a ten-thousandth of it."""
+    the image by secants; the second order is a ten-thousandth of it.
+    """
     _, _, points = predicted(distorted)
     shifted = redrawn(3, 2e-5)
     _, _, others = predicted(distorted, shifted)
@@ -164,9 +165,9 @@ def thickest(tubes):
 
 
 def outline_away(shape, tubes, points, k):
-    """(E, n) px to the nearest outline of another leg drawn alone, negative inside of it.
+    """(E, n) px to the nearest outline of another leg rendered alone, negative inside of it.
 
-    shape : of each leg's tubes, the ones to draw. Good to a pixel or two, as drawings are.
+    shape : of each leg's tubes, the ones to render. Accurate to a pixel or two.
     """
     away = np.full(points.along[k].shape, np.inf)
     x, y = np.rint(points.pixel[k]).astype(int).clip(0, (639, 479)).transpose(2, 0, 1)
@@ -189,7 +190,7 @@ def test_obstructed_points_are_those_behind_or_beside_other_legs(clearance):
         drawn = outline_away(list, tubes, points, k)
         # ends of legs, where joints are, have no outline that would be kept free
         endless = outline_away(lambda leg: stretched(leg, 0.1), tubes, points, k)
-        # pixels are told at the point's depth, and other legs are at 0.6 to 1.6 times it
+        # pixels at the point's depth; other legs are at 0.6 to 1.6 times it
         beside = (np.abs(drawn) < 0.5 * clearance) & (np.abs(endless) < 0.5 * clearance)
         free = ~hidden & (outline_away(thickest, tubes, points, k) > 1.7 * clearance + 2)
         assert not clear[k][hidden].any()
@@ -202,7 +203,9 @@ def test_obstructed_points_are_those_behind_or_beside_other_legs(clearance):
 
 
 def test_a_leg_before_another_is_clear_where_it_crosses():
-    """The nearer leg's edges are seen against the middle of the other; the other's are hidden."""
+    """The nearer leg's edges are visible in front of the middle of the other; the other's are
+    hidden.
+    """
     legs, tubes, points = predicted()
     clear = unobstructed(machine(), camera_of(), legs, tubes, points, 0.0)
     before, behind = 0, 0

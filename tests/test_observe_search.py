@@ -1,4 +1,4 @@
-"""The machine recognised in photographs, the station's pose found, each leg found to a pixel."""
+"""Localization of a station in images, and each leg found to a pixel."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ def looked_for(mechanism, pictures, samples=12):
 
 @pytest.mark.parametrize("spread", [0.0, 0.001, 0.002, 0.004])
 def test_legs_are_found_where_a_wrong_drawing_does_not_put_them(spread):
-    """Drawing errors of up to 4 mm shift and tilt legs by up to ten pixels: found to 0.6 px.
+    """Nominal errors of up to 4 mm shift and tilt legs by up to ten pixels: found to 0.6 px.
 
-    Shifts are tried by whole pixels and tilts too, so 0.3 px each is the best there is.
+    Shifts are tried by whole pixels and tilts too, so 0.3 px each is the best possible.
     """
     shifts = []
     for seed in range(2):
@@ -88,7 +88,7 @@ def test_legs_are_found_where_a_wrong_drawing_does_not_put_them(spread):
 
 
 def test_a_leg_that_is_not_there_is_not_found():
-    """The picture without leg 3: the others are found as before, it is nowhere clear."""
+    """The image without leg 3: the others are found as before, leg 3 is nowhere clear."""
     without = [draw([t for t in tubes_at(machine(), T) if t.leg != 2])[0] for T in poses()[:3]]
     places, value, truth, counted = looked_for(redrawn(0, 0.001), without)
     assert not places.clear[:, 2].any()
@@ -175,7 +175,7 @@ def inconsistent_poses(T_camera_base):
 
 
 def often(*values):
-    """One more draw of what others prove already: a search of a second or more."""
+    """Another draw of a test above: a search of a second or more."""
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
@@ -190,7 +190,7 @@ def test_the_station_is_found_from_ten_degrees_and_ten_centimetres_or_from_nothi
 ):
     """To a few pixels, within the reach of the search for legs that follows.
 
-    Tables are of reduced pictures, a table's pixel is 2.5 of the photograph's.
+    Tables are of reduced images; a table's pixel is 2.5 of the image's.
     """
     rough = rough_pose(seed)
     view = view_of(images()[:count])
@@ -206,7 +206,7 @@ def test_the_station_is_found_from_ten_degrees_and_ten_centimetres_or_from_nothi
 
 @pytest.mark.parametrize("turn", [often(90), often(180), 270])
 def test_turned_photographs_are_found_from_nothing(turn):
-    """By a camera that was turned about its line of sight: the same pixels in another order."""
+    """A camera rotated about its line of sight: the same pixels in another order."""
     turned = pose(rotation(np.array([0.0, 0.0, np.radians(turn)])), np.zeros(3))
     cosine, sine = np.round([np.cos(np.radians(turn)), np.sin(np.radians(turn))])
     camera = camera_of()
@@ -230,7 +230,7 @@ def test_turned_photographs_are_found_from_nothing(turn):
 
 
 def test_one_photograph_says_where_but_not_that_it_is_the_machine():
-    """Of one photograph the place is right; no other is there to confirm it."""
+    """From one image the pose is right; no other image confirms it."""
     for seed in range(2):
         localization = find_station(view_of(images()[:1]), None, np.random.default_rng(seed))
         assert inconsistent_poses(localization.T_camera_base) < 5
@@ -239,7 +239,7 @@ def test_one_photograph_says_where_but_not_that_it_is_the_machine():
 
 @pytest.mark.parametrize("seed", [2, *(often(seed) for seed in (0, 1, 3))])
 def test_the_station_is_found_from_thirty_degrees_and_thirty_centimetres(seed):
-    """Though a place beside the right one is confirmed by photographs as well."""
+    """Though images confirm a pose beside the right one as well."""
     rough = rough_pose(seed, 30.0, 0.3)
     localization = find_station(view_of(images()), rough, np.random.default_rng(seed))
     assert localization.good
@@ -248,8 +248,8 @@ def test_the_station_is_found_from_thirty_degrees_and_thirty_centimetres(seed):
 
 @pytest.mark.parametrize(("degrees", "distance", "far"), [(5.0, 0.05, False), (14.0, 0.14, True)])
 def test_a_search_goes_further_only_where_the_pose_is_not_near(monkeypatch, degrees, distance, far):
-    """A place that is confirmed is not the station's if it is further than was looked for: so near
-    to a pose that is wrong nothing is found by chance.
+    """A confirmed pose is not the station's if it is further away than the search: so near to a
+    wrong rough pose nothing is found by chance.
     """
     searched, searching = [], station_localization._random_search
 
@@ -341,7 +341,7 @@ def test_photographs_of_something_else_are_not_recognised(scene, count):
 
 
 def test_photographs_of_other_configurations_are_not_recognised():
-    """Each photograph under its neighbour's name."""
+    """Each image under its neighbour's name."""
     view = view_of([*images()[1:], images()[0]])
     for seed in range(2):
         assert not find_station(view, rough_pose(seed), np.random.default_rng(seed)).good
@@ -382,7 +382,7 @@ def test_tables_of_a_direction_are_worked_out_when_it_is_looked_for():
     np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), one)
     chance = tables.by_chance(np.array([5]), distance)
     np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), [3, 5])
-    # the same whatever was looked for before
+    # independent of earlier searches
     tables.tables.get_ready(np.arange(EDGE_DIRECTIONS))
     assert tables.look_up(one, pixel, np.array(0))[0] == distance
     assert tables.by_chance(np.array([5]), distance) == chance
@@ -392,7 +392,7 @@ def test_tables_of_a_direction_are_worked_out_when_it_is_looked_for():
 
 
 def test_tables_hold_the_distance_to_an_edge_of_that_direction():
-    """A dark half picture: its upright border is at 320, and there is no level one."""
+    """An image with a dark half: its upright border is at 320, and there is no level one."""
     image = np.full((480, 640), 200, np.uint8)
     image[:, :320] = 40
     tables = distance_tables([image])
@@ -421,7 +421,7 @@ def test_outside_the_picture_and_without_an_image_nothing_is_inside():
 
 
 def test_edges_that_never_move_are_left_out_where_photographs_can_be_compared():
-    """A shelf in all of five photographs is background; in two it cannot be told."""
+    """A shelf in all of five images is background; in two images it cannot be separated."""
     shelf = np.full((480, 640), 180, np.uint8)
     shelf[100:140] = 60
     pictures = []
@@ -462,8 +462,9 @@ def test_a_shadow_darkens_and_is_left_out_beside_what_casts_it():
 
 @pytest.mark.slow
 def test_a_place_that_half_of_the_photographs_miss_is_asked_about_again(tmp_path, monkeypatch):
-    """Of three legs that are alike a search in five photographs ends beside the place that all ten
-    lead to: it is believed once the others are asked about that, and not before."""
+    """Of three equal legs a search in five images ends beside the pose that all ten lead to: it is
+    accepted once the other images are tested at that pose, and not before.
+    """
     settings = Settings(stations=1, configurations=10)
     folder = tmp_path / "session"
     simulate_session(folder, load_mechanism("3-rps"), camera_of_size((640, 480)), settings, seed=5)

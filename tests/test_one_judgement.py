@@ -37,7 +37,7 @@ JOINTS = "configuration,leg1,leg2,leg3,leg4,leg5,leg6\n01,0.41,0.37,0.41,0.37,0.
 
 
 def lines_alone(folder):
-    """Two photographs by hand of lines, and no machine in them."""
+    """Two hand-held images of lines, without a machine."""
     (folder / "images").mkdir(parents=True)
     (folder / "session.yaml").write_text(BY_HAND)
     (folder / "camera.yaml").write_text(CAMERA)
@@ -52,7 +52,7 @@ def lines_alone(folder):
 
 
 def exchanged_stations(session):
-    """The photographs of two stations in each other's place."""
+    """The images of two stations exchanged."""
     one, other = (session / "images" / name for name in ("station1", "station2"))
     names = sorted(path.name for path in one.iterdir()), sorted(p.name for p in other.iterdir())
     for first, second in zip(*names, strict=True):
@@ -63,7 +63,7 @@ def exchanged_stations(session):
 
 
 def one_black(session):
-    """One photograph in which nothing shows."""
+    """One image without any content."""
     path = min((session / "images" / "station1").iterdir())
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(path), np.zeros_like(picture))
@@ -89,7 +89,7 @@ def calibrated_code(folder):
 
 
 def hold_together(value, code, message):
-    """What one says implies what the other does."""
+    """The verdict of one command implies the other's."""
     assert (value.exit_code == 2) == (code == 2)
     refused = [f.text for f in value.findings if f.error is not None]
     assert refused == [message] if message else not refused
@@ -116,7 +116,7 @@ def test_a_spoilt_session(session, spoil):
 
 @pytest.mark.slow
 def test_photographs_by_hand_without_a_machine(tmp_path):
-    """Both are refused, with one finding; it said that it can be calibrated."""
+    """Both are refused, with one finding; `check` once accepted it."""
     folder = lines_alone(tmp_path / "session")
     done, other = run("check", folder, "--json"), run("calibrate", folder, "--json")
     assert done.code == other.code == 2
@@ -129,7 +129,7 @@ def test_photographs_by_hand_without_a_machine(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_photographs_by_hand(tmp_path, seed):
-    """Those that are left out are so in both, for the same reason."""
+    """Rejected images are the same in both, with the same reason."""
     folder = tmp_path / "session"
     settings = Settings(configurations=3, repeats=2, handheld=True)
     machine = load_mechanism("gough-stewart")

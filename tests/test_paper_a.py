@@ -1,4 +1,4 @@
-"""[A] 4.3 reproduced with errata's settings: a reduced study here, the full one when asked."""
+"""[A] 4.3 reproduced with errata's settings: a reduced study here, the full one with -m slow."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_what_it_states_is_what_it_errs_by(reduced):
 
 
 def test_the_table_of_errata(reduced):
-    """RMSE in mm of Axy, Az, Bxy, Bz, q0. Depth as printed follows the drawing's own error."""
+    """RMSE in mm of Axy, Az, Bxy, Bz, q0. Depth as printed equals the nominal error."""
     expected = {
         "four steps as printed": [0.077, 1.79, 0.100, 1.62, 0.198],
         "four steps": [0.061, 0.181, 0.086, 0.146, 0.170],
@@ -83,8 +83,9 @@ def test_the_table_of_errata(reduced):
         "bound": [0.034, 0.060, 0.020, 0.030, 0.059],
     }
     for name, values in expected.items():
-        # depth as printed is the drawing's error, whose size the paper leaves open; the others as
-        # far as 75 runs tell, three times 5 %, and the cameras' height lets the bound be: 6 %
+        # depth as printed is the nominal error, whose size the paper does not state; the others
+        # within the accuracy of 75 runs, three times 5 %, and of the bound by the cameras' height:
+        # 6 %
         rtol = 0.35 if "printed" in name else 0.06 if name == "bound" else 0.2
         np.testing.assert_allclose(millimetres(reduced.of(name)), values, rtol=rtol)
 
@@ -114,7 +115,7 @@ def test_the_bound_has_its_own_end_effector(reduced):
 
 
 def test_depth_as_printed_is_the_drawings(reduced):
-    """Products of distances do not tell depth; the drawing's error stays, to the micrometre."""
+    """Products of distances do not determine depth; the nominal error stays, to the micrometre."""
     drawing, printed = (reduced.of(name) for name in ("drawing", "four steps as printed"))
     assert printed["base_z"].value == pytest.approx(drawing["base_z"].value, rel=1e-3)
     assert printed["platform_z"].value == pytest.approx(drawing["platform_z"].value, rel=1e-3)
@@ -122,7 +123,7 @@ def test_depth_as_printed_is_the_drawings(reduced):
 
 
 def test_standard_errors_are_the_scatter_of_studies():
-    """Eight small studies scatter as each one's standard error says."""
+    """Eight small studies scatter by each one's standard error."""
     studies = [study(runs=12, poses=6, seed=seed).of(PAPER_A_JOINT) for seed in range(8)]
     names = (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
     values = np.array([[s[name].value for name in names] for s in studies])

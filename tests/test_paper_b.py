@@ -112,7 +112,7 @@ def test_plain_and_m_regressions_collapse(method):
 
 
 def test_a_hexapod_seen_through_a_mirror(tmp_path):
-    """Rendered photographs from between the legs, one place, to a fifth of the drawing's error."""
+    """Rendered images from between the legs, one place, to a fifth of the nominal error."""
     folder = Path(tmp_path) / "session"
     station = StationPlace((0.01, -0.02, 0.07), (0.01, -0.02, 0.4), (0.0, -1.0, 0.0))
     settings = Settings(

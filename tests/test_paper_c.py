@@ -1,4 +1,4 @@
-"""[C] IV computed again: what is expected, that each expectation can fail, page and command."""
+"""[C] IV computed again: its expectations, that each of them can fail, page and command."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_the_simulated_machines():
 
 
 def test_rods_alone_tilt_the_nacelle():
-    """With rods alike the model with rods is a machine of four freedoms."""
+    """With equal rods the model with rods is a machine of four degrees of freedom."""
     tilt = []
     for rods in (0.0, 3e-4):
         setting = H4ByBoard(deviations=Deviations(rods=rods))
@@ -146,7 +146,7 @@ def test_noise_twice_as_large_is_not_a_reproduction():
 
 
 def test_better_methods_are_better(short):
-    """As printed, whitened, joint: and the last is not better than the bound says."""
+    """As printed, whitened, joint: and the last is not better than the bound."""
     for kind, printed in (("design", EQ3_AS_PRINTED), ("calibration", EQ5_AS_PRINTED)):
         a = {
             m: short.of(kind, kind, m)["shift"].value
@@ -160,7 +160,7 @@ def test_better_methods_are_better(short):
 
 
 def test_another_seed_draws_anew():
-    """In every batch of every truth; what is drawn is all that chance decides."""
+    """Draws differ in every batch of every truth, and nothing else is random."""
     setting = H4ByBoard()
     for first, again, other in zip(
         *(engine.batches(setting, 2, s) for s in (1, 1, 2)), strict=True

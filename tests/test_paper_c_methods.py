@@ -100,7 +100,7 @@ def test_turns_between_directions():
 
 
 def session(name, rng, chosen=None, noise=1.0):
-    """Drawing, truth and measurements of a machine with one board."""
+    """Nominal model, truth and measurements of a machine with one board."""
     drawing = load_mechanism(name, model=chosen)
     truth = true_machine(drawing, rng, shift=5e-4, turn=2e-3)
     body, joints = platform_poses(truth, rng, 40)
@@ -145,7 +145,7 @@ def test_jacobians(name, form):
 
 
 def test_whitened_rows_have_unit_variance():
-    """Rows at the truth, divided by what the noise makes of them."""
+    """Rows at the truth, whitened by the noise."""
     truth = H4ByBoard().simulated("calibration", 30, np.random.default_rng(0))
     machine, n = truth.machine, truth.count
     problem, state = pose_problem(
@@ -166,7 +166,7 @@ def test_whitened_rows_have_unit_variance():
 
 
 def replace_start(machine, truth):
-    """A state with camera and board where they truly are: to look at rows, not to estimate."""
+    """State with the true poses of camera and board, to evaluate rows, not to estimate."""
     from pkmcal.identify.estimate import State
 
     return State(
@@ -186,7 +186,7 @@ def replace_start(machine, truth):
 @pytest.mark.parametrize("form", ["joint", "implicit"])
 @pytest.mark.parametrize("kind", ["design", "calibration"])
 def test_without_noise_every_form_finds_the_machine(kind, form, whitened):
-    """And the unknowns that nothing tells are those of the errata."""
+    """And the unidentifiable unknowns are those of the errata."""
     truth = QUIET.simulated(kind, 1, np.random.default_rng(2))
     machine = model(kind)
     fit = at_poses(machine, truth, start(machine, truth), form, whitened=whitened)
@@ -223,7 +223,7 @@ def test_whitened_is_the_joint_estimate():
 
 @pytest.mark.parametrize("name", ["gough-stewart", "3-rps", "3-rpr", "delta", "linear-delta", "h4"])
 def test_any_machine_with_a_board(name):
-    """From the drawing to the noise: the predicted boards of new configurations."""
+    """From the nominal model to the noise: the predicted boards of new configurations."""
     rng = np.random.default_rng(6)
     drawing = load_mechanism(name)
     truth = true_machine(drawing, rng, shift=1e-3, turn=3e-3)
@@ -288,7 +288,7 @@ def test_runs_do_not_touch_one_another():
 
 
 def boards(turns, rng, sigma=5e-4):
-    """Poses with these turns, seen with noise."""
+    """Poses with these rotations, with noise."""
     n = len(turns)
     whiten = np.diag(1 / np.repeat([sigma, 2e-4], 3))
     exact = anywhere(rng, 1.0) @ pose(rotation(turns), rng.normal(size=(n, 3)) * 0.1)
@@ -327,7 +327,7 @@ def test_one_axis_is_found_and_tested():
     loud = boards(angles, rng)
     optimistic = rotation_axis(replace(loud, whiten=1.25 * loud.whiten), "schoenflies")
     assert optimistic.p_value < 1e-3
-    assert optimistic.tenable  # a photograph's noise is not known that well
+    assert optimistic.tenable  # an image's noise is less accurate
     tilted = angles + 8e-4 * rng.normal(size=(71, 3))
     axis = rotation_axis(boards(tilted, rng), "schoenflies")
     assert not axis.tenable

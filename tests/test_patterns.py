@@ -16,7 +16,7 @@ from backtracking import ambiguity
 SOURCE = Path(pkmcal.__file__).parent
 METHODS = ("match", "fullmatch", "search", "findall", "finditer", "split", "sub", "subn")
 PLACES_OF_FLAGS = {"compile": 1, "split": 3, "sub": 4, "subn": 4}
-"""Of the arguments of functions of `re`; two for the others."""
+"""Number of arguments before a pattern's text in functions of `re`; two for the others."""
 MADE = {
     "commands/cli.py: inside": "[pattern for pattern, _ in _MACHINERY]",
     "files/documents.py: f'(?:{_pattern})\\\\Z'": "[rf'(?:{p})\\Z' for _, p, _ in _SCALARS]",
@@ -28,13 +28,13 @@ BOUNDED = {
     "session/image_files.py: _regex(parts, '[^/]+?')":
         r"a/(?P<configuration>[^/]+?)_(?P<repeat>[^/]+?)\.png",
 }  # fmt: skip
-"""The same with an example, of texts that are no longer than a file's name: may be polynomial."""
+"""Patterns with an example, for texts that are no longer than a file's name: may be polynomial."""
 METHOD_BY_OWNER = {"files/documents.py: f'(?:{_pattern})\\\\Z'": "match"}
-"""How patterns are used that go to another library: PyYAML's resolver."""
+"""Uses of patterns that are passed to another library: PyYAML's resolver."""
 
 
 class Use(NamedTuple):
-    """One use of a pattern. key : its file and what is written as its argument."""
+    """One use of a pattern; key : its file and the text of its argument."""
 
     key: str
     line: int

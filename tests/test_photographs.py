@@ -1,4 +1,4 @@
-"""Sizes of photographs, read without decoding them."""
+"""Sizes of images, read without decoding them."""
 
 import os
 import struct
@@ -80,7 +80,7 @@ def test_other_formats_are_not_read(tmp_path):
 def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):
     path = tmp_path / "a.jpg"
     image(path, 37, 21)
-    # An EXIF block that asks viewers to turn the image by a quarter (orientation 6).
+    # an EXIF block that requests a quarter turn of the image (orientation 6)
     entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
     exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
     block = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif

@@ -54,13 +54,13 @@ def small(subject, monkeypatch, **more):
 
 @pytest.fixture(scope="module")
 def planned():
-    """Of a hexapod's legs, seen from two places."""
+    """Plan for a hexapod's legs from two places."""
     with pytest.MonkeyPatch.context() as patch:
         return small(hexapod(), patch)
 
 
 def test_more_pixels_than_a_lens_resolves_promise_nothing():
-    """Of a camera nobody has seen the photographs of."""
+    """Plan for a camera without any images."""
     machine = load_mechanism("gough-stewart")
     rows = []
     for size in ((1024, 768), (4096, 3072)):
@@ -114,10 +114,10 @@ def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch, planned
     pairs = np.array([(numbers[s], k) for k in range(n) for s in count.stations[k]])
     data = rig.measured(count.joints, count.T_base_platform, pairs)
     (position, orientation), stated = stated_by(rig, data, count.work)
-    # the means of edges are drawn one by one for the promise: here they are all alike
+    # the means of edges are drawn one by one for the prediction: here they are all equal
     assert count.promised.position == pytest.approx(position, rel=2e-3)
     assert count.promised.orientation == pytest.approx(orientation, rel=2e-3, abs=1e-9)
-    # how alike edges err is not planned with
+    # plans ignore the error correlation
     assert count.promised.position == pytest.approx(stated[0], rel=0.03)
     assert count.promised.orientation == pytest.approx(stated[1], rel=0.03, abs=1e-9)
 
@@ -146,7 +146,7 @@ def test_configurations_are_possible_and_their_way_is_short(planned):
 def test_more_configurations_never_tell_less(planned):
     positions = [a.position for a in planned.curve]
     assert all(after < before for before, after in itertools.pairwise(positions))
-    # noise of photographs alone would go with the root; what all share falls more slowly
+    # noise of images alone would fall with the root; errors common to all fall more slowly
     assert planned.curve[-1].position > 0.4 * planned.promised.position
 
 
@@ -185,7 +185,7 @@ def test_exchange_comes_near_the_best_of_all_subsets(name):
 
 
 def test_a_tie_is_decided_by_the_variance():
-    """Two rows leave one of three directions as the drawing has it, whichever two they are."""
+    """Two rows leave one of three directions nominal, whichever two they are."""
     info = toy(0)
     index = PLAN_INDICES["E"](info)
     first = greedy(info, 1, index).chosen
@@ -231,7 +231,7 @@ def test_the_greedy_path_is_that_of_its_choice():
 
 
 def test_what_a_calibration_knows_counts_as_its_data_would():
-    """Measuring in two campaigns tells what measuring in one does, stations standing still."""
+    """Two campaigns have the information of one, with stations at rest."""
     subject = hexapod()
     rig, machine = subject.rig, subject.rig.machine
     poses, _ = draw_configurations(machine, 16, 0.5, np.random.default_rng(1))
@@ -368,7 +368,7 @@ def test_a_session_before_any_photograph(demo, quick_plans, tmp_path):
     assert sum(place["chosen"] for place in values["places_tried"]) == 2
     assert "no photograph tells it yet" in values["assumptions"][0]
     assert (session / "plan" / "stations.yaml").is_file()
-    # and calibrate still asks for photographs
+    # and calibrate still needs images
     assert run("calibrate", str(session)).code == 2
 
 
@@ -413,7 +413,7 @@ def test_an_index_that_is_none(monkeypatch):
 def test_a_camera_that_sees_nothing(monkeypatch):
     subject = hexapod(1)
     (one,) = subject.rig.instruments
-    away = np.diag([1.0, -1.0, -1.0, 1.0]) @ one.T_camera_base  # it looks the other way
+    away = np.diag([1.0, -1.0, -1.0, 1.0]) @ one.T_camera_base  # directed away from the machine
     rig = replace(
         subject.rig,
         T_station_base=away[None],
@@ -433,7 +433,7 @@ def test_a_hand_held_session_is_not_planned(demo):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_promise_is_kept_by_photographs(seed, tmp_path):
-    """A few photographs, the plan made from them, its photographs, and what calibrate states."""
+    """A few images, the plan made from them, its images, and the accuracy from calibrate."""
     few, whole = tmp_path / "few", tmp_path / "whole"
     size = ["--size", "640x480", "--seed", str(seed)]
     assert run("simulate", str(few), "--configurations", "4", *size).code == 0

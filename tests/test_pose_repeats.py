@@ -1,4 +1,6 @@
-"""Repeated photographs of a board as one pose: noise that is put in comes out, odd ones go."""
+"""Repeated images of a board as one pose: known noise is recovered, outlying repeats are
+rejected.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +14,14 @@ from test_targets import CAMERA, board, poses_around, seen  # noqa: F401 - board
 
 CONFIGURATIONS, REPEATS = 300, 5
 SIGMA = np.repeat([3e-4, 2e-4], 3)
-"""Of one photograph's pose, rad and m."""
+"""Noise of one image's pose, rad and m."""
 FOUR = 4 * np.sqrt(2 / (6 * CONFIGURATIONS))
 """Four standard deviations of the mean of as many squares of unit normals."""
 
 
 def repeated(alone, common, seed=0, n=CONFIGURATIONS, repeats=REPEATS):
-    """True poses (n, 4, 4), and repeats of each with errors of their own and shared ones, as shares
-    of the variance that each photograph states.
+    """True poses (n, 4, 4), and repeats of each with independent and common errors, as shares of
+    the variance that each image states.
     """
     rng = np.random.default_rng(seed)
     truth = poses_around(n, seed)
@@ -66,7 +68,7 @@ def test_repeats_that_agree_too_well_promise_nothing_more():
 
 
 def test_what_is_common_does_not_average_out():
-    """The error of a hundred repeats is the shared part, and the covariance says so."""
+    """The error of a hundred repeats is the common part, and the covariance contains it."""
     truth, rows, T, covariance = repeated(0.5, 0.5, n=30, repeats=100)
     value = mean_poses(rows, T, covariance, 0.5)
     error = pose_difference(value.pose, truth)
@@ -98,7 +100,7 @@ def test_of_two_that_differ_both_stay():
     assert value.covariance[0, 0, 0] > 10 * SIGMA[0] ** 2
 
 
-# boards in photographs
+# boards in images
 
 
 def photographs(board, rows, noise, seed=0):  # noqa: F811
@@ -127,7 +129,7 @@ def test_photographs_of_one_configuration_become_one_measurement(board):  # noqa
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.3)
     single, _ = one_a_configuration(seen(board, value[::4], rows[::4]), mount=3)
     gain = np.linalg.norm(poses.whiten, axis=(1, 2)) / np.linalg.norm(single.whiten, axis=(1, 2))
-    np.testing.assert_allclose(gain, 2.0, rtol=0.15)  # the root of four photographs
+    np.testing.assert_allclose(gain, 2.0, rtol=0.15)  # the root of four images
 
 
 def test_an_odd_photograph_is_named(board):  # noqa: F811

@@ -1,4 +1,4 @@
-"""Sessions of poses from tables, without photographs: calibrated, mixed, spoilt."""
+"""Sessions of poses from tables, without images: calibrated, mixed, with faults."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ POSITION, TURN = 2e-5, 1e-4
 
 @dataclass(frozen=True)
 class Made:
-    """A session's folder and what is true of it."""
+    """A session's folder and its truth."""
 
     folder: object
     drawing: object
@@ -167,7 +167,9 @@ def test_points_alone(folder):
 
 
 def test_heights_of_a_flat_bed(folder):
-    """A linear delta probed: its tilt and bulge go, what the bed does not tell is said."""
+    """A probed linear delta: its tilt and bulge are corrected, unidentifiable directions are
+    reported.
+    """
     target = pose(np.eye(3), np.array([0.0, 0.0, -0.04]))
     made = make(folder, "linear-delta", "heights", n=20, station=target)
     result = calibrate_session(folder)
@@ -219,7 +221,7 @@ def test_a_model_too_poor_is_refused_and_the_richer_one_named(folder):
 
 
 def test_inverse_kinematic_is_a_method(folder, monkeypatch):
-    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # of its deviations nothing is asked
+    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # standard deviations are not tested
     made = make(folder, "h4", n=30)
     result = calibrate_session(folder, method="inverse-kinematic")
     assert tool_error(result.machine, made) < 0.1 * tool_error(made.drawing, made)
@@ -288,7 +290,8 @@ def test_no_configuration_is_exchanged_with_itself(folder):
 
 def test_poses_that_coarse_readings_explain_are_not_rejected(folder):
     """Hobby servos, half a degree, stated as a thousandth of that: some poses look wrong until the
-    readings' noise is found, and are right then."""
+    readings' noise is estimated, and are right then.
+    """
     made = make(folder, "h4", n=24)
     rng = np.random.default_rng(3)
     write_joints(folder, made.joints + np.deg2rad(0.5) * rng.normal(size=made.joints.shape))
@@ -346,7 +349,7 @@ def test_the_sign_of_one_encoder(folder, motor):
 
 @pytest.mark.parametrize("motor", [pytest.param(0, marks=pytest.mark.slow), 3])
 def test_a_motor_that_counts_the_other_way(folder, motor):
-    """With a constant that nobody knows: what is named with it fits the mechanism's tolerance."""
+    """With an unknown constant: the reported value fits the mechanism's tolerance."""
     made = make(folder, "gough-stewart", n=20)
     joints = made.joints.copy()
     constant = joints[:, motor].min() + joints[:, motor].max() + 0.003

@@ -1,4 +1,4 @@
-"""poses.csv: what it may say, and how it is told what is wrong."""
+"""poses.csv: its valid contents, and messages for mistakes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_points_have_three_rows_and_heights_one(tmp_path):
     assert points.poses(0, 0).rows.tolist() == [3] * 8
     assert heights.poses(0, 0).rows.tolist() == [1] * 8
     np.testing.assert_array_equal(points.T[:, :3, 3], T[:, :3, 3])
-    # only along z does a height say anything
+    # a height has information along z only
     assert np.flatnonzero(heights.poses(0, 0).whiten[0]).tolist() == [35]
 
 

@@ -33,8 +33,8 @@ ANY = (-1.5, 1.5)
 
 
 class Limb(NamedTuple):
-    """A tube before a background: half width (px), angle of the light, grey levels; the lamp's
-    picture in polished metal, times as bright as the rest.
+    """A tube in front of a background: half width (px), angle of the light, grey levels; reflection
+    of the lamp in polished metal, times as bright as the rest.
     """
 
     half_width: float
@@ -66,7 +66,7 @@ def blurred(brightness, blur):
 
 
 def cubic(distance):
-    """The cubic convolution kernel of photographs' interpolation, a = -0.75 as OpenCV's."""
+    """Cubic convolution kernel of the images' interpolation, a = -0.75 as OpenCV's."""
     t, a = np.abs(distance), -0.75
     near = (a + 2) * t**3 - (a + 3) * t**2 + 1
     far = a * (t**3 - 5 * t**2 + 8 * t - 4)
@@ -170,8 +170,8 @@ def test_well_exposed_edges_are_unbiased(blur, scene):
     """A hundredth of a pixel off in the mean, for any width, light and contrast above 40 levels.
 
     Noise alone leaves 0.02 / sqrt(300) = 0.001 px; the tabulated half widths leave the rest, and
-    the beliefs about the shading: on slim legs only the limb's few samples are used, so much blur
-    lets the beliefs speak, towards less shading (0.013 px at 0.8 px).
+    the priors of the shading: on slim legs only the limb's few samples are used, so that with much
+    blur the priors matter, towards less shading (0.013 px at 0.8 px).
     """
     made = make(1, blur=blur, **scene)
     at = located(made.profiles, blur)
@@ -221,7 +221,9 @@ def test_more_noise_is_a_larger_sigma():
 
 
 def test_overexposed_edges_are_cut_or_dropped():
-    """Clipped samples are left out; what remains says less, and its sigma says so."""
+    """Clipped samples are ignored; the remaining ones have less information, and sigma is
+    larger.
+    """
     made = make(5, 600, gain=1.7, albedo=(150, 230))
     cut = made.profiles.cut > 0
     assert 0.3 < cut.mean() < 0.99
@@ -236,7 +238,9 @@ def test_overexposed_edges_are_cut_or_dropped():
 
 
 def test_what_is_cut_off_widens_the_sigma():
-    """Well-exposed profiles with their inner samples withheld: off by more, and told to be."""
+    """Well-exposed profiles with their inner samples withheld: larger errors, and sigma
+    to match.
+    """
     made = make(5, half_width=(9, 50))  # wide enough for all samples to be used
     assert np.all(made.profiles.cut == 0)
     whole = located(made.profiles, 0.7)
@@ -250,7 +254,7 @@ def test_what_is_cut_off_widens_the_sigma():
 
 
 def test_clipped_samples_that_are_not_cut_would_bias():
-    """The same profiles with the clipped samples believed: several times further off."""
+    """The same profiles with the clipped samples used: several times further off."""
     made = make(5, 600, gain=1.7, albedo=(150, 230))
     blind = replace(made.profiles, cut=np.zeros_like(made.profiles.cut))
     cut = located(made.profiles, 0.7)
@@ -291,7 +295,7 @@ def test_a_highlight_is_not_taken_for_the_limb():
 
 
 def test_what_lies_beyond_a_highlights_middle_is_left_out():
-    """Where it stands out less than the limb itself, the profile is good for that."""
+    """If the highlight has less contrast than the limb itself, the profile is used."""
     dark = {"albedo": (20, 30), "ground": (30, 60), "light": FRONTAL, "least_contrast": 2}
     made = make(8, half_width=(7, 14), lamp=3.0, **dark)
     less, highlight = without_highlights(made.profiles, {0: 0.7})

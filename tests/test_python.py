@@ -35,7 +35,7 @@ LONGEST = 500
 
 @pytest.fixture(scope="module")
 def result(demo, calibrated) -> pkmcal.api.calibrate.CalibrationResult:
-    """What Python gives of the calibration that these tests share."""
+    """Python's result of the calibration that these tests share."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pkmcal.api.calibrate.run", lambda *_, **_more: calibrated)
         return pkmcal.calibrate(demo.session)
@@ -322,7 +322,7 @@ def test_configurations_are_planned(demo, result, planned):
 RENAMED = {("plan", "configurations"): "count"}
 """Options whose argument has another name."""
 FOR_FILES = {"out", "as_json", "quiet", "force", "rrd", "table", "model"}
-"""Options of what is written, or of which file is loaded."""
+"""Options of outputs, or of loaded files."""
 OTHERWISE = {
     ("plan", "size"): ("camera", "1280x960"),
     ("simulate", "size"): ("camera", "800x600"),

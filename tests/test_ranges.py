@@ -35,7 +35,7 @@ BAD = ("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", str(10**9), str(10**3
 
 
 def arguments(command):
-    """Words for what a command needs; none of it is there."""
+    """Arguments that a command requires; the files do not exist."""
     words = []
     for owner, _, flag, _, info, default in options():
         if owner == command and default is inspect.Parameter.empty:

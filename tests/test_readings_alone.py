@@ -99,8 +99,9 @@ def whitened(value, truth):
     ids=["four-belt", "4-rpr", "7 legs"],
 )
 def test_the_truth_is_within_the_stated_deviations(make, noise, n):
-    """Twenty-one machines off their drawing by its tolerances; the noise is stated three times too
-    large, three times too small, and right, and found."""
+    """Twenty-one machines with errors as large as the prior sigmas; the noise is stated three times
+    too large, three times too small, and right, and is estimated.
+    """
     drawing, rng = make(), np.random.default_rng(3)
     assert drawing.redundancy == drawing.n_joints - drawing.layout.own_motion.shape[1] > 0
     errors, scales = [], []
@@ -124,7 +125,7 @@ def test_the_truth_is_within_the_stated_deviations(make, noise, n):
 
 
 def test_without_a_drawing_worth_the_name():
-    """Tolerances of half a metre: the data tell all but the frame."""
+    """Tolerances of half a metre: the data determine all but the frame."""
     drawing = load_mechanism("four-belt")
     document = drawing.document.model_copy(
         update={"tolerance": drawing.document.tolerance.model_copy(update={"center": 0.5})}
@@ -213,7 +214,7 @@ def test_new_readings_tell_whether_the_machine_changed(belts, tmp_path):
 
 
 def test_repeats_of_a_pose_count_once(tmp_path):
-    """What the model leaves out is the same in all repeats: four of each do not halve sigma."""
+    """The model's error is the same in all repeats: four of each do not halve sigma."""
     drawing, rng = load_mechanism("four-belt"), np.random.default_rng(7)
     truth = true_machine(drawing, 1.0, rng)
     joints = readings(truth, 20, rng)

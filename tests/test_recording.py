@@ -1,4 +1,4 @@
-"""A calibration as a recording: what is in it, by itself; and in rerun's own reader."""
+"""A calibration as a recording: its content, by itself, and in rerun's own reader."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from pkmcal.report.recording import RECORDED_GREY, VIEWER_PIXEL_CORNER, recorded
 
 LOUD = "NO RERUN: recordings were not written and read by it (pip install '.[rerun]')"
 NEAR, MIDDLE = 1.0, 0.15
-"""px, of any edge and of the middle one: shading moves single edges by half a pixel, most by less
-than 0.1. A picture's corner taken for a pixel's centre moves all of them by 0.35 and more."""
+"""px, of any edge and of the median one: shading moves single edges by half a pixel, most by less
+than 0.1. An image's corner taken for a pixel's centre moves all of them by 0.35 and more."""
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def entries(calibrated):
 
 
 def of(entries, *path, at=None):
-    """What was logged at a path, the newest up to a configuration, as a viewer shows it."""
+    """The newest log entry of a path up to a configuration, as a viewer shows it."""
     results = [e for e in entries if e.path == path and (e.at is None or at is None or e.at <= at)]
     return results[-1]
 
@@ -68,19 +68,19 @@ def test_a_station_without_a_photograph_shows_nothing_of_the_last_one(calibrated
     for name, at in absent:
         for part in ("edges", "aside", "contour"):
             assert of(entries, *image(name, part), at=at).kind == "clear"
-        # black, since rerun's viewer goes on showing coded pictures that were cleared
+        # black, since rerun's viewer continues to show encoded images that were cleared
         assert not decoded(of(entries, *image(name, "photograph"), at=at)).any()
 
 
 def seen(calibrated, entries, name, points):
-    """Places in a picture of points (n, 3), base frame, by the camera's place as it was logged."""
+    """Pixels of points (n, 3), base frame, by the camera's logged pose."""
     (station,) = (s for s in calibrated.session.stations if s.name == name)
     T = of(entries, "machine", "cameras", name).values["T"]
     return station.camera.project(apply(inverse(T), points)) + 0.5
 
 
 def apart(strip, line):
-    """How far (px) a strip's ends and middle are from the nearest part of a line of many points."""
+    """Distance (px) of a strip's ends and middle from the nearest part of a line of many points."""
     points = strip[[0, len(strip) // 2, -1]][:, None]
     start, direction = line[:-1], np.diff(line, axis=0)
     share = np.sum((points - start) * direction, axis=-1) / np.sum(direction**2, axis=-1)
@@ -89,7 +89,7 @@ def apart(strip, line):
 
 
 def test_tubes_in_space_lie_on_their_edges_in_the_photographs(calibrated, entries):
-    """By nothing but what was logged: the camera's place and lens, the tubes, the edges."""
+    """From logged data only: the camera's pose and lens, the tubes, the edges."""
     off: list[float] = []
     for e in entries:
         if e.path[-1] != "edges" or e.kind != "lines2d" or "cameras" not in e.path:
@@ -155,7 +155,7 @@ def test_poses_and_numbers_are_the_calibrations(calibrated, entries):
 
 
 def test_the_drawing_lies_beside_the_machine(calibrated, entries):
-    """Laid over by all joint centres: millimetres off, as the tolerances say, and not elsewhere."""
+    """Fitted by all joint centres: millimetres off, as the tolerances allow, and not elsewhere."""
     new = np.array(of(entries, "machine", "calibrated", at=1).values["strips"])
     old = np.array(of(entries, "machine", "drawing", at=1).values["strips"])
     off = np.linalg.norm(new - old, axis=-1)

@@ -1,4 +1,4 @@
-"""Regions of a workspace: poses spread over what a machine can take of them."""
+"""Regions of a workspace: poses spread over the reachable part of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_every_machine_takes_what_it_is_given(name):
 
 
 def test_poses_fill_the_box_evenly():
-    """Of every cell of a box about as many; of what lies beyond a machine's reach, none."""
+    """About as many points in every cell of a box; none beyond a machine's reach."""
     limits = cube().limits()
     poses = poses_in(limits, Region(x=(0.0, 0.5), y=(-0.05, 0.05)), 512)
     low, high = np.array([0.0, -0.05, -0.1]), np.array([0.1, 0.05, 0.1])

@@ -1,4 +1,4 @@
-"""Repeated photographs: one edge of several, their scatter as noise, and [A] Table 1 from them."""
+"""Repeated images: one edge of several, their scatter as noise, and [A] Table 1 from them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def poses(machine):
 
 
 def edges_of(machine, poses, T_camera_base=STATION, shift=0.1):
-    """All edges of a station; those of one seed differ only by what the machine does."""
+    """All edges of a station; those of one seed differ only by the machine's motion."""
     noise = EdgeNoise(shift=shift, tilt=shift)
     rng = np.random.default_rng(3)
     return simulate_edges(machine, T_camera_base[None], CAMERA, poses, noise, rng)[0]
@@ -84,7 +84,7 @@ def repeated(edges, n, pixels, rng):
 
 
 def look_of(edges):
-    """A look at one station with one point an edge, which stands for the edge's number."""
+    """Edges of one station with one point for each edge, which encodes the edge's number."""
     number = np.arange(len(edges))
     points = np.stack([number, number], axis=1).astype(float)
     return StationEdges(edges, (), points, number, 0.7, 0.1)
@@ -159,8 +159,9 @@ def test_the_scatter_is_measured_by_leg(machine, poses):
 def test_errors_agree_with_their_deviations_for_any_number_of_repeats(
     machine, poses, count, share, inside
 ):
-    """Shading stays in every repeat. Scatter in the stated covariance: sensor noise; beside it:
-    a shaken camera. Single photographs of three configurations stand beside the repeats."""
+    """Shading is common to all repeats. Scatter within the stated covariance: sensor noise; beyond
+    it: a shaken camera. Single images of three configurations are beside the repeats.
+    """
     exact = edges_of(machine, poses, shift=1e-9)
     pixels = 0.1 * np.sqrt([1 - share if inside else 1.0, share])
     rng = np.random.default_rng(5)
@@ -282,7 +283,7 @@ def test_a_fitted_axis_is_where_the_leg_went(machine, poses):
 
 
 def motion_look(machine, poses, edges, rng):
-    """A look at 6 repeats of all configurations; edges(repeat) gives those of one."""
+    """Edges of 6 repeats of all configurations; edges(repeat) gives those of one."""
     sets = [edges(r) for r in range(6)]
     common = set.intersection(*({tuple(k) for k in keys(e)} for e in sets))
     sets = [e.select(np.array([tuple(k) in common for k in keys(e)])) for e in sets]
@@ -379,8 +380,9 @@ def test_the_first_repeat_is_the_photograph_of_a_session_without(tmp_path):
 
 
 def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
-    """The standard deviations of one photograph's calibration, hardly less with four: what
-    differs from the truth is shading, the same in all of them."""
+    """The standard deviations of one image's calibration, hardly less with four: the error is
+    shading, the same in all of them.
+    """
     single = tmp_path / "session"
     shutil.copytree(repeats, single)
     for path in single.glob("images/*/*_[234].png"):
@@ -421,8 +423,8 @@ def looked(repeats):
 
 @pytest.fixture
 def once(looked, checked, monkeypatch):
-    """Commands tell of one look at the repeats, as it does not depend on what they write; what else
-    a check finds is the demonstration's, as nobody asks for it here.
+    """Commands share one measurement of the repeats, as it does not depend on their outputs; the
+    rest of the check is the demonstration's, which is not tested here.
     """
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     monkeypatch.setattr(
@@ -488,7 +490,7 @@ def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypa
 
 
 def test_repeats_are_asked_of_cameras_that_stand(demo):
-    """Those by hand have a place for each photograph, and none of their own in session.yaml."""
+    """Hand-held images have a pose each, and none in session.yaml."""
     session = load_session(demo.session)
     first, *rest = session.stations
     by_hand = replace(first, name="by hand/1", handheld=True)

@@ -183,7 +183,7 @@ def test_camera_position_sigma(case):
     np.testing.assert_allclose(np.sqrt(np.diag(got)), places.std(axis=0), rtol=0.03)
 
 
-# ------------------------------------------------------------------ edges and pictures
+# ------------------------------------------------------------------ edges and images
 
 
 def test_outward_shift_is_found_in_pixels(case):
@@ -246,7 +246,7 @@ def test_straight_curves_are_two_points_and_bent_ones_are_kept():
 
 
 def album_of(case: Case, **changed) -> pictures.Album:
-    """The case's photographs with another observation or estimate."""
+    """The case's images with another observation or estimate."""
     observation, estimate = (
         changed.get(name, getattr(case, name)) for name in ("observation", "estimate")
     )

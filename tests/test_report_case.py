@@ -36,11 +36,11 @@ class Case:
 
 
 TOLD = Findings(Identifiability(54, 12, 42, (), (), np.full(42, 20.0)), (), (), 1e-3)
-"""Findings where the data tell of everything."""
+"""Findings if the data determine everything."""
 
 
 def calibration(session, observation, estimate, verdict=None, findings=TOLD, timings=None):
-    """The case as `calibrate` gives it, as far as the report looks at it."""
+    """The case as `calibrate` returns it, as far as the report needs it."""
     return Calibration(
         session, observation, None, estimate, verdict, findings, None, "bundle", 0, timings or {}
     )
@@ -57,7 +57,7 @@ def camera() -> Pinhole:
 
 
 def one_edge(machine, camera, T, pose, joints, place, shift):
-    """An edge seen without noise, ``shift`` px outward; None outside the picture."""
+    """An edge without noise, ``shift`` px outward; None outside the image."""
     leg, tube, side = place
     legs = legs_in_camera(machine, T, pose, joints)
     a, u, radius = legs.a[leg], legs.u[leg], np.array(RADIUS[tube])

@@ -1,4 +1,4 @@
-"""Residuals over the picture: what edges and corners tell of a shift, each across its direction."""
+"""Residuals over the image: shifts from edges and corners, each across its direction."""
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ def case(tmp_path_factory) -> Case:
 
 
 def drawn_field(case: Case, shift_at, noise, n=6000):
-    """The first station's cells from n edges that tell ``shift_at`` pixels across themselves; the
-    factor by which they are drawn.
+    """The first station's cells from n edges with ``shift_at`` pixels across themselves, and the
+    factor of the arrows.
     """
     rng = np.random.default_rng(5)
     pixel = rng.uniform(0, 1, (n, 2)) * [319, 239]

@@ -1,4 +1,4 @@
-"""The report's section on what the data can tell: rank, sentences, counts, what was fixed."""
+"""The report's section on identifiability: rank, sentences, counts, fixed parameters."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_the_spectrum_shows_lost_directions_as_stubs(apart):
     assert not bars[-1].quiet
     assert bars[0].quiet
     assert "times better than the drawing" in bars[0].tip
-    # the line where data and drawing know as much is the tick that says 1
+    # the line where data and nominal model have equal information is the tick with 1
     assert (drawn.curve[0][1], "1") in drawn.ticks
 
 

@@ -1,4 +1,4 @@
-"""The report's page: its text, that it asks for nothing outside, and that browsers run it."""
+"""The report's page: its text, no requests to other places, and its scripts in browsers."""
 
 import re
 import shutil
@@ -58,7 +58,7 @@ class Found(HTMLParser):
         self.text = "".join(self._texts)
 
     def updatepos(self, i, j):
-        """Nobody asks for lines; to count them through megabytes takes longer than all else."""
+        """Line numbers are not needed; counting lines in megabytes takes longer than all else."""
         return j
 
     def handle_starttag(self, tag, attrs):
@@ -196,7 +196,7 @@ setInterval(() => {
 
 
 def browse(page: str, folder: Path, width: int) -> tuple[str, str]:
-    """The page's document after its scripts ran, and what the console said."""
+    """The page's document after its scripts ran, and the console's output."""
     if CHROMIUM is None:
         message = "NO CHROMIUM: the report was not opened in a browser (apt install chromium)"
         pytest.skip(message)
@@ -242,7 +242,7 @@ LED = """
 
 
 def fine(document: str, console: str) -> dict[str, str | None]:
-    """What the page tells of itself; nothing failed and nothing sticks out."""
+    """The page's log; nothing failed and nothing exceeds its width."""
     root = Found(document).tags[0][1]
     assert root["data-errors"] == ""
     assert root["data-overhang"] == "0"
@@ -251,14 +251,14 @@ def fine(document: str, console: str) -> dict[str, str | None]:
 
 
 def loaded(page: str, *acts: str) -> str:
-    """The page with what is done as soon as it is there."""
+    """The page with a script that runs as soon as it is loaded."""
     did = "\n".join(f'addEventListener("load", () => {{{act}\n}});' for act in acts)
     return page.replace("</body>", f"<script>{did}</script></body>")
 
 
 def test_page_runs_in_a_browser(page, tmp_path):
-    """On a telephone: plots stand, the table sorts, a picture opens; a bar's link and a plot's
-    point go to their photograph; on paper, plots are as wide as it, and light.
+    """On a phone: plots have their size, the table sorts, an image opens; a bar's link and a plot's
+    point lead to their image; on paper, plots are as wide as it, and light.
     """
     document, console = browse(loaded(page, OPENED, LED), tmp_path, 390)
     root = fine(document, console)
@@ -282,7 +282,7 @@ def test_page_runs_in_a_browser(page, tmp_path):
     assert float(str(root["data-low"])) == pytest.approx(0.78)  # as the style has it on paper
     assert root["data-screen"] == root["data-again"] != "672"
     assert root["data-light"] == "#1a1e24"
-    # what is drawn in space has a picture for paper, twice as fine as a screen
+    # plots in space have an image for paper, at twice the resolution of a screen
     assert root["data-printed"] == ",".join(["1344"] * page.count('class="panel in-space"'))
 
 

@@ -1,4 +1,4 @@
-"""The machine in space as it was photographed: tubes, arms, cameras, and the slider's poses."""
+"""The machine in space at its configurations: tubes, arms, cameras, and the slider's poses."""
 
 from dataclasses import replace
 
@@ -104,7 +104,7 @@ def test_points_lead_to_photographs_that_are_on_the_page(case):
 
 @pytest.mark.parametrize("scale", [1.0, 6.0])
 def test_all_that_is_drawn_is_in_the_picture(case, scale):
-    """By a look-at of its own, at Plotly's angle of 45 degrees, in a square and in a wide picture;
+    """By an independent look-at, at Plotly's angle of 45 degrees, in a square and in a wide view;
     and no smaller than needed. scale : of the cameras' distances.
     """
     estimate = case.estimate

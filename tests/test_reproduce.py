@@ -1,4 +1,4 @@
-"""``pkmcal reproduce``: what it shows, writes and refuses, and when it says that it failed."""
+"""``pkmcal reproduce``: its outputs and refusals, and when it reports a failure."""
 
 from __future__ import annotations
 
@@ -227,7 +227,9 @@ def test_every_figure_of_the_prototype_is_compared(short):
 
 
 def test_what_differs_and_what_fails():
-    """Beyond the Monte-Carlo error is told; beyond what the setting explains fails."""
+    """A deviation beyond the Monte-Carlo error is reported; one that the setting does not explain
+    fails.
+    """
 
     def figure(method, quantity, value, error, wanted, rounding):
         allowed = expected.tolerance((method,), quantity)
@@ -238,7 +240,7 @@ def test_what_differs_and_what_fails():
     assert offset._replace(measured=Summary(0.0640, 0.0010)).differs
     assert offset._replace(measured=Summary(0.0640, 0.0010)).tolerable
     assert not offset._replace(measured=Summary(0.0780, 0.0010)).tolerable
-    # what follows the drawing's error may differ more, nothing else
+    # results that follow the nominal error may differ more, nothing else
     assert figure(FOUR_STEPS_PRINTED, "base_z", 2.3, 0.01, 1.79, 0.005).tolerable
     assert not figure(FOUR_STEPS_PRINTED, "base_xy", 2.3, 0.01, 1.79, 0.005).tolerable
 

@@ -1,4 +1,4 @@
-"""``pkmcal reproduce b``: the simulation, what it is held against, and when it says it failed."""
+"""``pkmcal reproduce b``: the simulation, its reference values, and when it reports a failure."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_what_is_believed_is_what_was_estimated(short, ran):
     true = inverse(views_by_name()[PERSPECTIVE_VIEW].T_camera_base)
     believed = inverse(ran.trials["hand"].estimate.view.T_camera_base)
     shift = np.linalg.norm(believed[:, :3, 3] - true[:3, 3], axis=-1)
-    # three centimetres by hand, and what laying the drawing on the truth leaves
+    # three centimetres by hand, and the residual of fitting the nominal model to the truth
     assert np.abs(shift - CAMERA_BY_HAND_ERRORS["hand"][0]).max() < 5e-3
 
 

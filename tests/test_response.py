@@ -1,4 +1,4 @@
-"""How photographs code light: the curve, what is usual for files of a kind, what edges tell."""
+"""Response of images to light: the curve, the default for kinds of files, detection from edges."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SRGB = np.rint(levels_of_light(np.arange(256.0), "srgb")).astype(np.uint8)
 
 
 def recode(folder: Path, kind: str, table=None) -> None:
-    """A session's photographs as files of a kind, their levels changed by a table."""
+    """A session's images as files of a kind, their levels changed by a table."""
     for path in sorted((folder / "images").rglob("*.png")):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         coded = image if table is None else cv2.LUT(image, table)
@@ -108,7 +108,9 @@ def test_a_blurred_edge_is_where_it_is_by_the_right_code_alone():
 
 
 def test_light_that_is_cut_off_is_so_by_any_code():
-    """Bright legs, overexposed: levels from 250 on say nothing, whatever light they stand for."""
+    """Bright legs, overexposed: levels above 250 carry no information, whatever light they
+    represent.
+    """
     table = np.minimum(1.6 * (255 - np.arange(256)), 255).astype(np.uint8)
     clipped = [cv2.LUT(image, table) for image in photographs()[0]]
     there = redrawn(0, 0.0005), FRONT, poses()
@@ -148,7 +150,7 @@ def test_a_response_that_there_is_not(session):
     assert "linear" in message
 
 
-# what edges tell
+# detection from edges
 
 
 def test_a_session_that_is_as_usual_says_nothing(calibrated):
@@ -157,15 +159,15 @@ def test_a_session_that_is_as_usual_says_nothing(calibrated):
 
 @pytest.fixture(scope="module")
 def coded(demo, tmp_path_factory):
-    """The demonstration's photographs, coded as no PNG files are usually, and what is found."""
+    """The demonstration's images with a response unusual for PNG files, and its detection."""
     folder = shutil.copytree(demo.session, tmp_path_factory.mktemp("coded") / "session")
     recode(folder, ".png", SRGB)
     return SimpleNamespace(folder=folder, calibration=pkmcal.calibrate(folder))
 
 
 def check_overruled(calibration, value, usual, demo, worse=1.0):
-    """And the machine is found as well as where it is as usual, but for what the file's kind does:
-    errors that are so many times as large.
+    """And the machine is as accurate as with the default response, except for the effect of the
+    kind of file: errors that are so many times as large.
     """
     (hint,) = calibration.verdict.of("image.response")
     assert (hint.facts["other"], hint.facts["usual"]) == (value, usual)
@@ -198,9 +200,8 @@ def painted(estimate):
 
 
 def asked_of(calibrated, measurements, estimate, other):
-    """Edges (N,) of which is asked at first, and whether all are asked then.
-
-    other : edges as measured by the other response.
+    """Edges (N,) of the first test, and whether all are tested then. other : edges measured with
+    the other response.
     """
     edges, every = other, []
     some = np.zeros(len(edges), dtype=bool)
@@ -229,8 +230,8 @@ def asked_of(calibrated, measurements, estimate, other):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_edges_that_are_not_asked_do_not_hold_back_those_that_are(calibrated, seed):
-    """Of the same machine, they would: it has taken up most of what a wrong response does to all of
-    them, and by a part alone no other would fit. Here it moves each line by itself.
+    """For a common machine they would: it has absorbed most of a wrong response's effect on all of
+    them, and for a part alone no other would fit. Here it moves each line by itself.
     """
     right = calibrated.measurements.edges
     sign = np.random.default_rng(seed).choice([-0.6, 0.6], (3, 6, 2, 2))
@@ -249,8 +250,8 @@ def test_edges_that_are_not_asked_do_not_hold_back_those_that_are(calibrated, se
 
 
 def test_right_photographs_are_seldom_all_asked(calibrated):
-    """Those of some configurations tell that there is nothing to gain: one session of ten has as
-    much by chance, so of twenty no more than six.
+    """Edges of some configurations show no gain: one session of ten has as much by chance, so of
+    twenty no more than six.
     """
     right, times = calibrated.measurements.edges, 0
     for seed in range(20):
@@ -263,7 +264,9 @@ def test_right_photographs_are_seldom_all_asked(calibrated):
 
 
 def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(calibrated):
-    """In the dark the wrong one leaves three of a hundred, which say nothing, and that says it."""
+    """In the dark the wrong response leaves three of a hundred, which do not decide, and the
+    message says so.
+    """
     few = calibrated.measurements.edges.select(np.arange(3))
     values = responses_by_edges(
         calibrated.session,
@@ -321,7 +324,7 @@ def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
 
 @pytest.mark.slow
 def test_each_camera_is_asked_by_itself(session):
-    """One station's photographs by a camera of its own, coded; the others' not."""
+    """One station's images by a camera of its own, coded; the others' not."""
     names = sorted(path.name for path in (session / "images").iterdir())
     for path in sorted((session / "images" / names[0]).glob("*.png")):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)

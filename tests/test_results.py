@@ -1,4 +1,4 @@
-"""What a calibration leaves on disk, and that it comes back the same or is refused."""
+"""Files of a calibration, and that they are read back equal or refused."""
 
 from __future__ import annotations
 

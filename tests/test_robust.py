@@ -36,7 +36,7 @@ def ring(n, radius=75.0):
 
 def problem_of(folder, off, n, wrong=0.0):
     """The problem, and its start, of n heights of a printer whose radius is ``off`` mm larger than
-    its firmware says; wrong : mm, of the second height.
+    its firmware's value; wrong : mm, of the second height.
     """
     true = printers.machine(replace(SAYS, radius=SAYS.radius + off))
     readings = printers.felt(true, ring(n), 0.005, np.random.default_rng(1))

@@ -30,7 +30,9 @@ def scales(machine):
 
 
 def scaled(name):
-    """A machine off its drawing whose readings are off by thousandths, each motor its own."""
+    """Machine with nominal errors whose readings' scales are off by thousandths, each motor its
+    own.
+    """
     machine = built(name, share=1.0)
     values, table = machine.values.copy(), machine.parameters
     for leg, column in enumerate(machine.layout.actuated):
@@ -60,7 +62,7 @@ def test_the_file_says_how_sure_scales_are(tmp_path, name, tolerance, count):
 
 
 def test_a_scale_that_is_exact_still_counts(tmp_path):
-    """tolerance 0: it is no parameter, and readings are what it makes of them."""
+    """tolerance 0: the scale is no parameter, and readings are scaled by it."""
     rod = f"{ROD}\n    scale: 1.002"
     changes = [(ROD, rod), ("tolerance: {", "tolerance: {scale: 0, ")]
     machine, plain = load_mechanism(drawn(tmp_path, "gough-stewart", *changes)), load_mechanism(
@@ -116,7 +118,7 @@ def test_a_scale_that_cannot_be_is_named(tmp_path, fault):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_readings_are_what_motors_move_over_the_scale(name):
-    """The same machine without scales, at readings times the scales, goes where this one goes."""
+    """The same machine without scales, at readings times the scales, has the same poses."""
     machine = scaled(name)
     table = machine.parameters
     values = machine.values.copy()
@@ -229,7 +231,7 @@ def test_a_calibration_from_before_scales_has_exact_ones(demo, tmp_path):
     assert not any(name.endswith(".scale") for name in saved.machine.parameters.names)
     assert (saved.machine.layout.exact_scale == 1).all()
     assert not saved.machine.layout.unsure_scales.any()
-    # a session's drawing of today is still that machine's, and another's is not
+    # a session's present nominal model is still that machine's, and another's is not
     now = load_mechanism("gough-stewart")
     _check_machine(saved, SimpleNamespace(machine=now))
     other = now.with_values(now.values + 0.1)

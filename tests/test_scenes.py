@@ -21,7 +21,7 @@ DRAWS = 100
 def scenes():
     spec = importlib.util.spec_from_file_location("scenes", FILE)
     module = importlib.util.module_from_spec(spec)
-    sys.modules["scenes"] = module  # dataclasses look their module up
+    sys.modules["scenes"] = module  # dataclasses resolve their module by name
     spec.loader.exec_module(module)
     yield module
     del sys.modules["scenes"]
@@ -37,7 +37,7 @@ def case(scenes, calibrated, demo):
 
 
 def drawn(case, rng):
-    """Truths that lie about the estimate as its covariance says."""
+    """Truths distributed about the estimate by its covariance."""
     parts, covariance, truth = case
     value, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(value, 0))
@@ -90,7 +90,7 @@ def test_frames_are_conventions(scenes, case, calibrated):
     assert again.a == pytest.approx(first.a, rel=1e-6)
     assert again.station == pytest.approx(first.station, rel=1e-6)
     assert len(first.station) == 3
-    assert max(first.station) < 5e-3  # coarse photographs, but the camera is found
+    assert max(first.station) < 5e-3  # coarse images, but the camera is localized
 
 
 def test_a_whole_session_is_scored_and_its_truth_not_shown(scenes, demo, tmp_path, capsys):
@@ -105,7 +105,7 @@ def test_a_whole_session_is_scored_and_its_truth_not_shown(scenes, demo, tmp_pat
 
 
 def test_what_is_refused_has_its_sentence(scenes, session, demo, capsys):
-    """Photographs that show nothing, under a truth that is never read."""
+    """Images without content, under a truth that is never read."""
     (session / "truth.json").write_text((demo.session / "truth.json").read_text())
     for path in (session / "images").glob("*/*.png"):
         path.unlink()

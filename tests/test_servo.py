@@ -1,4 +1,4 @@
-"""The servoing loop in simulation, its ends, and the analysis of what the legs show."""
+"""The servoing loop in simulation, its ends, and the analysis of visibility and equilibria."""
 
 from __future__ import annotations
 
@@ -297,7 +297,7 @@ def test_wrong_assembly_as_start():
 
 
 def test_losing_a_leg(eye):
-    """The machine stands near the picture's border, and some ways lead out of it."""
+    """The machine is near the image's border, and some paths lead out of it."""
     starts, goals = ways_of(eye, 12)
     parameters = eye.camera.parameters.copy()
     parameters[2] += 250
@@ -377,7 +377,7 @@ def test_three_legs_leave_other_poses(eye):
 
 
 def test_an_equilibrium_is_one(eye):
-    """N^T e vanishes where the search says that the control rests."""
+    """N^T e vanishes at the equilibria of the search."""
     poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
     three = eye.true.only(np.array([0, 1, 2]))
     value = equilibria(three, "directions", poses[:3], poses[3:40])
@@ -403,7 +403,7 @@ def test_estimates_have_the_errors_asked_for(eye):
     off = identified.view.theta - eye.true.theta
     np.testing.assert_allclose(off.std(axis=0), sigma, rtol=0.2)
     np.testing.assert_allclose(cad.view.theta, drawing)
-    # eq. 15: the drawing lies on the identified base centres as well as it can
+    # eq. 15: the nominal model fits the identified base centres as well as possible
     index = [table.names.index(f"legs[{j}].base.center.{x}") for j in range(1, 7) for x in "xyz"]
     a = [apply(e.view.T_camera_base[:, None], e.view.theta[..., index].reshape(-1, 6, 3))
          for e in (identified, cad)]  # fmt: skip
@@ -441,8 +441,8 @@ def test_a_study_that_is_well(eye):
 
 
 def test_how_far_a_platform_leaves_its_way(eye):
-    """By hand millimetres beside it, which neither its end nor the time tells; and by definition
-    nothing with the true geometry.
+    """Hand-measured poses are millimetres off the path, which neither its end nor the time shows;
+    and zero by definition with the true geometry.
     """
     value = study_servoing(scene_of(eye), Plan(SHORT, runs=6))
     true, identified, _, hand = (o.astray for o in value.outcomes)

@@ -121,7 +121,7 @@ def test_another_camera(tmp_path):
 
 
 def test_one_way(tmp_path):
-    """Start and goal as asked for: the same for every run."""
+    """Requested start and goal: the same for every run."""
     done = run("servo", "gough-stewart", *QUICK, "--start", HOME, "--goal", "0.02,0,0.36,0,0,0.1",
                "-o", tmp_path / "out", "--json")  # fmt: skip
     assert done.code == 0, done.out

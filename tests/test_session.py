@@ -302,7 +302,7 @@ EDITS = [
      ["line 2, board: there is no such file"]),
     ("cameras/front.yaml", "focal: [9.0, 9.0]", "focal: [9.0, -9.0]",
      ["cameras/front.yaml, line 3, focal[2]", "a number above 0"]),
-    # pictures' pattern
+    # pattern of the images
     ("session.yaml", "{configuration}", "0000",
      ["line 7, stations.front.images: the pattern does not say", "'images/front/0000.png'"]),
     ("session.yaml", "{configuration}", "{configration}",
@@ -379,7 +379,9 @@ def test_lengths_in_millimetres(folder):
 
 
 def test_motors_in_degrees(folder):
-    """Only what turns can be in degrees; a leg's length as large is merely out of range."""
+    """Only rotary readings can be in degrees; a leg's length of that size is merely out
+    of range.
+    """
     (folder / "joints.csv").write_text(scaled(180 / np.pi))
     assert "this reading is outside the machine's range" in fault(load_session, folder)
     table = read_csv(folder / "joints.csv", label="joints.csv")

@@ -1,4 +1,4 @@
-"""Sessions whose stations observe a board: what loads, and what is said of the rest."""
+"""Sessions whose stations observe a board: valid ones, and messages for the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a whole machine's silhouettes lie on the edges of one photograph."""
+"""Silhouettes of a whole machine on the edges of one image."""
 
 import json
 import shutil
@@ -51,7 +51,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def views(folder):
-    """Each photograph's view, with a machine that is known exactly, and its true place."""
+    """Each image's view, with a machine that is known exactly, and its true pose."""
     session = load_session(folder)
     poses, truth = platform_poses(session), load_truth(folder, session.machine)
     photographs = read_photographs(session)
@@ -60,8 +60,8 @@ def views(folder):
 
 
 def off_truth(view, T, edges):
-    """How far edges lie outward of where they truly are (n, 2): in the middle and at the end, in
-    what each states.
+    """Outward errors (n, 2) of edges, in the middle and at the end, in their standard
+    deviations.
     """
     legs = legs_in_camera(view.machine, T, view.poses, view.joints)
     points = edge_points(view.machine, view.camera, legs, view.tubes, 2)
@@ -76,7 +76,7 @@ def off_truth(view, T, edges):
 
 
 def test_silhouettes_lie_on_the_machine(views):
-    """From a place a few pixels off they are where it truly is, as far as they say."""
+    """From a pose a few pixels off they give the true one, within their standard deviations."""
     rng = np.random.default_rng(0)
     results = []
     for view, T in views:
@@ -109,7 +109,7 @@ def test_silhouettes_say_how_they_depend_on_the_camera(views):
 
 
 def test_coarse_edges_say_nothing_of_how_light_is_coded(views):
-    """What lies beside an edge that could not be measured moves by no response."""
+    """Silhouettes of edges that could not be measured do not depend on the response."""
     view, T = views[0]
     edges = silhouette_edges(view, T, 0).edges
     measured = replace(edges, coarse=np.arange(len(edges)) % 2 == 1)
@@ -146,7 +146,7 @@ def calibration(folder):
 
 
 def test_edges_that_could_not_be_measured_are_found_whole(calibration):
-    """Of a photograph by hand: once each, measured or coarse, and not among what is left out."""
+    """In a hand-held image: once each, measured or coarse, and not among the rejected."""
     value = calibration.observation
     edges = value.edges
     assert 0 < edges.coarse.sum() < (~edges.coarse).sum()
@@ -157,7 +157,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     }
     assert not given_up & set(map(tuple, each.tolist()))
     assert set(value.point_edge.tolist()) == set(range(len(edges)))
-    # and told apart
+    # and distinguished
     values = outcome_of(calibration)
     rows = json.loads(values.texts["calibration.json"])["residuals"]
     coarse = [row[rows["columns"].index("coarse")] for row in rows["edges"]]
@@ -166,7 +166,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     text = f"{len(edges) - count} edges measured and {count} from silhouettes"
     page = page_html(values)
     assert text in page
-    # what depends on where they were looked for is in the deviations, and said
+    # the variance between measurement passes is in the standard deviations, and in the message
     variance = calibration.measurements.imputation_covariance
     assert 0.02 < variance < 2
     assert calibration.estimate.statistics.look_scatter == pytest.approx(np.sqrt(variance))
@@ -175,7 +175,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
 
 @pytest.fixture(scope="module")
 def tripod_calibration(beside):
-    """Of the photographs of the camera on the tripod alone."""
+    """For the images of the camera on the tripod alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(refinement, "IMPUTATION_PASSES", 2)
         return calibrate_session(beside[0].parent / "tripod")
@@ -199,7 +199,9 @@ def test_looks_scatter_by_their_variance_in_that_of_noise(tripod_calibration):
 
 
 def turns_of(calibration, shading, photographs):
-    """What the last look left, had its edges been shaded by so many px, as light moves them."""
+    """Result of the last measurement pass, with its edges shaded by so many px, as light moves
+    them.
+    """
     estimate = calibration.estimate
     noise = replace(estimate.edge_noise, shading=np.full_like(estimate.edge_noise.shading, shading))
     return RefinementResult(
@@ -227,7 +229,7 @@ def test_painted_legs_on_a_tripod_are_not_looked_for_again(tripod_calibration, t
 
 
 def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibration):
-    """In photographs of nothing no look finds an edge."""
+    """In images without content no measurement pass finds an edge."""
     empty = [
         replace(p, images=[np.full_like(image, 90) for image in p.images])
         for p in read_photographs(tripod_calibration.session)
@@ -239,7 +241,7 @@ def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibratio
 
 @pytest.fixture(scope="module")
 def beside(folder, tmp_path_factory):
-    """The same photographs by hand beside a camera on a tripod, and where all truly stand."""
+    """Hand-held images beside a camera on a tripod, and their true poses."""
     out = tmp_path_factory.mktemp("beside")
     tripod = replace(SETTINGS, stations=1, handheld=False)
     machine, camera = load_mechanism("gough-stewart"), camera_of_size((640, 480))
@@ -256,7 +258,7 @@ def beside(folder, tmp_path_factory):
 
 
 def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, monkeypatch):
-    """Silhouettes are looked for in one photograph of a place: edges of others lie elsewhere."""
+    """Silhouettes are matched in one image of a pose: edges of others are elsewhere."""
     session = load_session(beside[0])
     photographs, T = read_photographs(session), beside[1]
     assert [len(p.images) for p in photographs] == [1, 1, 1, 1, 4]
@@ -302,7 +304,7 @@ def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
 
 
 def test_a_machine_that_does_not_settle_is_refused(tripod_calibration):
-    """By how far the last look moved it, in its deviations."""
+    """Change of the machine by the last measurement pass, in its standard deviations."""
     results = turns_of(tripod_calibration, 0.0, ())
     assert list(results._replace(change=0.9 * refinement.SETTLED_MACHINE_CHANGE).reasons) == []
     (reason,) = results._replace(change=2.5).reasons
@@ -322,7 +324,7 @@ def test_few_coarse_edges_do_not_tell_how_they_scatter():
 
 
 def test_edges_of_two_looks_are_matched(views):
-    """By where they are, whatever their order; what only one look has has no partner."""
+    """By position, whatever the order; edges of one pass only have no partner."""
     edges = silhouette_edges(views[0][0], views[0][1], 0).edges
     shuffled = np.random.default_rng(0).permutation(len(edges))[2:]
     mine, theirs = edges.same_as(edges.select(shuffled))

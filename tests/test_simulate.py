@@ -1,4 +1,4 @@
-"""Simulated photographs and edges against the geometry, and sessions against their truth."""
+"""Simulated images and edges against the geometry, and sessions against their truth."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_a_pixel_has_the_mean_over_its_area():
     border = np.abs(np.gradient(mean, axis=1)) > 0.02
     assert np.count_nonzero(border) > 1000
     assert np.ptp(mean) > 0.5
-    # points in a border pixel tell its share to one in thirty
+    # samples in a border pixel determine its share to one in thirty
     assert np.abs(off).max() < 0.05 * np.ptp(mean)
     assert np.sqrt(np.mean(off[border] ** 2)) < 0.006
     assert abs(off[border].mean()) < 0.001
@@ -262,7 +262,7 @@ def test_a_style_changes_the_legs_alone_and_no_silhouette(machine):
     for style in ("matte", "dark", "metal"):
         differs = np.abs(in_view(parts(style)[1]) - usual)
         assert np.mean(differs[on_legs] > 0.02) > 0.2
-        # other borders are looked at through other points of their pixels
+        # other borders are sampled at other points of their pixels
         assert differs[~on_legs].max() < 0.1
     assert in_view(parts("dark")[1])[on_legs].mean() < 0.5 * usual[on_legs].mean()
     _, built = parts("mixed", as_built=True)

@@ -1,4 +1,4 @@
-"""Photographs of machines with cranks, guides and side bars, and what is recognised in them."""
+"""Images of machines with cranks, guides and side bars, and their localization."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def seen_along(parts, origin, targets):
     return hits.min(axis=0), hits.argmin(axis=0)
 
 
-# drawings
+# nominal models
 
 
 def test_rods_without_cylinders_get_one(machine):
@@ -156,7 +156,7 @@ def test_forearms_are_drawn_from_arm_to_platform(machine):
 
 
 def test_little_of_a_machine_hides_its_own_forearms(machine):
-    """From where the simulation puts a camera, on average over what it photographs."""
+    """From the default station, on average over its images."""
     truth = draw_truth(machine, (SMALL,), Settings(stations=1, configurations=6), 0)
     eye = inverse(truth.T_camera_base[0])[:3, 3]
     shares = []
@@ -197,7 +197,7 @@ def test_platforms_with_side_bars_do_not_fold(h4):
     assert platform_unfolded(h4, T).tolist() == [True, True, True, False, False]
     assert platform_unfolded(load_mechanism("gough-stewart"), T).all()
     truth = draw_truth(h4, (SMALL,), Settings(stations=1, configurations=20), 1)
-    for machine in (h4, truth.machine):  # as it is, and as its controller believes
+    for machine in (h4, truth.machine):  # as it is, and as its controller models it
         poses = machine.forward(truth.joints)
         turn = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
         assert np.abs(turn).max() < FARTHEST_TURN * machine.most_turn[0]
@@ -241,7 +241,7 @@ def test_the_command_writes_cylinders_into_the_sessions_drawing(tmp_path):
     assert table.startswith("configuration,leg1,leg2,leg3,leg4\n")
 
 
-# in photographs
+# in images
 
 
 def photographed(folder, name, camera, configurations, board, seed):
@@ -263,7 +263,7 @@ def observing(folder, words):
 
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory):
-    """An H4 whose forearms and board one camera sees; few photographs, and small ones."""
+    """An H4 whose forearms and board one camera sees; few images, and small ones."""
     fields = {"type": "charuco", "squares": [5, 4], "square": 0.065, "marker": 0.05,
               "dictionary": "DICT_4X4_50"}  # fmt: skip
     folder = tmp_path_factory.mktemp("mixed") / "session"
@@ -303,7 +303,7 @@ def test_the_board_says_where_the_camera_stands(mixed):
 
 
 def test_the_blur_is_not_told_by_a_few_odd_profiles():
-    """Of slim legs few profiles are whole; a highlight on these said nothing of the rest."""
+    """Few profiles of slim legs are complete; a highlight on these does not affect the rest."""
     from test_profiles import make
 
     slim, wide = make(6, 300, blur=0.7).profiles, make(7, 5, blur=0.7).profiles
@@ -324,7 +324,7 @@ def test_the_blur_is_not_told_by_a_few_odd_profiles():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_legs_and_board_know_more_than_each(name, tmp_path):
-    """Twenty photographs, 800x600, one place: errors as large as said, and least together.
+    """Twenty images, 800x600, one place: errors as stated, and least together.
 
     Platform at the readings, mm, by legs, board and both: h4 0.07, 0.18, 0.04; delta 0.19, 0.14,
     0.03; linear-delta 0.06, 0.08, 0.04; 6-rus 0.22, 0.58, 0.04; hexaglide 0.64, 0.83, 0.47.

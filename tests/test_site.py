@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 
 class Links(HTMLParser):
-    """A page's links, pictures and marks."""
+    """Links, images and anchors of a page."""
 
     def __init__(self):
         super().__init__()

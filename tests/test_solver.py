@@ -128,7 +128,7 @@ def with_damping(linear, damping):
 @pytest.mark.parametrize("sharp", [1.0, 1e6])
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
 def test_products_of_strips_are_those_of_their_rows(damping, sharp):
-    """To the last digits, however sharp the rows in none of them."""
+    """Equal to the last digits, however sharp the rows in none of them."""
     rows, damping = in_strips(np.random.default_rng(12), sharp), np.full(2, damping)
     linear = rows.linear()
     assert np.all(linear.by_shared[:, :, :8, [1, 5, 6, 7, 8]] == 0)
@@ -145,7 +145,7 @@ def test_products_of_strips_are_those_of_their_rows(damping, sharp):
 
 
 def test_runs_of_a_batch_do_not_touch_each_other():
-    """A run solved in a batch, among easier and harder ones, gives what it gives alone."""
+    """A run solved in a batch, among easier and harder ones, gives the same solution alone."""
     rng = np.random.default_rng(3)
     assembled, truth = make_scene(rng, runs=4, configurations=6).batch(rng)
     station = np.stack(

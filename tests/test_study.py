@@ -1,4 +1,4 @@
-"""pkmcal study: what can be varied, what is simulated, and the command."""
+"""pkmcal study: varied settings, the simulation, and the command."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
 from pkmcal.wording import brief
 
 SMALL = ("--vary", "configurations=6", "--vary", "stations=1,2")
-"""Of 3-rpr: two combinations in a second or two."""
+"""Study of 3-rpr: two combinations in a second or two."""
 
 
 def design_of(name, *vary):
@@ -170,7 +170,9 @@ def test_a_session_gives_its_cameras_stations_and_noise(demo):
 
 
 def test_a_session_without_photographs_can_be_studied(session):
-    """Before any is taken: fifteen from each place; and its workspace is said to be left out."""
+    """Before any images exist: fifteen from each place; and its workspace is reported as
+    ignored.
+    """
     shutil.rmtree(session / "images")
     with (session / "session.yaml").open("a") as file:
         file.write("workspace: {turn: 0.1}\n")
@@ -199,7 +201,7 @@ def test_a_folder_called_like_a_machine_is_not_taken_for_a_session(tmp_path, mon
 
 
 def test_the_tool_of_the_truth_is_not_off():
-    """Whatever frames the truth is told in: only what moves the tool counts."""
+    """In any frames of the truth: only effects on the tool count."""
     design = design_of("gough-stewart", "configurations=5")
     setting = SimulatedCalibrations(design)
     data = setting.draw(batch_of(setting, 2))
@@ -279,7 +281,7 @@ def test_edges_that_scatter_more_than_stated_are_told():
 
 
 def test_wrong_deviations_are_told():
-    """Half of the true deviations: the study says so, and exit code and page with it."""
+    """Half of the true standard deviations: the study reports it, in exit code and page."""
     rng = np.random.default_rng(0)
     sigma = np.ones((40, 30))
     error = rng.normal(size=sigma.shape)
@@ -293,7 +295,7 @@ def test_wrong_deviations_are_told():
 
 
 def test_standard_errors_know_of_batches():
-    """Runs of a batch that are alike count as one."""
+    """Equal runs of a batch count as one."""
     rng = np.random.default_rng(1)
     means = rng.normal(size=(400, 25))
     batch = np.repeat(np.arange(25), 8)
@@ -302,7 +304,9 @@ def test_standard_errors_know_of_batches():
 
 
 def test_calibrations_that_all_fail_are_told(tmp_path, one_process):
-    """A thousand times the noise of [A] Table 1: no calibration can be used, and that is said."""
+    """A thousand times the noise of [A] Table 1: no calibration can be used, and the study reports
+    it.
+    """
     done = run("study", "a", "--vary", "axis_noise=1,1000", "--runs", 4, "-o", tmp_path)
     assert done.code == 1, done.err
     assert "Too few calibrations of some combinations can be used" in done.out
@@ -352,8 +356,9 @@ def test_parameters_keep_their_names_where_legs_and_boards_are_compared(one_proc
 
 
 def test_what_chance_does_is_no_gain():
-    """Three values that do not matter, each told from two batches of runs: one study in twenty may
-    call the largest difference a gain, and two standard errors would do so in half of them."""
+    """Three values that do not matter, each from two batches of runs: one study in twenty may call
+    the largest difference a gain, and two standard errors would do so in half of them.
+    """
     rng = np.random.default_rng(4)
     cell = study("a", (), runs=2).found[0]
     calls = 0

@@ -1,4 +1,4 @@
-"""A study that is stopped goes on where it was: on other processes, and on a cluster."""
+"""A stopped study continues from its finished batches: on other processes, and on a cluster."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def started(out: Path, command: tuple[str, ...] = COMMAND) -> subprocess.Popen[b
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
     def heard() -> None:
-        """What a shell started in the background ignores is heard again."""
+        """Handle signals that a shell started in the background ignores."""
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     return subprocess.Popen(words, stdout=quiet, stderr=quiet, env=environment, preexec_fn=heard)
@@ -59,8 +59,9 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("how", ["SIGINT", pytest.param("SIGKILL", marks=pytest.mark.slow)])
 def test_a_study_that_is_stopped_goes_on(tmp_path, how, whole, one_process):
     """The same numbers to the byte, no finished batch lost and none done twice; begun by one
-    process a core, ended by one. One that is killed keeps its batches, too:
-    test_two_studies_do_not_work_in_one_folder_at_once.
+    process for each core, ended by one.
+
+    One that is killed keeps its batches, too: test_two_studies_do_not_work_in_one_folder_at_once.
     """
     stopped = tmp_path / "stopped"
     process = started(stopped)
@@ -77,7 +78,7 @@ def test_a_study_that_is_stopped_goes_on(tmp_path, how, whole, one_process):
     assert run("study", *COMMAND, "-o", stopped).code == 0
     for name in ("study.csv", "study.json"):
         assert (stopped / name).read_bytes() == (whole / name).read_bytes()
-    # the page tells to the minute when it was made
+    # the page has the minute of its making
     pages = [(folder / "study.html").read_text() for folder in (stopped, whole)]
     pages, times = zip(
         *(re.subn(r"\d+ \w+ \d{4}, \d\d:\d\d", "", page) for page in pages), strict=True
@@ -200,10 +201,12 @@ def test_what_is_kept_is_what_was_done(tmp_path):
 
 
 def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, one_process):
-    """Neither another one nor the same again; once the first has ended, its command goes on."""
+    """Neither another study nor the same again can start; once the first has ended, its command
+    continues.
+    """
     first = started(tmp_path, LONGER)
     deadline = time.monotonic() + 120
-    while not (tmp_path / "batches" / "000-00000.npz").exists():  # asked for below
+    while not (tmp_path / "batches" / "000-00000.npz").exists():  # requested below
         assert first.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -229,7 +232,7 @@ def test_an_impossible_combination_is_named_before_the_others_are_done(tmp_path,
 
 
 def test_a_folder_where_nothing_was_finished_is_free(tmp_path, one_process):
-    """After a combination that nobody can photograph, the command is mended, and runs."""
+    """After a combination that cannot have images, the corrected command runs."""
     with pytest.raises(InputError, match=r"does not see the machine"):
         study("3-rpr", ["focal=900", "distance=0.1"], runs=2, out=tmp_path)
     assert study("3-rpr", ["stations=1", SMALL[1]], runs=2, out=tmp_path).runs == 2
@@ -261,7 +264,7 @@ def test_what_is_no_address_is_told_at_once(address):
 
 @pytest.mark.filterwarnings("default")
 def test_a_scheduler_that_goes_away_is_told(tmp_path):
-    """What was finished by then is kept."""
+    """Batches finished by then are kept."""
     distributed, dask = (pytest.importorskip(name) for name in ("distributed", "dask"))
     local = distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None,

@@ -1,4 +1,4 @@
-"""CSV tables: what is taken as it comes, and every fault with its line."""
+"""CSV tables: accepted variants, and every fault with its line."""
 
 import numpy as np
 import pytest
@@ -129,7 +129,7 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
     ],
 )
 def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, said, monkeypatch):
-    """Of one that is read in many blocks."""
+    """For a table that is read in many blocks."""
     monkeypatch.setattr(documents, "TEXT_BLOCK_BYTES", 1 << 14)
     rows = [b"%06d,0.%06d,1e-3\n" % (k, k) for k in range(3000)]
     rows.insert(2400, line)

@@ -31,7 +31,7 @@ def board(tmp_path_factory):
 
 
 def before(tilt=(0.3, -0.45, 0.1), place=(-0.12, -0.09, 0.45)):
-    """A pose T_camera_board in which the whole board is in the picture."""
+    """A pose T_camera_board with the whole board in the image."""
     return pose(rotation(np.array(tilt)), np.array(place))
 
 
@@ -43,7 +43,7 @@ def poses_around(n, seed=0):
 
 
 def detections(board, T_camera_board, seed=0, noise=NOISE, camera=CAMERA):
-    """What a detector would find, corners with normal noise that it knows of."""
+    """Output of a detector: corners with normal noise of stated size."""
     rng = np.random.default_rng(seed)
     pixels = camera.project(apply(T_camera_board[:, None], board.points))
     pixels = pixels + noise * rng.standard_normal(pixels.shape)
@@ -89,7 +89,7 @@ def test_errors_of_poses_are_what_their_covariances_say(board):
 
 
 def test_rendered_boards(board):
-    """Whole photographs: the errors are no larger than their covariances say."""
+    """Whole images: the errors match their covariances."""
     truth = poses_around(6, seed=3)
     images = [render(CAMERA, T, board, seed=k) for k, T in enumerate(truth)]
     result = detect_in(images, board, [f"{k}.png" for k in range(6)])
@@ -148,7 +148,7 @@ def test_no_photograph_shows_it(board):
 
 
 def test_a_tilt_that_is_not_sure_is_rejected(board):
-    """Far away and straight on, a board tilted left looks as one tilted right."""
+    """Far away and seen from straight ahead, a board tilted left looks like one tilted right."""
     far = before(tilt=(0.0, 0.06, 0.0), place=(-0.12, -0.09, 6.0))
     views = seen(board, detections(board, far[None], noise=0.1))
     assert not views.usable[0]
@@ -185,7 +185,7 @@ def test_one_mirrored_photograph_is_named_alone(board):
 
 
 def test_corners_that_are_not_this_boards(board):
-    """The photographs' squares are half as long again one way."""
+    """The images' squares are half as long again in one direction."""
     stretched = replace(board, points=board.points * [1.5, 1.0, 1.0])
     value = detections(stretched, poses_around(3))
     with pytest.raises(InputError, match="do not lie as the board file") as caught:
@@ -217,7 +217,7 @@ def test_slow_ways_are_tried_on_some_chessboards_only(tmp_path, monkeypatch):
 
 
 def still(board, n=8, moves=(), seed=0):
-    """Detections of a board that stands; moves : {photograph: (6,) perturbation}."""
+    """Detections of a board at rest; moves : {image: (6,) perturbation}."""
     T = np.tile(before(), (n, 1, 1))
     for k, step in dict(moves).items():
         T[k] = perturb(T[k], np.asarray(step))
@@ -228,7 +228,7 @@ AWAY = (0.0, 0.0, 0.0, 2e-3, 0.0, 0.0)
 
 
 def test_a_still_board_is_one_measurement(board):
-    """Its covariance is that of the mean, and its error what that says, over many sessions."""
+    """Its covariance is that of the mean, and matches its error, over many sessions."""
     values, sigmas = [], []
     for seed in range(20):
         views = seen(board, still(board, seed=seed), rows=np.arange(8) + 3)
@@ -245,7 +245,7 @@ def test_a_still_board_is_one_measurement(board):
 
 
 def test_what_all_photographs_share_does_not_average_out(board):
-    """Corners printed in slightly wrong places: more photographs do not make the pose sure."""
+    """Corners printed in slightly wrong places: more images do not reduce the pose's covariance."""
     rng = np.random.default_rng(5)
     printed = replace(board, points=board.points + [1, 1, 0] * rng.normal(0, 5e-5, (48, 3)))
     few, many = (

@@ -1,4 +1,4 @@
-"""Edges of legs from one photograph: fast, and lost rather than guessed."""
+"""Edges of legs from one image: fast, and lost rather than guessed."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ PIXEL = 1 / 564.0
 
 @pytest.fixture(scope="module", params=["perspective", "mirror"])
 def view(request):
-    """A lab, its photograph at AT, and what is looked for."""
+    """A lab, its image at AT, and the sight of the tracker."""
     camera, T = (PERSPECTIVE, BESIDE) if request.param == "perspective" else (MIRROR, WITHIN)
     lab = Lab(MACHINE, camera, T)
     return lab, lab.photograph(AT, READINGS), Sight(machine_view(MACHINE, T), camera)
 
 
 def root(lines):
-    """Of the covariance of each edge alone, (L, 2, 2, 2) rad."""
+    """Covariance of each edge alone, (L, 2, 2, 2) rad."""
     own = np.stack([lines.joint[:, :2, :2], lines.joint[:, 2:, 2:]], axis=1)
     return np.linalg.cholesky(own)
 
 
-# ------------------------------------------------------------------ from photographs
+# ------------------------------------------------------------------ from images
 
 
 def test_edges_are_found_within_their_sigma(view):
@@ -70,7 +70,7 @@ def test_edges_are_found_within_their_sigma(view):
 
 
 def test_large_photographs_are_binned():
-    """Of three times as many pixels across, each edge spread over as many: the same legs."""
+    """With three times as many pixels across, each edge blurred over as many: the same legs."""
     import cv2
 
     small = Lab(MACHINE, PERSPECTIVE, BESIDE).photograph(AT, READINGS)
@@ -91,7 +91,7 @@ def test_large_photographs_are_binned():
 
 
 def test_a_photograph_late_by_a_millimetre_is_followed(view):
-    """The readings have gone on; the next photograph profits from what this one showed."""
+    """The readings have changed; the next image uses the correction of this one."""
     _, image, sight = view
     later = READINGS + np.array([1, -1, 1, 1, -1, 1]) * 1.5e-3
     first = track(sight, first_track_state(sight.view), image, later)
@@ -118,7 +118,7 @@ def test_a_first_photograph_several_pixels_off_is_searched():
     value = track(sight, first_track_state(sight.view), image, shifted)
     assert value.state.searched
     assert value.valid.sum() >= 4
-    assert value.beside > 2e-3  # and said
+    assert value.beside > 2e-3  # with a reason
     truth = true_edges(sight.view, AT)
     off = np.linalg.norm((value.lines.normal - truth)[value.valid], axis=-1)
     assert np.median(off) < 1.5 * PIXEL

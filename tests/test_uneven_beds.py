@@ -35,7 +35,7 @@ def surface(xy, seed):
 
 
 def kit_of(folder, *, bed=0.0, scale=(1.0, 1.0, 1.0), seed=0):
-    """A session of a printer that is as its firmware says but for its motors' scales; bed : (n,) mm
+    """Session of a printer with its firmware's values except for its motors' scales; bed : (n,) mm
     above the plane.
     """
     true = printers.machine(SAYS, scale=scale)
@@ -48,8 +48,8 @@ def kit_of(folder, *, bed=0.0, scale=(1.0, 1.0, 1.0), seed=0):
 
 @pytest.fixture(scope="module")
 def uneven(tmp_path_factory):
-    """An uneven bed, the session in which it was felt, and its calibration; its residuals look like
-    a motor's other scale.
+    """An uneven bed, the session in which it was probed, and its calibration; its residuals look
+    like a wrong scale of a motor.
     """
     heights = surface(printers.bed(POINTS), 2)
     kit = kit_of(tmp_path_factory.mktemp("uneven"), bed=heights)
@@ -57,8 +57,8 @@ def uneven(tmp_path_factory):
 
 
 def flatness(value):
-    """Root mean square height (m) of the true tool over the disc that was probed, where the
-    calibrated machine is told to go along a plane, the plane's own tilt and height aside.
+    """Root mean square height (m) of the true tool over the probed disc, for the calibrated
+    machine's readings along a plane, without the plane's own tilt and height.
     """
     k = np.arange(200)
     r, a = value.findings.bed.radius * np.sqrt((k + 0.5) / 200), k * np.pi * (3 - np.sqrt(5))
@@ -81,7 +81,7 @@ def test_an_uneven_bed_is_accepted_and_blamed_on_no_motor(uneven):
 
 
 def test_deviations_contain_the_unevenness(uneven):
-    """Of the bed as it will be, and of the parameters, all of which are right from the first."""
+    """Errors of the future bed, and of the parameters, all of which are right from the first."""
     _, _, value = uneven
     assert flatness(value) < 3 * value.findings.bed.sigma
     sigma = np.sqrt(np.diag(value.estimate.covariance))
@@ -156,7 +156,7 @@ def test_a_bed_that_moved_has_no_numbers_that_heights_do_not_determine(dropped):
 
 
 def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
-    """Neither in a verdict nor in any table of the report."""
+    """The surface is neither in a verdict nor in any table of the report."""
     for item in (dropped, uneven[2]):
         verdict, parts = item.verdict, report_of(item).parts
         texts = [verdict.headline, *verdict.reasons, *verdict.warnings, *verdict.advice]
@@ -168,7 +168,7 @@ def test_no_text_has_a_number_of_absurd_size(dropped, uneven):
 
 
 def test_a_bed_stands_nowhere_along_itself(uneven, tmp_path):
-    """Neither the bed's x, y and turn nor the tool's are numbers with a deviation."""
+    """Neither the bed's x, y and turn nor the tool's are numbers with a standard deviation."""
     _, _, value = uneven
     document = json_value(calibration_document(value))
     (station,), (target,) = document["stations"], document["targets"]

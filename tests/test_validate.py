@@ -1,4 +1,4 @@
-"""Validation: promises that hold, changes that are found, paths, hold-outs, and what is refused."""
+"""Validation: right calibrations, detected changes, paths, hold-outs, and refusals."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def hexapod():
 
 @pytest.fixture(scope="module")
 def new(hexapod):
-    """The same machine seen once more: where the stations stand, and what was measured."""
+    """The same machine again: other stations, and their measurements."""
     return legs_case(60, hexapod[1])[2:]
 
 
@@ -137,7 +137,7 @@ def test_residuals_scatter_as_promised(hexapod):
 
 
 def test_own_readings_have_no_part_in_a_pose(hexapod, new):
-    """A reading that is wrong by 5 mm shows as 5 mm, and moves no seen pose."""
+    """A reading that is wrong by 5 mm shows as 5 mm, and moves no estimated pose."""
     estimate = hexapod[2]
     stations, data = new
     start = start_state(estimate.machine, data, stations)
@@ -149,7 +149,7 @@ def test_own_readings_have_no_part_in_a_pose(hexapod, new):
 
 
 def test_a_refined_camera_is_no_part_of_the_machine(hexapod, new):
-    """Intrinsics that are refined with the machine are found beside it, and ask for nothing."""
+    """Intrinsics that are refined with the machine are found beside it, without an option."""
     estimate = hexapod[2]
     stations, data = new
     start = start_state(estimate.machine, data, stations)
@@ -203,7 +203,7 @@ def test_better_than_the_drawing(hexapod, new):
     assert advice.facts["stations"] == 3
 
     def report(seen_from):
-        """What is advised where station ``seen_from(row)`` sees a configuration, for each edge."""
+        """Advice if station ``seen_from(row)`` sees a configuration, for each edge."""
         edges = replace(data.edges, station=seen_from(data.edges))
         case = replace(data, edges=edges)
         (text,) = validation_verdict(judged, (), estimate.machine, case).advice
@@ -216,7 +216,9 @@ def test_better_than_the_drawing(hexapod, new):
 
 
 def test_rows_that_contradict_the_verdict_are_explained(hexapod):
-    """One station sees depth badly: plain root mean squares are its noise, the weighed ones not."""
+    """One station determines depth badly: plain root mean squares are its noise, the weighted ones
+    not.
+    """
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
@@ -239,7 +241,7 @@ def test_a_leg_that_changed_is_named(hexapod):
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
     verdict = validation_verdict(judged, (), estimate.machine, data)
     assert not verdict.usable
-    assert judged.ratio.better  # it is still better than the drawing
+    assert judged.ratio.better  # it is still better than the nominal model
     assert "joint 3 reads" in verdict.reasons[0]
     assert abs(judged.promise.common[2] + 1e-3) < 4 * judged.promise.common_sigma[2]
 
@@ -514,7 +516,7 @@ def test_poses_that_the_calibration_used_are_known_by_their_readings(demo):
 
 
 def test_the_drawing_is_the_drawing_again(kept, demo):
-    """Held-out regions must not know, through the drawing, what they told the calibration."""
+    """Held-out regions must not influence the calibration through the nominal model."""
     from pkmcal.judge.validate import drawing_of
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")
@@ -532,7 +534,7 @@ def test_the_same_photographs(demo, session):
     lines = (session / "joints.csv").read_text().splitlines()
     (session / "joints.csv").write_text("\n".join([lines[0], *(line + "1" for line in lines[1:])]))
     again = run("validate", demo.calibration, session)
-    assert again.err == done.err  # known by their content, whatever is said of them
+    assert again.err == done.err  # identified by their content, under any names
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_a_hexapods_rows_are_the_papers():
     expected = np.concatenate([np.cross(arms, u), u], axis=1)
     np.testing.assert_allclose(machine.inverse_jacobian(T), expected, atol=1e-15)
     paper = np.concatenate([u, np.cross(machine.base_centers(), u)], axis=1)
-    # the same motion told at the base's origin: v = tau - omega x t
+    # the same motion at the base's origin: v = tau - omega x t
     twist = np.random.default_rng(0).normal(size=6)
     at_base = np.concatenate([twist[3:] - np.cross(twist[:3], T[:3, 3]), twist[:3]])
     np.testing.assert_allclose(paper @ at_base, expected @ twist, atol=1e-14)

@@ -1,4 +1,4 @@
-"""Whether a result may be used: what data leave open counts where it moves the platform."""
+"""Verdict on a result: unidentifiable directions count if they move the platform."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_light_that_moves_single_edges_is_warned_of(whole):
 
     (text,) = said_of(0.08, 0.2)
     assert text.facts["value"] == 0.08
-    assert said_of(0.02, 0.2) == ()  # painted tubes tell enough beside polished rods
+    assert said_of(0.02, 0.2) == ()  # painted tubes are enough beside polished rods
 
 
 def test_stations_apart_are_refused_with_words_and_advice(apart):
@@ -104,7 +104,7 @@ def test_heave_alone_is_said():
 
 
 def test_what_does_not_move_the_platform_is_a_note():
-    """A passive leg in no photograph: its own values are free, the platform is not."""
+    """A passive leg without images: its own values are unidentified, the platform is not."""
     scene = make("6-spu-passive")
     _, _, _, verdict = judged(scene, *[(1, 2, 3, 4, 5, 6)] * 3)
     assert verdict.usable, verdict.reasons
@@ -143,7 +143,9 @@ def test_the_share_of_the_drawings_error_decides(whole):
 
 
 def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
-    """Few photographs: the deviation says it, and what is open is a small part of it."""
+    """Few images: the standard deviation shows it, and unidentified directions are a small part of
+    it.
+    """
     observation, estimate, findings, _ = whole
     open_ = (sentence(2 * UNIDENTIFIABLE * findings.by_drawing),)
     findings = replace(findings, unidentified=open_)
@@ -153,7 +155,7 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
 
 
 def test_a_result_that_is_no_gain_is_refused(whole):
-    """Legs are judged as heights are: half of what the tolerances let expect is too much."""
+    """Legs are judged as heights are: half of what the prior sigmas let expect is too much."""
     observation, estimate, findings, _ = whole
     sigma = platform_sigma(estimate)
     for share, usable in ((0.9, True), (1.1, False)):

@@ -1,4 +1,4 @@
-"""The page of photographs: who may ask, what is answered, what is written, and a browser on it."""
+"""The page of images: access, responses, written files, and a browser on it."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def truth(demo, page):
     return load_truth(demo.session, page.subject.session.machine)
 
 
-# ------------------------------------------------------------------ who may ask
+# ------------------------------------------------------------------ access
 
 
 def test_the_page_opens_with_its_token(page):
@@ -215,7 +215,7 @@ def test_a_defect_is_told_as_one(page, monkeypatch):
 
 
 def test_the_overlay_is_where_the_machine_is(page, truth):
-    """By the true pose, the joints are where the camera sees them."""
+    """At the true pose, the joints are at their pixels."""
     T = truth.T_camera_base[0]
     answer = page.ask("overlay", pose=T.tolist())
     pane = page.subject.drawn(0, 0)
@@ -229,7 +229,7 @@ def test_the_overlay_is_where_the_machine_is(page, truth):
 
 
 def test_a_joint_comes_to_where_it_is_pulled(page):
-    """One joint, then another in a second photograph: both stay."""
+    """One joint, then another in a second image: both stay pinned."""
     first = {"photograph": 0, "end": "platform", "leg": 2, "pixel": [300, 200]}
     answer = page.ask("overlay", pins=[first])
     shifted = next(j for j in answer["joints"] if (j["end"], j["leg"]) == ("platform", 2))
@@ -289,8 +289,9 @@ def off(value, true):
 
 
 def test_the_machine_snaps_to_its_place(page, truth):
-    """From a pose that is off by some centimetres and degrees, to what the drawing's errors leave:
-    2 mm of its centres on a base of half a metre are half a degree, and half of that at a metre.
+    """From a pose that is off by some centimetres and degrees, to the accuracy of the nominal
+    model: 2 mm of its centres on a base of half a metre are half a degree, and half of that at a
+    metre.
     """
     true = truth.T_camera_base[0]
     rough = perturb(true, np.array([0.03, -0.04, 0.05, 0.03, -0.02, 0.05]))
@@ -485,7 +486,7 @@ def test_the_command_serves_until_it_is_interrupted(demo):
 
 
 def test_answers_are_sent_at_once():
-    """asyncio sends without delay (TCP_NODELAY) where it knows the protocol, else 40 ms later."""
+    """asyncio sends without delay (TCP_NODELAY) if the protocol is registered, else 40 ms later."""
     with server.listening_socket(0) as socket_:
         assert socket_.getsockname()[0] == "127.0.0.1"
         assert socket_.proto == socket.IPPROTO_TCP
@@ -576,7 +577,7 @@ async function pulled(target, from, to) {
 @pytest.mark.skipif(CHROMIUM is None, reason="NO CHROMIUM: the page was not opened in a browser")
 @pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch, width):
-    """One walks, pulls, takes back, pulls two joints to their places, and the machine snaps."""
+    """A user walks, pulls, undoes, pins two joints, and the machine snaps to its pose."""
     template, before = server._template, (session / "session.yaml").read_text()
     with server.listening_socket(0) as socket_:
         port = socket_.getsockname()[1]

@@ -36,7 +36,7 @@ NO_WORDS = frozenset(
         "closely",
     }
 )
-"""No part of an identifier: what was told, to whom, and when, the word does not say."""
+"""Words that are no part of an identifier: they do not name a quantity."""
 NO_NAMES = NO_WORDS | {"left", "way", "looks", "says", "tells", "ask", "tell"}
 """No identifier by itself; as a part they have a meaning (``left_margin``, ``half_way``)."""
 ALLOWED = {

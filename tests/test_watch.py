@@ -68,7 +68,7 @@ def made_calibration():
 
 
 def photographs_of(machine):
-    """One camera and thirty poses, of which those that watch take some."""
+    """One camera and thirty poses, of which the watches use some."""
     settings = Settings(stations=1, configurations=30, tolerance=0.0)
     return draw_truth(machine, (CAMERA,), settings, 5)
 
@@ -80,9 +80,9 @@ def half_of(covariance):
 
 
 class Watched:
-    """A hexapod with a calibration from three stations, and places to photograph it anew.
+    """Hexapod with a calibration from three stations, and places for new images.
 
-    Calibrations are drawn about the true machine by the covariance of one that was made.
+    Calibrations are drawn about the true machine by the covariance of an actual one.
     """
 
     def __init__(self):
@@ -107,7 +107,7 @@ class Watched:
         return Measurements(edges, readings, 3e-6, 1, np.zeros(1, dtype=int))
 
     def evidence(self, machine, rng, few=FEW):
-        """Of one session of ``machine``, held against a calibration of the true one."""
+        """Watch of one session of ``machine``, against a calibration of the true one."""
         calibrated, data = self.calibrated(rng), self.seen(machine, rng, few)
         start = start_state(calibrated, data, self.pool.T_camera_base)
         return change_evidence(
@@ -198,8 +198,8 @@ def test_false_alarms_of_all_tests_together(unchanged, watched):
 
 
 def test_the_calibrations_errors_must_be_in_the_noise(watched):
-    """Held against a calibration that were exact, an unchanged machine is flagged again and again:
-    what the covariance of the calibration is for.
+    """Against a calibration without errors, an unchanged machine is flagged again and again, which
+    the calibration's covariance prevents.
     """
     every, factor = whole_machine(watched.true), []
     for k in range(8):
@@ -214,7 +214,7 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
 
 
 def test_other_frames_and_cameras_change_nothing(watched):
-    """A test knows neither where the base frame is nor where the camera stands."""
+    """A test does not depend on the base frame and the camera's pose."""
     rng = np.random.default_rng(2)
     data, calibrated = watched.seen(watched.true, rng), watched.calibrated(rng)
     start = start_state(calibrated, data, watched.pool.T_camera_base)
@@ -236,7 +236,7 @@ def test_other_frames_and_cameras_change_nothing(watched):
 
 @pytest.mark.parametrize("by", [2e-5, 1e-3])
 def test_the_regression_predicts_what_a_change_does(watched, by):
-    """The same data, seen with a machine that has changed: w moves by X times the change."""
+    """The same data with a machine that has changed: w moves by X times the change."""
     rng = np.random.default_rng(6)
     data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
@@ -288,7 +288,7 @@ def test_a_joint_that_moved(watched):
 
 
 def test_two_changes_are_both_named(watched):
-    """The first single cause that is found resembles both; all pairs tell."""
+    """The first single cause that is found resembles both; all pairs decide."""
     rng = np.random.default_rng(23)
     now = moved(watched.true, leg3_length__offset=1.5e-3, leg5_length__offset=-1.5e-3)
     judged = detect_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
@@ -312,7 +312,7 @@ def test_warming_is_told_from_a_leg(watched):
 
 
 def test_causes_that_look_alike_are_all_named(watched):
-    """Three configurations hardly tell a leg's zero from its joints."""
+    """Three configurations hardly separate a leg's offset from its joints."""
     rng = np.random.default_rng(26)
     now = moved(watched.true, leg4_platform__center__z=1.2e-3)
     judged = detect_changes(watched.evidence(now, rng, few=3), watched.true, ALPHA)
@@ -356,7 +356,7 @@ def test_what_is_not_seen_is_not_detected(watched):
 
 
 def flat(n=6, p=3):
-    """Evidence of p parameters, each seen in a row of its own."""
+    """Evidence of p parameters, each determined by a row of its own."""
     return Evidence(np.zeros(n), np.eye(n, p) * 1e6)
 
 
@@ -433,7 +433,7 @@ def test_an_h4_by_its_board(h4):
 
 
 def test_too_few_poses_of_a_board(h4):
-    """One pose of a board tells no more than where camera and board are."""
+    """One pose of a board determines no more than the poses of camera and board."""
     true, estimate, rng = h4
     judged = detect_changes(
         by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA
@@ -466,7 +466,7 @@ def test_a_planar_machine_by_its_board():
 
 
 def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
-    """They are said to be too few, with what would have been found."""
+    """They are reported as too few, with the detectable change."""
     rng = np.random.default_rng(5)
     drawing = load_mechanism("gough-stewart")
     true = true_machine(drawing, 1.0, rng)
@@ -507,7 +507,7 @@ def test_a_family_that_sees_nothing():
 
 
 def least_chance(watched, machine, k):
-    """Of all tests of one session of a machine."""
+    """Smallest p-value over all tests of one session of a machine."""
     values = watched.evidence(machine, np.random.default_rng([k, 77]))
     legs, zero, _ = made_tests(values, watched.true)
     return min(t.adjusted for t in (*legs, *zero) if t and t.dof)

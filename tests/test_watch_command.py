@@ -1,4 +1,4 @@
-"""``pkmcal watch`` from photographs: verdicts, files, and what is refused."""
+"""``pkmcal watch`` from images: verdicts, files, and refusals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from rendered import rendered
 
 
 def photographed(folder, drawing, machine, camera, seed, **settings):
-    """New photographs of a machine, beside its drawing: truth reaches nothing."""
+    """New images of a machine, beside its nominal model; the truth is not used otherwise."""
     wanted = {"stations": 1, "configurations": 4, "tolerance": 0.0, **settings}
     rendered(folder, machine, camera, Settings(**wanted), seed)
     (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
@@ -52,9 +52,9 @@ def changed(machine, name, by):
 
 @pytest.fixture(scope="module")
 def later(demo, tmp_path_factory):
-    """The demonstration's machine photographed again, as it was and with leg 3's zero off.
+    """New images of the demonstration's machine, unchanged and with another offset of leg 3.
 
-    Photographs do not show a zero: with 2.5 mm more offset the same poses have readings that are as
+    Images do not show an offset: with 2.5 mm more of it the same poses have readings that are as
     much less.
     """
     folder = tmp_path_factory.mktemp("watch")
@@ -128,7 +128,7 @@ def test_a_changed_machine_in_words(demo, later):
 
 
 def test_configurations_that_the_calibration_used_are_left_out(demo, later, calibration):
-    """Two of four are known by the content of their photographs."""
+    """Two of four are identified by the content of their images."""
     session = load_session(later.same)
     reference_values = list(session.configurations[:2])
 
@@ -198,7 +198,7 @@ def test_no_calibration_there(again):
 
 @pytest.fixture(scope="module")
 def stayed(demo, later):
-    """Photographed again by the demonstration's first camera, which nobody touched."""
+    """New images by the demonstration's first camera, which nobody touched."""
     drawing = load_mechanism(demo.session / "mechanism.yaml")
     truth = load_truth(demo.session, drawing)
     camera = load_camera(next((demo.session / "cameras").iterdir()))
@@ -243,7 +243,9 @@ def test_stations_are_numbered_without_photographs_that_were_not_placed(demo, st
 
 
 def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
-    """Decimetres away, so far beyond what is linear: found anew, and no leg is blamed."""
+    """A camera decimetres away, far beyond the linear range: localized again, and no leg is
+    reported.
+    """
     done = run(
         "watch", demo.calibration, later.same, "--same-place", stayed.name, "-o", tmp_path / "w",
         "--json",
@@ -287,7 +289,7 @@ def seen_through(camera, wrong, edges):
 
 
 def test_a_cameras_magnification_is_told():
-    """Photographs by a lens that is 0.5 % longer than its file says: the change comes back."""
+    """Images by a lens that is 0.5 % longer than its file states: the change is recovered."""
     drawing, camera, longer = load_mechanism("gough-stewart"), demo_camera(), 5e-3
     focal = camera.parameters.copy()
     focal[:2] *= 1 + longer
@@ -314,7 +316,7 @@ def test_a_cameras_magnification_is_told():
     assert got[1].value[0] - got[0].value[0] == pytest.approx(longer, rel=0.05)
 
 
-# photographs as large as a user's
+# images as large as a user's
 
 
 @pytest.mark.slow

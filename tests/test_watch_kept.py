@@ -43,8 +43,8 @@ class Left:
         self.poses = photographs_of(self.true).T_base_platform
 
     def looked(self, machine, rng, by=None, few=FEW):
-        """A calibration with errors, held on what the first camera sees of a machine; by : how the
-        camera turned and moved before, (6,) of T_camera_base.
+        """A calibration with errors, fixed against the first camera's data of a machine; by :
+        motion of the camera before, (6,) of T_camera_base.
         """
         errors = self.half @ rng.standard_normal(len(self.half))
         calibrated = self.true.with_values(self.true.values + errors[: self.n])
@@ -68,7 +68,7 @@ def left():
 
 @pytest.fixture(scope="module")
 def unchanged(left):
-    """Sessions of a machine that did not change: held, and what the calibration knows."""
+    """Sessions of an unchanged machine: the fixed machine, and the calibration's prior."""
     return [left.looked(left.true, np.random.default_rng([k, 7])) for k in range(SESSIONS)]
 
 
@@ -85,9 +85,10 @@ def test_an_unchanged_machine_gives_unit_noise(left, unchanged):
 
 
 def test_the_place_knows_smaller_changes_of_a_leg(left, unchanged):
-    """The same photographs find half as large a slip of an encoder. It is what the place and the
-    machine have in common that tells: known apart, both as well as they are, they tell no more than
-    the machine alone.
+    """The same images detect half as large a slip of an encoder.
+
+    The gain comes from the correlation of pose and machine: independent, with the same standard
+    deviations, they detect no more than the machine alone.
     """
     held, retained = unchanged[0]
     apart, n = retained.covariance.copy(), left.n
@@ -110,8 +111,8 @@ def test_without_its_stations_it_is_the_evidence_of_a_machine_alone(left, unchan
 
 
 def test_frames_of_machine_and_camera_together_change_nothing(left, unchanged):
-    """A turn of the base frame moves the base joints and the camera, and shows in no residual; of
-    the joints alone it is seen now.
+    """A rotation of the base frame moves the base joints and the camera, and shows in no residual;
+    of the joints alone it is detected now.
     """
     held, retained = unchanged[2]
     value, basis = change_evidence(held, retained), freedoms(left.true)
@@ -138,7 +139,7 @@ def _by_twist(T_camera_base):
 
 
 def test_a_camera_that_was_moved_is_told_and_no_leg_is_blamed(left):
-    """By 5 mm and half a degree: its shift is told within its deviations."""
+    """By 5 mm and half a degree: its shift is estimated within its standard deviations."""
     by = np.array([0.0, 8e-3, 0.0, 3e-3, 0.0, 4e-3])
     for k in range(4):
         held, retained_rows = left.looked(left.true, np.random.default_rng([k, 9]), by=by)
@@ -173,7 +174,7 @@ def test_a_leg_that_changed_is_not_taken_for_the_camera(left):
 
 
 def test_a_change_moves_the_evidence_as_the_regression_says(left):
-    """The same noise, seen by a camera that was moved: w moves by X times the move."""
+    """The same noise with a camera that was moved: w moves by X times the motion."""
     by = np.array([1e-4, -2e-4, 1e-4, 2e-4, 1e-4, -3e-4])
     here, there = (
         left.evidence(left.true, np.random.default_rng(3), by=move) for move in (np.zeros(6), by)

@@ -1,4 +1,4 @@
-"""Photographs pass through in windows: what is held at a time, and that nothing else changes."""
+"""Images pass through in windows: bounded memory, and unchanged results."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from test_observe_drawing import FRONT, poses, redrawn
 from test_observe_measure import taken
 
 REPEATED = 3
-"""Times that the six drawn photographs are taken."""
+"""Repetitions of the six rendered images."""
 
 
 class Fresh(Sequence):
-    """Photographs that are made when they are looked at; counts how many there are at a time."""
+    """Images that are made when they are read; counts how many exist at a time."""
 
     def __init__(self, images):
         self.images, self.alive, self.most, self.looks = images, 0, 0, 0
@@ -49,7 +49,7 @@ class Fresh(Sequence):
 
 
 def many(repeated=REPEATED):
-    """Photographs, their platform poses, and what counts them."""
+    """Images, their platform poses, and their counter."""
     few = taken()
     rows = np.tile(np.arange(len(few.images)), repeated)
     fresh = Fresh([few.images[k] for k in rows])
@@ -64,7 +64,7 @@ LOOKS = {
 
 
 def same(edges, other):
-    """Two looks show the same."""
+    """Two measurements are equal."""
     assert edges.rejected == other.rejected
     for field in fields(other.edges):
         ours, theirs = (getattr(one.edges, field.name) for one in (edges, other))
@@ -116,8 +116,8 @@ def test_large_photographs_have_small_windows(monkeypatch):
 
 
 def stations():
-    """Photographs of one camera at three places, many at the first, from a little aside and more
-    blurred at the second, and of another camera.
+    """Images of one camera at three places, many at the first, from a little aside and more blurred
+    at the second, and of another camera.
     """
     longer = replace(taken().camera, parameters=taken().camera.parameters * 1.0001)
     soft = taken([gaussian_filter(image, 0.6) for image in taken().images])

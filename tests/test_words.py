@@ -1,4 +1,4 @@
-"""What data leave open, in words: the right sentence for what a session lacks."""
+"""Unidentifiable directions in words: the right sentence for what a session lacks."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def heaved(machine, n=8):
 
 
 def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3, machine=None) -> Scene:
-    """A machine with errors, of exact readings unless another is given, seen whole by cameras
-    around it.
+    """A machine with errors, with exact readings by default, and cameras around it that see all
+    legs.
     """
     rng = np.random.default_rng(seed)
     machine = machine or exact(name)
@@ -111,7 +111,7 @@ def test_a_whole_session_leaves_nothing_open(name):
 
 @pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "3-rps"])
 def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
-    """Cameras measure angles; what tells lengths is readings, each unsure by its scale."""
+    """Cameras measure angles; lengths come from readings, each uncertain by its scale."""
     machine = load_mechanism(name)
     values, _, sentences = told_of(make(name, machine=machine))
     assert len(values.unidentified) == 1
@@ -204,7 +204,9 @@ def test_a_passive_leg_nobody_sees_moves_nothing():
 
 
 def test_common_turns_of_parallel_axes_move_nothing():
-    """The 3-UPU as drawn: six of twelve axis directions cannot be seen (errata)."""
+    """The 3-UPU with nominal geometry: six of twelve axis directions are unidentifiable
+    (errata).
+    """
     machine = load_mechanism("3-upu")
     poses = moved(machine, np.random.default_rng(1), 15, turn=0.0)
     _, _, sentences = told_of(make("3-upu", poses=poses, errors=0.0))
@@ -406,7 +408,7 @@ def test_all_legs_are_fixed_in_one_entry_beside_what_is_fixed_already():
 
 
 def test_a_model_is_fixed_where_its_own_entries_stand():
-    """Of the file's own ``fixed`` nothing holds where a model of it was asked for."""
+    """The file's own ``fixed`` is ignored if one of its models was requested."""
     visible = np.ones((1, 3), bool)
 
     def advice(model):
@@ -424,7 +426,7 @@ def test_a_model_is_fixed_where_its_own_entries_stand():
 
 @pytest.mark.parametrize("name", ["gough-stewart", "3-rps"])
 def test_how_far_the_platform_moves_agrees_with_the_forward_solution(name):
-    """Of both machines, at the same readings, the one's frames laid over the other's."""
+    """Both machines at the same readings, the one's frames fitted to the other's."""
     machine = load_mechanism(name)
     few = moved(machine, np.random.default_rng(5), 30)
     few = kinematics.on_manifold(machine.layout, machine.values, few).T_base_platform
@@ -515,7 +517,7 @@ def test_a_board_on_the_base_joins_stations():
 
 @pytest.mark.parametrize("carrier", [*base_carriers().values(), *platform_carriers().values()])
 def test_carriers_name_motions_of_their_own_numbers(carrier):
-    """What a carrier's file says of itself, for every carrier."""
+    """Motions that a carrier's file declares, for every carrier."""
     assert carrier.called
     parameters = np.random.default_rng(0).normal(size=len(carrier.parameters))
     places = set(re.findall(r"``{(\w+)}``", NamedChanges.__doc__ or ""))
@@ -528,7 +530,7 @@ def test_carriers_name_motions_of_their_own_numbers(carrier):
 
 
 def test_what_a_carrier_names_is_said(monkeypatch):
-    """Words come from the carrier's file: nobody else knows its joint."""
+    """Words come from the carrier's file: no other file has its joint."""
 
     def drift(parameters, readings):
         del readings

@@ -1,4 +1,6 @@
-"""What boards on platforms leave open on cranks, sliders and bars: [C]'s machine and the deltas."""
+"""Unidentifiable directions of boards on platforms with cranks, sliders and bars: [C]'s machine and
+the deltas.
+"""
 
 from __future__ import annotations
 
@@ -101,7 +103,7 @@ def test_parallelism_is_said_to_be_the_boards():
     (tilt,) = of(findings, "How the cranks' axes of legs 1 to 4 are tilted to each other")
     assert "is known from the drawing only in one way: +1 mm of leg " in tilt.text
     assert any(".base.axis." in name for name in tilt.parameters)
-    assert (tilt.weak, tilt.matters) == (True, False)  # readings say nothing of it
+    assert (tilt.weak, tilt.matters) == (True, False)  # readings do not determine it
 
 
 @pytest.mark.parametrize("name", ["delta", "linear-delta"])
@@ -152,13 +154,13 @@ def test_what_moves_with_hinges_moves_no_platform():
 
 
 def test_radii_are_no_business_of_boards():
-    """A hexapod by its platform's poses: of its tubes nothing is said."""
+    """A hexapod by its platform's poses: its tubes are not mentioned."""
     _, findings, _ = told_of("gough-stewart")
     assert not [s for s in (*findings.unidentified, *findings.weak) if "tube" in s.text]
 
 
 def test_weak_and_free_are_told_together():
-    """Poses' noise blends the two; a sentence says which of them it is by what the data know."""
+    """Poses' noise mixes the two; a sentence distinguishes them by the data's information."""
     _, findings, _ = told_of("linear-delta")
     (lean,) = of(findings, "How the guides of legs 1 to 3 lean cannot be told from where they")
     assert lean.weak

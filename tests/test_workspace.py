@@ -75,7 +75,7 @@ def test_poses_of_readings_in_range_are_inside_and_others_are_not(machine):
 def test_the_reasons_in_words():
     machine = hexapod()
     low = yawed(0, 0.25)
-    length = float(machine.inverse(low)[0])  # all six alike
+    length = float(machine.inverse(low)[0])  # all six equal
     assert machine.reachable(low).why() == tuple(
         f"motor {j} would stand at {length:.4g} m, below its range, which begins at 0.345 m"
         for j in range(1, 7)
@@ -193,7 +193,7 @@ def test_extents_end_where_something_stands_against_them(machine):
 
 
 def test_a_rod_of_constant_length_bends_the_way():
-    """Its end runs on a sphere; the way along the direction is kept all the same."""
+    """The leg's end runs on a sphere; the distance along the direction is kept all the same."""
     machine = tripod()
     own = np.linalg.svd(machine.forward_jacobian(machine.home()))[0][:, 0]
     value = machine.extents([own])

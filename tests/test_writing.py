@@ -231,7 +231,7 @@ def test_a_result_is_the_old_or_the_new_wherever_calibrate_is_killed(
         killed, remeasured = contents_of(state / "killed"), contents_of(state / "read")
         assert remeasured == killed  # whoever reads changes nothing
         visible = {k: v for k, v in killed.items() if not k.startswith(".stage.")}
-        # and finds the one or the other, or is told
+        # and finds the one or the other, or gets a message
         assert (visible in (before, after)) == read
         assert any((state / "read" / COMMITTED_FOLDER).glob("*")) != read
         # the next run begins with the one or the other, keeps its files and nothing of this one
@@ -405,7 +405,9 @@ def test_a_replacement_cut_short_again_is_finished_all_the_same(interrupted, mon
 
 
 def left_alone(folder):
-    """Whether neither readers nor writers follow what lies in COMMITTED_FOLDER, and say so."""
+    """Whether neither readers nor writers follow the contents of COMMITTED_FOLDER, and
+    report it.
+    """
     before = contents_of(folder.parent)
     refused = [
         fault(read_text, folder / "a"),

@@ -1,4 +1,4 @@
-"""The demonstration: session, truth and calibration, each made when it is asked for."""
+"""The demonstration: session, truth and calibration, each made when it is needed."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class Case:
 
     @cached_property
     def truth(self) -> Truth:
-        """What the simulation drew."""
+        """The simulation's truth."""
         return load_truth(self.folder, self.session.machine)
 
     @cached_property
     def photographs(self) -> list[Photographs]:
-        """Decoded photographs by station."""
+        """Decoded images by station."""
         return read_photographs(self.session)
 
     @cached_property
@@ -50,7 +50,7 @@ class Case:
 
     @cached_property
     def looks(self) -> list[Array]:
-        """Stations by hand and as recognised, T_camera_base (S, 4, 4) each."""
+        """Rough and localized poses of the stations, T_camera_base (S, 4, 4) each."""
         poses = platform_poses(self.session)
         rngs = np.random.default_rng(0).spawn(len(self.photographs) + 1)
         results = recognise(self.session, self.photographs, poses, rngs[1:])

@@ -29,14 +29,14 @@ LEGS = ("#c77f00", "#2a94cc", "#008f68", "#bd5f95", "#0a62a6", "#c8500a")
 Box = tuple[int, int, int, int]
 """Left, top, width, height, px."""
 REACH = 1.4
-"""Pixels about the true edge in which the strongest gradient is looked for."""
+"""Pixels about the true edge in which the strongest gradient is searched."""
 
 
 # ------------------------------------------------------------------ frames
 
 
 def frames(truth: Truth) -> str:
-    """The machine with base, platform and camera frames, seen from outside."""
+    """The machine with base, platform and camera frames, from outside."""
     eye = look_at(np.array([1.6, -1.25, 1.0]), np.array([0.0, -0.02, 0.2]), np.array([0, 0, 1.0]))
     rgb = (CALIBRATED, GOOD, DRAWING)
 
@@ -137,7 +137,7 @@ def edge_planes() -> str:
 
 
 def looks(case: Case) -> str:
-    """Three panels: a pose by hand, the station recognised, the result."""
+    """Three panels: a rough pose, the localized station, the result."""
     s, k = 1, 5
     photographs, session, result = case.photographs[s], case.session, case.result
     row = int(photographs.configuration[k])
@@ -164,7 +164,7 @@ def looks(case: Case) -> str:
 def edge_lines(
     machine: Machine, photographs: Photographs, T_camera_base: Array, pose: Array, k: int
 ) -> Array:
-    """Predicted edges in photograph k, (E, n, 2) px; NaN where nothing is seen."""
+    """Predicted edges in image k, (E, n, 2) px; NaN where nothing is visible."""
     tubes = tubes_of(machine)
     in_view = legs_in_camera(machine, T_camera_base, pose[None], photographs.joints[k][None])
     points = edge_points(machine, photographs.camera, in_view, tubes, 60)
@@ -175,10 +175,10 @@ def edge_lines(
 def _panel(
     image: Integers, crop: Box, frame: Box, lines: Array, colour: str, title: str, number: int
 ) -> str:
-    """A part of a photograph in a frame, with edges over it."""
+    """A part of an image in a frame, with edges over it."""
     x, y, w, h = crop
     left, top, width, height = frame
-    # brighter, so that dark sides of legs can be told from the wall
+    # brighter, to distinguish dark sides of legs from the wall
     visible = np.clip(image[y : y + h, x : x + w] * 1.5, 0, 255).astype(np.uint8)
     packed = cv2.imencode(".png", visible)[1]
     data = base64.b64encode(packed.tobytes()).decode("ascii")

@@ -34,7 +34,7 @@ EXPORTS = ("json", "klipper", "linuxcnc", "mujoco", "reprap", "ros", "yaml")
 
 
 def pkmcal(*words: Any, expect: tuple[int, ...] = (0, 1)) -> tuple[int, str]:
-    """One command; its exit code and what it printed."""
+    """One command; its exit code and its output."""
     done = subprocess.run(
         [sys.executable, "-m", "pkmcal", *map(str, words)],
         capture_output=True,
@@ -47,7 +47,7 @@ def pkmcal(*words: Any, expect: tuple[int, ...] = (0, 1)) -> tuple[int, str]:
 
 
 def command(*words: Any) -> dict[str, Any]:
-    """What a command says with --json, and its exit code."""
+    """Result of a command with --json, and its exit code."""
     code, out = pkmcal(*words, "--json")
     return {"exit": code, **json.loads(out)}
 
@@ -68,12 +68,12 @@ def flat(value: Any, key: str = "") -> dict[str, Any]:
 
 
 def saved(folder: Path) -> dict[str, Any]:
-    """A calibration's numbers, and what it says."""
+    """Numbers and sentences of a calibration."""
     return json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
 
 
 def scored(render: Path, script: str, *words: Any) -> str:
-    """What a scoring script prints."""
+    """Output of a scoring script."""
     done = subprocess.run(
         [sys.executable, script, *map(str, words)],
         cwd=render, capture_output=True, text=True, check=False,
@@ -182,7 +182,7 @@ def _timeless(text: str) -> bytes:
 
 
 def compiled(source: Any, folder: Path) -> Any:
-    """What the exported C computes: its own self-test, compiled with all warnings."""
+    """Output of the exported C: its own self-test, compiled with all warnings."""
     code, _ = pkmcal("export", source, "--to", "c", "-o", folder, expect=(0, 1, 2))
     if code:
         return {"exit": code}

@@ -31,7 +31,7 @@ HERE = Path(__file__).resolve().parents[1]
 HELD_OUT = 6
 """Configurations that the tutorial leaves out."""
 NUMBER = 1
-"""Of the wrong sessions."""
+"""Number of the wrong sessions."""
 
 
 @cache
@@ -51,7 +51,7 @@ def calibrated(folder: Path, holdout: int = 0) -> Calibration:
 
 
 def photographs(work: Path) -> str:
-    """The first photograph of each station."""
+    """The first image of each station."""
     shots = [sorted(folder.iterdir())[0] for folder in sorted((session(work) / "images").iterdir())]
     figures = "".join(
         "<figure><img src='data:image/png;base64,"
@@ -77,7 +77,7 @@ def report_part(work: Path, name: str) -> str:
 
 
 def confirmed(work: Path) -> str:
-    """What `pkmcal validate` says of the configurations held out."""
+    """Results of `pkmcal validate` on the held-out configurations."""
     out = work / "out"
     if not (out / "calibration.json").exists():
         calibration.save(calibrated(session(work), HELD_OUT), out)
@@ -85,12 +85,14 @@ def confirmed(work: Path) -> str:
 
 
 def laid_over(folder: Path) -> str:
-    """The drawing over the first station's first photograph, by hand and as found."""
+    """The nominal model over the first station's first image, at the rough and at the localized
+    pose.
+    """
     check = check_session(folder)
     if check.look is None:
         sys.exit(f"{folder}: nothing to look at")
     few = replace(check.look, stations=check.look.stations[:1])
-    # the section shows up to three photographs of a station, each twice; one is enough
+    # the section shows up to three images of a station, each twice; one is enough
     figures = str(pictures.with_pictures(few).html).split("<figure")[1:3]
     style = "<style>.row { display: flex; gap: 10px; padding: 6px } .row figure { flex: 1 }</style>"
     return style + "<div class='row'>" + "".join("<figure" + one for one in figures) + "</div>"

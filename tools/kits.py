@@ -1,6 +1,6 @@
-"""What a kit gains: deltas half a millimetre off, measured by a webcam or by a probe on the bed.
+"""Gain of a calibration for kits: deltas half a millimetre off, measured by a webcam or a probe.
 
-python tools/kits.py [MACHINES]      tool error before and after, and beside its own deviation
+python tools/kits.py [MACHINES]      tool error before and after, and in its own deviations
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CASES: dict[str, Callable[[Path, int], object]] = {
 
 
 def main(machines: int) -> None:
-    """One row a case, root mean squares over the machines, mm."""
+    """One row for each case, root mean squares over the machines, mm."""
     heads = ("tool before", "after", "worst", "sideways", "error/sigma", "bed before", "after")
     print(f"{'':36}" + "".join(f"{head:>12}" for head in heads) + "  usable")
     for title, make in CASES.items():

@@ -3,7 +3,7 @@
     python tools/notebook.py
 
 Needs nbformat, nbclient and ipykernel, and the package's extra ``plot``; tests/test_examples.py
-runs the cells without them. Look at what it made before you commit it.
+runs the cells without them. Check the notebook before you commit it.
 """
 
 from __future__ import annotations

@@ -62,16 +62,14 @@ from case import Case, simulated
 
 HERE = Path(__file__).resolve().parents[1]
 LARGEST = 200_000
-"""Bytes of a picture."""
+"""Largest size of a picture, bytes."""
 REPEATS, EDGE_REPEATS = 12, 200
-"""Sessions simulated with photographs, and with edges only."""
+"""Number of simulated sessions with images, and with edges only."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A page to be photographed: HTML and its size in pixels; or a session, as `pkmcal view` shows
-    it.
-    """
+    """Page for a screenshot: HTML and its size in pixels; or a session, in `pkmcal view`."""
 
     html: str
     width: int
@@ -91,7 +89,7 @@ def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot
 
 
 def result(case: Case) -> Shot:
-    """README's first picture: a photograph with fitted edges beside the geometry's change."""
+    """README's first picture: an image with fitted edges beside the geometry's change."""
     session, estimate = case.session, case.result.estimate
     centres = joint_centres(
         session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
@@ -147,7 +145,7 @@ def edge_planes(_case: Case) -> Shot:
 
 
 def looks(case: Case) -> Shot:
-    """One photograph, and the edges predicted in it after each look."""
+    """One image, and the edges predicted in it after each stage."""
     return whole_page(drawings.looks(case), 1160, 360)
 
 
@@ -187,7 +185,7 @@ def residuals(case: Case) -> Shot:
 
 
 def repeats(case: Case) -> Shot:
-    """Errors over standard deviations: repeated sessions with edges only, and with photographs."""
+    """Errors over standard deviations: repeated sessions with edges only, and with images."""
     edges = np.concatenate([_edge_scores(case, k) for k in range(EDGE_REPEATS)])
     groups: dict[str, list[Array]] = {}
     for k in range(REPEATS):
@@ -229,7 +227,7 @@ def _edge_scores(case: Case, seed: int) -> Array:
 
 
 def _photograph_scores(case: Case, seed: int) -> dict[str, Array]:
-    """Errors over standard deviations by kind of parameter, from rendered photographs."""
+    """Errors over standard deviations by kind of parameter, from rendered images."""
     folder = simulated(case.work / f"repeat{seed}", seed)
     estimate = pkmcal.calibrate(folder).estimate
     truth = load_truth(folder, case.session.machine)
@@ -292,7 +290,7 @@ def photograph(shot: Shot, path: Path) -> None:
         source, target = Path(folder) / "page.html", Path(folder) / "page.png"
         source.write_text(shot.html, encoding="utf-8")
         command = [browser, "--headless=new", "--no-sandbox", "--hide-scrollbars"]
-        # drawings in space need WebGL, and a moment
+        # plots in space need WebGL, and a moment
         command += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         command += ["--virtual-time-budget=8000"]
         command += [f"--window-size={shot.width},{shot.height}", f"--screenshot={target}"]
@@ -318,7 +316,7 @@ def served(session: Session) -> str:
 
 
 def plan(_case: Case) -> Shot:
-    """Where a plan puts three cameras round a hexapod: the page's drawing in space."""
+    """Poses of three cameras round a hexapod from a plan: the page's plot in space."""
     machine = pkmcal.load_mechanism(DEMO_MECHANISM)
     subject = of_machine(machine, [demo_camera()], machine.joint_names)
     outcome = outcome_of(make_plan(subject, free_places=3))
@@ -328,17 +326,17 @@ def plan(_case: Case) -> Shot:
 
 
 def view(case: Case) -> Shot:
-    """A photograph of the session in `pkmcal view`, the drawing at the pose by hand."""
+    """An image of the session in `pkmcal view`, the nominal model at the rough pose."""
     return Shot("", 1180, 640, case.session)
 
 
 def tutorial_photographs(case: Case) -> Shot:
-    """A photograph from each place of the tutorial's session."""
+    """An image from each place of the tutorial's session."""
     return whole_page(guide.photographs(case.work), 1180, 330)
 
 
 def tutorial_check(case: Case) -> Shot:
-    """The drawing over one of them, by the pose by hand and by the pose found."""
+    """The nominal model over one of them, at the rough and at the localized pose."""
     return whole_page(guide.laid_over(guide.session(case.work)), 1000, 410)
 
 
@@ -353,7 +351,7 @@ def tutorial_workspace(case: Case) -> Shot:
 
 
 def tutorial_residuals(case: Case) -> Shot:
-    """What is left between edges and model."""
+    """Residuals of the edges."""
     return Shot(guide.report_part(case.work, "residuals"), 1000, 800)
 
 
@@ -369,14 +367,14 @@ def trouble_scale(case: Case) -> Shot:
 
 
 def trouble_columns(case: Case) -> Shot:
-    """The drawing over a photograph whose readings stand in each other's columns."""
+    """The nominal model over an image whose readings are in exchanged columns."""
     spoil = guide.two_columns_exchanged
     folder = guide.wrong(case.work, "legs", "two columns exchanged", spoil)
     return whole_page(guide.laid_over(folder), 1000, 410)
 
 
 def trouble_numbering(case: Case) -> Shot:
-    """The same where the legs are numbered from another one."""
+    """The same for legs in another numbering."""
     spoil = guide.numbered_from_another_leg
     folder = guide.wrong(case.work, "legs", "numbered from another leg", spoil)
     return whole_page(guide.laid_over(folder), 1000, 410)
@@ -410,7 +408,7 @@ PICTURES: dict[str, Callable[[Case], Shot]] = {
 
 
 def main() -> None:
-    """Make the pictures that were asked for."""
+    """Make the requested pictures."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", help=f"{', '.join(PICTURES)} or accuracy; all if none")
     parser.add_argument("--out", type=Path, default=HERE / "docs" / "pictures")

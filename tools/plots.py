@@ -128,7 +128,7 @@ class Plot:
         self.parts.append(text(self.at(x, y), words, colour))
 
     def svg(self) -> str:
-        """The finished drawing."""
+        """The finished plot."""
         return svg(*self.size, *self.parts)
 
     def _axes(self) -> None:

@@ -1,8 +1,8 @@
-"""What the documentation's site does differently from the pages in the repository (a MkDocs hook).
+"""Differences between the documentation's site and the pages in the repository (a MkDocs hook).
 
 Pages link to sources, which are no pages of the site: there such a link is its text alone. The
-README, to which pages lead as well, is taken in as a page, and from the report what makes its
-scrolling areas reachable by the keyboard.
+README, to which pages link as well, is included as a page, and from the report a script that makes
+its scrolling areas reachable by the keyboard.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ def _inside(link: re.Match[str]) -> str:
 
 
 FENCE = re.compile(r"^```(\w+) [\w ]+$", re.MULTILINE)
-"""Of code that the tests run; Python's Markdown takes one word only."""
+"""Fence of code that the tests run; Python's Markdown takes one word only."""
 
 
 ROLE = re.compile(r":(?:class|data|func|meth|mod):<code>~?(?:pkmcal\.(?:\w+\.)+(?=[A-Z]))?")
-"""Of a docstring, which Markdown leaves before the name."""
+"""Role in a docstring, which Markdown leaves before the name."""
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

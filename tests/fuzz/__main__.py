@@ -12,8 +12,8 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from unittest.mock import patch
 
-# Threads would be lost in a fork, and slow on one core; OpenCV is told as the command line does.
-# Libraries read these when they are imported.
+# Threads would be lost in a fork, and are slow on one core; OpenCV is set as by the command line.
+# Libraries read these variables when they are imported.
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
 os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
 
@@ -47,7 +47,7 @@ def main() -> int:
 
 
 def fuzz(given, place: Path) -> Summary:
-    """The cases that were asked for, or those until Ctrl-C."""
+    """The requested cases, or those until Ctrl-C."""
     bases = given.bases or place / "bases"
     if not bases.exists():
         made = [sys.executable, "-c", MAKE, str(bases)]
@@ -57,7 +57,7 @@ def fuzz(given, place: Path) -> Summary:
     numbers = given.only or range(given.first, given.first + given.count)
     if given.telling:
         numbers = telling(numbers, bases, place)
-    # quick cases do not ask which of all models a camera has
+    # quick cases do not compare all models of a camera
     one = patch("pkmcal.boards.camera.DISTORTION_CANDIDATES", ("pinhole",))
     with suppress(KeyboardInterrupt), one if max(numbers) < FIRST else nullcontext():
         for number in numbers:
@@ -69,7 +69,7 @@ def fuzz(given, place: Path) -> Summary:
 
 
 def show(result) -> None:
-    """A case, what is wrong with what it did, and the beginning of what it said."""
+    """A case, its violations of the rules, and the beginning of its output."""
     print(f"{result.case}\n  exit {result.code}: {'; '.join(result.faults) or 'good'}")
     for text in (result.err, result.out):
         print("".join(f"    {line[:400]}\n" for line in text.splitlines()[:6]), end="")

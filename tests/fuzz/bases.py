@@ -59,7 +59,7 @@ def make(folder: Path) -> None:
 
 
 def delta_printers(folder: Path) -> None:
-    """What firmwares say of a printer and of its bed."""
+    """Firmwares' files of a printer, and of its bed."""
     folder.mkdir()
     places = printers.bed(8)
     (folder / "printer.cfg").write_text("[probe]\nz_offset: 1.2\n" + printers.calibrated_cfg())
@@ -91,7 +91,7 @@ def more(path: Path, text: str) -> None:
 
 
 def by_exif(folder: Path) -> None:
-    """Photographs that tell the focal length, for camera: exif."""
+    """Images with a focal length in EXIF, for camera: exif."""
     path = folder / "session.yaml"
     path.write_text(path.read_text().replace("cameras/camera.yaml", "exif"))
     for photo in (folder / "images").rglob("*.jpg"):
@@ -100,7 +100,9 @@ def by_exif(folder: Path) -> None:
 
 
 def measured(folder: Path, seed: int, count: int) -> None:
-    """A hexapod seen by a laser tracker, with distances between places of its tool's point."""
+    """A hexapod measured by a laser tracker, with distances between positions of its
+    tool's point.
+    """
     rng, drawing = np.random.default_rng(seed), load_mechanism("gough-stewart")
     built = np.random.default_rng(0).normal(size=len(drawing.values))
     truth = drawing.with_values(drawing.values + 0.5 * drawing.parameters.tolerance * built)
@@ -134,7 +136,7 @@ def measured(folder: Path, seed: int, count: int) -> None:
 
 
 def boards(folder: Path) -> None:
-    """Photographs of a chessboard on a platform, a session of them, and a camera to be found."""
+    """Images of a chessboard on a platform, a session of them, and an uncalibrated camera."""
     rng = np.random.default_rng(3)
     columns, rows = (n + 1 for n in BOARD["corners"])
     side = 40
@@ -150,7 +152,7 @@ def boards(folder: Path) -> None:
             rotation(rng.uniform(-0.45, 0.45, 3)),
             np.array([0, 0, 0.34]) + rng.uniform(-0.02, 0.02, 3),
         )
-        # the drawing's pixels to metres about its middle, and these to the photograph's
+        # pixels of the pattern to metres about its middle, and these to the image's pixels
         metres = BOARD["square"] / side
         middle = np.array([[metres, 0, -metres * drawn.shape[1] / 2],
                            [0, metres, -metres * drawn.shape[0] / 2], [0, 0, 1]])  # fmt: skip
@@ -201,7 +203,7 @@ def cameras(folder: Path) -> None:
 
 
 def pictures_of(folder: Path, whole: bytes) -> None:
-    """The same photograph in other kinds of file, and other photographs of its name."""
+    """The same image in other kinds of file, and other images of its name."""
     folder.mkdir()
     grey = cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_GRAYSCALE)
     colour = cv2.applyColorMap(grey, cv2.COLORMAP_JET)
@@ -239,8 +241,9 @@ def pictures_of(folder: Path, whole: bytes) -> None:
 
 
 def results(folder: Path) -> None:
-    """What commands wrote of these sessions; the calibration may be used. How good a plan is and
-    which model a camera has are no question here.
+    """Results of commands on these sessions; the calibration is usable.
+
+    The quality of a plan and the model of a camera are not tested here.
     """
     at = os.getcwd()  # noqa: PTH109
     os.chdir(folder)

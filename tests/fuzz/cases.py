@@ -19,11 +19,11 @@ PICTURES = (".png", ".jpg")
 
 @dataclass(frozen=True)
 class Task:
-    """A command, and which files it reads.
+    """A command, and the files that it reads.
 
     words : SESSION, CALIBRATION and the like name copies of the bases; OUT the output folder, FILE
-    the spoilt file, where there is one by itself. files : patterns of what is spoilt.
-    before : the base whose files stand in OUT beforehand. often : its weight.
+    the damaged file, if there is one by itself. files : patterns of files to damage. before : the
+    base whose files are in OUT beforehand. often : its weight.
     """
 
     words: str
@@ -99,15 +99,17 @@ TASKS = (
 )  # fmt: skip
 """Most often those that are quick, where most malformed files are refused."""
 FORMATS = ("c", "json", "mujoco", "yaml")
-"""That take every machine."""
+"""Commands that take every machine."""
 ALONE = ("machines/", "cameras/", "printers/")
 """Bases of which a task takes one file only."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What was made. words : the command. out : where it may write. spoilt : (file, how, words of
-    which the message of a refusal should hold one, none where there is no such place).
+    """Case that was made.
+
+    words : the command. out : where it may write. spoilt : (file, how, words of which the message
+    of a refusal should have one, none where there is no such place).
     """
 
     number: int
@@ -121,9 +123,7 @@ class Case:
 
     @property
     def news(self) -> set[tuple[str, str]]:
-        """What one case may try before others: a way of spoiling a kind of file, and a file of a
-        command.
-        """
+        """Novelty of a case: a fault in a kind of file, and a file of a command."""
         actual_names = set()
         for file, how, _ in self.spoilt:
             path = Path(file)
@@ -133,7 +133,7 @@ class Case:
 
 
 def telling(numbers: Iterable[int], bases: Path, scratch: Path) -> list[int]:
-    """Those cases that try something which none before them does."""
+    """Cases that try something which none before them does."""
     met, chosen = set(), []
     for number in numbers:
         place = scratch / f"case-{number}"
@@ -187,9 +187,9 @@ def make(number: int, bases: Path, place: Path) -> Case:
 def spoil(
     path: Path, bases: Path, place: Path, rng: Random, fresh: bool
 ) -> tuple[str, tuple[str, ...]]:
-    """One fault into one file; returns what it is, and the words that tell where.
+    """Put one fault into one file; returns its name, and the words of its place.
 
-    fresh : whether the file is whole; what is spoilt already can be spoilt as bytes only.
+    fresh : whether the file is whole; a damaged file can be damaged further as bytes only.
     """
     if rng.random() < 0.07:
         return _as_entry(path, place, rng), ()

@@ -1,4 +1,4 @@
-"""Photographs spoilt: as bytes, by their chunks with right checksums, as other kinds of picture."""
+"""Damaged images: as bytes, by their chunks with right checksums, as other kinds of image."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def segments(data: bytes) -> list[bytes]:
 
 
 def spoil_picture(data: bytes, others: dict[str, bytes], rng: Random) -> tuple[str, bytes]:
-    """(kind, bytes); others : whole pictures of other kinds by name, made beforehand."""
+    """(kind, bytes); others : whole images of other kinds by name, made beforehand."""
     kinds = [*COMMON, *(PNG_KINDS if data.startswith(PNG) else JPEG_KINDS)]
     kind = rng.choice(kinds)
     at = rng.randrange(len(data))
@@ -69,7 +69,7 @@ def spoil_picture(data: bytes, others: dict[str, bytes], rng: Random) -> tuple[s
 
 
 def spoil_other(data: bytes, rng: Random) -> tuple[str, bytes]:
-    """Of any kind of file: cut, bits turned, or numbers of its beginning made large."""
+    """For any kind of file: cut, bits flipped, or numbers of its beginning made large."""
     kind = rng.choice(["cut", "bits", "large"])
     if kind == "cut":
         return kind, data[: rng.randrange(len(data))]
@@ -183,7 +183,7 @@ def _spoil_jpeg(data, kind, rng):
 
 
 def cmyk(grey: bytes) -> bytes:
-    """A JPEG file of four components, each with a grey one's picture in a scan of its own."""
+    """A JPEG file of four components, each with a grey one's image in a scan of its own."""
     parts = segments(grey)
     frame = next(k for k, part in enumerate(parts) if part[:2] == b"\xff\xc0")
     start = parts[frame]
@@ -207,7 +207,7 @@ def palette(width: int, height: int) -> bytes:
 
 
 def animated(whole: bytes) -> bytes:
-    """A PNG file of two pictures, one after the other."""
+    """A PNG file of two images, one after the other."""
     head, *body, end = chunks(whole)
     size = head[1][:8]
     control = [

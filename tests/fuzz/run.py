@@ -30,32 +30,31 @@ INTERNALS = re.compile(
     r"|libpng|libjpeg|JPEG data|OpenCV\(|\[ ?WARN|\[ERROR|cv::|np\.(float|int)|array\(|dtype|ufunc"
     r"|pydantic|Errno|validation error|\bstr\b|KeyError|IndexError|TypeError|ValueError|imdecode"
 )
-"""What no person should be shown."""
+"""Texts that no user should see."""
 INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
 """Categories of characters that a terminal obeys or does not show."""
 ODD_FOLDER_NAME = os.fsdecode(b"a\xff\x1b[31m\n# \xe2\x80\xaeb")
 ODD_FOLDERS_EACH = 5
-"""Of so many cases one stands in a folder of such a name."""
+"""One case of so many is in a folder with such a name."""
 PROGRESS = re.compile(r"[A-Z].* \(\d+%, \d+ s\)")
-"""What a long command says off a terminal."""
+"""Progress output of a long command without a terminal."""
 PLACE = re.compile(
     r"\bline \d+|\bcolumn |\bstation\d|\bat station |camera [\w/.]+:"
     r"|\.(yaml|json|csv|xml)(, [\w\[\]{}.-]+|: (legs|the camera)\b)|[\w-]+\.(png|jpg)\b|mechanism '"
 )
-"""Where a fault is: by its line, its column, a file's field, a station, a camera that stands in no
-place of its own, or a photograph's name; or what kind of machine it is that a command does not
-take."""
+"""Place of a fault: its line, its column, a file's field, a station, a camera without a file of its
+own, or an image's name; or the kind of machine that a command does not take."""
 
 ELSEWHERE = re.compile(r"(^|: )/[\w/.\\\[# -]+(, line \d+|: )")
 
 
 @dataclass(frozen=True)
 class Result:
-    """What one case came to.
+    """Result of one case.
 
-    code : exit code, negative for a signal. seconds : of the processor. kilobytes : of memory.
-    faults : sentences about what pkmcal did wrong. refused : whether an error was told. has_file,
-    has_field : whether that tells where, as far as there is a place.
+    code : exit code, negative for a signal. seconds : processor time. kilobytes : memory. faults :
+    sentences about pkmcal's violations of the rules. refused : whether an error was reported.
+    has_file, has_field : whether the message has the place, as far as there is one.
     """
 
     case: Case
@@ -71,7 +70,7 @@ class Result:
 
 
 def run(number: int, bases: Path, scratch: Path, keep: bool = False) -> Result:
-    """Make a case, run its command, judge what it left."""
+    """Make a case, run its command, judge its results."""
     odd = number % ODD_FOLDERS_EACH == 0
     place = scratch / (f"case-{number}" + ODD_FOLDER_NAME * odd)
     shutil.rmtree(place, ignore_errors=True)
@@ -142,7 +141,7 @@ def _read_camera(path: Path) -> None:
 
 
 def _look_at(folder: Path) -> None:
-    """What the page of `pkmcal view` asks for of every station, without serving it."""
+    """Requests of the page of `pkmcal view` for every station, without serving it."""
     from pkmcal.session.load import load_session
     from pkmcal.view.content import Viewed
     from pkmcal.view.edge_search import edge_search
@@ -161,7 +160,7 @@ def _look_at(folder: Path) -> None:
 
 
 def listing(place: Path) -> dict[str, tuple[int, ...]]:
-    """What stands in a folder, so that whatever is written, moved or removed is seen."""
+    """Contents of a folder, so that everything written, moved or removed is detected."""
     out = {}
     for folder, folders, files in os.walk(place):
         for name in (*folders, *files):
@@ -212,7 +211,7 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
 
 
 def _errors(case, code, out, err, faults) -> list[str]:
-    """The sentences of what is wrong with the input, however they were told."""
+    """Sentences about the input, however they were reported."""
     lines = [line for line in err.splitlines() if not PROGRESS.fullmatch(line)]
     if len(lines) > 1 or (lines and not lines[0].startswith("Error: ")):
         faults.append(f"on standard error: {err[:200]!r}")
@@ -248,8 +247,8 @@ def _refuse(constant):
 
 
 def _files_of(case: Case) -> set[str]:
-    """Names of the spoilt files, and of those that a fault in them may be told of."""
-    names = {"mine.txt"}  # of the output folder, which is looked at first
+    """Names of the damaged files, and of files in which their fault may be reported."""
+    names = {"mine.txt"}  # of the output folder, which is checked first
     for file, _, _ in case.spoilt:
         path = Path(file)
         names |= {path.name, path.stem}
@@ -283,7 +282,7 @@ def _written(case: Case, code: int, before, after) -> list[str]:
 
 @dataclass
 class Summary:
-    """Of many results."""
+    """Summary of many results."""
 
     codes: Counter = field(default_factory=Counter)
     commands: Counter = field(default_factory=Counter)

@@ -153,10 +153,10 @@ def spots(tree, above=()):
 
 @dataclass
 class Place:
-    """A value in a tree, and all that is needed to spoil it.
+    """A value in a tree, with the data needed to damage it.
 
-    holder, at : it is holder[at] or, of a mapping, holder[at][1]. found : all places as `spots`
-    gives them. words : what a message about it may be expected to say one of.
+    holder, at : it is holder[at] or, for a mapping, holder[at][1]. found : all places as `spots`
+    gives them. words : one of them is expected in a message.
     """
 
     tree: list

@@ -126,18 +126,22 @@ def equilibria(view: MachineView, law: str, goals: Array, starts: Array) -> Equi
     """
     machine = view.machine
     g, s = len(goals), len(starts)
+    # descents from all starts to all goals
     goal = np.repeat(goals, s, axis=0)
     poses = _descended(view, law, np.tile(starts, (g, 1, 1)), true_edges(view, goal))
+    # |e| and |N^T e| at their ends
     task = _task(view, law, poses, true_edges(view, goal))
     size = np.sqrt(dot(task.error, task.error))
     slope = (task.matrix.mT @ task.error[..., None])[..., 0]
     largest = np.sqrt(np.sum(task.matrix**2, axis=(-1, -2)))
+    # distance from the goal, and whether the end is in the workspace and the goal's assembly mode
     off = platform_joints(machine, poses) - platform_joints(machine, goal)
     distance = np.sqrt(np.mean(dot(off, off), axis=-1))
     readings, wanted = machine.inverse(poses), machine.inverse(goal)
     inside = ~outside(machine, readings)
     here, there = (assembly_sign(machine.layout, view.theta, T) for T in (poses, goal))
     inside &= here * there >= 0
+    # kinds of ends: at the goal, at another pose with the same image, where errors cancel
     indistinguishable = size < INDISTINGUISHABLE_ERROR
     flat = np.sqrt(dot(slope, slope)) < CANCELLED_ERROR_SHARE * largest * np.maximum(
         size, INDISTINGUISHABLE_ERROR

@@ -4,12 +4,12 @@ The error is e_j = u_j x u*_j of the legs' directions, or e_ij = n_ij x n*_ij of
 normals; measured and wanted (*), camera frame. Its derivative by the platform's twist is N_j =
 -[u*_j]x L_j, where L_j is the direction's interaction matrix, and the motors follow
 
-q' = -gain D N+ e,        D the inverse Jacobian, [B] eq. 6-7.
+    q' = -gain D N+ e,        D the inverse Jacobian, [B] eq. 6-7.
 
 [B] eq. 9 holds for fixed base centres. Here the base's end of a leg depends on its reading as well,
 A_j(q_j), which covers cranks and sliders: with q' = D twist,
 
-du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
+    du_j = (I - u u^T) / length (dB_j - dA_j),    dA_j = (dA_j / dq_j) D_j twist,
 
 which is [B] eq. 9 where dA_j / dq_j = 0. Machines with fewer than six degrees of freedom are
 restricted to the twists that they can make. The wanted values are measured as well (the machine was
@@ -128,10 +128,12 @@ def edge_interaction(
     with J = -(A x n) n^T / (u . (A x n)) and the direction's L; [B] 12-13 differentiated.
     """
     by_a, by_b = moving(view, legs, rates(view, legs) if rate is None else rate)
+    # ends of the legs and their derivatives, camera frame
     T = view.T_camera_base[..., None, :, :]
     a, b = (apply(T, p[..., view.legs, :])[..., None, :] for p in (legs.a, legs.b))
     by_a, by_b = (T[..., :3, :3] @ by for by in (by_a, by_b))
     side_a, side_b = cross(b, normals), cross(normals, a)
+    # [a b n]^T dn = (-n.da, -n.db, 0) by cross products
     with np.errstate(divide="ignore", invalid="ignore"):
         volume = dot(cross(a, b), normals)[..., None, None]
         along_a, along_b = (normals @ by for by in (by_a, by_b))

@@ -234,6 +234,7 @@ def _of_closure(view: MachineView, c: Closure, u: Array, pivot: Array) -> Legs:
     layout, a_by_reading = c.layout, np.broadcast_to(c.a_by_reading, u.shape)
     b_by_internal = c.platform.by_internal
     rows, hinges, by_reading = c.rows.by_pose, c.rows.by_internal, c.by_reading
+    # replace the rows of the rods' lengths, which come first, by those along the given directions
     if u is not c.rows.u:
         rows, hinges, by_reading = (np.array(x) for x in (rows, hinges, by_reading))
         keep, n = layout.closing, int(layout.closing.sum())

@@ -263,6 +263,7 @@ def simulate_servo_runs(
     record = _Record.empty(eye.true.machine, starts, goals, now.readings.shape[-1], loop.samples)
     floor = _floor(eye, goals, np.nan_to_num(goal_readings), loop, rng)
     queue: list[tuple[Array, Array]] = []
+    # each sample: record, image with noise, delay, motor velocities, motion
     for k in range(loop.samples):
         points = eye.points(now.poses, now.readings)
         record.take(k, now, kind.error(points.normal.reshape(wanted.shape), wanted))
@@ -426,6 +427,7 @@ def _judged(error: Array, direction: Array, loop: LoopSettings, floor: Array) ->
     n = max(1, round(FINAL_RUN_SHARE * error.shape[1]))
     e, w = error[:, -n:].mean(axis=1), direction[:, -n:].mean(axis=1)
     before = direction[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
+    # arrived : near the goal, or as near as noise allows. shaken : noise keeps the platform away
     near = np.maximum(ARRIVED_DISTANCE_SHARE * direction[:, 0], LEAST_DISTANCE)
     arrived = w < np.maximum(near, np.minimum(floor, TREMBLING_DISTANCE_SHARE * direction[:, 0]))
     shaken = w < floor

@@ -220,8 +220,8 @@ class Study:
     """Results of a study.
 
     outcomes : true, identified, cad, hand. image, held : noise at the goals, of one image and in
-    the loop. hidden : (s,) share of starts and goals at which a leg stands behind another. choices
-    : subsets of all legs with tubes, see :func:`pkmcal.control.analysis.subsets`.
+    the loop. hidden : (s,) share of starts and goals at which a leg stands behind another.
+    choices : subsets of all legs with tubes, see :func:`pkmcal.control.analysis.subsets`.
     """
 
     scene: Plant
@@ -254,6 +254,7 @@ def study_servoing(
     unreachable, and if the camera does not see the legs.
     """
     check_loop(plan.loop)
+    # workspace, and starts and goals of the runs
     seeds = np.random.SeedSequence(plan.seed).spawn(5)
     eye = Eye.of(scene.view(), scene.camera)
     progress("Looking at the workspace", 0.02)
@@ -262,6 +263,7 @@ def study_servoing(
     )
     workspace = drawn[0][:VISIBILITY_POSES]
     starts, goals = _ways(eye, plan, np.random.default_rng(seeds[1]))
+    # runs with each estimate
     beliefs = estimates(
         eye.true, scene.drawing, scene.uncertainty, plan.runs, np.random.default_rng(seeds[2]),
         plan.hand_position, plan.hand_rotation,
@@ -275,6 +277,7 @@ def study_servoing(
         ideal = outcomes[0].runs if outcomes else runs
         outcomes.append(outcome(eye.true.machine, belief, runs, ideal))
     progress("Looking for other equilibria", 0.87)
+    # noise at the goals
     ends, joints = np.concatenate([starts, goals]), np.nan_to_num(scene.machine.inverse(goals))
     rng, loop = np.random.default_rng(seeds[4]), plan.loop
     image = one_image(eye, eye.true, loop.law, goals, joints, loop.noise, rng)

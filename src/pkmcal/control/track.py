@@ -116,12 +116,14 @@ def edge_misfits(
     machine = view.machine
     c = closure(machine.layout, machine.values, readings, T_base_platform)
     a, b = (apply(view.T_camera_base, p[view.legs]) for p in (c.a, c.b))
+    # edges of the seen legs
     own = edges.leg[:, None] == view.legs
     edges = edges.select(own.any(axis=1))
     leg = own[own.any(axis=1)].argmax(axis=1)
     radius = machine.radii_of(edges.leg, edges.tube)
     at = edge_normal_jacobians(a[leg], b[leg], radius, edges.side)
     to_tangent = edges.basis.mT
+    # covariance with a common shift of the edge, from shading
     off = SHADING_EDGE_SHIFT * edges.shift
     covariance = edges.covariance + off[:, :, None] * off[:, None, :]
     return EdgeMisfits(
@@ -186,6 +188,7 @@ def weighted_task(law: str, task: Task, lines: LegLines, used: Booleans) -> tupl
     typical one, the geometric mean, so that their magnitude is kept.
     """
     normal, basis, joint = lines.normal[used], lines.basis[used], lines.joint[used]
+    # covariance of each leg's error, and the matrix from the error's vectors to its coordinates
     if law == "directions":
         u, spread = _direction_spread(normal, basis, joint)
         tangent = tangent_basis(u, normal[:, 0])
@@ -197,6 +200,7 @@ def weighted_task(law: str, task: Task, lines: LegLines, used: Booleans) -> tupl
         covariance = joint
     size = to_turn.shape[-2]
     typical = np.exp(np.mean(np.log(np.linalg.det(covariance))) / (2 * size))
+    # whitened rows
     whiten = typical * np.linalg.inv(np.linalg.cholesky(covariance)) @ to_turn
     error = (whiten @ task.error.reshape(len(whiten), -1, 1)).reshape(-1)
     matrix = whiten @ task.matrix.reshape(len(whiten), whiten.shape[-1], -1)
@@ -340,6 +344,7 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
     """
     check_image(image, sight.camera)
     view = sight.view
+    # prediction: pose from the readings, with the last image's correction
     forward = view.machine.forward_result(readings, state.T_base_platform)
     if not bool(forward.converged):
         lines = LegLines.nothing(len(view.legs))
@@ -347,6 +352,7 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
         lost = replace(state, valid=lines.valid)
         return TrackedLegs(lines, lines.valid, reasons, state.T_base_platform, False, 0.0, lost)
     closed, first, blur = forward.T_base_platform, np.isnan(state.blur), state.blur
+    # measurement pass; for the first image also after a wide search, the better of the two
     photograph = sight.photograph(image, readings)
     predicted = perturb(closed, state.correction)
     searched = not first and _poor(state.valid) and not state.searched
@@ -357,6 +363,7 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
         again = _edge_pass(sight, photograph, _searched(sight, photograph, predicted), blur)
         searched = again.quality > at.quality
         at = again if searched else at
+    # blur from the first image, and the correction for the next
     value = at.lines.valid
     if value.any() and first:
         blur = at.station_edges.blur

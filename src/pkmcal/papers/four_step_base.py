@@ -88,17 +88,19 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Stat
     used = poses.select(on_base[poses.mount])
     if not len(used):
         return stations_apart(n_stations)
+    # mean pose of each board in each station's camera frame
     pair, group = np.unique(used.station * len(on_base) + used.mount, return_inverse=True)
     T_camera_mount = mean_pose(used.T_station_target, used.whiten, group, len(pair))
     in_view = list(zip(*np.divmod(pair, len(on_base)), T_camera_mount, strict=True))
     of_station, of_mount = np.full(n_stations, -1), np.full(len(on_base), -1)
     T_camera_view = np.tile(np.eye(4), (n_stations, 1, 1))
     T_view_mount = np.tile(np.eye(4), (len(on_base), 1, 1))
+    # views: from a first station to its boards, to their stations, and so on
     for first in range(n_stations):
         if of_station[first] >= 0:
             continue
         of_station[first] = view = of_station.max() + 1
-        for _ in range(n_stations):  # breadth first: stations to boards to stations
+        for _ in range(n_stations):
             for s, m, T in in_view:
                 if of_station[s] == view and of_mount[m] < 0:
                     of_mount[m] = view

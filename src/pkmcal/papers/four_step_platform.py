@@ -56,9 +56,10 @@ def joint_distance_deviations(
 ) -> tuple[Array, Array]:
     """Residuals (B, r) m of step 3 at offsets (B, L), and their derivatives (B, r, L).
 
-    printed : differences between consecutive images of a station, C_2 of [A] 14. corrected (errata)
-    : deviations from each pair's mean, sum (d_k - mean d)^2.
+    printed : differences between consecutive images of a station, C_2 of [A] 14. corrected
+    (errata) : deviations from each pair's mean, sum (d_k - mean d)^2.
     """
+    # pairs of joints that are seen together at least twice
     j, g = np.triu_indices(axes.visible.shape[1], 1)
     both = axes.visible[:, j] & axes.visible[:, g]
     used = both.sum(axis=0) > 1
@@ -73,6 +74,7 @@ def joint_distance_deviations(
     slope[:, :, pair, j] = dot(e, axes.u[:, :, j])
     slope[:, :, pair, g] = -dot(e, axes.u[:, :, g])
     rows = np.concatenate([distance[..., None], slope], axis=-1)
+    # criterion: consecutive differences, or deviations from each pair's mean
     if form == "printed":
         same = axes.station[1:] == axes.station[:-1]
         use = both[1:] & both[:-1] & same[:, None]

@@ -127,6 +127,7 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     from each start; the result is the one with the smallest median error. Raises ResultError if the
     poses do not determine the camera's rotation.
     """
+    # all starts of all runs as one batch
     starts = [_placed(body, visibility, *turns) for turns in _turns(body, visibility)]
     n, runs = len(starts), len(body)
     every = Pair(*(np.concatenate(parts) for parts in zip(*starts, strict=True)))
@@ -146,6 +147,7 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
         # Cauchy weights relative to the median error
         usual = np.maximum(np.median(apart, axis=1, keepdims=True), 1e-9)
         problem = replace(problem, weight=1 / (1 + (apart / (2.4 * usual)) ** 2))
+    # start with the smallest median error, for each run
     best = np.argmin(np.median(apart, axis=1).reshape(n, runs), axis=0)
     chosen = best * runs + np.arange(runs)
     pair = take(every, chosen)
@@ -279,6 +281,7 @@ def _carried_on(
     body[moving] = poses[in_view.configuration[moving]]
     good = np.isfinite(body[:, 0, 0])
     target = in_view.T_station_target
+    # known stations to mounts, known mounts to stations, else the pair with the most poses
     while True:
         has_station = np.isfinite(stations[in_view.station, 0, 0])
         has_mount = np.isfinite(mounts[in_view.mount, 0, 0])

@@ -98,9 +98,9 @@ class ImplicitProblem:
 
     Jacobian of one pose (own columns are eliminated by the Schur complement):
 
-                     z      stations   mounts  | own (hinges)
-    closure rows   [ X         X         X     |     X       ]
-    deviations     [           X         X     |             ]
+                         z      stations   mounts  | own (hinges)
+        closure rows   [ X         X         X     |     X       ]
+        deviations     [           X         X     |             ]
     """
 
     layout: LimbLayout
@@ -135,6 +135,7 @@ class ImplicitProblem:
     def linearize(self, state: ImplicitState) -> Linear:
         """Weighted rows and exact Jacobian by z, stations and mounts, zero for fixed unknowns."""
         rows = self._rows(state)
+        # closure rows are followed by the deviations, which do not depend on z and the hinges
         off = ((0, 0), (0, 0), (0, rows.taken.off.shape[-1]), (0, 0))
         closures = rows.scale[..., None] * (dense(rows.closure, self.drawing.size) @ self.free)
         stations, mounts = np.eye(self.n_stations)[self.station], np.eye(self.n_mounts)[self.mount]
@@ -386,9 +387,11 @@ def on_axis(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
     camera, mount = state.T_camera_base[:, 0], state.T_mount[:, 0]
     axis = frames.camera[..., :, 2]
     sign = np.sign(dot(axis, camera[:, :3, 2]))[:, None]
+    # rotate the camera about the middle of the workspace
     middle = problem.platform_poses(state)[..., :3, 3].mean(axis=1)
     turn = turn_between(camera[:, :3, 2], sign * axis) @ camera[:, :3, :3]
     place = apply(camera, middle) - (turn @ middle[..., None])[..., 0]
+    # rotate the mount so that the carried axis is z
     carried = (mount[:, :3, :3] @ (sign * frames.board[:, 2])[..., None])[..., 0]
     turned = turn_between(carried, np.array([0.0, 0.0, 1.0])) @ mount[:, :3, :3]
     return state._replace(

@@ -165,6 +165,7 @@ def in_base(axes: Axes, T_camera_base: Array) -> Axes:
     weighted mean direction: the minimum of u^T (sum R^T W R) u over the images, with their
     information W.
     """
+    # directions in the base frame, one group of images for each configuration
     rot = T_camera_base[:, axes.station, None, :3, :3]
     back = rot.mT
     u = np.where(axes.visible[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
@@ -172,6 +173,7 @@ def in_base(axes: Axes, T_camera_base: Array) -> Axes:
     member = (row == np.arange(len(names))[:, None]).astype(float)
     count = member @ axes.visible
     total = np.einsum("kc,bcli->bkli", member, u)
+    # weighted mean direction of legs with several images
     info = None
     if count.max(initial=0) > 1 or axes.information is not None:
         info = across_directions(axes.u) if axes.information is None else axes.information
@@ -193,10 +195,12 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
     """
     edges, n_legs = measurements.edges, machine.n_legs
     radius = machine.radii_of(edges.leg, edges.tube)
+    # groups: one for each leg and image
     photo, index = np.unique(
         edges.station * len(measurements.joints) + edges.configuration, return_inverse=True
     )
     group, n = index * n_legs + edges.leg, len(photo) * n_legs
+    # normal equations of each group, and the mean normals of both sides
     weight = np.where(weights > 0.5, 1 / np.trace(edges.covariance, axis1=1, axis2=2), 0.0)
     weighted = weight[:, None] * edges.normal
     information, right, sides = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((2, n, 3))
@@ -205,6 +209,7 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
     np.add.at(sides, (edges.side, group), weighted)
     visible: Booleans = np.all(np.linalg.norm(sides, axis=-1) > 0, axis=0)
     total = np.maximum(np.bincount(group, weight, n), 1e-300)
+    # direction: smallest eigenvector; its sign from the two sides, u = n1 x n0
     normal = np.where(visible[:, None, None], information / total[:, None, None], np.eye(3))
     u = np.linalg.eigh(normal)[1][..., 0]
     u = u * np.where(dot(u, cross(sides[1], sides[0])) < 0, -1.0, 1.0)[:, None]

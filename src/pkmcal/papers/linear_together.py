@@ -13,10 +13,10 @@ keep their nominal values and prior sigmas.
 
 Rows of the system:
 
-               machine z   stations   edge shifts (cameras, lines)
-edges       [      X           X             X      ]   n.A + R = 0
-priors      [      1                                ]   nominal model
-            [                                1      ]   shifts
+                   machine z   stations   edge shifts (cameras, lines)
+    edges       [      X           X             X      ]   n.A + R = 0
+    priors      [      1                                ]   nominal model
+                [                                1      ]   shifts
 """
 
 from __future__ import annotations
@@ -205,6 +205,7 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
             found=f"{finite.sum(axis=1).min()} legs at one of them",
             next_step=USE_DEFAULT_METHOD,
         )
+    # columns of each edge's shifts: its camera's, and its line's if lines are shaded
     n_cameras = measurements.n_cameras
     camera = np.asarray(measurements.camera_of_station)[edges.station]
     shifts = camera[:, None]
@@ -246,6 +247,7 @@ def _registered(system: _System, centres: Array, valid: Booleans) -> _System:
     edges, start = system.edges, system.start
     drawing = system.theta(start)[centre_index(system.machine.layout)[0]]
     best, least = start.T_camera_base.copy(), np.full(len(valid), np.inf)
+    # all legs first, then every three legs
     for legs in ((), *combinations(range(len(drawing)), 3)):
         three = np.isin(np.arange(len(drawing)), legs) if legs else np.ones(len(drawing), bool)
         for s, (a, there) in enumerate(zip(centres, valid & three, strict=True)):

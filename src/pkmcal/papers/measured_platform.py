@@ -75,11 +75,13 @@ def taken(motion: Array, whole: Array) -> Taken:
     (s is then horizontal), and the identity for one that does not turn. Translations that the
     machine cannot make are deviations as they are.
     """
+    # rotation split, translation masked
     can: Booleans = np.any(motion != 0, axis=1)
     own, off, turn_by, off_turn_by = _turn_split(int(can[:3].sum()), whole[..., :3, :3])
     place = np.where(can[3:], whole[..., :3, 3], 0.0)
     missing = np.flatnonzero(~can[3:])
     shape = whole.shape[:-2]
+    # derivatives by the whole pose
     by = np.zeros((*shape, 6, 6))
     by[..., :3, :3] = turn_by
     by[..., 3:, 3:] = np.diag(can[3:].astype(float))

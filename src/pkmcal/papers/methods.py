@@ -52,6 +52,7 @@ def by_paper(
     guess = joint.state.T_camera_base
     state = _solve(method, machine, measurements, guess)
     rng = np.random.default_rng(seed)
+    # repetitions with the stated noise added
     repeats: list[State] = []
     failed: list[ResultError] = []
     for _ in range(SIGMA_REPETITIONS):
@@ -61,6 +62,7 @@ def by_paper(
             failed.append(error)
     if len(failed) > len(repeats):
         raise failed[0]
+    # scatter of machine and stations over the repetitions
     theta = np.stack([r.theta for r in repeats])
     turns = np.stack([pose_difference(r.T_camera_base, state.T_camera_base) for r in repeats])
     mounts = np.zeros((len(repeats), 6 * len(state.T_mount)))
@@ -147,11 +149,13 @@ def _estimate(
     large residual have weight 0.
     """
     gauge = default_gauge(machine)
+    # whitened residuals of the state
     assembled = assemble(machine, measurements, gauge, use_drawing=False)
     batch = batch_of(machine, assembled, state)
     unweighted = assembled.problem.unweighted(batch)
     edges = np.nan_to_num(assembled.places.edges.taken(unweighted.edges[0]))
     distance = np.sqrt(np.sum(edges**2, axis=-1))
+    # noise scale from the median, and weights
     middle = float(np.median(distance)) if distance.size else 0.0
     scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
     weight = (distance < NO_WEIGHT_DISTANCE * scale).astype(float)

@@ -48,9 +48,9 @@ class BodyProblem:
 
     Jacobian of frame k (own columns are eliminated by the Schur complement):
 
-                 items   | own (pose k)
-    frame k    [   X     |     X       ]
-    gauge      [   X     |             ]
+                     items   | own (pose k)
+        frame k    [   X     |     X       ]
+        gauge      [   X     |             ]
     """
 
     measured: Array
@@ -181,6 +181,7 @@ def loose(
     # orthonormal basis of each frame's motions, without motions that its items do not show
     u, s, _ = np.linalg.svd(own * mask, full_matrices=False)
     u = u * (s > LOOSE_ITEMS_EIGENVALUE * np.sqrt(len(items)))[:, None, :]
+    # rows left by the frames' poses (Schur complement), with the rigid motions added
     normal = np.sum(np.eye(len(own)) * mask - u @ u.mT, axis=0)
     rigid = np.linalg.qr(own)[0]
     values, vectors = np.linalg.eigh(normal + rigid @ rigid.T)

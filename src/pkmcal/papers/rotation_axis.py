@@ -200,6 +200,7 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     In the camera frame. A rotation phi with noise n of its two poses moves the axis by n / (2
     sin(phi / 2)) across.
     """
+    # rotations of all pairs that turn enough
     i, j = _pairs(len(rot))
     turn = rotation_vector(rot[j] @ rot[i].mT)
     angle = np.sqrt(dot(turn, turn))
@@ -207,12 +208,14 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float]:
     if used.sum() < 2:
         return np.nan, np.nan
     i, j, turn, angle = i[used], j[used], turn[used], angle[used]
+    # mean axis, with a common sign
     axis = turn / angle[:, None]
     main = np.linalg.eigh(axis.T @ axis)[1][:, -1]
     axis = axis * np.where(axis @ main < 0, -1.0, 1.0)[:, None]
     mean = axis.sum(axis=0)
     mean = mean / np.linalg.norm(mean)
     apart = np.linalg.norm(skew(mean) @ axis[..., None], axis=(-1, -2))
+    # covariance of each axis from the noise of its two poses
     by = turn_jacobian(turn)  # by the later pose; the earlier pose's is its other half
     across = (np.eye(3) - axis[:, :, None] * axis[:, None, :]) @ by / angle[:, None, None]
     back = across @ rot[j] @ rot[i].mT

@@ -194,6 +194,7 @@ def place_board(
     GeometryError if that share is below LEAST_VISIBLE_CORNERS for all candidates.
     """
     discs = discs_of(machine)
+    # candidate poses, in the frame of the board's body
     places: list[Array] = []
     if on == "base":
         eyes = inverse(T_camera_base)[:, :3, 3]
@@ -201,11 +202,13 @@ def place_board(
     finish = Finish.from_noise(SmoothNoise.from_rng(rng))
     if on == "platform":
         places = _brackets(board, discs, rng)
+    # machine and board's body at a few configurations
     few = np.unique(np.linspace(0, len(joints) - 1, BOARD_TRIAL_CONFIGURATIONS).astype(int))
     carried = (
         T_base_platform[few] if on == "platform" else np.broadcast_to(np.eye(4), (few.size, 4, 4))
     )
     scenes = [machine_parts(machine, discs, finish, T_base_platform[k], joints[k]) for k in few]
+    # visible share of each candidate: mean over configurations, least over stations
     there = np.stack(places)
     visible = np.min(
         [

@@ -124,6 +124,7 @@ def visible_edges(
     photo, edge = np.nonzero(count >= LEAST_VISIBLE_SAMPLES)
     begin, count = begin[photo, edge], count[photo, edge]
     span = np.stack([along[photo, edge, begin], along[photo, edge, begin + count - 1]], axis=-1)
+    # edges of these stretches, with rays resampled along each
     normal = normal[photo, edge]
     points = contour_point(
         a_e[photo, edge][:, None], u[photo, edge][:, None], normal[:, None], radius[edge][:, None],

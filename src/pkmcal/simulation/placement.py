@@ -271,9 +271,10 @@ def default_stations(
     the base.
 
     board : body that carries a board which all cameras see. Cameras then stand to one side of a
-    machine, but round one that lies flat; with a board on the base they leave room for it. distance
-    : from the machine's middle, m; by default such that the machine fills the image. elevation :
-    rad above the horizontal; random by default. Neither applies to a camera between the legs.
+    machine, but round one that lies flat; with a board on the base they leave room for it.
+    distance : from the machine's middle, m; by default such that the machine fills the image.
+    elevation : rad above the horizontal; random by default. Neither applies to a camera between the
+    legs.
     """
     space = legs_space(machine)
     start = rng.uniform(0, 2 * np.pi)

@@ -97,10 +97,12 @@ def discs_of(machine: Machine) -> Discs:
     """
     ends = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
     a, b = np.array(ends.a), np.array(ends.b)
+    # sides of the plates
     rise = float(apply(machine.home(), b)[:, 2].mean() - a[:, 2].mean())
     side = -1.0 if rise < -1e-3 else 1.0
     balls, drives = _ball_radii(machine), drives_of(machine)
     ball = float(balls.max())
+    # widths and heights of the plates, by what they carry
     held, room = _held(machine, drives, balls[:, 0])
     width_a, width_b = (
         float(np.linalg.norm(p[..., :2] - p[..., :2].mean(axis=0), axis=1).max())
@@ -350,6 +352,7 @@ def guide_parts(
     width, spare = RAIL_HALF_WIDTH * ball, 1.2 * along
     back = ball + 2 * deep + width
     attempt = drives.ways[j]
+    # rails: one along a straight guide, to the base plate if it is upright; else one for each piece
     rails: list[Box] = []
     if len(attempt) == 2:
         v = drives.axis[j]
@@ -371,6 +374,7 @@ def guide_parts(
         middles = (attempt[1:] + attempt[:-1]) / 2
         nearest = int(np.argmin(np.linalg.norm(middles - a, axis=1)))
         rot = _turned_along(attempt[nearest + 1] - attempt[nearest], away)
+    # carriage, square to the rail at the leg's end
     block = Box(a + (ball + deep) * rot[2], rot, np.array([along, across, deep]))
     return [
         *(ScenePart(rail, finish.platform) for rail in rails),
