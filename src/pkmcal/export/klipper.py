@@ -93,6 +93,7 @@ class Klipper(Exporter):
         config.read_string(text)
         move = klipper_carriage_heights if fit.kind == "linear" else klipper_arm_angles
         zero = homed(config) - fit.rate * fit.delta.ends[fit.order]
+        # switches at other readings: homing with the value that the text gives for them
         elsewhere = [
             np.where(
                 np.isnan(readings),

@@ -30,6 +30,7 @@ def read_mujoco(text: str) -> ReadModel:
     radii: dict[str, float] = {}
     world = root.find("worldbody")
     dofs = 0 if world is None else _collect(world, 0, bodies, 0, sites, radii)
+    # state at home: every joint at its reference value
     joints = {j.name: j for body in bodies for j in body.joints}
     drawn = np.zeros(dofs)
     for j in joints.values():
@@ -70,6 +71,7 @@ def _collect(
     for geom in node.findall("geom"):
         if "name" in geom.attrib:
             radii[geom.attrib["name"]] = float(_vector(geom, "size")[0])
+    # depth first, as MuJoCo numbers bodies and joints
     for child in node.findall("body"):
         me, joints = len(bodies), list[ReadJoint]()
         for j in child:

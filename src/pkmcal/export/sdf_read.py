@@ -22,6 +22,7 @@ LOOP_JOINT_ENDING = "_loop"
 def read_sdf(text: str) -> ReadModel:
     """Model of an SDF text; joints named ``…_loop`` are the loop closures."""
     model = fromstring(text)[0]
+    # links as bodies along the tree, then loops between them
     tree = _Links(model)
     for link in tree.links:
         tree.put(link)

@@ -123,6 +123,7 @@ def report_of(
     over : tool error over the workspace, or the reason why there is no map; None for no section.
     digest : digest of the session.
     """
+    # data that several sections share: offsets of edges, joint centres, images and links to them
     c, session, observation = calibration, calibration.session, calibration.observation
     estimate, findings, edges = calibration.estimate, calibration.findings, observation.edges
     shifts = residuals.outward_shift(edges, estimate, session.joints, session.camera_of_station)
@@ -135,6 +136,7 @@ def report_of(
     album = pictures.album(c, shifts, centres)
     links = album.links
     space = image_scene.plot(session, estimate, links, poses.target_places(observation, estimate))
+    # sections in the order of the page
     parts = (
         scene.section(session, estimate, centres),
         provenance.stations(session, observation, estimate, space),

@@ -56,6 +56,7 @@ def spectrum(findings: Findings) -> BarChart | None:
     information = np.asarray(findings.identifiability.singular_values, dtype=float)
     if information.size == 0:
         return None
+    # logarithmic height above the least information; 1 is that of the nominal model
     decades = math.log10(1 / LEAST_BAR_INFORMATION)
     heights = np.maximum(
         np.log10(np.maximum(information, LEAST_BAR_INFORMATION)) + decades, STUB_BAR_HEIGHT
@@ -77,6 +78,7 @@ def spectrum(findings: Findings) -> BarChart | None:
             else f"the data know it {brief(ratio)} times better than the drawing"
         ]
     )
+    # a tick for each decade
     tops = range(math.floor(high) + 1)
     ticks = tuple((float(t), _power(t - round(decades))) for t in tops)
     places = sorted({0, len(bars) - 1} | set(range(9, len(bars) - 4, 10)))

@@ -185,6 +185,7 @@ def _static_traces(
     """Traces of base, cameras, poses, and targets measured by trackers or boards."""
     carried = np.stack([arm[0, 0] for arm in limbs.arms])
     out = [line("base", "--muted", 4, [ring(carried)], showlegend=False)]
+    # frustums reach towards the machine, and stay visible close to it
     ends = np.concatenate([limbs.a[0], limbs.b[0]])
     middle, least = ends.mean(axis=0), LEAST_FRUSTUM_DEPTH * float(np.ptp(ends, axis=0).max())
     eyes = [inverse(T) for T in estimate.state.T_camera_base[: len(session.stations)]]

@@ -24,6 +24,7 @@ def sections(session: Session, every: Sequence[LinkSet], estimate: Estimate) -> 
     out: list[Part] = []
     first = 0
     for links in every:
+        # residuals and weights of all kinds are in one array, kind after kind
         mine = slice(first, first + len(links))
         first += len(links)
         if not len(links):

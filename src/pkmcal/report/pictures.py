@@ -198,11 +198,13 @@ class _ImageOverlays:
         self.factor = enlargement(
             np.linalg.norm(self.corners.off, axis=1), CORNER_ARROW_LENGTH * width
         )
+        # rejections by station; whole images have no leg
         rejected: dict[int, list[Rejection]] = defaultdict(list)
         for one in calibration.observation.rejected:
             rejected[one.station].append(one)
             if one.leg < 0:
                 self.reasons[one.station, one.configuration].append(one.reason)
+        # chosen configurations of each station, as far as their poses were estimated
         rows: dict[int, list[int]] = defaultdict(list)
         for s, photo in chosen:
             if estimate.configurations[photo.configuration]:

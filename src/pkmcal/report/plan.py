@@ -294,6 +294,7 @@ def _space(plan: MeasurementPlan) -> Part:
     """Section with a plot of the machine, its configurations, cameras, and candidate places."""
     rig, home = plan.subject.rig, plan.subject.rig.machine.home()[None]
     machine = rig.machine
+    # machine at home, and platform positions of the plan
     ends = machine.ends_at(machine.inverse(home), home)
     middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
     legs = [np.stack([a, b]) for a, b in zip(ends.a[0], ends.b[0], strict=True)]
@@ -306,6 +307,7 @@ def _space(plan: MeasurementPlan) -> Part:
             hovertext=hover, hoverinfo="text",
         ),
     ]  # fmt: skip
+    # cameras with their frustums
     eyes: list[Array] = []
     for name, camera, T_camera_base in _cameras(plan):
         T = inverse(T_camera_base)

@@ -79,6 +79,7 @@ def stations(
         photographs = count(taken, "photograph")
         if used[s] < taken:
             photographs = f"{used[s]} of {photographs} in use"
+        # edge shifts are estimated in binned pixels
         pixels = int(observation.binning[s])
         shift = float(estimate.state.edge_shift[camera[s]]) * pixels
         sigma = float(estimate.edge_shift_sigma[camera[s]]) * pixels
@@ -92,6 +93,7 @@ def stations(
             f"{station.camera_file}, {station.camera.model}, {photographs}",
         )
         rows.append(Row(station.name, cells))
+    # trackers come after the cameras' stations
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         what = f"{table.label}, tracker, {table.kind}, {count(len(table.configuration), 'row')}"
         rows.append(

@@ -127,6 +127,7 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     pose = state.T_base_platform[k]
     yield Logged(("machine", "platform"), "transform", {"T": pose}, at)
     machine = c.estimate.machine
+    # nominal machine in its own frames, then moved to the calibrated base frame
     base, platform = (side.T_calibrated_drawing for side in centres)
     old = inverse(base) @ pose @ platform
     for name, of, T, move in (

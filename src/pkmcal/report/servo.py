@@ -517,6 +517,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     runs = s.outcome("identified").runs
     start, goal = runs.T_base_platform[run, 0], runs.goals[run]
     observed = set(s.eye.true.legs.tolist())
+    # moving traces: observed legs in their colours, then the platform
     *legs, platform = _moving(s, start)
     data = [
         line(
@@ -529,6 +530,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
         for j, leg in enumerate(legs)
     ]
     data.append(line("platform", "--ink", 6, (), **platform))
+    # static traces: base, goal, paths and camera
     a, b = (v[0] for v in _limbs(s, goal[None]))
     data.append(line("base", "--muted", 3, [ring(a)], showlegend=False))
     dashed = line("goal", "--ink", 2, [ring(b)])

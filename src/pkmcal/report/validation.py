@@ -200,6 +200,7 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         inside = f" In the configurations in use, {amount(finite_rms(used.after), unit)}."
     broken = "" if out.promise.holds else " That is more than the deviations promise."
     held = count(len(out.rows), "configuration")
+    # repeats of a pose are not independent configurations
     poses = len(np.unique(same_pose(session.joints[out.rows], session.joint_noise)))
     if poses < len(out.rows):
         held += f" of {count(poses, 'pose')}"

@@ -267,6 +267,7 @@ def _add_axes(
     extent : (3, 2) mm.
     """
     (column, row), (across, down) = place, shape
+    # domain of the panel, in shares of the plot
     wide = (1 - SLICE_GAP_SHARE * (across - 1)) / across
     gap = SLICE_GAP_SHARE if down > 1 else 0.0
     tall = (1 - gap * (down - 1)) / down
@@ -380,6 +381,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
     hover += "<br>σ %{customdata[0]:.3g} mm"
     hover += ", %{customdata[2]:.2g}°" if turns else ""
     hover += "<br>drawing's error %{customdata[1]:.3g} mm<extra></extra>"
+    # rotations count from home; without them home is not needed
     home = poses[0] if components.min() >= 3 else session.machine.home()
     used = np.flatnonzero(estimate.configurations)
     data = [

@@ -43,6 +43,7 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
             found="observe: board" if "legs" not in station.observe else "legs without tubes",
             next_step="Its place is found from the board when you calibrate",
         )
+    # several images verify each other; a single one is searched globally
     start = placed_by_hand(viewed, request).T_camera_base
     view = _search_view(viewed, request.station)
     many = len(view.configuration) >= FEWEST_FITTED_TOGETHER
@@ -53,6 +54,7 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
             view, viewed.image(request.station, request.photograph)
         )
     pose = localized if sure else start
+    # overlay at the localized pose, without the gesture and pins that led to the start
     plain = {"pose": tuple(map(tuple, pose.tolist())), "gesture": None, "pins": ()}
     return {
         **overlay_after_gesture(viewed, request.model_copy(update=plain)),

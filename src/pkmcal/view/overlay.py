@@ -41,6 +41,7 @@ def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any
         pane.machine, pane.camera, pane.T_camera_base, pane.joints, pane.T_base_platform
     )
     lines = [*edges, *_bare_limbs(pane)]
+    # one SVG path for each leg
     legs = sorted({edge.leg for edge in lines})
     paths = [
         {

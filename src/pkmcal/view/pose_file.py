@@ -27,6 +27,7 @@ class PoseFile:
         of somebody else's session), for a file that somebody else has changed since it was last
         read, and for a pose that cannot be edited by itself.
         """
+        # images of a hand-held camera are localized one by one
         keys = ("stations", station.entry, "pose")
         if station.handheld:
             raise InputError(
@@ -34,6 +35,7 @@ class PoseFile:
                 where=f"{SESSION_FILE_NAME}, {'.'.join(keys[:2])}",
                 next_step="Every such photograph is placed when you calibrate",
             )
+        # one writer at a time; the file must be the one that this page read or wrote last
         with self._lock:
             if self._path.is_symlink():
                 raise InputError(
@@ -47,6 +49,7 @@ class PoseFile:
             except OSError as error:
                 reason = error.strerror
                 raise InputError(f"cannot be read ({reason})", where=str(self._path)) from None
+            # an edit of the user in the meantime must not be lost
             if now != self._last_bytes:
                 raise InputError(
                     "the file was changed by somebody else since this page read it",

@@ -84,6 +84,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
 
         return endpoint
 
+    # files and images by GET
     async def photograph(request: Request) -> Response:
         s, k = request.path_params["s"], request.path_params["k"]
         return await _answered(lambda: Response(viewed.jpeg(s, k), media_type="image/jpeg"))
@@ -98,6 +99,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         report = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
         return Response(report + _template("view.css"), media_type="text/css")
 
+    # requests by POST, each a validated JSON document
     routes = [
         Route("/", page),
         Route("/view.js", script),
