@@ -36,10 +36,6 @@ varied.
 """
 NEIGHBOURS_TRIED_EACH = 6
 """Number of variations of each chosen configuration."""
-DRAWN_FOR_EACH_WANTED = 3
-"""Number of configurations drawn for each wanted one: some are singular, folded, or have legs that
-touch.
-"""
 
 
 class Configurations(NamedTuple):
