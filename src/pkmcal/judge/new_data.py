@@ -105,6 +105,7 @@ def _as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, 
         )
         response = responses.get(next(names, station.name))
         has_response = response is not None and not station.response_given
+        # Turn the images by half where the calibration had to.
         camera = station.camera
         turned_camera = turned.get(station.camera_file)
         # otherwise the file has been corrected since, or is another one

@@ -164,6 +164,7 @@ class HexapodByLegs:
         pixel = camera.project(truth)
         out: dict[Key, Sample] = {}
         for key, fit in fits.items():
+            # Error in the camera's frame, and distance from the registered nominal centres.
             centres = fit.extra["centres"]
             off = centres - truth
             T = register(np.broadcast_to(nominal, centres.shape), centres)
