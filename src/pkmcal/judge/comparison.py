@@ -289,10 +289,10 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
 class Weights:
     """Weights of residuals by the observability of each configuration's readings in the images.
 
-    Unweighted root mean squares are dominated by the direction that an image determines worst,
-    depth, in which any two machines look alike. matrices : (n, m, m); the mean of their traces is
-    m, so units are kept. floor : weighted root mean square of a perfect machine's residuals, m or
-    rad.
+    matrices : (n, m, m); the mean of their traces is m, so units are kept. floor : weighted root
+    mean square of a perfect machine's residuals, m or rad. Unweighted root mean squares are
+    dominated by the direction that an image determines worst, depth, in which any two machines are
+    similar.
     """
 
     matrices: Array
