@@ -17,7 +17,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.gauge import moved_centres
 from pkmcal.identify.machine_change import machine_change
-from pkmcal.judge.difference import _shared, difference
+from pkmcal.judge.difference import _shared_data, difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level
@@ -195,9 +195,9 @@ def test_photographs_are_counted_however_they_are_grouped(saved):
         used = np.ones(len(configurations), dtype=bool)
         return replace(saved, document={"configurations": configurations}, used=used)
 
-    assert _shared([of(each), of(grouped)]) == (3, 3 / 6)
-    assert _shared([of(grouped), of(each)]) == (1, 3 / 6)
-    assert _shared([of(each), of(each)]) == (6, 1.0)
+    assert _shared_data([of(each), of(grouped)]) == (3, 3 / 6)
+    assert _shared_data([of(grouped), of(each)]) == (1, 3 / 6)
+    assert _shared_data([of(each), of(each)]) == (6, 1.0)
 
 
 def test_a_refused_calibration_is_no_base_for_a_comparison(saved):

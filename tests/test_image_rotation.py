@@ -18,7 +18,7 @@ from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras import load_camera
 from pkmcal.identify.score import OneStepUpdate, ScoreTests
-from pkmcal.judge.new_data import _as_then
+from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.report.calibration import save
 from test_calibration import check_found
 
@@ -191,7 +191,7 @@ def test_new_photographs_are_taken_to_be_as_those_of_the_calibration_were(
     own, upright = turned_calibration.session.stations[0].camera, session.stations[0].camera
     right = turned_round(session, {"cameras/camera.yaml": own})
     for before, after in ((session, own), (right, own), (lens(session, (3.0, 3.0)), None)):
-        for station, was in zip(_as_then(saved, before), before.stations, strict=True):
+        for station, was in zip(_as_calibrated(saved, before), before.stations, strict=True):
             wanted = was.camera if after is None else after
             np.testing.assert_allclose(station.camera.parameters, wanted.parameters)
     assert not np.allclose(own.parameters, upright.parameters)

@@ -28,7 +28,7 @@ from pkmcal.cameras.response import levels_of_light, light_in, light_of_levels
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import bundle
-from pkmcal.judge.new_data import _as_then
+from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.observe.legs import measure
 from pkmcal.session.load import load_session
 from test_calibration import check_found
@@ -344,6 +344,6 @@ def test_new_photographs_are_measured_as_the_calibration_found_them_to_be(coded,
     coded.calibration.save(tmp_path / "calibration")
     saved = load(tmp_path / "calibration")
     assert {row["response"] for row in saved.document["stations"]} == {"srgb"}
-    fresh = _as_then(saved, load_session(coded.folder))
+    fresh = _as_calibrated(saved, load_session(coded.folder))
     assert {station.response for station in fresh} == {"srgb"}
     assert all(station.response_given for station in fresh)

@@ -151,6 +151,7 @@ def _lost_edges(
     level, behind = (
         part[edges.photographs] for part in (station.quality.level, station.quality.behind)
     )
+    # Causes of lost edges by the brightness of the leg and of its background.
     contrast = np.abs(level - behind)
     usual = contrast[edges.valid & np.isfinite(contrast)]
     usual = float(np.median(usual)) if usual.size else math.nan

@@ -93,6 +93,7 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
     photographs, broken = _decode_images(session)
     progress("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
+    # Images, readings, links and numbering of the legs.
     observed = _check_images(session, photographs, motion.poses, seed, progress)
     stations, joints = observed.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]

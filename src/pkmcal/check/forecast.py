@@ -139,6 +139,7 @@ def _planned_capture(inspection: Inspection, first: FirstEdges, photographs: int
     ones.
     """
     machine, stations = first.estimate.machine, inspection.stations
+    # The present share of extreme configurations, and whether stations share configurations.
     low, high = machine.joint_ranges.T
     margin = NEAR_END * (high - low)
     joints = inspection.session.joints
@@ -199,6 +200,7 @@ def _capture_information(capture: _Capture) -> _CaptureInformation:
     rig, machine = capture.rig, capture.rig.machine
     n_stations = len(rig.names)
     rng = np.random.default_rng(FORECAST_SEED)
+    # The problem of the joint estimate at the true state.
     measurements = rig.measured(capture.joints, capture.T_base_platform, capture.pairs, rng)
     edges = measurements.edges
     assembled, at_truth = rig.assembled(measurements, capture.T_base_platform)
@@ -206,14 +208,17 @@ def _capture_information(capture: _Capture) -> _CaptureInformation:
     info = Information(problem, at_truth)
     observed = np.flatnonzero(assembled.observed)
     poses, joints = capture.T_base_platform[observed], capture.joints[observed]
+    # J N^-1, and the variance of the platform's pose.
     by = tool_by_free(rig, problem, joints, poses)
     machine_part = problem.unknowns.machine
     spread = by @ info.covariance[0][machine_part]  # (K, 6, na)
     variance = np.sum(spread[..., machine_part] * by, axis=-1)
+    # Contributions of the rows of readings and edges, and of priors, to the variance.
     place = spread[:, 3:].reshape(-1, spread.shape[-1])
     rows = info.reduced.rows[0][:, : info.linear.value.shape[-1]]
     part = np.sum((rows @ place.T) ** 2, axis=-1)  # (K, r)
     prior = float(np.sum((info.linear.shared_by @ place.T) ** 2))
+    # Information of the rows on the machine in prior sigmas.
     tolerance = machine.parameters.tolerances_free()
     row_information = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
     at = assembled.places.edges

@@ -1,1 +1,1 @@
-"""The commands, one a module; heavy imports stand inside them, so that help comes at once."""
+"""Commands, one in each module; heavy imports are inside the functions, so that help is quick."""

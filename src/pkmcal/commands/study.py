@@ -44,7 +44,7 @@ def study(
     ] = None,
     as_json: console.Json = False,
 ) -> int:
-    """Tell by simulation how accurate calibrations would be."""
+    """Estimate by simulation how accurate calibrations would be."""
     from importlib.util import find_spec
 
     from pkmcal.files import check_own_folder, default_output

@@ -380,6 +380,7 @@ def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> Change
 
     alpha : false-alarm rate, the share of unchanged machines that are flagged.
     """
+    # Tests of the machine, of a common scale, and of each leg and kept station.
     (every, scale, *each), own, level = made_tests(evidence, machine)
     single = level.single(alpha)
     wholes, of_stations = each[: len(own)], each[len(own) :]
@@ -400,6 +401,7 @@ def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> Change
     )
     if not out.changed:
         return out
+    # Causes of a significant change, and what they do not explain.
     findings = explained(evidence, single_causes(machine, evidence), alpha)
     rest = _project_out(evidence, [f.suspect.cause for f in findings])
     rest = chi_square(rest, whole_machine(machine))

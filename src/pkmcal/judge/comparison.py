@@ -180,10 +180,12 @@ def compare_with_drawing(
     """
     observed = np.flatnonzero(prediction.observed)
     m = measurements.joints.shape[1]
+    # Covariance by noise, and derivatives, of the residuals at ``rows``.
     place = np.searchsorted(observed, rows)
     flat = (place[:, None] * m + np.arange(m)).reshape(-1)
     noise, by = prediction.noise[np.ix_(flat, flat)], prediction.by_machine[flat]
     weights = Weights.by(np.einsum("kikj->kij", noise.reshape(len(rows), m, len(rows), m)))
+    # Errors of both machines.
     calibrated = prediction.errors.of(rows)
     nominal = errors_on(
         drawing, measurements.joints[observed], prediction.T_base_platform[observed]
@@ -253,10 +255,12 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
     from scipy.special import chdtrc
 
     shape, covariance = residuals.shape, noise + machine
+    # Whitening of the directions with a variance.
     scale = np.sqrt(np.diag(covariance))
     eigenvalues, eigenvectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
     significant = eigenvalues > NULL_EIGENVALUE_SHARE * eigenvalues[-1]
     whiten = (eigenvectors[:, significant] / np.sqrt(eigenvalues[significant])).T / scale
+    # Chi-square of all residuals, and generalised least squares for their common offsets.
     white = whiten @ residuals.reshape(-1)
     design = whiten @ np.tile(np.eye(shape[1]), (shape[0], 1))
     spread = np.linalg.pinv(design.T @ design)
@@ -285,10 +289,10 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
 class Weights:
     """Weights of residuals by the observability of each configuration's readings in the images.
 
-    Unweighted root mean squares are dominated by the direction that an image determines worst,
-    depth, in which any two machines look alike. matrices : (n, m, m); the mean of their traces is
-    m, so units are kept. floor : weighted root mean square of a perfect machine's residuals, m or
-    rad.
+    matrices : (n, m, m); the mean of their traces is m, so units are kept. floor : weighted root
+    mean square of a perfect machine's residuals, m or rad. Unweighted root mean squares are
+    dominated by the direction that an image determines worst, depth, in which any two machines are
+    similar.
     """
 
     matrices: Array

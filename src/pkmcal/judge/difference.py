@@ -155,6 +155,7 @@ def difference(
     """
     one, other = _compared_machine(a), _compared_machine(b)
     _check_same_machine(one, other)
+    # Correlation of two calibrations: common data, and a common nominal model.
     both = [side.saved for side in (one, other) if side.saved is not None]
     shared, share = _shared_data(both)
     one_drawing = len(both) == 2 and _same_nominal_model(*both)
@@ -176,6 +177,7 @@ def difference(
         )
     except PkmcalError as error:
         tool = f"There is no map of the workspace: {error}"
+    # Significance of the change, as a whole and by parameter.
     chance, chances = _p_values(change)
     least = float(np.nanmin(chances, initial=1.0))
     held = (change.sigma <= SAME_NUMBER_DIFFERENCE) & (

@@ -189,6 +189,7 @@ def hold(
     still = still.with_values(problem.theta(state)[0])
     if data_weights is None or magnified is None:
         return Held(still, assembled.observed, problem, state, ("machine",))
+    # The same solution in a problem with magnifications, which are zero there.
     opened = assemble(still, magnified, default_gauge(still), shading=data_weights.shading)
     problem = opened.trusting(data_weights.weights)
     state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))

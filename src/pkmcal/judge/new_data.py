@@ -78,13 +78,13 @@ def measured_new_data(
     the progress.
     """
     return calibrate_session(
-        replace(session, machine=saved.machine, stations=_stations_as_calibrated(saved, session)),
+        replace(session, machine=saved.machine, stations=_as_calibrated(saved, session)),
         seed=seed,
         progress=lambda text, part: progress(text, share * part),
     )
 
 
-def _stations_as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
+def _as_calibrated(saved: SavedCalibration, session: Session) -> tuple[Station, ...]:
     """Stations with the camera response and the half turn of images that the calibration found.
 
     The session's own response has precedence. A few new images determine both worse.
@@ -105,6 +105,7 @@ def _stations_as_calibrated(saved: SavedCalibration, session: Session) -> tuple[
         )
         response = responses.get(next(names, station.name))
         has_response = response is not None and not station.response_given
+        # Turn the images by half where the calibration had to.
         camera = station.camera
         turned_camera = turned.get(station.camera_file)
         # otherwise the file has been corrected since, or is another one

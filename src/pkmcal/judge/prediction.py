@@ -200,6 +200,7 @@ def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
     covariance of E P y is ``H - less H H``, in a form without differences of nearly equal numbers.
     """
     n, m = along.shape[:2]
+    # Blocks of each configuration, and the low-rank part that all share.
     block = (np.eye(m) - along) @ ((1 - less) * np.eye(m) + less * along)
     flat = beside.reshape(n * m, -1)
     inner = less * (np.eye(flat.shape[1]) - flat.T @ flat) - (1 - less) * np.eye(flat.shape[1])
@@ -268,8 +269,10 @@ def closing_frame_changes(
         own = e @ poses @ inverse(f)
         internal = inverse_result(machine.layout, machine.values, own)[1]
         c = closure(machine.layout, machine.values, joints, own, np.nan_to_num(internal))
+        # Linearized closure by both frame changes.
         jac, value = c.rows.by_pose @ pose_generators(own), c.rows.value
         if machine.layout.n_internal:
+            # eliminate the hinges
             q = np.linalg.qr(c.rows.by_internal)[0]
             rest = np.eye(q.shape[-2]) - q @ q.mT
             jac, value = rest @ jac, (rest @ value[..., None])[..., 0]

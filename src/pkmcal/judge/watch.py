@@ -134,6 +134,7 @@ def watch_machine(
         check_new(calibrated, observed, *NOTHING_NEW)
 
         report("Testing for changes", 0.9)
+        # Weights and noise of the new data, with the machine free; then the fit with it fixed.
         old = saved.document.get("statistics") or {}
         factors = ("noise_scale", "pose_scale", "link_scale")
         before = Kinds(*(float(old.get(name, 1.0)) for name in factors))

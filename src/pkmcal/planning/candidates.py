@@ -36,10 +36,6 @@ varied.
 """
 NEIGHBOURS_TRIED_EACH = 6
 """Number of variations of each chosen configuration."""
-DRAWN_FOR_EACH_WANTED = 3
-"""Number of configurations drawn for each wanted one: some are singular, folded, or have legs that
-touch.
-"""
 
 
 class Configurations(NamedTuple):
@@ -76,12 +72,14 @@ def neighbours(
     poses = np.repeat(chosen.T_base_platform, NEIGHBOURS_TRIED_EACH, axis=0)
     low, high = machine.joint_ranges.T
     if np.isfinite(machine.joint_ranges).all():
+        # vary the readings within the ranges
         step = NEIGHBOUR_RANGE_SHARE * (high - low)
         ends = [low + share * (high - low) for share in READING_RANGE_SHARES]
         wanted = np.clip(joints + rng.uniform(-1, 1, joints.shape) * step, *ends)
         fk = machine.forward_result(wanted, poses)
         poses = fk.T_base_platform[fk.converged]
     else:
+        # vary the poses within the machine's motion
         size = float(np.ptp(chosen.T_base_platform[:, :3, 3], axis=0).max())
         unit = np.array([NEIGHBOUR_RANGE_SHARE] * 3 + [NEIGHBOUR_RANGE_SHARE * size] * 3)
         motion = machine.layout.motion

@@ -157,12 +157,14 @@ def first_edges(
             edges, session.joints, session.joint_noise, len(images), numbers, shaded=True
         )
 
+    # Coarse edges by a search from the nominal model, and an estimate by them.
     passes = legs.search_stations(placed_at(images, T_camera_base, poses), machine)
     coarse = replace(measurements(concatenate([one.edges for one in passes])), shaded=False)
     # The accuracy of the search is a pixel, so its noise is not estimated.
     start = start_state(machine, coarse, T_camera_base)
     estimate = bundle(machine, coarse, start, scale_noise=False)
     state = estimate.state
+    # One measurement pass from there, and the final estimate.
     placed = placed_at(images, state.T_camera_base, state.T_base_platform)
     passes = legs.measure_stations(placed, estimate.machine, {})
     fine = measurements(concatenate([one.edges for one in passes]))
@@ -180,6 +182,7 @@ def _edge_information(
     machine, state = estimate.machine, estimate.state
     tubes = tubes_of(machine)
     n_edges, n_legs = len(tubes), machine.n_legs
+    # Exact edges of the estimate, in the order of ``tubes_of``.
     number = np.full((n_legs, int(tubes.tube.max()) + 1, 2), -1)
     number[tubes.leg, tubes.tube, tubes.side] = np.arange(n_edges)
     pairs = np.array([(p.station, k) for p in images for k in p.configuration])

@@ -167,9 +167,11 @@ def information_of(
     assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
     directions, u = machine_directions(machine, problem), problem.unknowns
+    # Rows of each candidate, its platform pose eliminated.
     reduced = eliminate(problem.linearize(state)).rows[0]
     rows = np.zeros((len(joints), *reduced.shape[1:]))
     rows[assembled.observed] = reduced  # candidates that show nothing have no information
+    # Prior information: of the nominal model, stations and mounts, or of an earlier calibration.
     prior = problem.prior
     if calibration_prior is not None:  # it includes the nominal model's priors
         prior = prior[~prior[:, u.machine].any(axis=1)]
@@ -237,6 +239,7 @@ def _prior_information(
     to_free = np.zeros((u.n_free + 6 * len(fixed_stations), n + 6 * len(fixed_stations)))
     to_free[: u.n_free, :n] = problem.structure.to_free
     to_free[u.n_free :, n:] = np.eye(6 * len(fixed_stations))
+    # Variance of frame changes, which move the machine and its kept stations together.
     frames = conventions(machine)
     frame_changes = [directions.span]
     if len(fixed_stations):
@@ -246,6 +249,7 @@ def _prior_information(
     size = np.append(machine.parameters.tolerances_free(), np.ones(6 * len(fixed_stations)))
     share = frame_changes / size[:, None]
     frame_changes = frame_changes / np.maximum(np.linalg.norm(share, axis=0), 1e-12)
+    # Inverse of the covariance, in units of prior sigmas.
     spread = to_free @ prior.covariance @ to_free.T + frame_changes @ frame_changes.T
     eigenvalues, eigenvectors = np.linalg.eigh(spread / np.outer(size, size))
     half = eigenvectors / np.sqrt(np.maximum(eigenvalues, DIRECTION_VARIANCE_FLOOR)) / size[:, None]

@@ -164,6 +164,7 @@ def plan_measurements(
     _check(rig, count, index, free_places, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
+    # Candidate configurations, by which stations are chosen first, if they are free.
     candidates = configurations(
         rig.machine, max(PLAN_CANDIDATES, CANDIDATES_FOR_EACH_WANTED * count), rng
     )
@@ -181,6 +182,7 @@ def plan_measurements(
         together = len(rig.names) > 1 and several
     stations = range(len(rig.names))
     groups = (tuple(stations),) if together else tuple((s,) for s in stations)
+    # The best configurations for these stations.
     selection = _Selection(rig, subject.prior, groups, count, index, work)
     pool = selection.pool(Candidates.of_all(groups, *candidates))
     chosen = selection.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
@@ -245,8 +247,10 @@ class _Selection:
     def chosen(self, pool: _Pool, rng: np.random.Generator, progress: ShareProgress) -> Candidates:
         """Best candidates of a pool, improved locally."""
         index = PLAN_INDICES[self.index](pool.info)
+        # Global choice among the candidates.
         first = greedy(pool.info, self.count, index, lambda x: progress(0.4 * x)).chosen
         best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
+        # Local improvement, until a round gains too little.
         size = np.inf
         for k in range(BETTERING_ROUNDS):
             progress(0.5 + 0.5 * k / BETTERING_ROUNDS)
@@ -301,6 +305,7 @@ def _routed_plan(
     # edges with drawn rather than mean information, as real images have
     own = selection.pool(chosen, np.random.default_rng(PLAN_SEED)).info
     index, every = PLAN_INDICES[selection.index](own), np.arange(len(chosen.group))
+    # Accuracy by number of configurations, in the greedy order, and beyond the plan.
     nested = greedy(own, count, index)
     curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
     covariance = own.covariance(own.of(every))
@@ -448,6 +453,7 @@ def _with_stations(
         wide, poses = _on_sphere(rig)
     else:
         wide, poses = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
+    # Rows of the same few configurations from each station.
     few = np.unique(np.linspace(0, len(candidates.joints) - 1, FOR_PLACES).astype(int))
     part = Configurations(*(x[few] for x in candidates))
     machine_prior = subject.prior and subject.prior.only(())

@@ -108,6 +108,7 @@ class BoardFrom:
         visible = self._visible_corners(
             At(at.machine, at.joints[rows], at.T_base_platform[rows]), T, there
         )
+        # Information of the visible corners on (omega, tau) of the board's pose.
         by_point = self.camera.project_jacobians(there)[0]
         by_pose = np.concatenate([-by_point @ skew(there - T[:, None, :3, 3]), by_point], axis=-1)
         by_pose = np.where(visible[..., None, None], by_pose, 0.0) / self.sigma

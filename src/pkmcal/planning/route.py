@@ -44,11 +44,13 @@ def shortest_path(
     cost = np.zeros((n + 1, n + 1))
     cost[:n, :n] = apart + (0.0 if barred is None else barred * (apart.max() * n + 1.0))
     cost[n, :n] = 0.0 if first is None else first
+    # Nearest neighbour.
     order, remaining = [n], np.ones(n, dtype=bool)
     while remaining.any():
         rest = np.flatnonzero(remaining)
         order.append(int(rest[np.argmin(cost[order[-1], rest])]))
         remaining[order[-1]] = False
+    # 2-opt and Or-opt.
     path = np.array([*order, n])
     for _ in range(ROUTE_CHANGES_A_POINT * n):
         gain, better = max(

@@ -97,6 +97,7 @@ def as_it_stands(
     InputError if the given calibration is not usable, or if ``same_place`` is set without a
     calibration.
     """
+    # The session's own calibration is the default.
     saved: SavedCalibration | None = None
     if (
         after is None
@@ -155,6 +156,7 @@ def of_machine(
     if tracker is not None:
         rig = _tracker_rig(machine, tracker, joint_noise)
         return Subject(rig, None, tuple(columns), (), (noise + ", as told.",))
+    # Stations at default poses, which observe legs or a board.
     cameras = tuple(cameras)
     stations = default_stations(machine, cameras, rng, "platform" if board else None)
     T_camera_base = np.stack([place.T_camera_base() for place in stations])

@@ -133,6 +133,7 @@ class SimulatedCalibrations:
         measurements.
         """
         design, rng = self.design, batch.generator(0)
+        # Truth and readings; one problem with the structure of the plan for all runs.
         capture = captured(design, batch.generator(PHOTOGRAPH_PLAN_STREAM))
         theta, poses, internal = _machines(design, capture, batch.runs, rng)
         readings = capture.joints + design.reading_noise * rng.standard_normal(
@@ -147,6 +148,7 @@ class SimulatedCalibrations:
         pose_data = problem.pose_data
         if len(capture.views):
             pose_data = _measured_boards(design, capture, template, poses, rng)
+        # Start of the estimate, and the priors of the mounts there.
         off = STATION_START_SIGMAS * rng.standard_normal((batch.runs, len(capture.cameras), 6))
         stations = perturb(capture.T_camera_base, off)
         problem = replace(problem, data=data, pose_data=pose_data)
@@ -344,6 +346,7 @@ def _machines(
     internal = np.empty((runs, *start.internal.shape))
     remaining = np.arange(runs)
     for _ in range(TIMES_MACHINES_REDRAWN):
+        # Draw the remaining machines, and keep those that close at all readings.
         step = tolerance * rng.standard_normal((len(remaining), len(tolerance)))
         theta[remaining] = table.unit_axes(table.drawing + step @ free.T)
         fk = forward(
@@ -464,6 +467,7 @@ def _measured_boards(
     information = np.empty((*true.shape[:2], 6, 6))
     for number, camera in enumerate(capture.cameras):
         own = np.flatnonzero(station == number)
+        # Information of the visible corners on (omega, tau) of the board's pose.
         points = apply(true[:, own][:, :, None], capture.board.points)
         arm = points - true[:, own][:, :, None, :3, 3]
         by_point, _ = camera.project_jacobians(points)
@@ -471,6 +475,7 @@ def _measured_boards(
         by_pose = np.where(capture.corners[own][..., None, None], by_pose, 0.0)
         by_pose = by_pose.reshape(*by_pose.shape[:2], -1, 6) / design.corner_noise
         information[:, own] = by_pose.mT @ by_pose
+    # Draw poses with the covariance of the corners' noise.
     covariance = np.linalg.inv(information)
     covariance = 0.5 * (covariance + covariance.mT)
     root = np.linalg.cholesky(covariance)

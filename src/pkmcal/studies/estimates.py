@@ -117,6 +117,7 @@ def tool_errors(
     Base and tool frames are registered for the best fit, since a calibration determines them too.
     turn, shift : rad and m that have equal weight in the registration.
     """
+    # Register base and tool frames of all runs, then take the remaining differences.
     fk = forward(layout, theta[..., None, :], at.readings, at.poses).T_base_platform
     still = np.broadcast_to(np.eye(4), (len(fk), 4, 4))
     weight = np.ones(fk.shape[:2])

@@ -261,6 +261,7 @@ def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
     good = values["failed"] == 0
     groups = len(np.unique(batch[good]))
 
+    # Figures of the runs that did not fail.
     def summed(name: str) -> Summary:
         return clustered(values[name][good], batch[good])
 
@@ -269,6 +270,7 @@ def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:
         root = float(np.sqrt(square.value))
         return Summary(root, square.error / (2 * max(root, 1e-300)))
 
+    # Errors and standard deviations of parameters (e, s) and of the tool (t, st).
     e, s = values["parameters"][good], sigma["parameters"][good]
     t, st = values["tool"][good], sigma["tool"][good]
     parts = t.reshape(*t.shape[:-1], 2, 3)

@@ -153,6 +153,7 @@ class HexapodByAxes:
         """Draw true machines in the study's gauge, with poses by their readings."""
         machine, rng = hexapod_with_held_radii(), batch.generator(0)
         table = machine.parameters
+        # Uniform errors of all parameters but the radii, projected onto the gauge.
         error = spread_evenly(rng, (batch.runs, len(table)), self.drawing_error)
         error *= np.array(table.kinds) != "radius"
         held = ThreeCentres().constraints(machine)
@@ -474,6 +475,7 @@ def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator)
         for p in (theta, data.theta)
     )
     base, platform = centre_index(machine.layout)
+    # Frame changes of base and platform by registration on all centres.
     e = register(theta[:, base], data.theta[:, base])[:, None]
     f = register(theta[:, platform], data.theta[:, platform])[:, None]
     b1 = data.theta[:, None, platform[0]]  # the gauge holds A1 and B1 at their nominal values
@@ -499,6 +501,7 @@ def _tool(machine: Machine, true: Array, fit: Fitted, rng: np.random.Generator) 
         for theta in (fit.theta, true)
     )
     off = pose_difference(there, T_true)
+    # Derivatives of the pose by the parameters, from the closure's.
     c = closure(layout, fit.theta[:, None], readings, there)
     by = layout.own_motion @ np.linalg.solve(by_own(layout, c.rows), dense(c, true.shape[1]))
     if fit.covariance is None:

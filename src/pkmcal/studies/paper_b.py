@@ -55,7 +55,7 @@ MIRROR_VIEW, PERSPECTIVE_VIEW = "mirror", "perspective"
 PLAIN_REGRESSION, HUBER_REGRESSION, TUKEY_REGRESSION = "plain", "huber", "tukey"
 LEAST_MEDIAN_REGRESSION, ROBUST_REGRESSION = "least-median", "robust"
 SCALED_BY_RATIO, SCALED_BY_SIMILARITY = "eq. 16", "similarity"
-PAPER_B_JOINT, PAPER_B_DRAWING = "joint", "drawing"
+PAPER_B_JOINT = "joint"
 PAPER_B_REGRESSIONS: tuple[linear.RegressionMethod, ...] = (
     PLAIN_REGRESSION,
     HUBER_REGRESSION,
@@ -164,6 +164,7 @@ class HexapodByLegs:
         pixel = camera.project(truth)
         out: dict[Key, Sample] = {}
         for key, fit in fits.items():
+            # Error in the camera's frame, and distance from the registered nominal centres.
             centres = fit.extra["centres"]
             off = centres - truth
             T = register(np.broadcast_to(nominal, centres.shape), centres)

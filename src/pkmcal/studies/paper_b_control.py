@@ -59,6 +59,7 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     eye = Eye.of(true, view.camera)
     runs = len(centres)
     rng = np.random.default_rng(seed)
+    # Assumptions: the truth, cameras placed by hand, and both estimates by edges.
     exact = Uncertainty(np.zeros((len(machine.values),) * 2), np.zeros(3), np.zeros(3))
     beliefs: dict[str, Belief] = {}
     for name, (position, degrees) in CAMERA_BY_HAND_ERRORS.items():
@@ -74,6 +75,7 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     fitted = register(np.broadcast_to(nominal.base_centers(), centres.shape), centres)
     as_drawn = np.broadcast_to(nominal.values, theta.shape)
     beliefs[E1] = _belief(E1, "Drawing, fitted", true, as_drawn, fitted)
+    # The same motion with each of them.
     start, goal = (
         np.broadcast_to(machine.forward(q), (runs, 4, 4))
         for q in (CONTROL_START_READINGS, CONTROL_GOAL_READINGS)

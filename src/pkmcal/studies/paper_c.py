@@ -185,6 +185,7 @@ class H4ByBoard:
         out: dict[Key, Sample] = {}
         for (kind, name, method), fit in fits.items():
             machine = model(kind_of(name))
+            # Errors of the tool over the measured volume and the larger workspace.
             one, other = (
                 tool_errors(machine.layout, fit.theta, at, self.turn, self.shift)
                 for at in (near, far)
@@ -195,6 +196,7 @@ class H4ByBoard:
                 "larger_shift": other.shift, "larger_turn": other.turn,
             }  # fmt: skip
             if papers and method != PAPER_C_BOUND:
+                # The paper's validation.
                 off = control_residuals(machine, fit, data)
                 figures |= {
                     "control_mean": off.mean(axis=1),

@@ -98,12 +98,14 @@ def simulate_runs(
     camera = view.T_camera_base[view.station]
     axis, board = np.zeros((runs, count, 0, 4)), np.zeros((runs, 0, 4, 4))
     if view.legs.size:
+        # Axes of the observed legs.
         ends = limb_ends(machine.layout, theta[:, None], readings, T_base_platform)
         k = np.arange(count)[:, None]
         a, b = (apply(camera[:, None], p[:, k, view.legs]) for p in (ends.a, ends.b))
         axis = to_coordinates(a, b)
         axis = axis + noise.axis * rng.normal(size=axis.shape)
     if view.T_platform_board is not None:
+        # Poses of the board.
         off = noise.pose * rng.normal(size=(runs, count, 6))
         board = perturb(camera @ T_base_platform @ view.T_platform_board, off)
     if noise.even:
@@ -162,6 +164,7 @@ def joint_problem(
     template, at = assembled.problem, assembled.places.edges
     blocks, edge_data = template.blocks, replace(template.data, joints=data.joints[:, :n])
     if data.view.legs.size:
+        # Each axis as two whitened edges.
         axis = data.axis.reshape(len(data.axis), -1, 4)
         radius = machine.parameters.drawing[blocks.radius[at.row, at.place]]
         whitened = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))

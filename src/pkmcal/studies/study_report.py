@@ -296,6 +296,7 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
         x = [value if isinstance(value, str) else float(value) for value in values]
         data: list[dict[str, Any]] = []
         if len(groups) > MOST_LINES:
+            # too many curves: one of the means
             means = [study.at(name, value) for value in values]
             bars = {"type": "data", "array": [2e3 * s.error for s in means]}
             y = [1e3 * s.value for s in means]

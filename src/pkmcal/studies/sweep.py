@@ -295,6 +295,7 @@ def _paper_setting(setting: JointByAxes, values: Mapping[str, Value]) -> JointBy
 
 def _design(design: Design, values: Mapping[str, Value]) -> Design:
     """Design with other values; stations are chosen anew if their poses no longer fit."""
+    # Stations and cameras.
     affects_stations = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
     if affects_stations:
         design = replace(design, T_camera_base=None)
@@ -307,6 +308,7 @@ def _design(design: Design, values: Mapping[str, Value]) -> Design:
         cameras = tuple(_resized(camera, int(values["resolution"])) for camera in cameras)
     if "focal" in values:
         cameras = tuple(_refocused(camera, float(values["focal"])) for camera in cameras)
+    # The machine, and values that are fields of the design.
     machine = design.machine
     if "size" in values:
         machine = scaled(machine, float(values["size"]))
