@@ -97,7 +97,7 @@ class DirectionTables:
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
             write_distances(place[taken_in.take(number)], table)
-  # many images in one operation, for threads wait for each other in Python
+        # many images in one operation, for threads wait for each other in Python
         for first in range(0, len(self.place), rows):
             tables = self.picture[: len(self.place) - first, :, first // rows, direction]
             counted += _counted(tables)
