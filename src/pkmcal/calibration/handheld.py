@@ -48,7 +48,7 @@ MISPLACED_PROBABILITY = 0.05
 """Largest probability that any image of a session is accepted with a wrong pose."""
 CANDIDATES_SCORED_AGAIN = 4
 """Number of an image's best poses that are always scored again with a better known machine,
-whatever the localization by itself says: a wrong pose corrupts the estimate."""
+whatever their score by the image alone: a wrong pose corrupts the estimate."""
 RESCORING_GROWTH = 1.25
 """Ratio by which the number of images that determine the machine must grow before the poses of
 an image are scored anew."""

@@ -115,10 +115,7 @@ def spread(points: Array, n: int) -> Integers:
 
 
 def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
-    """The n regions of configurations ``rows`` at points (k, 6), see :func:`points_of_poses`.
-
-    Fewer than n where a cluster is empty.
-    """
+    """The n regions of configurations ``rows`` at points (k, 6) of :func:`points_of_poses`."""
     owner = clusters(points, n)
     scale = points.std(axis=0)
     scale = np.where(scale > 1e-6, scale, np.inf)  # a coordinate that is constant
@@ -131,8 +128,7 @@ def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
 
 
 def _named(middle: Array) -> str:
-    """Name of a region by the two directions of its largest offsets (6,), in standard deviations.
-    """
+    """Name of a region by the directions of its two largest offsets, (6,) standard deviations."""
     order = np.argsort(-np.abs(middle))[:2]
     words = [
         REGION_DIRECTION_NAMES[k][int(middle[k] > 0)]

@@ -41,8 +41,8 @@ FEWEST_POINT_PAIRS = 16
 matches cannot be estimated from fewer."""
 MACHINE_OUTLINE_FACTOR = 1.5
 """Size of the image region that may belong to the machine, relative to the outline of its
-joints: plates, motors and cables extend beyond the joints, and the nominal model does not say
-how far."""
+joints: plates, motors and cables extend beyond the joints, to an extent that the nominal model
+does not contain."""
 EPIPOLAR_SPREADS = np.radians([0.1, 0.25, 0.6])
 """Standard deviations (rad) of points about their epipolar planes, of which the likeliest is
 used: from the localization error of a feature to the camera rotation that a nominal model wrong

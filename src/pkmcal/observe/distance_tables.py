@@ -158,7 +158,7 @@ class DistanceTables:
         (..., 2).
 
         The derivatives, per full-size pixel, are central differences over a reduced pixel to each
-        side. The third array says which pixels lie in the image.
+        side. The third array is the mask of the pixels in the image.
         """
         import cv2
 

@@ -26,8 +26,8 @@ LEAST_OWN = 0.05
 """Smallest weight with which a sample is used: lower ones contribute little, and a higher limit
 would make edges appear and disappear from one measurement pass to the next."""
 WIDEST_SCATTER = 2.0
-"""Largest scatter of silhouettes about image edges, in reduced pixels, where the machine is
-known to a few pixels."""
+"""Largest scatter of silhouettes about image edges, in reduced pixels, once the machine is
+accurate to a few pixels."""
 
 
 def silhouette_edges(

@@ -161,7 +161,7 @@ def find_station(
     """Camera pose of a station near a rough pose, or anywhere.
 
     The pose is searched in half of the images or, with few, in all but one or two, and tested on
-    the held-out ones, in turns; then it is refined on all images.
+    the held-out ones; each part is held out in turn. Then the pose is refined on all images.
 
     T_camera_base : rough pose (4, 4); None searches everywhere.
     near_prior : also try perturbed poses where the likeliest are all the same, as in a search
