@@ -53,6 +53,7 @@ RESCORING_GROWTH = 1.25
 """Ratio by which the number of images that determine the machine must grow before the poses of
 an image are scored anew."""
 EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
+"""Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
 CAMERA_TURNED_REASON = "all photographs together turn its camera by more than ten degrees"
 """Reason for rejecting an image that has a single candidate pose and does not belong there."""
 MOST_TURN = SAME_PLACE_TURN / 2
@@ -506,6 +507,7 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
     """
     session, scene = case.session, case.scene
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
+    # no hand-held image or one configuration only is an error
     if by_hand and lost.keys() >= set(by_hand):
         raise InputError(
             "the machine is recognised in none of the photographs by hand",
@@ -516,6 +518,7 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
             next_step="Check that these photographs show this machine's legs, large and sharp, that"
             " each bears the name of its configuration, and that the drawing is this machine's",
         )
+    # new station numbers, and the parts of session, images, boards and scene
     retained = [k for k in range(len(session.stations)) if k not in lost]
     number = {k: new for new, k in enumerate(retained)}
     trackers = range(len(session.stations), len(scene.T_camera_base))

@@ -26,6 +26,7 @@ from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
 SESSION_FILE = "session.yaml"
+"""File that identifies a session's folder."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +168,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
             *(str(session_entry[key]) for key in ("folder", "digest") if key in session_entry),
         )
     )
+    # intrinsics of the stations whose camera files are available
     files = {station.name: station.camera for station in saved.stations}
     cameras = {
         name: load_camera(value)

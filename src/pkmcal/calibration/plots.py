@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CALIBRATED_COLOUR, DRAWING_COLOUR, QUIET_COLOUR = "#2a6fb0", "#b5651d", "#888888"
+"""Colours of the calibrated machine, of the nominal model, and of reference lines."""
 PARAMETER_ROW_HEIGHT = 0.17
 """Height of a parameter's row in inches."""
 RESIDUAL_PLOT_REACH = 5.0

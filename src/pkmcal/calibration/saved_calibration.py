@@ -43,8 +43,10 @@ editing a millionth."""
 Sigma3 = tuple[float | None, float | None, float | None]
 """None where the data do not determine the number."""
 Row4 = tuple[float, float, float, float]
+"""Row of a 4x4 matrix."""
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Factor = Annotated[float, Field(gt=0)]
+"""Positive number."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +138,12 @@ class SavedCalibration(CalibrationSummary):
         document = self.document
         residuals = document.get("residuals") or {}
         edges, poses = (residuals.get(key) or () for key in ("edges", "poses"))
+        # residuals of inlying edges and poses
         parts = [
             [x for row in edges if row[EDGE_WEIGHT] >= 0.5 for x in row[EDGE_RESIDUALS]],
             [x for row in poses if row[POSE_WEIGHT] >= 0.5 for x in row[POSE_WEIGHT + 1 :]],
         ]
+        # statistics, if the file has all that have no default
         reference_values = {f.name for f in fields(Statistics)}
         statistics = {
             k: v for k, v in (document.get("statistics") or {}).items() if k in reference_values
@@ -244,6 +248,7 @@ class _Target(_Part):
 
 
 Numbers = tuple[float | None, ...]
+"""A row of residuals."""
 
 
 def _has_weight(columns: Sequence[str], fewest: int) -> AfterValidator:
@@ -290,6 +295,7 @@ class _Statistics(_Part):
 
 
 Ends = tuple[float, float] | None
+"""Lower and upper bound, m."""
 
 
 class _Region(_Part):
@@ -381,6 +387,7 @@ def load(source: Path | str) -> SavedCalibration:
     """
     document = _read(Path(source))
     saved = validated_document(document, _Saved)
+    # consistency of machine, poses, readings and covariance
     machine = checked_machine(_mechanism(saved), document, "mechanism")
     _check_parameters(document, saved, machine)
     for group, key in (

@@ -137,6 +137,7 @@ class CalibrationSummary(ABC):
     def _figures(self, values: Overview) -> list[tuple[str, str]]:
         """Names and values of the main figures."""
         out: list[tuple[str, str]] = []
+        # mean and largest tool error, after and before
         tool = self.tool_error(values.poses)
         for name, place, turn in (
             ("Tool, σ", tool.position, tool.orientation),
@@ -150,6 +151,7 @@ class CalibrationSummary(ABC):
                 out.append(
                     (name, f"{brief(float(place[finite].mean()) * 1e3)} mm{turned} ({where})")
                 )
+        # what determines the parameters
         kinds = [row.decided_by for row in self.parameters]
         parts = [f"{kinds.count(k)} by {text}" for k, text in
                  (("data", "the data"), ("drawing", "the drawing")) if k in kinds]  # fmt: skip

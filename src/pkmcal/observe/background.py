@@ -258,6 +258,7 @@ class Surroundings:
         """
         import cv2
 
+        # correspondences of the image's features and the landmarks
         rays: list[Array] = [np.zeros((0, 3))]
         points: list[Array] = [np.zeros((0, 3))]
         for other, reference_values in landmarks.items():
@@ -270,6 +271,7 @@ class Surroundings:
         ray, point = ray[ahead], point[ahead]
         if len(ray) < FEWEST_POINT_PAIRS:
             return np.zeros((0, 4, 4))
+        # P3P with RANSAC on normalized image coordinates, then refinement on the inliers
         plane = np.ascontiguousarray(ray[:, :2] / ray[:, 2:])
         off = float(np.tan(EPIPOLAR_SPREADS[-1]))
         ok, turn, shift, inside = cv2.solvePnPRansac(
