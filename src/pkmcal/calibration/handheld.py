@@ -108,7 +108,7 @@ def localize(
     photographs : images of all stations that observe legs.
     progress : called with the step as text and the share done.
     """
-    # stations on tripods, without which hand-held images are not searched
+    # stations on tripods first; if they fail, hand-held images are not searched
     fixed = [p for p in photographs if not session.stations[p.station].handheld]
     search = locate_stations(session, fixed, boards, rng, progress)
     places: dict[int, PoseHypotheses] = {}
@@ -340,7 +340,7 @@ def _search(
     """
     p, scene, placed, k = photograph, so_far.scene, so_far.placed, photograph.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
-    # reuse the scores unless the machine has changed
+    # localize anew with the first machine from images; reuse the scores of a similar machine
     if scene.prior is not None:
         if before.by is None:
             alone = _image_hypotheses(session, scene, p)
@@ -507,7 +507,7 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
     """
     session, scene = case.session, case.scene
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
-    # no hand-held image or one configuration only is an error
+    # an error if no hand-held image, or a single configuration, remains
     if by_hand and lost.keys() >= set(by_hand):
         raise InputError(
             "the machine is recognised in none of the photographs by hand",
