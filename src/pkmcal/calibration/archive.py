@@ -1,8 +1,7 @@
-"""An earlier result is kept when a new one takes its place: beside it, under its date.
+"""Archive of earlier results: a result that is about to be replaced is copied to a dated folder.
 
-The copy is made first, whole or not at all; then the new result takes the folder as it would any
-other. A run that is killed between the two leaves the earlier result twice, and the next one finds
-its copy there.
+The copy is made first and atomically; then the new result replaces the old one as usual. A run that
+is killed between the two leaves the earlier result twice, and the next run finds its copy.
 """
 
 from __future__ import annotations
@@ -23,18 +22,21 @@ def keep_earlier(
     document: str = CALIBRATION_DOCUMENT_FILE,
     page: str = CALIBRATION_REPORT_FILE,
 ) -> Path | None:
-    """Copy the result that ``folder`` holds into a folder beside it; returns that.
+    """Copy the result in ``folder`` to a folder beside it; returns that folder.
 
-    texts : the new result's by their files' names. document : the file by which a result is known;
-    page : the one that is made from it. None where there is no earlier one, or the new
-    one is the same but for how long it took: nothing needs keeping twice. The copy's name is the
-    folder's with the earlier result's date, as calibration-2026-11-23T1502; a second one of the
-    same minute ends in -2.
+    None without an earlier result, or if the new one is the same except for its timings. The copy's
+    name is that of the folder with the date of the earlier result, as calibration-2026-11-23T1502;
+    a second one in the same minute ends in -2.
+
+    texts : contents of the new result by file name.
+    document : file that identifies a result.
+    page : file that is made from the others, and is not compared.
     """
     folder = resolved(folder)
     names = entries(folder)
     if document not in names or _same(folder, names, texts, page):
         return None
+    # first free name, unless a copy exists already
     written = datetime.fromtimestamp((folder / document).stat().st_mtime)
     stem = f"{folder.name}-{written:%Y-%m-%dT%H%M}"
     number, place = 1, folder.with_name(stem)
@@ -50,7 +52,7 @@ def keep_earlier(
 
 
 def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page: str) -> bool:
-    """Whether the new result tells what the one in the folder does; pages are made from these."""
+    """Whether the new result equals the one in the folder, apart from the page made from it."""
     if {*names} - {page} != {*texts} - {page} or not _regular(folder, names):
         return False
     return all(
@@ -61,13 +63,13 @@ def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page
 
 
 def _comparable(name: str, content: str | bytes) -> object:
-    """What a file says, but for how long it took to find out."""
+    """Content of a file without the timings of the run."""
     raw = content if isinstance(content, bytes) else content.encode("utf-8")
     if name != CALIBRATION_DOCUMENT_FILE:
         return raw
     try:
         document = json.loads(raw)
-    except (ValueError, RecursionError):  # changed by hand, or cut short: kept all the same
+    except (ValueError, RecursionError):  # edited or truncated: compared as bytes
         return raw
     if isinstance(document, dict):
         document.pop("timings", None)
@@ -75,7 +77,7 @@ def _comparable(name: str, content: str | bytes) -> object:
 
 
 def _copied(folder: Path, names: list[str], place: Path) -> bool:
-    """Whether a folder holds these files already."""
+    """Whether a folder holds copies of exactly these files."""
     same = entries(place) == names and _regular(folder, names) and _regular(place, names)
     return same and all(
         (folder / name).read_bytes() == (place / name).read_bytes() for name in names
@@ -83,7 +85,9 @@ def _copied(folder: Path, names: list[str], place: Path) -> bool:
 
 
 def _regular(folder: Path, names: list[str]) -> bool:
-    """Whether all of these are files. What a link leads to is neither read nor copied: it may be
-    anything, in somebody else's session.
+    """Whether all of these are regular files.
+
+    The target of a link is neither read nor copied: it may be anything, including a file of another
+    session.
     """
     return all((folder / name).is_file() and not (folder / name).is_symlink() for name in names)

@@ -1,4 +1,4 @@
-"""What is known of a session before its edges are measured: where everything stands."""
+"""Prior scene of a session, and the case: session, images, boards and prior scene."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from pkmcal.session.load import Session
 
 
 class PriorScene(NamedTuple):
-    """The machine, T_camera_base (S, 4, 4) of the stations, NaN where one is not known, and
-    T_base_platform (K, 4, 4) of the configurations.
+    """Machine, stations and platform poses from which an estimate starts.
 
-    Of photographs by hand that have told the machine: edges, the silhouettes found in each, by its
-    station; told, what they and the drawing know of the machine together; scatter, by how much more
-    or less these edges scatter than each says. findings : notes on places that could not be tested.
+    T_camera_base : (S, 4, 4) of the stations, NaN where unknown.
+    T_base_platform : (K, 4, 4) of the configurations.
+    edges : silhouettes of each localized hand-held image, by station.
+    prior : marginal prior of the machine from these edges and the nominal model.
+    scatter : ratio of the scatter of these edges to their stated standard deviations.
+    findings : notes on poses that could not be tested.
     """
 
     machine: Machine
@@ -35,13 +37,16 @@ class PriorScene(NamedTuple):
 
     @classmethod
     def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> PriorScene:
-        """A drawing; of platforms the nearest poses, where it does not quite close."""
+        """Scene of the nominal model at the joint readings.
+
+        Where the nominal model does not close exactly, the nearest platform pose is used.
+        """
         return cls(machine, T_camera_base, machine.forward_result(joints).T_base_platform)
 
 
 class Case(NamedTuple):
-    """A session, the photographs of its stations that observe legs, the boards in all, and what is
-    known of machine, stations and platforms.
+    """A session with the images of its stations that observe legs, the boards in all images, and
+    the prior scene.
     """
 
     session: Session

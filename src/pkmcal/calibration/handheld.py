@@ -1,13 +1,15 @@
-"""Where all stations stand: those on a tripod as recognised, photographs by hand one by one.
+"""Localization of all stations: those on tripods jointly, hand-held images one by one.
 
-Each photograph by hand is searched by itself (:mod:`pkmcal.observe.image_localization`), for
-nothing but the machine joins it to others, and from the places that it could show it is looked at
-more closely (:mod:`pkmcal.calibration.pose_scoring`), the clearest first. A board on the base
-places those that see it beside one that is placed. Those that are sure tell the machine better than
-its drawing, and with that the others are asked, and asked again, until none is added. What stays
-unsure is left out and told, for one photograph in a wrong place spoils the rest; so is one in which
-legs cannot be measured where they should be, or of which the joint estimate gives up most edges: it
-was in a wrong place.
+Each hand-held image is localized by itself (:mod:`pkmcal.observe.image_localization`), because only
+the machine connects it to other images. Its candidate poses are then scored by the joint estimate
+(:mod:`pkmcal.calibration.pose_scoring`), beginning with the least ambiguous images. A board on the
+base connects the images in which it is visible.
+
+Images whose pose is certain determine the machine better than the nominal model does. With that
+machine the other images are scored, and scored again, until no image is added. Images that stay
+ambiguous are rejected with a reason, because a single wrong pose corrupts the estimate; so are
+images in which legs cannot be measured at their predicted positions, or most of whose edges the
+joint estimate rejects: their pose was wrong.
 """
 
 from __future__ import annotations
@@ -43,30 +45,32 @@ from pkmcal.session.load import Session
 from pkmcal.wording import brief, listed
 
 MISPLACED_PROBABILITY = 0.05
-"""Probability that any photograph of a session is believed to be where it is not."""
+"""Largest probability that any image of a session is accepted with a wrong pose."""
 CANDIDATES_SCORED_AGAIN = 4
-"""Places of a photograph that are asked about again, whatever the picture says to a machine that is
-known better: one in a wrong place spoils it."""
+"""Number of an image's best poses that are always scored again with a better known machine,
+whatever their score by the image alone: a wrong pose corrupts the estimate."""
 RESCORING_GROWTH = 1.25
-"""By what factor more photographs have told a machine when the others are asked all over again."""
+"""Ratio by which the number of images that determine the machine must grow before the poses of
+an image are scored anew."""
 EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
+"""Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
 CAMERA_TURNED_REASON = "all photographs together turn its camera by more than ten degrees"
-"""Why one is left out that was found in one place and does not belong there."""
+"""Reason for rejecting an image that has a single candidate pose and does not belong there."""
 MOST_TURN = SAME_PLACE_TURN / 2
-"""Turn (rad) from where a photograph was placed from which on it does not belong there."""
+"""Largest rotation (rad) by which the joint estimate may change the localized pose of an image."""
 FEWEST_LEGS, FEWEST_EDGES = 4, 4
-"""Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
-focal length are seven numbers: each edge tells two, and each leg little more, so of three legs none
-contradicts another that was taken for something else."""
+"""Fewest legs of an image, if the machine has so many, and fewest edges that determine its pose.
+Pose and focal length are seven numbers: each edge gives two, and each leg little more, so among
+three legs a wrong match contradicts none of the others."""
 
 
 @dataclass(frozen=True)
 class Localization:
-    """Where the stations of a session stand, by what their photographs show; nothing raised.
+    """Poses of all stations of a session, from their images; no error is raised.
 
-    recognition : of the machine in the photographs on tripods, None where none was searched. places
-    : that each photograph by hand could show, by its station's number. result : what is known,
-    without the rejected photographs by hand, or why nothing is.
+    recognition : of the machine in the images on tripods, None if none was searched.
+    places : pose hypotheses of each hand-held image, by station number.
+    result : the case without the rejected hand-held images, or the error if there is none.
     """
 
     recognition: Recognition | None
@@ -81,10 +85,10 @@ def localize_case(
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
 ) -> Case:
-    """Where all stations stand, as of :func:`localize`.
+    """Case with the poses of all stations, by :func:`localize`.
 
-    Raises `InputError`, or `ResultError`, where nothing tells where a station stands that is not by
-    hand, and where no photograph by hand is placed.
+    Raises `InputError` or `ResultError` if the pose of a station on a tripod is undetermined, or if
+    no hand-held image is localized.
     """
     value = localize(session, photographs, boards, rng, progress).result
     if isinstance(value, PkmcalError):
@@ -99,17 +103,19 @@ def localize(
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
 ) -> Localization:
-    """Where all stations stand; photographs by hand that are not found are rejected, with a reason.
+    """Poses of all stations; hand-held images that are not localized are rejected with a reason.
 
-    photographs : of all stations that observe legs. progress : called with the step in words and
-    the share done.
+    photographs : images of all stations that observe legs.
+    progress : called with the step as text and the share done.
     """
+    # stations on tripods first; if they fail, hand-held images are not searched
     fixed = [p for p in photographs if not session.stations[p.station].handheld]
     search = locate_stations(session, fixed, boards, rng, progress)
     places: dict[int, PoseHypotheses] = {}
     if search.error is not None:
         return Localization(search.recognition, places, search.error)
     scene = PriorScene.as_drawn(session.machine, search.T_camera_base, session.joints)
+    # hand-held images, and the reasons of those without a pose or with a contradictory one
     lost: dict[int, str] = {}
     if len(fixed) < len(photographs):
         places, scene = search_by_hand(session, photographs, boards, scene, progress)
@@ -120,6 +126,7 @@ def localize(
             turn = angle_between(scene.T_camera_base[k], places[k].T_camera_base[0])
             if turn > MOST_TURN and k in sure:
                 lost[k] = CAMERA_TURNED_REASON
+    # remove the rejected images
     case = Case(session, photographs, boards, scene)
     if len(fixed) < len(photographs):
         try:
@@ -136,14 +143,17 @@ def search_by_hand(
     scene: PriorScene,
     progress: CalibrationProgress | None = None,
 ) -> tuple[dict[int, PoseHypotheses], PriorScene]:
-    """The places that each photograph by hand could show, by its station's number; and what is
-    known with those that are believed, T_camera_base NaN for the others.
+    """Pose hypotheses of each hand-held image, by station number, and the scene with accepted
+    poses.
 
-    photographs : of all stations that observe legs. scene : by the drawing, T_camera_base of the
-    stations that are placed already, NaN for the others. progress : called with the step in words
-    and the share done.
+    T_camera_base of the scene is NaN for images without an accepted pose.
+
+    photographs : images of all stations that observe legs.
+    scene : of the nominal model, with T_camera_base of the stations localized already and NaN for
+        the others.
+    progress : called with the step as text and the share done.
     """
-    first = np.zeros(1, dtype=int)  # of a camera on a tripod it stands for all
+    first = np.zeros(1, dtype=int)  # one image represents a camera on a tripod
     at = {p.station: p.select(first) for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
@@ -166,11 +176,12 @@ def search_by_hand(
         return _believed(hypotheses(), len(by_hand), boards, scene.T_camera_base)
 
     with ThreadPoolExecutor(THREADS) as pool:
+        # each image by itself
         alone = pool.map(partial(_image_hypotheses, session, scene), [at[k] for k in by_hand])
         for k, one in zip(by_hand, alone, strict=True):
             answers[k] = _CachedHypotheses(one, one)
             step(f"Placing photographs by hand: {len(answers)} of {len(by_hand)}", 0.2)
-        # the clearer half tells a machine, with which the others are asked
+        # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = (len(clearer) + 1) // 2
         step(f"Asking the {half} clearest of {len(by_hand)} photographs", 0.25)
@@ -178,6 +189,7 @@ def search_by_hand(
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
         step(f"Asking the others, with {len(so_far.placed)} photographs placed", 0.25)
         rescore(clearer[half:])
+        # join the images of a board, and repeat until no image is added
         for k, one in _on_board(hypotheses(), boards).items():
             answers[k] = replace(answers[k], places=one)
         before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
@@ -204,7 +216,7 @@ def _untested(
     answers: Mapping[int, _CachedHypotheses],
     T_camera_base: Array,
 ) -> Iterator[Finding]:
-    """Notes on what could not be tested, of the photographs that have no place in the end."""
+    """Notes on candidate poses that could not be tested, for images without a pose in the end."""
     if so_far.failure:
         yield note("image.not_taken_together", why=so_far.failure.rstrip("."))
     for k, answer in answers.items():
@@ -215,10 +227,13 @@ def _untested(
 
 
 class _LocalizationState(NamedTuple):
-    """What is known when a photograph is asked: the scene, the photographs that are placed, and
-    what they show of the room; bare : those in which too few legs can be measured from where they
-    were believed to be. failure : why the last photographs that were believed could not be taken
-    together with the others.
+    """State in which images are scored.
+
+    scene : with the machine estimated so far.
+    placed : images with accepted poses.
+    landmarks : background points of these images.
+    bare : images in which too few legs can be measured at their assumed pose.
+    failure : why the images accepted last could not be estimated together with the others.
     """
 
     scene: PriorScene
@@ -230,11 +245,13 @@ class _LocalizationState(NamedTuple):
 
 @dataclass(frozen=True)
 class _CachedHypotheses:
-    """What is known of the places of one photograph.
+    """Hypotheses of one image, cached with the state in which they were scored.
 
-    hypotheses : by the search in it alone. places : weighed with all that is known. scores : what
-    was found out of them, None where they were not asked about. by : the machine that was known
-    then, None where it was as drawn; beside : how many photographs had told it.
+    hypotheses : by localization from the image alone.
+    places : weighted by everything known.
+    scores : by the joint estimate, None before it.
+    by : marginal prior of the machine at that time, None for the nominal model.
+    beside : number of images that determined the machine.
     """
 
     hypotheses: PoseHypotheses
@@ -252,7 +269,10 @@ def _with_sure(
     believed: Array,
     boards: Boards,
 ) -> _LocalizationState:
-    """What is known with all photographs that are believed; the same where there are no others."""
+    """State with all accepted images registered; unchanged without new ones.
+
+    believed : T_camera_base (S, 4, 4), NaN for images without an accepted pose.
+    """
     scene = so_far.scene
     sure = {k: T for k, T in enumerate(believed) if k in photographs and not np.isnan(T).any()}
     new = {k: T for k, T in sure.items() if k not in scene.edges}
@@ -260,7 +280,7 @@ def _with_sure(
         return so_far
     try:
         joined = register_images(session, photographs, scene, new, boards)
-        # silhouettes are found anywhere; legs can be measured where they are
+        # silhouettes match anywhere, legs can be measured at the correct pose only
         bare = frozenset(
             k
             for k in new
@@ -276,6 +296,7 @@ def _with_sure(
         scene = joined
     except PkmcalError as error:
         return so_far._replace(failure=str(error))
+    # legs and landmarks of all accepted images with the new machine
     placed: dict[int, Neighbour] = {}
     for k in sorted(scene.edges):
         p, T = photographs[k], scene.T_camera_base[k]
@@ -284,7 +305,7 @@ def _with_sure(
 
 
 def _too_few_edges(scene: PriorScene, photograph: Photographs) -> bool:
-    """Whether too few legs can be measured in a photograph where it is."""
+    """Whether fewer legs than FEWEST_LEGS can be measured in an image at its pose."""
     p, machine = photograph, scene.machine
     T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
@@ -294,7 +315,7 @@ def _too_few_edges(scene: PriorScene, photograph: Photographs) -> bool:
 def _image_hypotheses(
     session: Session, scene: PriorScene, photograph: Photographs
 ) -> PoseHypotheses:
-    """The places of a photograph by the search in it alone."""
+    """Pose hypotheses from one image alone."""
     p = photograph
     view = StationView(
         scene.machine, p.camera, p.configuration, session.joints, scene.T_base_platform,
@@ -310,24 +331,28 @@ def _search(
     photograph: Photographs,
     before: _CachedHypotheses,
 ) -> _CachedHypotheses:
-    """The places that a photograph could show, those of before among them, weighed by its legs and
-    by what it shares of the room with those that are placed.
+    """Pose hypotheses of an image, weighted by its legs and by the background.
 
-    As soon as photographs have told a machine, it is searched again, once, with that: later ones
-    change it by little. Places that were asked with a machine like this one are not asked again.
+    The background is compared with that of the images with accepted poses; earlier hypotheses are
+    among the candidates. Once images have determined the machine, the image is localized by itself
+    once more; later images change the machine little. Poses that were scored with a similar machine
+    are not scored again.
     """
     p, scene, placed, k = photograph, so_far.scene, so_far.placed, photograph.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
+    # localize anew with the first machine from images; reuse the scores of a similar machine
     if scene.prior is not None:
         if before.by is None:
             alone = _image_hypotheses(session, scene, p)
         elif len(placed) < RESCORING_GROWTH * before.beside and scene.prior.like(before.by):
             scores, by, beside = before.scores, before.by, before.beside
+    # further candidates: from landmarks, from the last scoring, and from the background
     likely = before.places.T_camera_base[:CANDIDATES_SCORED_AGAIN]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
+    # joint estimate, then the background
     closer, scores = rescore_poses(session, p, scene, alone, others, scores)
     axes = _legs(session, p, scene, closer.T_camera_base)
     places = room.weighed(closer, k, p.camera, axes, placed)
@@ -337,7 +362,9 @@ def _search(
 def _legs(
     session: Session, photograph: Photographs, joined: PriorScene, T_camera_base: Array
 ) -> LegsInCamera:
-    """Leg axes (H, L, 3) of a photograph taken from places (H, 4, 4), or (1, L, 3) from one."""
+    """Leg axes (H, L, 3) in the frames of an image's candidate poses (H, 4, 4), or (1, L, 3) for
+    one.
+    """
     first = photograph.configuration[:1]
     pose, readings = joined.T_base_platform[first], session.joints[first]
     return legs_in_camera(joined.machine, T_camera_base, pose, readings)
@@ -346,11 +373,11 @@ def _legs(
 def _on_board(
     hypotheses: Mapping[int, PoseHypotheses], boards: Boards
 ) -> dict[int, PoseHypotheses]:
-    """The places of the photographs that see a board on the base, weighed together: where it stands
-    on the base is one unknown, and each of their places tells it.
+    """Joint pose hypotheses of the images in which a board on the base is visible.
 
-    A photograph's place is its own where that agrees with the board, which knows the drawing no
-    better, and the board's where none does.
+    The pose of the board on the base is one unknown, and each hypothesis of each image gives a
+    value. An image takes its own pose where that agrees with the board's, which relies on the
+    nominal model equally, and otherwise the pose that follows from the board.
     """
     T_camera_board = {
         k: visible.stood.T_camera_board
@@ -359,6 +386,7 @@ def _on_board(
     }
     if len(T_camera_board) < 2:
         return {}
+    # every hypothesis as a pose of the board, scored by all images
     candidates = [inverse(T) @ hypotheses[k].T_camera_base for k, T in T_camera_board.items()]
     T_board_base = np.concatenate(candidates)
     total = np.zeros(len(T_board_base))
@@ -381,8 +409,10 @@ def _on_board(
 
 
 def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
-    """The photographs whose places are believed, by the station's number: of those that were found,
-    of ``count`` by hand, the surest, as many as together leave little doubt.
+    """Station numbers of the images whose poses are accepted.
+
+    These are the images with the smallest rival probabilities, as long as their sum stays below
+    MISPLACED_PROBABILITY, in proportion to the images scored so far among ``count``.
     """
     order = sorted(hypotheses, key=lambda k: hypotheses[k].rival_probability)
     together = np.cumsum([hypotheses[k].rival_probability for k in order])
@@ -396,10 +426,12 @@ def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
 def _believed(
     hypotheses: Mapping[int, PoseHypotheses], count: int, boards: Boards, prior_poses: Array
 ) -> Array:
-    """Poses T_camera_base (S, 4, 4) with those of photographs of whose place there is little
-    doubt, and those that a board on the base joins to them; NaN for the others.
+    """Poses T_camera_base (S, 4, 4) of the accepted images and those connected to them by a board.
 
-    count : of all photographs by hand, some of which may not be found yet.
+    NaN for the others.
+
+    count : number of hand-held images, some of which may not be scored yet.
+    prior_poses : (S, 4, 4) of the stations localized before.
     """
     out = prior_poses.copy()
     for k in _sure(hypotheses, count):
@@ -412,18 +444,21 @@ def _believed(
 def inconsistent_poses(
     session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
 ) -> dict[int, str]:
-    """Why photographs by hand do not belong where they were placed, T_camera_base, by the station's
-    number: the joint estimate finds the camera looking another way, has given up most edges, or has
-    too few edges or legs to tell the place. A board that agrees with the others tells the place of
-    its photograph whatever the edges do.
+    """Reasons why hand-held images do not belong at their localized poses, by station number.
+
+    The joint estimate rotates the camera, rejects most edges, or leaves too few edges or legs to
+    determine the pose. A board that agrees with the others determines the pose of its image
+    whatever the edges do.
+
+    T_camera_base : (S, 4, 4) localized poses.
     """
     astray = angle_between(estimate.state.T_camera_base, T_camera_base) > MOST_TURN
     station = measurements.edges.station
-    measured = ~measurements.edges.coarse  # silhouettes are found wherever they are looked for
+    measured = ~measurements.edges.coarse  # silhouettes match anywhere
     inliers = np.bincount(station, measured * estimate.edge_weights, len(session.stations))
     count = np.bincount(station, measured, len(session.stations))
     poses = measurements.poses.station
-    # trackers have the numbers behind the cameras'
+    # trackers are numbered after the cameras
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations))
     by_board = by_board[: len(session.stations)] >= 0.5
     visible = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
@@ -441,8 +476,10 @@ def inconsistent_poses(
 def without_misplaced(
     case: Case, wrong: Mapping[int, str], edges: EdgeSet, estimate: Estimate
 ) -> Case:
-    """What is seen without these stations, each told why, and what is known by an estimate of all.
-    edges : from which it was made.
+    """Case without some stations, with the scene of an estimate that included them.
+
+    wrong : reasons by station number.
+    edges : measurements of the estimate.
     """
     state = estimate.state
     mine = {p.station: edges.select(edges.station == p.station) for p in case.photographs}
@@ -454,7 +491,7 @@ def without_misplaced(
 
 
 def why_lost(hypotheses: PoseHypotheses) -> str:
-    """Why a photograph could not be placed, in words."""
+    """Reason, as text, why an image could not be localized."""
     return (
         "its edges fit the legs nearly as well from another place, which with probability"
         f" {brief(hypotheses.rival_probability)} is the right one"
@@ -462,11 +499,15 @@ def why_lost(hypotheses: PoseHypotheses) -> str:
 
 
 def _without(case: Case, lost: Mapping[int, str]) -> Case:
-    """What is seen without the stations that are lost, each rejected for a reason, the others
-    numbered anew; an error where no photograph by hand is left.
+    """Case without rejected stations, the others renumbered.
+
+    Raises `InputError` if no hand-held image remains, or only one configuration.
+
+    lost : reasons by station number.
     """
     session, scene = case.session, case.scene
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
+    # an error if no hand-held image, or a single configuration, remains
     if by_hand and lost.keys() >= set(by_hand):
         raise InputError(
             "the machine is recognised in none of the photographs by hand",
@@ -477,6 +518,7 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
             next_step="Check that these photographs show this machine's legs, large and sharp, that"
             " each bears the name of its configuration, and that the drawing is this machine's",
         )
+    # new station numbers, and the parts of session, images, boards and scene
     retained = [k for k in range(len(session.stations)) if k not in lost]
     number = {k: new for new, k in enumerate(retained)}
     trackers = range(len(session.stations), len(scene.T_camera_base))

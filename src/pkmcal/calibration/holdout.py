@@ -1,7 +1,7 @@
-"""Configurations put aside before an estimate is made: which, and the estimate without them.
+"""Selection of holdout configurations, and the estimate without them.
 
-They are spread over the workspace, or a region of it. What the calibrated machine then predicts of
-them is judged in :mod:`pkmcal.judge.holdouts`.
+They are spread over the workspace, or fill a region of it. The predictions of the calibrated
+machine for them are judged in :mod:`pkmcal.judge.holdouts`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from pkmcal.session.readings import same_pose
 from pkmcal.wording import count
 
 FEWEST_TO_CALIBRATE = 3
-"""Configurations without which a calibration of the rest means nothing."""
+"""Fewest configurations from which a calibration is meaningful."""
 
 MOST_CLUSTERING_ROUNDS = 100
+"""Upper bound of the k-means iterations."""
 NAMED_REGION_OFFSET = 0.7
-"""Standard deviations of the whole workspace by which a region must lie off its middle to be named
-by that direction."""
+"""Offset of a region from the middle, in standard deviations of the whole workspace, from which
+a direction is part of its name."""
 REGION_DIRECTION_NAMES = (
     ("turned about −x", "turned about +x"),
     ("turned about −y", "turned about +y"),
@@ -36,11 +37,17 @@ REGION_DIRECTION_NAMES = (
     ("towards −y", "towards +y"),
     ("low", "high"),
 )
+"""Names of the negative and the positive direction of each coordinate of
+:func:`points_of_poses`."""
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Configurations beside each other. rows : (n,) which. name : where, in words."""
+    """Configurations near each other.
+
+    rows : (n,) their indices.
+    name : their region in words.
+    """
 
     rows: Integers
     name: str
@@ -48,9 +55,10 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Holdout:
-    """Configurations that an estimate did not see, to judge it by.
+    """Configurations that an estimate did not use, to judge it by.
 
-    region : which. measurements : of these and of those in use.
+    region : the configurations.
+    measurements : of these and of those in use.
     """
 
     region: Neighbours
@@ -58,8 +66,10 @@ class Holdout:
 
 
 def points_of_poses(machine: Machine, poses: Array) -> Array:
-    """Where poses (n, 4, 4) are, as points (n, 6) in metres: turns times the platform's radius,
-    then positions; both from the mean.
+    """Poses (n, 4, 4) as points (n, 6) in metres: rotations times the platform's radius, then
+    positions.
+
+    Both are relative to the mean.
     """
     joints = machine.platform_centers()
     radius = float(np.sqrt(np.mean(np.sum((joints - joints.mean(axis=0)) ** 2, axis=1))))
@@ -69,15 +79,17 @@ def points_of_poses(machine: Machine, poses: Array) -> Array:
 
 
 def clusters(points: Array, n: int) -> Integers:
-    """Number (k,) of each point's cluster: k-means, begun at points far from one another.
+    """Cluster number (k,) of each point: k-means from points far from each other.
 
-    No random draw: the same points give the same clusters.
+    Deterministic: the same points give the same clusters.
     """
+    # farthest-point initialization
     centres = points[[int(np.argmax(np.sum(points**2, axis=1)))]]
     for _ in range(n - 1):
         far = _distances(points, centres).min(axis=1)
         centres = np.concatenate([centres, points[[int(np.argmax(far))]]])
     owner = np.argmin(_distances(points, centres), axis=1)
+    # Lloyd's iterations
     for _ in range(MOST_CLUSTERING_ROUNDS):
         inside = owner[:, None] == np.arange(n)
         centres = (inside.T @ points) / np.maximum(inside.sum(axis=0), 1)[:, None]
@@ -89,7 +101,10 @@ def clusters(points: Array, n: int) -> Integers:
 
 
 def spread(points: Array, n: int) -> Integers:
-    """Some points, n in rising order, spread over all: the middle one of each of n clusters."""
+    """Indices of n points, in rising order, spread over all: the middle one of each of n clusters.
+
+    Clusters are those of :func:`clusters`.
+    """
     owner = clusters(points, n)
     chosen: list[int] = []
     for k in range(n):
@@ -100,10 +115,10 @@ def spread(points: Array, n: int) -> Integers:
 
 
 def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
-    """The regions, n, of configurations ``rows`` at points (k, 6), see :func:`points_of_poses`."""
+    """The n regions of configurations ``rows`` at points (k, 6) of :func:`points_of_poses`."""
     owner = clusters(points, n)
     scale = points.std(axis=0)
-    scale = np.where(scale > 1e-6, scale, np.inf)  # a direction in which nothing moves
+    scale = np.where(scale > 1e-6, scale, np.inf)  # a coordinate that is constant
     results = [np.flatnonzero(owner == k) for k in range(n)]
     return tuple(
         Neighbours(rows[own], _named(points[own].mean(axis=0) / scale))
@@ -113,7 +128,7 @@ def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
 
 
 def _named(middle: Array) -> str:
-    """A region by the two directions in which it lies off the middle the most."""
+    """Name of a region by the directions of its two largest offsets, (6,) standard deviations."""
     order = np.argsort(-np.abs(middle))[:2]
     words = [
         REGION_DIRECTION_NAMES[k][int(middle[k] > 0)]
@@ -124,14 +139,15 @@ def _named(middle: Array) -> str:
 
 
 def _distances(points: Array, centres: Array) -> Array:
-    """Squared distances (k, n)."""
+    """Squared distances (k, n) between points and centres."""
     return np.sum((points[:, None] - centres) ** 2, axis=-1)
 
 
 def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int) -> Neighbours:
-    """Configurations of n poses, to hold out, spread over the workspace.
+    """Configurations of n poses to hold out, spread over the workspace.
 
-    One that is in use tells of the others of its pose what they read: all of a pose are held out.
+    All configurations of a pose are held out, because one in use determines the readings of the
+    others. Raises InputError if too few poses remain.
     """
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
@@ -144,7 +160,10 @@ def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int
 def by_region(
     drawing: Machine, whole: Estimate, measurements: Measurements, n: int
 ) -> tuple[Neighbours, ...]:
-    """The configurations that were seen, in n regions of the workspace, those of a pose in one."""
+    """Measured configurations in n regions of the workspace, all of a pose in the same region.
+
+    Raises InputError if too few poses remain without a region.
+    """
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
     _check(n, first.size - first.size // n, first.size, "regions")
@@ -156,7 +175,7 @@ def by_region(
 
 
 def _poses(whole: Estimate, measurements: Measurements) -> tuple[Integers, Integers]:
-    """The configurations that were seen (n,), and the row of each one's pose (n,)."""
+    """Indices (n,) of the measured configurations, and the pose number (n,) of each."""
     rows = np.flatnonzero(whole.configurations)
     if not rows.size:
         return rows, rows
@@ -164,7 +183,9 @@ def _poses(whole: Estimate, measurements: Measurements) -> tuple[Integers, Integ
 
 
 def _check(n: int, remainder: int, total: int, what: str) -> None:
-    """Raise InputError where n poses or regions, of a total, leave too few poses to calibrate."""
+    """Raise InputError if holding out n poses or regions of a total leaves too few poses to
+    calibrate.
+    """
     if (
         n >= 1
         and remainder >= max(FEWEST_TO_CALIBRATE, total // 2)
@@ -189,10 +210,10 @@ def _check(n: int, remainder: int, total: int, what: str) -> None:
 
 
 def select(measurements: Measurements, keep: Booleans) -> Measurements:
-    """The measurements of some configurations (K,); readings keep their rows. Links stay where both
-    of their configurations do.
+    """Measurements of some configurations, ``keep`` (K,); rows of the readings are kept.
 
-    Boards on the base hang on no configuration and stay.
+    Links remain if both of their configurations do. Boards on the base belong to no configuration
+    and remain.
     """
     edges, poses = measurements.edges, measurements.poses
     on_base = ~measurements.on_platform[poses.mount]
@@ -206,9 +227,10 @@ def select(measurements: Measurements, keep: Booleans) -> Measurements:
 def estimate_without(
     drawing: Machine, turns: RefinementResult, out: Neighbours
 ) -> RefinementResult:
-    """What the last turn left, as if a region's configurations had not been taken.
+    """Result of the last measurement pass without the configurations of a region.
 
-    They did help to find legs in the photographs; no number of the estimate comes from them.
+    The configurations took part in predicting where legs are in the images; they contribute no
+    measurement to the estimate.
     """
     keep = np.ones(len(turns.measurements.joints), dtype=bool)
     keep[out.rows] = False
@@ -221,7 +243,7 @@ def estimate_without(
 
 
 def _without(observation: Observation, keep: Booleans) -> Observation:
-    """An observation of the configurations to keep, (K,), edges renumbered."""
+    """Observation of the configurations to keep, (K,), with edges renumbered."""
     retained = keep[observation.edges.configuration]
     points = retained[observation.point_edge]
     numbers = np.cumsum(retained) - 1

@@ -1,8 +1,9 @@
-"""Numberings of the legs that photographs and readings cannot tell apart.
+"""Numberings of the legs that images and readings cannot distinguish.
 
-A machine whose drawing looks the same after a turn fits as well with its readings' columns counted
-from another leg: all that differs is the base frame, turned by as much. So of such a machine only a
-camera's pose by hand tells whether the readings' first leg is the drawing's.
+If a nominal model is symmetric under a rotation, counting the columns of the readings from another
+leg fits equally well: only the base frame differs, by that rotation. For such a machine, only a
+hand-placed camera pose determines whether the first leg of the readings is the first leg of the
+nominal model.
 """
 
 from __future__ import annotations
@@ -21,17 +22,19 @@ from pkmcal.session.load import Session
 from pkmcal.wording import in_full
 
 NUMBERING_CONFIGURATIONS = 5
-"""Configurations at which numberings are compared: unlike machines differ at any."""
+"""Number of configurations at which numberings are compared; unequal machines differ at any."""
 LAST_DIGIT = 1e-6
-"""m; by as much equal drawings differ that were written with few digits."""
+"""Difference (m) between equal nominal models that is caused by rounding in their files."""
 
 
 def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
-    """Columns (m,) that the legs' readings can be taken from instead, counted from another leg, so
-    that within its tolerances the drawing is the same machine, turned.
+    """Permutations of the readings' columns, (m,) each, under which the nominal model is the same
+    machine.
 
-    joints : (K, m) readings at which that is tried. Empty of a machine with legs without a reading
-    of their own.
+    Each starts the count at another leg; the rotated machine agrees within its prior sigmas. Empty
+    for machines with legs without a reading of their own.
+
+    joints : (K, m) readings at which the machines are compared.
     """
     layout, m = machine.layout, machine.n_joints
     if machine.n_legs != m or sorted(layout.actuated.tolist()) != list(range(m)):
@@ -42,17 +45,18 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
 
 
 def _equivalent(machine: Machine, readings: Array, order: Integers) -> bool:
-    """Whether legs that take the readings (n, m) of other columns stand as those columns' legs do,
-    up to one turn and shift of the whole.
+    """Whether exchanging the columns of readings (n, m) is equivalent to one rigid motion of the
+    machine.
     """
     layout, table = machine.layout, machine.parameters
     column = layout.actuated
-    other = np.argsort(column)[order[column]]  # the leg that has each one's new column
+    other = np.argsort(column)[order[column]]  # leg that had each leg's new column
     for mine, its in zip(layout.radius, (layout.radius[j] for j in other), strict=True):
         if len(mine) != len(its):
             return False
         if np.any(np.abs(machine.values[mine] - machine.values[its]) > table.tolerance[mine]):
             return False
+    # limb ends at both orders of the readings
     points: list[Array] = []
     for joints in (readings, readings[:, order]):
         fk = machine.forward_result(joints)
@@ -60,6 +64,7 @@ def _equivalent(machine: Machine, readings: Array, order: Integers) -> bool:
             return False
         ends = limb_ends(layout, machine.values, joints, fk.T_base_platform, fk.internal)
         points.append(np.concatenate([ends.a, ends.b], axis=1))
+    # best rigid motion between corresponding legs, and its residuals
     legs = np.concatenate([other, other + machine.n_legs])
     before, after = points[0][:, legs].reshape(-1, 3), points[1].reshape(-1, 3)
     turn = register(after, before)
@@ -69,9 +74,9 @@ def _equivalent(machine: Machine, readings: Array, order: Integers) -> bool:
 
 
 def numbering_note(session: Session) -> Iterator[Finding]:
-    """A note where nothing in a session determines which leg of the drawing is the readings' first.
+    """Finding where nothing in a session determines which leg is the readings' first.
 
-    A station's pose by hand does.
+    A station's hand-placed pose determines it.
     """
     if not legs_stations(session) or any(
         station.T_camera_base is not None for station in session.stations
@@ -88,5 +93,5 @@ def numbering_note(session: Session) -> Iterator[Finding]:
             columns=[names[order[0]] for order in orders],
             others=" or ".join(names[order[0]] for order in orders),
             first=names[0],
-            pose=None if by_hand else "pose",  # which photographs by hand have none of
+            pose=None if by_hand else "pose",  # hand-held images have no pose
         )

@@ -1,4 +1,4 @@
-"""Whether a saved calibration and a session are of one machine."""
+"""Test whether a saved calibration and a session are of the same machine."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
 
 OTHER_MACHINE_TOLERANCES = 10.0
-"""Tolerances by which two drawings of one machine may differ: a corrected number, not another
-machine's."""
+"""Largest difference between two nominal models of one machine, in prior sigmas: a corrected
+value, not another machine."""
 
 
 def read_same_machine(
     calibration: SavedCalibration | Path | str, session: Session | Path | str
 ) -> tuple[SavedCalibration, Session]:
-    """Both, where they are not loaded. Raises InputError where the session is another machine's."""
+    """Saved calibration and session, loaded where they are given as paths.
+
+    Raises InputError if they are of different machines.
+    """
     saved = calibration if isinstance(calibration, SavedCalibration) else load(calibration)
     if not isinstance(session, Session):
         session = load_session(session)
@@ -30,10 +33,11 @@ def read_same_machine(
 
 
 def _check_machine(saved: SavedCalibration, session: Session) -> None:
-    """Raise `InputError` where the session is another machine's.
+    """Raise `InputError` if the session's nominal model is that of another machine.
 
-    Readings' scales tell no machine from another: the one may have them exact, as calibrations of
-    earlier versions have, and the other not.
+    The session's values are compared with the calibration's nominal and calibrated values; the
+    better agreement counts. The scales of readings are not compared: they may be exact in one file,
+    as in calibrations of earlier versions, and parameters in the other.
     """
     machine, drawn = saved.machine, session.machine
     rows, own = (np.flatnonzero(np.array(m.parameters.kinds) != "scale") for m in (machine, drawn))
@@ -56,6 +60,7 @@ def _check_machine(saved: SavedCalibration, session: Session) -> None:
 
 
 def _another(calibrated: str, text: str) -> InputError:
+    """Error for a calibration and a session of different machines."""
     return InputError(
         "the calibration is of another machine than the session",
         where="session.yaml, mechanism",
@@ -66,6 +71,7 @@ def _another(calibrated: str, text: str) -> InputError:
 
 
 def _check_joints(saved: SavedCalibration, session: Session) -> None:
+    """Raise `InputError` if calibration and session name other columns of the joint readings."""
     old, new = (_columns(d) for d in (saved.document.get("session"), session.document))
     if not old or not new or old == new:
         return
@@ -82,7 +88,7 @@ def _check_joints(saved: SavedCalibration, session: Session) -> None:
 
 
 def _columns(document: Any) -> list[str]:
-    """The readings' columns by a session's document, empty where it tells none."""
+    """Columns of the joint readings in a session's document; empty if it has none."""
     joints = document.get("joints") if isinstance(document, dict) else None
     columns = joints.get("columns") if isinstance(joints, dict) else None
     return [str(name) for name in columns] if isinstance(columns, list) else []

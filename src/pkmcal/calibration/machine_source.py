@@ -1,4 +1,4 @@
-"""A machine to be used: calibrated, drawn or built in, with the cameras that saw it."""
+"""Source of a machine for export or control: calibration, mechanism file or built-in machine."""
 
 from __future__ import annotations
 
@@ -26,20 +26,25 @@ from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
 SESSION_FILE = "session.yaml"
+"""File that identifies a session's folder."""
 
 
 @dataclass(frozen=True)
 class MachineSource:
-    """A machine to export or to control, and how far to trust it.
+    """A machine to export or to control, with its uncertainty.
 
-    machine : with the values to use. sigma, covariance : (P,) and (P, P) of its parameters;
-    None for a drawing. cameras, T_base_camera : intrinsics and poses (4, 4) m by station; a
-    station's camera is missing where its file was not found.
-    headline : the calibration's verdict in a sentence. usable : False for a refused one; reasons
-    : why. origin : where it was read. calibrated : False for a drawing. frames : the gauge.
-    sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes. bed : z (m, base frame)
-    of the platform's origin on a bed that was felt, None where none was. session : the
-    calibration's session and its digest, in words; empty for a drawing.
+    machine : with the values to use.
+    sigma, covariance : (P,) and (P, P) of its parameters; None for a nominal model.
+    cameras, T_base_camera : intrinsics, and poses (4, 4) in metres, by station; a station's camera
+        is missing if its file was not found.
+    headline : the verdict of the calibration in one sentence.
+    usable : False for a refused calibration; reasons : its reasons.
+    origin : name of the folder, file or built-in machine.
+    calibrated : False for a nominal model.
+    frames : the gauge.
+    sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes.
+    bed : z (m, base frame) of the platform's origin on a bed whose heights were measured, or None.
+    session : the calibration's session and its digest, as text; empty for a nominal model.
     """
 
     machine: Machine
@@ -65,20 +70,20 @@ class MachineSource:
 
     @property
     def identity(self) -> str:
-        """Where the values are from, and their short digest: many calibrations have one name."""
+        """Origin of the values and their short digest, because many calibrations share a name."""
         values = np.asarray(self.machine.values + 0.0, dtype="<f8")
         digest = blake2b(values.tobytes(), digest_size=4).hexdigest()
         parts = (self.origin, self.session, f"values {digest}", "" if self.usable else "refused")
         return ", ".join(part for part in parts if part)
 
     def sigma_of(self, name: str) -> float | None:
-        """A parameter's standard deviation, m or rad; None where it is not known."""
+        """Standard deviation of a parameter, m or rad; None if unknown."""
         if self.sigma is None or name not in self.machine.parameters.names:
             return None
         return float(self.sigma[self.machine.parameters.index(name)])
 
     def header(self, *conventions: str) -> tuple[str, ...]:
-        """Lines for the top of every file: what this is, of what, and in which conventions."""
+        """Lines for the top of an exported file: machine, origin, verdict, frames, conventions."""
         state = "" if self.usable else "REFUSED, NOT TO BE USED: "
         lines = (
             f"Machine {self.machine.name}, exported by pkmcal {version('pkmcal')}"
@@ -87,11 +92,13 @@ class MachineSource:
             f"Frames: {self.frames}.",
             *conventions,
         )
-        # A name may hold a line break; what follows it must stay a comment.
+        # a name may contain a line break; the rest must stay a comment
         return tuple(legible(" ".join(line.split())) for line in lines)
 
     def sigma_lines(self, kinds: Sequence[str] = ()) -> list[str]:
-        """One line a parameter, of these kinds or of all: name, value, unit and deviation."""
+        """One line for each parameter, of some kinds or of all: name, value, unit and standard
+        deviation.
+        """
         table = self.machine.parameters
         values = table.unit_axes(self.machine.values)
         out: list[str] = []
@@ -108,10 +115,12 @@ class MachineSource:
 
 
 def load_source(origin: Path | str, session: Path | None = None) -> MachineSource:
-    """A calibration's folder, a mechanism file, or a built-in machine by its name.
+    """Source from a calibration's folder, a mechanism file or the name of a built-in machine.
 
-    session : the calibration's session, for its cameras; else it is looked for around the folder.
-    Raises InputError where `origin` is none of these.
+    Raises InputError if ``origin`` is none of these.
+
+    session : the calibration's session, for its cameras; by default it is searched around the
+        folder.
     """
     calibration = loaded(origin)
     if isinstance(calibration, SavedCalibration):
@@ -123,9 +132,10 @@ def load_source(origin: Path | str, session: Path | None = None) -> MachineSourc
 
 
 def loaded(origin: Path | str) -> SavedCalibration | Machine:
-    """A calibration's folder or a file in it, a mechanism file, or a built-in machine by its name.
+    """Calibration or machine from a folder, a file in it, a mechanism file or a built-in machine's
+    name.
 
-    Raises InputError where `origin` is none of these.
+    Raises InputError if ``origin`` is none of these.
     """
     path = Path(origin)
     if str(origin) in catalogue() and not (path / CALIBRATION_DOCUMENT_FILE).is_file():
@@ -134,7 +144,7 @@ def loaded(origin: Path | str) -> SavedCalibration | Machine:
         path.name == CALIBRATED_MECHANISM_FILE
         and (path.parent / CALIBRATION_DOCUMENT_FILE).is_file()
     ):
-        path = path.parent  # a calibration's own mechanism file: the rest lies beside it
+        path = path.parent  # the mechanism file of a calibration
     if path.is_dir() or path.name == CALIBRATION_DOCUMENT_FILE:
         return load(path)
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
@@ -149,6 +159,7 @@ def loaded(origin: Path | str) -> SavedCalibration | Machine:
 
 
 def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSource:
+    """Source of a calibrated machine with its cameras."""
     folder = saved.path.parent
     session_entry = saved.document.get("session") or {}
     session_words = " ".join(
@@ -157,6 +168,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
             *(str(session_entry[key]) for key in ("folder", "digest") if key in session_entry),
         )
     )
+    # intrinsics of the stations whose camera files are available
     files = {station.name: station.camera for station in saved.stations}
     cameras = {
         name: load_camera(value)
@@ -164,7 +176,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
         if (value := _camera_file(folder, file, _session_folder(saved, session))) is not None
     }
     sigma = {s.name: np.append(s.sigma_rotation, s.sigma_translation) for s in saved.stations}
-    # where a bed is along itself, heights leave to convention: that is no place to export
+    # a bed's position along itself is undetermined by heights: not a pose to export
     placed = [s for s in saved.stations if np.isfinite(sigma[s.name]).all()]
     return MachineSource(
         machine=saved.machine,
@@ -185,8 +197,9 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
 
 
 def _bed(saved: SavedCalibration) -> float | None:
-    """Height of the platform's origin over a bed that was felt, m, base frame, where it is 0 there;
-    None where none was felt, or none that is level.
+    """Height (m, base frame) of the platform's origin on a bed whose heights were measured.
+
+    None without measured heights, or if their plane need not be level.
     """
     if saved.document.get("bed"):
         return saved.document["bed"].get("z")
@@ -196,14 +209,17 @@ def _bed(saved: SavedCalibration) -> float | None:
     for station in saved.stations:
         tracker = (stations.get(station.name) or {}).get("tracker") or {}
         mount = mounts.get(station.name)
-        if tracker.get("level") is True and mount is not None:  # then its table is of heights
+        if tracker.get("level") is True and mount is not None:  # its table is one of heights
             target = np.array(mount)
             return -float(inverse(station.T_base_camera)[2, 3] + target[2, 3])
     return None
 
 
 def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | None:
-    """Where the session lies: as told, above the calibration, or beside it (as demo writes it)."""
+    """Folder of the session: as given, above the calibration, or beside it (as demo writes it).
+
+    None if it is not found. Raises InputError if the given folder holds no session.
+    """
     if session is not None:
         if not (session / SESSION_FILE).is_file():
             raise InputError(
@@ -219,8 +235,8 @@ def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | Non
 
 
 def _camera_file(folder: Path, file: str, session: Path | None) -> Path | None:
-    """A station's camera: as refined with the machine, or as the session had it; a tracker's
-    table is none.
+    """Camera file of a station, as refined with the machine or as the session has it; None for
+    trackers.
     """
     if Path(file).suffix == ".csv":
         return None

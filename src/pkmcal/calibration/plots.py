@@ -16,14 +16,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CALIBRATED_COLOUR, DRAWING_COLOUR, QUIET_COLOUR = "#2a6fb0", "#b5651d", "#888888"
+"""Colours of the calibrated machine, of the nominal model, and of reference lines."""
 PARAMETER_ROW_HEIGHT = 0.17
-"""Inches of a parameter's line."""
+"""Height of a parameter's row in inches."""
 RESIDUAL_PLOT_REACH = 5.0
-"""Standard deviations to either side in which residuals are counted one by one."""
+"""Largest residual in standard deviations, to either side, that is plotted at its own value."""
 
 
 def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
-    """The axes to draw into, made where there are none."""
+    """The given axes, or new ones of a size in inches. Raises InputError without matplotlib."""
     if ax is not None:
         return ax
     try:
@@ -34,7 +35,7 @@ def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
 
 
 def draw_residuals(values: Array, ax: Axes | None = None) -> Axes:
-    """Residuals (n,) in standard deviations, beside the normal distribution of noise alone."""
+    """Histogram of residuals (n,) in standard deviations, with the standard normal density."""
     ax = _axes(ax, (6.0, 3.4))
     if not values.size:
         ax.set_title("There are no edges and no measured poses")
@@ -54,8 +55,12 @@ def draw_residuals(values: Array, ax: Axes | None = None) -> Axes:
 
 
 def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None = None) -> Axes:
-    """Each parameter's change from the drawing in its tolerances (P,), two deviations either way;
-    those that a frame or the file holds are left out.
+    """Change of each parameter from its nominal value, with two standard deviations, in prior
+    sigmas.
+
+    Parameters that the gauge or the file fixes are left out.
+
+    tolerance : (P,) prior sigmas.
     """
     rows = [k for k, row in enumerate(estimates) if row.decided_by in ("data", "drawing")]
     ax = _axes(ax, (6.0, 1.2 + PARAMETER_ROW_HEIGHT * len(rows)))
@@ -74,7 +79,9 @@ def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None 
 
 
 def tool(error: ToolError, ax: Axes | None = None) -> Axes:
-    """The drawing's error and the calibrated machine's standard deviation at each pose, mm."""
+    """Tool error of the nominal model, and standard deviation after the calibration, at each pose,
+    mm.
+    """
     ax = _axes(ax, (6.0, 3.4))
     finite = np.flatnonzero(np.isfinite(error.position))
     order = finite[np.argsort(error.position[finite])]

@@ -1,15 +1,16 @@
-"""Where a photograph by hand was taken from, asked of the joint estimate.
+"""Scores of candidate poses of a hand-held image by the joint estimate.
 
-A search in the picture alone knows the machine by its drawing, whose errors of millimetres are
-pixels: a machine of equal parts then fits nearly as well when it is turned by one of them. Here the
-silhouettes are looked for from each of the places that a photograph could show, and the machine is
-estimated with it there, in turns. What the drawing has wrong is explained by that, and paid for by
-the drawing's tolerances; where photographs that are placed already know the machine, by what they
-know of it. How well the machine, so changed, lies on the picture (the evidence of
-:mod:`pkmcal.observe.pose_likelihood`) less what was paid is the log likelihood of the place.
-Between places from which the machine lies on the same legs, turned onto itself, half an edge counts
-as one measurement, as it does in a station's photographs; against other places half a leg, since
-what chance puts under a leg in a picture full of edges, it puts under all of it.
+Localization from the image alone uses the nominal model, whose errors of millimetres are pixels: a
+machine of equal parts then fits nearly as well after a rotation by one of them. Here the
+silhouettes are measured from each candidate pose, and the machine is estimated with the camera
+there, in alternation. Errors of the nominal model are thereby explained, at a cost given by its
+prior sigmas or, if images with accepted poses have determined the machine already, by their
+marginal prior. The log-likelihood of a pose is the log-likelihood ratio of the changed machine in
+the image (:mod:`pkmcal.observe.pose_likelihood`) minus that cost.
+
+Among poses from which the machine, rotated onto itself, covers the same legs, half an edge counts
+as one measurement, as in a station's images. Against other poses half a leg counts as one, because
+in a cluttered image a chance match of a leg matches all of it.
 """
 
 from __future__ import annotations
@@ -52,20 +53,22 @@ from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
 
 CANDIDATES_RESCORED, MOST_BEHIND_BEST = 8, 12.0
-"""Most places of a photograph that are asked about, and by how many measurements of the search one
-may be behind the best: what is further behind has odds of one in a hundred thousand."""
+"""Largest number of an image's candidate poses that are scored, and how many measurements one
+may be behind the best: its odds are then one in a hundred thousand."""
 CANDIDATES_REFINED_LOCALLY = 4
-"""Places about which likelier ones are looked for, once others have told the machine."""
+"""Number of poses around which likelier ones are searched, once other images have determined the
+machine."""
 PASSES_FROM_NOMINAL, PASSES_FROM_PRIOR = 4, 2
-"""Looks at silhouettes, each from the estimate before: the drawing is off by pixels, a machine that
-photographs have told is not."""
+"""Numbers of measurement passes of silhouettes, each from the estimate before: the nominal model
+is off by pixels, a machine that images have determined is not."""
 SILHOUETTE_SCATTER = legs.SEARCH_SIGMA
-"""Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
-leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
-that lie near something; it does not offer legs that lie on it."""
+"""Largest scatter of silhouettes about image edges, pixels of the finest tables: a whole leg is
+measured no less accurately, and the nominal model's errors are explained by then. By chance legs
+lie near image edges; they do not lie on them."""
 
 ViewOf = Callable[[int, PriorScene], StationView]
-"""The view of a station's one photograph with what is known."""
+"""Function that returns the view of a station's single image, given the station's number and a
+scene."""
 
 
 def register_images(
@@ -75,12 +78,13 @@ def register_images(
     places: Mapping[int, Array],
     boards: Boards,
 ) -> PriorScene:
-    """What is known together with photographs at places T_camera_base (4, 4): those that were
-    placed before are looked at again as well, for what the machine was taken for then, their edges
-    were taken for.
+    """Scene estimated with further images at poses ``places``, T_camera_base (4, 4) by station.
 
-    photographs : by station. boards : what they show of a board. Raises a `PkmcalError` where there
-    is nothing to be estimated.
+    The silhouettes of images registered earlier are measured again too, because theirs depend on
+    the machine assumed at the time. Raises a `PkmcalError` if nothing can be estimated.
+
+    photographs : by station.
+    boards : boards in these images.
     """
 
     def view(k: int, scene: PriorScene) -> StationView:
@@ -92,7 +96,7 @@ def register_images(
     updated_scene = scene._replace(prior=None)
     while True:
         last = _measurement_pass(session, updated_scene, near, boards, view)
-        # how silhouettes scatter in these photographs, their residuals tell, more or less than each
+        # scatter of the silhouettes from their residuals, relative to the stated sigmas
         statistics = last.estimate.statistics
         freedom = statistics.dof_edges
         share = statistics.chi2_edges / freedom if freedom > LEAST_NOISE_FREEDOM else 1.0
@@ -108,13 +112,14 @@ def register_images(
 def evaluate_pose(
     session: Session, scene: PriorScene, station: int, T_camera_base: Array, view: StationView
 ) -> tuple[PriorScene, float]:
-    """What one photograph would make of what is known, if it were taken from a place (4, 4); and
-    what is paid for that, half the squares by which the machine and the readings are moved.
+    """Scene estimated with one image at a camera pose (4, 4), and the cost of the machine's change.
 
-    Those that are placed say what they know of the machine once and for all, so a question costs
-    the same however many they are. Boards are left out: what a place is asked is how the legs look
-    from there. view : of the photograph. Raises a `PkmcalError` where too few legs are where they
-    should be.
+    The cost is half the sum of squares by which the parameters and the joint readings are moved.
+    Images with accepted poses enter by their marginal prior, so the effort does not depend on their
+    number. Boards are left out: the score is about the legs. Raises a `PkmcalError` if too few legs
+    are measured.
+
+    view : of this image.
     """
 
     def changed(_: int, now: PriorScene) -> StationView:
@@ -130,7 +135,7 @@ def evaluate_pose(
 
 
 class _Pass(NamedTuple):
-    """What is known after a look, and the estimate that says so."""
+    """Result of a measurement pass: scene, measurements and estimate."""
 
     scene: PriorScene
     measurements: Measurements
@@ -144,8 +149,9 @@ def _measurement_pass(
     boards: Boards,
     view: ViewOf,
 ) -> _Pass:
-    """What is known once photographs were looked at from places, and nothing of others but what
-    they told of the machine.
+    """Measure silhouettes from the given poses and estimate the scene.
+
+    Other images enter by the marginal prior of the machine only.
     """
     stations = sorted(places)
 
@@ -154,12 +160,14 @@ def _measurement_pass(
 
     with ThreadPoolExecutor(THREADS) as pool:
         edges = dict(zip(stations, pool.map(measure, stations), strict=True))
+    # joint estimate of these stations alone
     only = replace(session.of_stations(stations), trackers=(), links=())
     visible = boards.of(np.array(stations, dtype=int))
     numbered = of_stations({n: edges[k] for n, k in enumerate(stations)})
     measurements = measurements_of(only, visible, numbered)
     start = start_state(scene.machine, measurements, np.stack([places[k] for k in stations]))
     estimate = bundle(session.machine, measurements, start, marginal_prior=scene.prior)
+    # results back into the scene of all stations
     at = scene.T_camera_base.copy()
     at[stations] = estimate.state.T_camera_base
     poses = estimate.state.T_base_platform
@@ -170,9 +178,11 @@ def _measurement_pass(
 
 
 class ScoredPoses(NamedTuple):
-    """What is known of places (n, 4, 4) of one photograph: the evidence (n,) that it shows the
-    machine from there, and what was paid (n,) for the machine. failures : why further places could
-    not be tested.
+    """Scored poses (n, 4, 4) of one image.
+
+    scores : (n,) log-likelihood ratio of the machine at each pose.
+    paid : (n,) cost of the machine's change.
+    failures : why further poses could not be tested.
     """
 
     T_camera_base: Array
@@ -182,6 +192,7 @@ class ScoredPoses(NamedTuple):
 
     @classmethod
     def nothing(cls) -> ScoredPoses:
+        """No poses."""
         return cls(np.zeros((0, 4, 4)), np.zeros(0), np.zeros(0))
 
 
@@ -193,26 +204,31 @@ def rescore_poses(
     others: Array,
     scores: ScoredPoses | None = None,
 ) -> tuple[PoseHypotheses, ScoredPoses]:
-    """The places of one photograph, weighed with what is known of the machine, the likeliest first;
-    evidence is then a log likelihood against chance. And what was found out for that.
+    """Pose hypotheses of one image, weighted by what is known of the machine, and their scores.
 
-    others : (n, 4, 4) places that are asked about beside those found in the picture. scores : what
-    was found out already with the same machine; nothing is asked about one of its places again.
+    The hypotheses are sorted; their log-likelihood ratios are in unit 1.
+
+    before : scene without the image.
+    hypotheses : from localization.
+    others : (n, 4, 4) further poses to score.
+    scores : earlier ones with the same machine; their poses are not scored again.
     """
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
     view = finest_view(before.machine, p, session.joints, before.T_base_platform)
+    # candidates, refined with the machine as it is known
     near = (
         hypotheses.log_likelihood_ratio
         > hypotheses.log_likelihood_ratio[0] - MOST_BEHIND_BEST * hypotheses.unit
     )
     places = np.concatenate([hypotheses.T_camera_base[near][:CANDIDATES_RESCORED], others])
-    # the machine as it is known; where it fits better changed, that is taken
+    # maximum likelihood with the machine unchanged; a changed machine is tried below
     settled, log_likelihood_ratio = refine_ml(view, places, one, 16, 6, SILHOUETTE_SCATTER)
-    if before.edges:  # what is known of the machine changes little: look about the likeliest places
+    if before.edges:  # the machine changes little: search around the likeliest poses
         for k in np.argsort(-log_likelihood_ratio, kind="stable")[:CANDIDATES_REFINED_LOCALLY]:
             settled[k], log_likelihood_ratio[k] = refine_local(view, settled[k], SILHOUETTE_SCATTER)
         places = settled
+    # drop poses that were scored before
     previous = ScoredPoses.nothing() if scores is None else scores
     order = np.argsort(-log_likelihood_ratio, kind="stable")
     both = np.concatenate([previous.T_camera_base, settled[order]])
@@ -224,13 +240,14 @@ def rescore_poses(
     )
     paid = [*previous.paid, *np.zeros(len(order))]
     failures = [*previous.failures]
+    # estimate the machine with the camera at each remaining pose
     for number, T in enumerate(places[order], start=count):
         best = max(fit / hypotheses.unit - cost for fit, cost in zip(fits, paid, strict=True))
         if before.edges and fits[number] / hypotheses.unit < best - MOST_BEHIND_BEST:
-            break  # what is known of the machine already does not change by so much
+            break  # the prior does not allow a change that large
         try:
             reference_values, cost = evaluate_pose(session, before, p.station, T, view)
-        except PkmcalError as error:  # such as too few legs where they should be from there
+        except PkmcalError as error:  # such as too few legs measured
             failures.append(str(error))
             continue
         changed = replace(
@@ -245,7 +262,10 @@ def rescore_poses(
 
 
 def _weighed(view: StationView, scores: ScoredPoses, unit: float) -> PoseHypotheses:
-    """Places by what was found out of them, the likeliest first."""
+    """Pose hypotheses from scored poses, best first.
+
+    Poses equal to the best one, or symmetric to it, are compared by edges, the others by legs.
+    """
     at, log_likelihood_ratio, paid, _ = scores
     edge = correlation_length(view, at[np.argmax(log_likelihood_ratio)])
     by_edges, by_legs = log_likelihood_ratio / edge - paid, log_likelihood_ratio / unit - paid

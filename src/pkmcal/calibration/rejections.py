@@ -1,4 +1,4 @@
-"""Rejected heights, boards and images by name, and what the result may owe to their rejection."""
+"""Findings about rejected heights, boards and images, and about results that rest on these."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from pkmcal.session.load import Session
 from pkmcal.wording import count, listed
 
 LEAST_CHECKED_SHARE = 0.1
-"""Degrees of freedom that a link leaves on average, below which a wrong one goes unnoticed up to
-``4.13 / sqrt(0.1)``, thirteen, of its standard deviations (Baarda 1968)."""
+"""Smallest mean redundancy of the links (degrees of freedom per equation): below it, an outlier
+of up to ``4.13 / sqrt(0.1)``, thirteen, standard deviations is not detected (Baarda 1968)."""
 
 
 def rejection_findings(
@@ -33,9 +33,10 @@ def rejection_findings(
     at_minimum: bool,
 ) -> Iterator[Finding]:
     """Warnings that name the rejected units of an estimate, and a reason where the result rests on
-    a rejection that nothing confirms.
+    an unconfirmed rejection.
 
-    at_minimum : whether the estimate is the joint problem's best, as hypotheses about it need.
+    at_minimum : whether the estimate is at the minimum of the joint problem, as hypotheses about it
+        require.
     """
     units = rejected_units(measurements, estimate)
     if at_minimum:
@@ -43,6 +44,7 @@ def rejection_findings(
     if not units:
         return
     edges = measurements.edges
+    # rejected units by kind, and how many there are of each kind
     kinds = np.array([_kind(session, k) for k in range(len(session.station_names))])
     every = kinds[measurements.poses.station].tolist() if len(measurements.poses) else []
     every += [name for links in measurements.links for name in [_link_name(links)] * len(links)]
@@ -60,6 +62,7 @@ def rejection_findings(
         )
     if not at_minimum:
         return
+    # effect of the rejections on the bed or, without one, on the platform
     if findings.bed:
         tool, sigma, what = bed_by_parameters(estimate), findings.bed.sigma, "the bed"
     else:
@@ -68,6 +71,7 @@ def rejection_findings(
         what = "the platform"
     value = rejections_of(measurements, estimate, tool)
     if value.shift > sigma:
+        # name the units with more than the mean effect
         worst = sorted(value.units, key=lambda unit: -unit.shift)
         share = [unit for unit in worst if unit.shift**2 * len(worst) >= value.shift**2]
         names = [
@@ -85,8 +89,8 @@ def rejection_findings(
 
 
 def _unchecked_links(measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
-    """A warning about links that determine what no other measurement does, so that a wrong one
-    leaves hardly any residual.
+    """Warning about links that alone determine something, so that an outlier leaves hardly any
+    residual.
     """
     s = estimate.statistics
     if measurements.n_links and s.dof_links < LEAST_CHECKED_SHARE * s.n_links:
@@ -97,7 +101,7 @@ def _unchecked_links(measurements: Measurements, estimate: Estimate) -> Iterator
 def unused_configurations(
     session: Session, estimate: Estimate, held_out: Sequence[int] | Integers
 ) -> Iterator[Finding]:
-    """A warning about configurations of which nothing was measured, but for those held out."""
+    """Warning about configurations without any measurement, except those held out."""
     unused = ~estimate.configurations
     unused[np.asarray(held_out, dtype=int)] = False
     names = [session.configurations[k] for k in np.flatnonzero(unused)]
@@ -107,25 +111,28 @@ def unused_configurations(
 
 
 def _kind(session: Session, station: int) -> str:
-    """What a station's measured poses are called."""
+    """Singular noun for the measured poses of a station."""
     tables = session.trackers[station - len(session.stations) :] if station >= len(
         session.stations) else ()  # fmt: skip
     return tables[0].target.one if tables else "board"
 
 
 def _link_name(links: LinkSet) -> str:
-    """What one of the links is called."""
+    """Singular noun for the links of a set."""
     return measurement_kinds()[links.kind].one
 
 
 def _kind_of(session: Session, measurements: Measurements, unit: RejectedUnit) -> str:
+    """Singular noun for a unit."""
     if unit.link >= 0:
         return _link_name(measurements.link_at(unit.link)[0])
     return "image" if unit.is_image else _kind(session, unit.station)
 
 
 def _name(session: Session, measurements: Measurements, unit: RejectedUnit) -> str:
-    """A unit by its image's file, or by its configuration where there is none, a link by both."""
+    """Name of a unit: its image's file or, without one, its configuration; for a link both
+    configurations.
+    """
     if unit.link >= 0:
         links, k = measurements.link_at(unit.link)
         first, second = (session.configurations[c] for c in links.configuration[k])

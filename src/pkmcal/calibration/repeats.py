@@ -1,7 +1,7 @@
-"""Measurement accuracy by experiment, [A] 4.2 and Table 1: how repeated photographs scatter.
+"""Measurement accuracy by experiment, [A] 4.2 and Table 1: scatter of repeated images.
 
-The session is calibrated, so that every leg is looked for where it is; then each photograph is
-measured by itself. What differs between photographs of one configuration from one station is the
+The session is calibrated, so that every leg is measured at its predicted position; then each image
+is measured by itself. Differences between images of one configuration from one station are the
 noise of a measurement: of the direction and position of each leg's axis, and of its edges.
 """
 
@@ -39,15 +39,19 @@ from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
 CAUSE_NAMED_SHARE = 0.3
-"""Share of the scatter, above what chance explains, from which its cause is told."""
+"""Share of the scatter, above chance, from which a motion is reported as its cause."""
 LEGS_BETTER_SHARE = 0.1
-"""Share by which each leg's own motion must explain more than one of the whole to be the cause."""
+"""Share by which separate motions of the legs must explain more than one motion of the whole to
+be the cause."""
 MOST_EXPLAINED_BY_CHANCE = 0.9
-"""Share that chance explains from which nothing can be told of a motion: too few edges show it."""
+"""Share explained by chance from which nothing is inferred about a motion: too few edges are
+affected by it."""
 MOSTLY_COMMON = 0.5
-"""Scatter, in what photographs promise, below which averaging repeats gains under an eighth."""
+"""Scatter, relative to the images' own estimate, below which averaging repeats gains less than
+an eighth."""
 REPEAT_SHUFFLES = 16
-"""Exchanges of the repeats that tell what chance explains, to a few hundredths."""
+"""Number of permutations of the repeats, from which the share explained by chance is estimated
+to a few hundredths."""
 PAPER_AXIS_NOISE = AxisNoise(images=1)
 """[A] Table 1, upper bounds, in degrees where the paper prints rad (errata)."""
 REPEATS_TABLE_LEGEND = (
@@ -59,20 +63,23 @@ REPEATS_TABLE_LEGEND = (
 )
 
 LEVEL_AXIS_SINE = float(np.sin(np.deg2rad(10.0)))
-"""Part u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2) lies
-far away or nowhere (errata)."""
+"""Component u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2)
+is far away or does not exist (errata)."""
 _RANK = 1e-9
-"""Singular values below this part of the largest are those of motions that no edge shows."""
+"""Eigenvalues of the normal equations below this share of the largest one belong to motions that
+affect no edge."""
 
 
 @dataclass(frozen=True)
 class LegScatter:
-    """Standard deviations of one photograph of a leg (from 1), pooled over configurations.
+    """Standard deviations of one image of a leg (from 1), pooled over configurations.
 
-    psi, theta (rad), x, z (m) : of the axis, [A] Table 1, camera frame; NaN where there are none.
-    shift, tilt : of an edge, px, as a whole and at its ends. promised : the edges' scatter over
-    what their own photographs promise. photographs, freedom : that saw the leg, and how many of
-    them are repeats.
+    psi, theta, x, z : of the axis, rad and m, [A] Table 1, camera frame; NaN where undefined.
+    shift, tilt : of an edge, px, as a whole and at its ends.
+    promised : ratio of the edges' scatter to the standard deviations estimated from each image
+        alone.
+    photographs, freedom : number of images in which the leg was measured, and how many of these are
+        repeats.
     """
 
     station: str
@@ -90,12 +97,13 @@ class LegScatter:
 
 @dataclass(frozen=True)
 class StationScatter:
-    """Why the repeats at a station differ.
+    """Causes of the differences between repeats at a station.
 
-    shift : px, and promised : as for a leg, over all of them. camera, platform, legs : share of
-    the squared scatter that a motion of the camera, of the platform, or of each leg by itself
-    explains, above chance. photographs, configurations : with repeats. dropped : repeats of
-    edges that lay far from the others.
+    shift, promised : as for a leg (px, ratio), over all legs.
+    camera, platform, legs : share of the squared scatter, above chance, that is explained by a
+        motion of the camera, of the platform, or of each leg separately.
+    photographs, configurations : numbers of images, and of configurations with repeats.
+    dropped : number of rejected repeats of edges.
     """
 
     station: str
@@ -110,9 +118,10 @@ class StationScatter:
 
     @property
     def cause(self) -> str:
-        """What moves: ``camera``, ``platform``, ``legs`` or, where nothing does, ``noise``.
+        """Cause of the scatter: ``camera``, ``platform``, ``legs`` or, where no motion explains it,
+        ``noise``.
 
-        Legs that move by themselves imitate a motion of the whole in part, and explain more.
+        Separate motions of the legs imitate a motion of the whole in part, and explain more.
         """
         best = "camera" if self.camera >= self.platform else "platform"
         whole = max(self.camera, self.platform)
@@ -125,7 +134,8 @@ class StationScatter:
 class RepeatStudy:
     """Table 1 of a session.
 
-    legs : by station and leg. middle, bound : median and largest of each column (leg 0).
+    legs : by station and leg.
+    middle, bound : median and largest value of each column (leg 0).
     """
 
     legs: tuple[LegScatter, ...]
@@ -135,7 +145,7 @@ class RepeatStudy:
     findings: tuple[Finding, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything under its name, for ``--json``."""
+        """All results by name, for ``--json``."""
         causes = [{**asdict(s), "cause": s.cause} for s in self.stations]
         paper = {name: getattr(PAPER_AXIS_NOISE, name) for name in ("psi", "theta", "x", "z")}
         findings = [finding.document() for finding in self.findings]
@@ -146,15 +156,15 @@ class RepeatStudy:
 def study_repeats(
     session: Session | Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
 ) -> RepeatStudy:
-    """How photographs of the same configurations scatter, by station and leg.
+    """Scatter of images of the same configurations, by station and leg.
 
-    Raises InputError where the session has no repeats, and what `calibrate_session` raises.
+    Raises InputError if the session has no repeats, and the errors of `calibrate_session`.
     """
     if not isinstance(session, Session):
         session = load_session(session)
     require_repeats(session)
     calibration = calibrate_session(session, seed=seed, progress=progress)
-    session = calibration.session  # without photographs by hand that were not placed
+    session = calibration.session  # without hand-held images that were not localized
     observed = [p for p in read_photographs(session) if _sees_legs(session.stations[p.station])]
     parts = [_StationEdges.of(calibration, photographs) for photographs in observed]
     parts = [station_edges for station_edges in parts if np.any(station_edges.same.count > 1)]
@@ -172,7 +182,7 @@ def study_repeats(
 
 
 def require_repeats(session: Session) -> None:
-    """An InputError, with what to write, where no station that observes legs has repeats."""
+    """Raise InputError, with the needed entry, if no station that observes legs has repeats."""
     for station in session.stations:
         rows = [photo.configuration for photo in station.photographs]
         if _sees_legs(station) and len(set(rows)) < len(rows):
@@ -198,15 +208,20 @@ def require_repeats(session: Session) -> None:
 
 
 def _sees_legs(station: Station) -> bool:
+    """Whether a station observes legs."""
     return "legs" in station.observe
 
 
 @dataclass(frozen=True)
 class _StationEdges:
-    """One station's edges, each photograph's by itself, without those that fell far off.
+    """One station's edges, measured in each image separately, without outlying repeats.
 
-    photo : (N,) number of the photograph. same : the repeats of each edge. turn : (N, 2) of each
-    from their mean, rad, in the bases (N, 3, 2) of ``basis``.
+    photo : (N,) number of the image.
+    cylinders : of the legs, camera frame.
+    same : groups of the repeats of each edge.
+    turn : (N, 2) rotation of each edge from the mean of its repeats, rad, in the tangent bases
+        ``basis`` (N, 3, 2).
+    dropped : number of rejected repeats.
     """
 
     station: int
@@ -220,11 +235,12 @@ class _StationEdges:
 
     @classmethod
     def of(cls, calibration: Calibration, photographs: Photographs) -> _StationEdges:
-        """Measure a station's photographs where the calibration says that the legs are."""
+        """Measure a station's images from the calibrated scene."""
         state, machine = calibration.estimate.state, calibration.machine
         s, rows = photographs.station, photographs.configuration
         camera = calibration.cameras.at_station(int(s))
         binning = int(calibration.observation.binning[s])
+        # each image as a configuration by itself, so that repeats are not combined
         numbered = replace(
             photographs, camera=camera, configuration=np.arange(len(rows)), binning=binning
         )
@@ -232,10 +248,12 @@ class _StationEdges:
         edges = legs.measure(numbered, machine, T_camera_base, poses).edges
         photo = edges.configuration
         edges = replace(edges, configuration=rows[photo])
+        # reject outlying repeats
         odd = odd_ones(edges, same_edges(edges))
         keep = ~odd.any
         edges, photo = edges.select(keep), photo[keep]
         same = same_edges(edges)
+        # deviations from the means
         turn = turns_from_first(edges, same)
         ends = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
         radius = machine.radii_of(edges.leg, edges.tube)
@@ -277,40 +295,43 @@ def _leg_rows(station_edges: _StationEdges, station: str) -> list[LegScatter]:
 
 @dataclass(frozen=True)
 class _Pooled:
-    """Sums of squares (G, n) of deviations from each group's mean, and their freedoms (G,)."""
+    """Sums of squares (G, n) of the deviations from each group's mean, and their freedoms (G,)."""
 
     squares: Array
     freedom: Array
 
 
 def _pooled(values: Array, groups: Groups) -> _Pooled:
+    """Deviations of values (N, n) from their groups' means."""
     away = values - groups.mean(values)[groups.member]
     return _Pooled(groups.total(away**2), groups.count - 1.0)
 
 
 def _deviation(pooled: _Pooled, mine: Booleans) -> Array:
-    """Standard deviations (n,) over some groups; NaN where nothing repeats."""
+    """Standard deviations (n,) pooled over some groups, ``mine`` (G,); NaN without repeats."""
     freedom = pooled.freedom[mine].sum()
     return np.sqrt(pooled.squares[mine].sum(axis=0) / (freedom if freedom else np.nan))
 
 
 def _stated(station_edges: _StationEdges) -> Array:
-    """Standard deviations (N, 2) that each edge's own photograph promises, mean over repeats."""
+    """Standard deviations (N, 2) estimated from each edge's own image, mean over repeats."""
     mean = station_edges.same.mean(station_edges.edges.covariance[:, [0, 1], [0, 1]])
     return np.sqrt(mean)[station_edges.same.member]
 
 
 def _whiten(station_edges: _StationEdges) -> Array:
-    """Inverse roots (N, 2, 2) of the edges' stated covariances, the same for all repeats of one."""
+    """Inverse Cholesky factors (N, 2, 2) of the edges' stated covariances, equal for all repeats of
+    one.
+    """
     stated = station_edges.same.mean(station_edges.edges.covariance)[station_edges.same.member]
     return np.linalg.inv(np.linalg.cholesky(stated))
 
 
 def _axis_scatter(station_edges: _StationEdges) -> tuple[Integers, _Pooled]:
-    """The axes' psi, theta, x, z in every photograph: the leg of each configuration, and sums.
+    """Scatter of psi, theta, x and z of the axes: the leg of each group of repeats, and the sums.
 
-    An axis is fitted to all edges of the leg, of all of its tubes, weighted as the calibration
-    weights them; one that shows a single side has none.
+    An axis is fitted to all edges of the leg, of all its tubes, with the weights of the
+    calibration. Legs with one visible side have no axis.
     """
     edges, legs = station_edges.edges, station_edges.cylinders
     in_view = groups_of(station_edges.photo, edges.leg)
@@ -329,7 +350,7 @@ def _axis_scatter(station_edges: _StationEdges) -> tuple[Integers, _Pooled]:
 
 
 def _station_row(station_edges: _StationEdges, station: str) -> StationScatter:
-    """Scatter over all legs of a station, and what motion explains it."""
+    """Scatter over all legs of a station, and the motions that explain it."""
     edges, same, legs = station_edges.edges, station_edges.same, station_edges.cylinders
     every = np.ones(len(same.first), dtype=bool)
     shift = _deviation(_pooled(station_edges.turn[:, :1] / pixel_units(edges)[:, :1], same), every)
@@ -352,9 +373,11 @@ def _station_row(station_edges: _StationEdges, station: str) -> StationScatter:
 def _explained(station_edges: _StationEdges, rows: Array, groups: Groups) -> float:
     """Share of the squared scatter that motions of groups explain: 0 as by chance, 1 all.
 
-    rows : (N, 2, p) turn of the edges by a group's motion. What chance explains is found by
-    exchanging the repeats of every edge by itself, which leaves its scatter and parts it from
-    the other edges'. Two edges of a leg look like a motion of it however they scatter.
+    The share explained by chance is estimated by permuting the repeats of each edge separately,
+    which preserves the edge's scatter and removes its correlation with the other edges. Two edges
+    of a leg always resemble a motion of it.
+
+    rows : (N, 2, p) derivative of the edges' rotation by a group's motion.
     """
     whiten, rng = _whiten(station_edges), np.random.default_rng(0)
 
@@ -375,7 +398,7 @@ def _explained(station_edges: _StationEdges, rows: Array, groups: Groups) -> flo
 
 @dataclass(frozen=True)
 class Cylinders:
-    """The legs of N edges: ends a, b (N, 3) of the axes, camera frame, and radii (N,), m."""
+    """Legs of N edges: ends a, b (N, 3) of the axes, camera frame, and radii (N,), m."""
 
     a: Array
     b: Array
@@ -383,7 +406,7 @@ class Cylinders:
 
 
 def half_angles(edges: EdgeSet, legs: Cylinders) -> Array:
-    """Half the angle (N,), rad, under which the camera sees an edge's length."""
+    """Half the angle (N,), rad, subtended by an edge's length at the camera."""
     d = legs.b - legs.a
     u = d / np.sqrt(dot(d, d))[:, None]
     first, last = (legs.a + edges.span[:, k, None] * u for k in (0, 1))
@@ -391,32 +414,44 @@ def half_angles(edges: EdgeSet, legs: Cylinders) -> Array:
 
 
 def by_ends(edges: EdgeSet, basis: Array, legs: Cylinders) -> Array:
-    """Turn of the edges, in tangent bases (N, 3, 2), by motions of a and b: (N, 2, 6), rad/m."""
+    """Derivative (N, 2, 6), rad/m, of the edges' rotation by the ends a and b of the axes.
+
+    basis : tangent bases (N, 3, 2) of the normals.
+    """
     e = edge_normal_jacobians(legs.a, legs.b, legs.radius, edges.side)
     return basis.mT @ np.concatenate([e.dn_da, e.dn_db], axis=-1)
 
 
 def by_camera(ends: Array, legs: Cylinders) -> Array:
-    """Turn (N, 2, 6) by six numbers (omega, tau) of the camera, from that by the ends."""
+    """Derivative (N, 2, 6) of the edges' rotation by six numbers (omega, tau) of the camera.
+
+    ends : (N, 2, 6) derivative by the ends, see :func:`by_ends`.
+    """
     return ends[..., :3] @ _rigid(legs.a) + ends[..., 3:] @ _rigid(legs.b)
 
 
 def by_platform(ends: Array, legs: Cylinders) -> Array:
-    """Turn (N, 2, 6) by six numbers (omega, tau) of the platform about the b ends' middle."""
+    """Derivative (N, 2, 6) of the edges' rotation by six numbers (omega, tau) of the platform.
+
+    The rotation omega is about the mean of the ends b.
+
+    ends : (N, 2, 6) derivative by the ends, see :func:`by_ends`.
+    """
     return ends[..., 3:] @ _rigid(legs.b - legs.b.mean(axis=0))
 
 
 def _rigid(points: Array) -> Array:
-    """Motion of points (N, 3) by (omega, tau): omega x p + tau, (N, 3, 6)."""
+    """Derivative (N, 3, 6) of points (N, 3) by (omega, tau): omega x p + tau."""
     eye = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     return np.concatenate([-skew(points), eye], axis=-1)
 
 
 @dataclass(frozen=True)
 class MotionFit:
-    """Motions that explain edges' turns best, by group.
+    """Least-squares motions of groups.
 
-    motion : (G, p). explained, total : sums of squared whitened turns.
+    motion : (G, p).
+    explained, total : (G,) sums of squared whitened rotations.
     """
 
     motion: Array
@@ -425,12 +460,16 @@ class MotionFit:
 
 
 def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> MotionFit:
-    """Least squares, by group, of turns (N, 2) on rows (N, 2, p), both whitened by (N, 2, 2).
+    """Least-squares motion of each group from rotations (N, 2) of its edges.
 
-    Motions that no edge shows stay zero.
+    Motions that affect no edge are zero.
+
+    rows : (N, 2, p) derivatives.
+    whiten : (N, 2, 2), applied to both.
     """
     white = (whiten @ turn[..., None])[..., 0]
     rows = whiten @ rows
+    # normal equations by group, solved by pseudo-inverse
     normal = groups.total(rows.mT @ rows)
     right = groups.total((white[:, None, :] @ rows)[:, 0])
     values, axes = np.linalg.eigh(normal)
@@ -442,19 +481,21 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
 
 
 def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:
-    """Change (G, 4) of psi, theta (rad), x, z (m) by motions (G, 6) of an axis' ends a, b (G, 3).
+    """Change (G, 4) of psi, theta (rad), x, z (m) by motions (G, 6) of an axis's ends a, b (G, 3).
 
-    To first order; the coordinates of papers.axis_measurements.to_coordinates. x and z are NaN
-    for a leg that is level in the image, which has no point with y = 0.
+    To first order; the coordinates of papers.axis_measurements.to_coordinates. x and z are NaN for
+    a leg that is level in the image, which has no point with y = 0.
     """
     d = b - a
     length = np.sqrt(dot(d, d))[:, None]
     u = d / length
+    # change of the direction u, and from it of both angles
     step = motion[:, 3:] - motion[:, :3]
     du = (step - dot(step, u)[:, None] * u) / length
     across = np.hypot(u[:, 0], u[:, 1])
     psi = (u[:, 0] * du[:, 1] - u[:, 1] * du[:, 0]) / across**2
     theta = du[:, 2] / across
+    # change of the point with y = 0
     uy = np.where(np.abs(u[:, 1]) < LEVEL_AXIS_SINE, np.nan, u[:, 1])[:, None]
     ay, day, duy = a[:, 1, None], motion[:, 1, None], du[:, 1, None]
     point = motion[:, :3] - day / uy * u + ay / uy**2 * duy * u - ay / uy * du
@@ -462,7 +503,7 @@ def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:
 
 
 def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
-    """A quantile of each column over all legs; at share 1 the largest, as [A] Table 1 has them."""
+    """Quantile of each column over all legs; share 1 is the largest value, as in [A] Table 1."""
 
     def quantile(name: str) -> float:
         column = np.array([getattr(row, name) for row in rows])
@@ -485,7 +526,7 @@ def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
 
 
 def part_of(study: RepeatStudy) -> Part:
-    """The scatter as a table, beside the paper's."""
+    """Report part with the scatter as a table, beside the paper's."""
     rows = [Row(leg.station, (str(leg.leg), *_cells(leg))) for leg in study.legs]
     rows.append(Row("median", ("", *_cells(study.middle))))
     rows.append(Row("upper bound", ("", *_cells(study.bound))))
@@ -500,6 +541,7 @@ def part_of(study: RepeatStudy) -> Part:
 
 
 def _cells(row: LegScatter) -> tuple[str, ...]:
+    """Cells of a row: number of images, axis and edges."""
     axis = (_degrees(row.psi), _degrees(row.theta), _mm(row.x), _mm(row.z))
     edges = (f"{v:.3f} px" if math.isfinite(v) else "–" for v in (row.shift, row.tilt))
     return str(row.photographs), *axis, *edges
@@ -514,7 +556,7 @@ def _mm(value: float) -> str:
 
 
 def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
-    """What each station's repeats show, and what more of them would bring."""
+    """Findings about each station's repeats, and about the benefit of further ones."""
     results = [_finding(station) for station in stations] or [doubtful("repeats.none")]
     if stations and all(station.promised < MOSTLY_COMMON for station in stations):
         results.append(note("repeats.mostly_common"))
@@ -522,7 +564,7 @@ def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
 
 
 def _finding(station: StationScatter) -> Finding:
-    """How large the scatter of a station is and where it comes from."""
+    """Finding about the size and the cause of a station's scatter."""
     share = {"camera": station.camera, "platform": station.platform, "legs": station.legs}
     return finding(
         f"repeats.by_{station.cause}",

@@ -1,5 +1,5 @@
-"""A calibration read back from disk, and checked to be whole: calibration.json as
-:mod:`pkmcal.calibration.results` writes it.
+"""Reader of saved calibrations: loads and validates calibration.json as written by
+:mod:`pkmcal.calibration.results`.
 """
 
 from __future__ import annotations
@@ -37,22 +37,25 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.wording import listed
 
 SAVED_NUMBER_ROUNDING = 1e-9
-"""Relative difference below which two numbers of a file are the same: rounding leaves 1e-15, a
-change by hand a millionth."""
+"""Relative difference below which two numbers of a file are equal: rounding causes 1e-15,
+editing a millionth."""
 
 Sigma3 = tuple[float | None, float | None, float | None]
 """None where the data do not determine the number."""
 Row4 = tuple[float, float, float, float]
+"""Row of a 4x4 matrix."""
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Factor = Annotated[float, Field(gt=0)]
+"""Positive number."""
 
 
 @dataclass(frozen=True)
 class SavedStation:
-    """One camera's pose as found: T_base_camera (4, 4), m.
+    """Estimated pose of one camera: T_base_camera (4, 4), m.
 
+    camera : its camera file.
     sigma_rotation, sigma_translation : (3,) standard deviations, rad and m, base axes; infinite
-    where the data do not determine the number.
+        where the data do not determine the number.
     """
 
     name: str
@@ -66,10 +69,11 @@ class SavedStation:
 
 @dataclass(frozen=True)
 class CalibrationPrior:
-    """What a calibration knows of its machine, and of the cameras that stand where it had them.
+    """Prior from a calibration, of the machine and of the cameras that have not moved since.
 
     covariance : (P + 6 k, P + 6 k) of the parameters and of these cameras' poses, left
-    perturbation. stations : (k,) their numbers in a session; all others have to be found anew.
+        perturbation.
+    stations : (k,) their numbers in a session; all others have to be localized anew.
     T_camera_base : (k, 4, 4).
     """
 
@@ -78,7 +82,7 @@ class CalibrationPrior:
     T_camera_base: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     def only(self, stations: Sequence[int]) -> CalibrationPrior:
-        """What it knows where no other stations stand as they stood."""
+        """Prior with only some of the stations in their former poses."""
         n = len(self.covariance) - 6 * len(self.stations)
         remainder = np.array([k for k, s in enumerate(self.stations) if s in stations], dtype=int)
         rows = rows_of_stations(n, remainder)
@@ -91,14 +95,18 @@ class CalibrationPrior:
 
 @dataclass(frozen=True, repr=False)
 class SavedCalibration(CalibrationSummary):
-    """A calibration read back, in the frames that `gauge` names.
+    """A calibration read from its file, in the frames that `gauge` names.
 
-    machine : with the calibrated values. drawing : (P,) values before.
-    placed : k stations whose covariance with the machine is known; none of an older file.
+    machine : with the calibrated values.
+    drawing : (P,) nominal values.
+    placed : the k stations whose covariance with the machine is stored; none in older files.
     joint_covariance : (P + 6 k, P + 6 k) of the parameters and then of these stations, (omega, tau)
-    of T_camera_base, left perturbation, as :class:`~pkmcal.identify.estimate.Estimate` has it.
-    data_share : (P,), NaN where it means nothing.
-    configurations : K names. used : (K,). joints : (K, m). T_base_platform : (K, 4, 4).
+        of T_camera_base, left perturbation, as in :class:`~pkmcal.identify.estimate.Estimate`.
+    data_share : (P,), NaN where undefined.
+    configurations : K names.
+    used : (K,) whether a configuration was in use.
+    joints : (K, m).
+    T_base_platform : (K, 4, 4).
     document : the whole file.
     """
 
@@ -121,19 +129,21 @@ class SavedCalibration(CalibrationSummary):
 
     @property
     def covariance(self) -> Array:
-        """(P, P) of the machine's parameters."""
+        """Covariance (P, P) of the machine's parameters."""
         n = len(self.machine.parameters)
         return self.joint_covariance[:n, :n]
 
     def overview(self) -> Overview:
-        """What it shows of itself; an older file may not have all of it."""
+        """Contents of the summary; older files may not have all of them."""
         document = self.document
         residuals = document.get("residuals") or {}
         edges, poses = (residuals.get(key) or () for key in ("edges", "poses"))
+        # residuals of inlying edges and poses
         parts = [
             [x for row in edges if row[EDGE_WEIGHT] >= 0.5 for x in row[EDGE_RESIDUALS]],
             [x for row in poses if row[POSE_WEIGHT] >= 0.5 for x in row[POSE_WEIGHT + 1 :]],
         ]
+        # statistics, if the file has all that have no default
         reference_values = {f.name for f in fields(Statistics)}
         statistics = {
             k: v for k, v in (document.get("statistics") or {}).items() if k in reference_values
@@ -157,8 +167,9 @@ class SavedCalibration(CalibrationSummary):
         )
 
     def prior(self, names: Sequence[str], of_session: Sequence[str]) -> CalibrationPrior:
-        """What it knows of the machine and of some stations, in their order, by their numbers among
-        those of a session. Raises InputError for one that is not ``placed``.
+        """Prior of the machine and of the stations ``names``, numbered as in ``of_session``.
+
+        Raises InputError for a station that is not in ``placed``.
         """
         for name in names:
             if name in self.placed:
@@ -189,7 +200,7 @@ class SavedCalibration(CalibrationSummary):
 
 
 class _Part(Schema):
-    """Fields that are needed here; a newer pkmcal may write more."""
+    """Schema of the needed fields; a newer pkmcal may write more."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -237,11 +248,13 @@ class _Target(_Part):
 
 
 Numbers = tuple[float | None, ...]
+"""A row of residuals."""
 
 
 def _has_weight(columns: Sequence[str], fewest: int) -> AfterValidator:
-    """A row of residuals has these columns, of which older files lack the last, and numbers up to
-    its weight.
+    """Validator of a row of residuals: number of columns, and numbers up to the weight.
+
+    fewest : number of columns in older files, which lack the last ones.
     """
     most = columns.index("weight") + 1
 
@@ -259,7 +272,7 @@ class _Residuals(_Part):
 
 
 class _Statistics(_Part):
-    """All of them are numbers; factors are positive."""
+    """Statistics of the estimate: numbers, with positive factors."""
 
     noise_scale: Factor = 1.0
     pose_scale: Factor = 1.0
@@ -282,6 +295,7 @@ class _Statistics(_Part):
 
 
 Ends = tuple[float, float] | None
+"""Lower and upper bound, m."""
 
 
 class _Region(_Part):
@@ -354,7 +368,7 @@ class _Saved(_Part):
     station_covariance: _StationCovariance | None = None
     configurations: tuple[_Configuration, ...]
     mechanism: MechanismDocument
-    # read where they are wanted, and absent from some older files
+    # optional, because some older files lack them
     cameras: tuple[_Camera, ...] = ()
     targets: tuple[_Target, ...] = ()
     residuals: _Residuals | None = None
@@ -367,9 +381,13 @@ class _Saved(_Part):
 
 
 def load(source: Path | str) -> SavedCalibration:
-    """Read a calibration from its folder or its calibration.json, and check that it is whole."""
+    """Read a calibration from its folder or its calibration.json, and validate it.
+
+    Raises InputError if there is none, or if it is inconsistent.
+    """
     document = _read(Path(source))
     saved = validated_document(document, _Saved)
+    # consistency of machine, poses, readings and covariance
     machine = checked_machine(_mechanism(saved), document, "mechanism")
     _check_parameters(document, saved, machine)
     for group, key in (
@@ -418,7 +436,7 @@ def _deviations(values: Sigma3) -> Array:
 
 
 def _verdict(saved: _Verdict) -> Verdict:
-    """The verdict in its own words; where a file is from before findings had codes, without."""
+    """Verdict with its saved sentences; findings from before there were codes have none."""
     coded = {(one.level, one.text): one for one in saved.findings}
     findings: list[Finding] = []
     for level, texts in (
@@ -442,7 +460,7 @@ def _verdict(saved: _Verdict) -> Verdict:
 
 
 def _mechanism(saved: _Saved) -> MechanismDocument:
-    """The mechanism; of a file from before readings had scales, one whose scales are exact."""
+    """Mechanism document; with exact scales if the file is from before scales were parameters."""
     mechanism = saved.mechanism
     if any(p.name.endswith(".scale") for p in saved.parameters):
         return mechanism
@@ -450,6 +468,7 @@ def _mechanism(saved: _Saved) -> MechanismDocument:
 
 
 def _read(source: Path) -> Document:
+    """Document of a calibration; raises InputError if there is none or its version is unknown."""
     path = source / CALIBRATION_DOCUMENT_FILE if source.is_dir() else source
     if not path.is_file():
         raise InputError(
@@ -471,6 +490,7 @@ def _read(source: Path) -> Document:
 
 
 def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> None:
+    """Raise `InputError` unless parameters and mechanism agree in names and values."""
     names = tuple(p.name for p in saved.parameters)
     if names != machine.parameters.names:
         raise _edited(document, "parameters", "the names of the mechanism's parameters")
@@ -483,7 +503,13 @@ def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> No
 
 
 def _covariance(document: Document, saved: _Saved) -> tuple[tuple[str, ...], Array]:
-    """Names of the stations that are known with the machine, and the covariance of both."""
+    """Names of the stations with a stored covariance, and the joint covariance.
+
+        [ covariance            rows^T   ]  parameters
+        [ rows of the stations           ]  six numbers for each station
+
+    Poses in the file are T_base_camera; the result is that of the inverse poses.
+    """
     count, reference_values = len(saved.parameters), saved.station_covariance
     _check_size(document, "covariance", saved.covariance, (count, count), "list of parameters")
     if reference_values is None:
@@ -518,6 +544,7 @@ def _check_size(
     shape: tuple[int, int],
     of: str,
 ) -> None:
+    """Raise `InputError` for a matrix of another shape."""
     if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
         raise InputError(
             f"the covariance has another size than the {of}",
@@ -547,6 +574,7 @@ def _check_covariance(document: Document, key: str, matrix: Array) -> None:
 
 
 def _check_poses(document: Document, group: str, key: str, items: tuple[Any, ...]) -> None:
+    """Raise `InputError` for a matrix that is not a rigid motion."""
     for k, item in enumerate(items):
         if (rows := getattr(item, key)) is None:
             continue
@@ -558,6 +586,7 @@ def _check_poses(document: Document, group: str, key: str, items: tuple[Any, ...
 
 
 def _edited(document: Document, field: str, expected: str) -> InputError:
+    """Error for a file that contradicts itself."""
     return InputError(
         "the calibration does not agree with itself",
         where=f"{document.label}, {field}",

@@ -1,6 +1,6 @@
-"""A calibration as people look at it in Python: short, as a summary, as tables and plots.
+"""Presentation of a calibration in Python: summary text, HTML, tables and plots.
 
-The same for one that was just made and for one read back from its file.
+The same for a new calibration and for one read from its file.
 """
 
 from __future__ import annotations
@@ -26,13 +26,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Overview:
-    """What a summary is made of.
+    """Contents of a summary.
 
-    source : the session's name. drawing : (P,) values before. covariance : (P, P). data_share :
-    (P,). poses : (n, 4, 4) of the platform, of the configurations in use. legs_observed : whether
-    edges of legs were. residuals : (n,) of edges and poses, whitened, with weights of half and
-    more. chi2 : per degree of freedom, of the noise as stated; NaN where it is not known. warnings
-    : about the session.
+    source : the session's name.
+    drawing : (P,) nominal values.
+    covariance : (P, P) of the parameters.
+    data_share : (P,) 1 - posterior variance / prior variance.
+    poses : T_base_platform (n, 4, 4) of the configurations in use.
+    legs_observed : whether edges of legs were measured.
+    residuals : (n,) of edges and poses, whitened, of weight 1/2 and more.
+    chi2 : per degree of freedom, with the noise as stated; NaN if unknown.
+    warnings : about the session.
     """
 
     source: str
@@ -51,21 +55,24 @@ class Overview:
 
 
 class CalibrationSummary(ABC):
-    """What a calibration shows of itself."""
+    """Base class of calibrations that present themselves as text, HTML, tables and plots."""
 
     @abstractmethod
     def overview(self) -> Overview:
-        """What it is made of."""
+        """Contents of the summary."""
 
     def tool_error(self, T_base_platform: Array) -> ToolError:
-        """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
-        see :func:`pkmcal.identify.tool.tool_error`. No frame is favoured: base and platform are
-        laid over the drawing's by all joint centres, or, where only boards or trackers saw the
-        machine, by these poses. NaN where the machine cannot take a pose. Raises InputError for an
-        array that holds no poses.
+        """Uncertainty of poses of the calibrated machine, and errors of the nominal model there.
+
+        See :func:`pkmcal.identify.tool.tool_error`. The result does not depend on the gauge: base
+        and platform are fitted to the nominal model's by all joint centres or, if only boards or
+        trackers observed the machine, by these poses. NaN where the machine cannot reach a pose.
+        Raises InputError for an array that holds no poses.
+
+        T_base_platform : (n, 4, 4).
         """
         overview = self.overview()
-        # what a file's machine calls its drawing are the calibrated values
+        # the nominal values in a calibration's mechanism file are the calibrated ones
         table = replace(overview.machine.parameters, drawing=overview.drawing)
         machine = replace(overview.machine, parameters=table)
         return tool_error(
@@ -78,8 +85,9 @@ class CalibrationSummary(ABC):
 
     @property
     def parameters(self) -> ParameterEstimates:
-        """All parameters: drawing, value, standard deviation, and what decides them. Shows itself
-        as a table; ``to_pandas()`` makes a DataFrame.
+        """All parameters: nominal value, value, standard deviation and what determines them.
+
+        The object shows itself as a table; ``to_pandas()`` makes a DataFrame.
         """
         overview = self.overview()
         return parameter_estimates(
@@ -120,6 +128,7 @@ class CalibrationSummary(ABC):
         )
 
     def _title(self, values: Overview) -> str:
+        """Machine, session, method and number of configurations."""
         return (
             f"Calibration of {values.machine.name} from {values.source or 'a session'}, method"
             f" {values.method}, {count(len(values.poses), 'configuration')}"
@@ -128,6 +137,7 @@ class CalibrationSummary(ABC):
     def _figures(self, values: Overview) -> list[tuple[str, str]]:
         """Names and values of the main figures."""
         out: list[tuple[str, str]] = []
+        # mean and largest tool error, after and before
         tool = self.tool_error(values.poses)
         for name, place, turn in (
             ("Tool, σ", tool.position, tool.orientation),
@@ -141,6 +151,7 @@ class CalibrationSummary(ABC):
                 out.append(
                     (name, f"{brief(float(place[finite].mean()) * 1e3)} mm{turned} ({where})")
                 )
+        # what determines the parameters
         kinds = [row.decided_by for row in self.parameters]
         parts = [f"{kinds.count(k)} by {text}" for k, text in
                  (("data", "the data"), ("drawing", "the drawing")) if k in kinds]  # fmt: skip
@@ -160,25 +171,36 @@ class CalibrationSummary(ABC):
     # ------------------------------------------------------------------ plots
 
     def plot_residuals(self, ax: Axes | None = None) -> Axes:
-        """Residuals of all edges and poses in standard deviations, against what noise alone makes.
+        """Plot the residuals of edges and poses in standard deviations, with the standard normal
+        density.
 
-        ax : axes to draw into; new ones unless given. Needs ``pip install '.[plot]'``.
+        Needs ``pip install '.[plot]'``.
+
+        ax : axes to draw into; new ones by default.
         """
         from pkmcal.calibration.plots import draw_residuals
 
         return draw_residuals(self.overview().residuals, ax)
 
     def plot_parameters(self, ax: Axes | None = None) -> Axes:
-        """How far each parameter is from its drawing, with two standard deviations, in tolerances
-        of the drawing. ax, needs : as :meth:`plot_residuals`.
+        """Plot each parameter's change from its nominal value, with two standard deviations.
+
+        In prior sigmas of the nominal model. Needs ``pip install '.[plot]'``.
+
+        ax : as in :meth:`plot_residuals`.
         """
         from pkmcal.calibration.plots import parameters
 
         return parameters(self.parameters, self.overview().machine.parameters.tolerance, ax)
 
     def plot_tool(self, T_base_platform: Array | None = None, ax: Axes | None = None) -> Axes:
-        """The tool's error at poses (n, 4, 4), the photographed ones unless given: the drawing's,
-        and what is uncertain after the calibration. ax, needs : as :meth:`plot_residuals`.
+        """Plot the tool's error of the nominal model, and its standard deviation after the
+        calibration.
+
+        Needs ``pip install '.[plot]'``.
+
+        T_base_platform : (n, 4, 4) poses; by default those of the configurations in use.
+        ax : as in :meth:`plot_residuals`.
         """
         from pkmcal.calibration.plots import tool
 

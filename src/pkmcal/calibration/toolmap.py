@@ -1,5 +1,5 @@
-"""Over the whole workspace: how sure the platform's poses are after a calibration, how sure they
-would be by the drawing's tolerances, and how wrong the drawing was.
+"""Uncertainty of the platform's poses over the workspace: after calibration, and by the prior
+sigmas of the nominal model, with the errors of the nominal model.
 """
 
 from __future__ import annotations
@@ -23,32 +23,33 @@ if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
 TOOL_MAP_POSES = 250
-"""Poses spread over the region, from which figures are told."""
+"""Number of poses spread over the region, from which figures are computed."""
 CELLS_ALONG_SLICE = 20
-"""Cells along a slice's longer side."""
+"""Number of cells along the longer side of a slice."""
 SLICE_HEIGHT_SHARES = (0.15, 0.5, 0.85)
-"""Where slices lie between the lowest and the highest of those poses."""
+"""Heights of the slices, as shares of the range of those poses."""
 SLICE_MARGIN_SHARE = 0.08
-"""What slices reach beyond those poses to either side, in their extent."""
+"""Extension of the slices beyond those poses to either side, as a share of their range."""
 NO_EXTENT = 1e-3
-"""Part of those poses' widest extent below which an axis has none."""
+"""Share of the poses' largest range below which the range along an axis is zero."""
 LEAST_CELLS, LEAST_FILLED_SHARE = 3, 0.4
-"""Rows and columns of cells, and their part that the machine can take, below which it is no slice:
-a platform that only moves aside as it turns is at one orientation in few places."""
+"""Fewest rows and columns of cells, and smallest share of reachable cells among these, for a
+slice: a platform that can only shift as it rotates has one orientation in few places."""
 MOST_OFF_CELL_MIDDLE = 0.25
-"""Of a cell: how far from its middle a pose may be put by rods and axes."""
+"""Largest distance, in cells, by which rods and axes may put a pose off its cell's middle."""
 MOST_SLICE_TURN = np.deg2rad(3.0)
-"""Turns that crooked axes force on a platform that should only shift; a slice is of one
-orientation."""
+"""Largest rotation in a slice of one orientation, for misaligned axes rotate a platform that
+should only shift."""
 
 
 @dataclass(frozen=True)
 class Slice:
-    """Positions in a plane, at home's orientation.
+    """Grid of positions in a plane, at the home orientation.
 
-    across, up : axes (0 to 2) of the base frame that the slice lies along. level : its place along
-    the third, m. u (a,), v (b,) : coordinates of the cells' middles, m. rows : (b, a) each cell's
-    pose in the map, -1 where the machine cannot take it.
+    across, up : axes (0 to 2) of the base frame that span the slice.
+    level : its coordinate along the third axis, m.
+    u, v : (a,) and (b,) coordinates of the cells' middles, m.
+    rows : (b, a) index of each cell's pose in the map, -1 where the machine cannot reach it.
     """
 
     across: int
@@ -60,16 +61,18 @@ class Slice:
 
     @property
     def normal(self) -> int:
-        """The third axis."""
+        """Index of the third axis."""
         return 3 - self.across - self.up
 
 
 @dataclass(frozen=True)
 class ToolMap:
-    """Poses of a region, the first ``spread`` of them evenly over it, the rest in slices.
+    """Uncertainty and error of the poses of a region.
 
-    after : how sure they are as calibrated, and how far the drawing was off. before : how sure they
-    would be by the drawing's tolerances alone.
+    spread : the first so many poses are evenly distributed over the region, the others are in
+        slices.
+    after : uncertainty after the calibration, and error of the nominal model.
+    before : uncertainty by the prior sigmas of the nominal model alone.
     """
 
     region: Region
@@ -82,11 +85,11 @@ class ToolMap:
 
     @cached_property
     def evenly(self) -> tuple[ToolError, ToolError]:
-        """``before`` and ``after`` at the evenly spread poses alone."""
+        """``before`` and ``after`` at the evenly distributed poses alone."""
         return self.before.first(self.spread), self.after.first(self.spread)
 
     def document(self) -> dict[str, Any]:
-        """For programs, of the evenly spread poses: m and rad."""
+        """Figures of the evenly distributed poses for programs, m and rad."""
         before, after = self.evenly
         worst = int(np.nanargmax(after.position))
         return {
@@ -103,7 +106,7 @@ class ToolMap:
 
 
 def _summary(position: Array, orientation: Array) -> dict[str, Any]:
-    """Medians and largest, None where nothing is known."""
+    """Medians and largest values, None where nothing is finite."""
     parts = {"position": position, "orientation": orientation}
     finite = {name: values[np.isfinite(values)] for name, values in parts.items()}
     return {
@@ -122,11 +125,13 @@ def map_of(
     *,
     legs_observed: bool = True,
 ) -> ToolMap:
-    """The map of a region, the whole reach unless given.
+    """Map of a region; of the whole workspace by default.
 
-    covariance : (P, P) of the calibrated parameters, in any frames. legs_observed : see
-    :func:`~pkmcal.identify.tool.tool_error`; without legs the frames are those that fit the evenly
-    spread poses best. Raises InputError where the machine can take no pose of the region.
+    Raises InputError if the machine can reach no pose of the region.
+
+    covariance : (P, P) of the calibrated parameters, in any gauge.
+    legs_observed : see :func:`~pkmcal.identify.tool.tool_error`; without legs the frames are those
+        that fit the evenly distributed poses best.
     """
     region = region or Region()
     limits = calibrated.limits()
@@ -148,9 +153,7 @@ def map_of(
 
 
 def of_calibration(calibration: Calibration) -> ToolMap:
-    """The map over the session's workspace. Raises PkmcalError where the calibrated machine has
-    none.
-    """
+    """Map over the session's workspace. Raises PkmcalError if the calibrated machine has none."""
     estimate, session = calibration.estimate, calibration.session
     in_view = estimate.edge_weights.size > 0
     return map_of(
@@ -163,8 +166,10 @@ def of_calibration(calibration: Calibration) -> ToolMap:
 
 
 def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, ...], list[Array]]:
-    """Horizontal slices and a vertical one where the machine has a height, and their poses, in the
-    order in which the rows count them, after the evenly spread ones.
+    """Slices and their poses: horizontal ones and, where the machine has a height, a vertical one.
+
+    The poses are in the order in which the slices' rows count them, after the evenly distributed
+    ones.
     """
     places = even[:, :3, 3]
     low, high = places.min(axis=0), places.max(axis=0)
@@ -173,6 +178,7 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
     flat = wide <= NO_EXTENT * wide.max()
     middle = (low + high) / 2
     if flat[2]:
+        # a planar machine has one horizontal slice
         planes = [(0, 1, float(middle[2]))]
     else:
         planes = [(0, 1, float(low[2] + share * wide[2])) for share in SLICE_HEIGHT_SHARES]
@@ -187,6 +193,7 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
         made, taken = _slice(limits, region, (across, up, level), box, first)
         there = made.rows >= 0
         rows, columns = there.any(axis=1).sum(), there.any(axis=0).sum()
+        # keep slices that the machine fills sufficiently
         if min(rows, columns) >= LEAST_CELLS and len(taken) >= LEAST_FILLED_SHARE * rows * columns:
             out.append(made)
             poses.append(taken)
@@ -201,7 +208,12 @@ def _slice(
     box: tuple[Array, Array],
     first: int,
 ) -> tuple[Slice, Array]:
-    """A slice within a box, its rows counted from ``first``, and its poses."""
+    """One slice within a box, and its poses.
+
+    plane : axes across and up, and the level along the third.
+    box : lowest and highest corner.
+    first : index of its first pose in the map.
+    """
     across, up, level = plane
     low, high = box
     cell = max(high[across] - low[across], high[up] - low[up]) / CELLS_ALONG_SLICE
@@ -212,6 +224,7 @@ def _slice(
     at = np.full((len(v), len(u), 3), level)
     at[..., across], at[..., up] = u, v[:, None]
     wanted = pose(limits.home[:3, :3], at.reshape(-1, 3))
+    # nearest poses that the mechanism can take, inside the region and close to the cell's middle
     closed = on_manifold(limits.layout, limits.theta, wanted, ROUGH_EFFORT.newton)
     there = closed.T_base_platform
     off = pose_difference(there, wanted)

@@ -1,14 +1,13 @@
-"""What stands around the machine, as photographs taken by hand from several places show it.
+"""Background of hand-held images: points of the room that several images share.
 
-A machine of equal parts looks much the same from several sides; the room about it does not. Points
-of texture that two photographs share lie on epipolar lines of each other where both were taken from
-where they are believed to be, and anywhere elsewhere. So each place that a photograph could show is
-asked how well the room agrees with photographs that are placed.
+A machine of equal parts looks nearly the same from several sides; the room around it does not.
+Feature points that two images share lie on each other's epipolar lines if both cameras are where
+they are assumed to be, and anywhere otherwise. Each candidate pose of an image is therefore scored
+by how well the room agrees with the images whose poses are already accepted.
 
-Points on the machine itself are left out: they move with it, and a machine alike from two sides
-agrees with itself from both. Points are Lowe's scale-invariant features (International Journal of
-Computer Vision 60, 2004) with the roots of their descriptors (Arandjelovic and Zisserman, CVPR
-2012).
+Points on the machine are excluded: they move with it, and a machine with symmetric parts agrees
+with itself from both sides. Features are Lowe's SIFT (International Journal of Computer Vision 60,
+2004) with square-rooted descriptors (Arandjelovic and Zisserman, CVPR 2012).
 """
 
 from __future__ import annotations
@@ -27,43 +26,55 @@ from pkmcal.observe.image_localization import SAME_PLACE_TURN, PoseHypotheses
 from pkmcal.observe.predict import LegsInCamera
 
 LARGEST_TEXTURE_SIDE = 1600
-"""Pixels of a photograph's longer side on which texture is looked for: finer is mostly noise."""
+"""Longer side, in pixels, to which images are reduced for feature detection; finer detail is
+mostly noise."""
 MOST_TEXTURE_POINTS = 3000
-"""Points of texture of a photograph, those of most contrast."""
+"""Largest number of features of an image; those of most contrast are used."""
 PARTNER_DISTANCE_RATIO = 0.8
-"""Distance to the likeliest partner, in that to the next, above which there is none (Lowe, 7.1)."""
+"""Largest ratio of the descriptor distances to the nearest and the second nearest feature at
+which two features are matched (Lowe, section 7.1)."""
 TEXTURE_POINTS_APART = 8.0
-"""Pixels within which points are one: a corner has several descriptions, and tells one thing."""
+"""Distance in pixels below which two matches count as one: a corner has several descriptors, but
+is one observation."""
 FEWEST_POINT_PAIRS = 16
-"""Pairs of points without which two photographs tell nothing of each other: of fewer nobody knows
-what chance makes of them."""
+"""Fewest matches of two images from which a likelihood is computed; the distribution of chance
+matches cannot be estimated from fewer."""
 MACHINE_OUTLINE_FACTOR = 1.5
-"""Size, in that of its joints' outline, of what may belong to the machine in a photograph: plates,
-motors and cables reach beyond the joints, and a drawing does not tell how far."""
+"""Size of the image region that may belong to the machine, relative to the outline of its
+joints: plates, motors and cables extend beyond the joints, to an extent that the nominal model
+does not contain."""
 EPIPOLAR_SPREADS = np.radians([0.1, 0.25, 0.6])
-"""Standard deviations (rad) of points from their epipolar planes, of which the likeliest is taken:
-from what a feature is off, to what a drawing that is wrong by millimetres turns a camera."""
+"""Standard deviations (rad) of points about their epipolar planes, of which the likeliest is
+used: from the localization error of a feature to the camera rotation that a nominal model wrong
+by millimetres causes."""
 RIGHT_PAIR_SHARES = np.linspace(0.02, 0.98, 49)
-"""Shares of right pairs, of which the likeliest is taken."""
+"""Shares of correct matches, of which the likeliest is used."""
 PARTNER_EXCHANGES, EPIPOLAR_WINDOW = 20, np.radians(2.0)
-"""How often partners are exchanged, to see how many chance puts within this angle of the planes."""
+"""Number of random permutations of the partners from which the density of chance matches is
+estimated, and the angle (rad) from the epipolar planes within which these are counted."""
 
 LEAST_LANDMARK_PARALLAX = np.radians(3.0)
-"""Angle between two rays below which their crossing is no place: five of the widest spreads."""
+"""Smallest angle (rad) between two rays at which their intersection is used as a landmark: five
+times the largest spread."""
 LANDMARK_TRIPLES_TRIED, LEAST_COSINE_AHEAD = 3000, 0.2
-"""Triples of landmarks that are tried for a photograph's place: one of ten right ones is enough for
-three of them to be found. Rays further off the camera's axis than its cosine are left out."""
+"""Number of landmark triples tried by RANSAC for the pose of an image: a share of one correct
+landmark in ten suffices to draw three correct ones. Rays whose cosine to the optical axis is
+smaller than the second number are left out."""
 
 CANDIDATES_TESTED_BY_BACKGROUND = 4
-"""Places of a photograph about which the room is asked."""
+"""Number of candidate poses of an image around which the background is evaluated."""
 TURN_GRID = np.radians(
     np.stack(np.meshgrid(*[np.arange(-6.0, 7.0, 2.0)] * 2), axis=-1).reshape(-1, 2)
 )
-"""Turns (49, 2) of the machine that are tried there, rad: beyond, the legs are others'."""
+"""Rotations (49, 2) about the machine, rad, that are tried there; with larger ones the
+silhouettes would match other legs."""
 
 
 class Texture(NamedTuple):
-    """Points of one photograph. ray : (n, 3) unit, camera frame. pixel : (n, 2).
+    """Feature points of one image.
+
+    ray : (n, 3) unit vectors, camera frame.
+    pixel : (n, 2).
     descriptor : (n, 128).
     """
 
@@ -73,7 +84,7 @@ class Texture(NamedTuple):
 
 
 def texture_of(image: Integers, camera: Camera) -> Texture:
-    """Points of texture of a photograph, grey levels (height, width)."""
+    """Feature points of an image of grey levels (height, width)."""
     import cv2
 
     scale = min(LARGEST_TEXTURE_SIDE / max(image.shape), 1.0)
@@ -89,11 +100,14 @@ def texture_of(image: Integers, camera: Camera) -> Texture:
 
 
 def partners(one: Texture, other: Texture) -> Integers:
-    """Pairs (n, 2) of points that are each other's likeliest partner, by far; no point twice."""
+    """Indices (n, 2) of mutually nearest features that pass the ratio test, no image point used
+    twice.
+    """
     import cv2
 
     if min(len(one.ray), len(other.ray)) < 2:
         return np.zeros((0, 2), dtype=int)
+    # mutual nearest neighbours, with their distance ratios
     match = cv2.BFMatcher(cv2.NORM_L2)
     there = match.knnMatch(one.descriptor, other.descriptor, k=2)
     back = {m.queryIdx: m.trainIdx for m in match.match(other.descriptor, one.descriptor)}
@@ -102,6 +116,7 @@ def partners(one: Texture, other: Texture) -> Integers:
         for best, second in there
         if back[best.trainIdx] == best.queryIdx
     ]
+    # best ratio first; a match near an accepted one, in either image, is the same point
     retained_rows: list[tuple[int, int]] = []
     taken = np.zeros((0, 2, 2))
     for worth, j, k in sorted(mutual):
@@ -114,7 +129,10 @@ def partners(one: Texture, other: Texture) -> Integers:
 
 
 def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans:
-    """Which pixels (n, 2) of a photograph lie beside the machine, legs : (L, 3) of it alone."""
+    """Mask (n,) of the pixels (n, 2) that lie outside the machine's outline.
+
+    legs : (L, 3) in the frame of this camera, for this image alone.
+    """
     import cv2
 
     joints = camera.project(np.concatenate([legs.a, legs.b]))
@@ -124,7 +142,7 @@ def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans
     middle = (joints.min(axis=0) + joints.max(axis=0)) / 2
     outline = (middle + MACHINE_OUTLINE_FACTOR * (joints - middle)).astype(np.float32)
     corner = cv2.convexHull(outline).reshape(-1, 2).astype(float)
-    # outside of a convex outline is what lies outside of one of its sides
+    # a point is outside a convex polygon if it is outside one of its sides
     side, away = np.roll(corner, -1, axis=0) - corner, pixel[:, None] - corner
     inward = side[:, 0] * away[..., 1] - side[:, 1] * away[..., 0]
     turn = side[:, 0] * np.roll(side[:, 1], -1) - side[:, 1] * np.roll(side[:, 0], -1)
@@ -132,23 +150,29 @@ def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans
 
 
 def agreement(one: Array, other: Array, T_other_one: Array) -> float:
-    """Log likelihood that pairs of unit rays (n, 3) see the same points, against chance.
+    """Log-likelihood ratio that matched unit rays (n, 3) observe the same points, against chance.
 
-    T_other_one : (4, 4) the one camera's frame in the other's. A pair is right, with a share that
-    all have in common, or lies where exchanged partners do. The share and the spread of the right
-    ones are chosen to fit, and paid for as two numbers are (Schwarz, Annals of Statistics 6, 1978).
+    A match is either correct, with a share common to all matches, or distributed as matches with
+    permuted partners. The share and the spread of the correct matches are maximized over, and each
+    costs half the logarithm of n (Schwarz, Annals of Statistics 6, 1978). Zero for fewer than
+    FEWEST_POINT_PAIRS matches.
+
+    T_other_one : (4, 4), from the frame of the first camera to that of the other.
     """
     if len(one) < FEWEST_POINT_PAIRS:
         return 0.0
+    # normals of the epipolar planes
     ray = one @ T_other_one[:3, :3].T
     normal = cross(np.broadcast_to(T_other_one[:3, 3], ray.shape), ray)
     normal /= np.maximum(np.sqrt(dot(normal, normal)), 1e-12)[:, None]
+    # angles from the planes, and their density by chance
     rng = np.random.default_rng(0)
     exchanged = other[np.stack([rng.permutation(len(other)) for _ in range(PARTNER_EXCHANGES)])]
     off, by_chance = (np.arcsin(np.clip(dot(normal, v), -1, 1)) for v in (other, exchanged))
     chance = max(float(np.mean(np.abs(by_chance) < EPIPOLAR_WINDOW)), 1 / by_chance.size) / (
         2 * EPIPOLAR_WINDOW
     )
+    # maximum over share and spread, less the penalty of both
     spread = EPIPOLAR_SPREADS[:, None]
     density = np.exp(-0.5 * (off / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
     gain = np.log1p(RIGHT_PAIR_SHARES[:, None, None] * (density / chance - 1)).sum(axis=-1)
@@ -156,7 +180,11 @@ def agreement(one: Array, other: Array, T_other_one: Array) -> float:
 
 
 class Neighbour(NamedTuple):
-    """A photograph that is placed. T_camera_base : (4, 4). legs : (L, 3) as it has them."""
+    """An image whose pose is accepted.
+
+    T_camera_base : (4, 4).
+    legs : (L, 3) in the frame of this camera.
+    """
 
     camera: Camera
     T_camera_base: Array
@@ -164,8 +192,10 @@ class Neighbour(NamedTuple):
 
 
 class Landmarks(NamedTuple):
-    """Points of the room that two placed photographs show. point : (n, 3) m, base frame. number :
-    (n,) of the photograph's texture that shows it.
+    """Points of the room that are triangulated from two images with accepted poses.
+
+    point : (n, 3) m, base frame.
+    number : (n,) index of each point among the image's features.
     """
 
     point: Array
@@ -173,10 +203,10 @@ class Landmarks(NamedTuple):
 
 
 class Surroundings:
-    """What a session's photographs share of what stands around the machine.
+    """Features that the images of a session share with each other.
 
-    Texture and its partners are looked for once, when they are asked for. photograph : by its
-    number, grey levels and camera.
+    Features and matches are computed on first use and cached. The constructor takes a function that
+    returns the grey levels and the camera of the image with a given number.
     """
 
     def __init__(self, photograph: Callable[[int], tuple[Integers, Camera]]) -> None:
@@ -186,13 +216,15 @@ class Surroundings:
         )
 
     def shared(self, one: int, other: int) -> tuple[Integers, Integers]:
-        """Numbers (n,) of the texture that two photographs share, in each."""
+        """Indices (n,) of the matched features of two images, in each of them."""
         first, second = sorted((one, other))
         pairs = self._pairs(first, second).T
         return (pairs[0], pairs[1]) if first == one else (pairs[1], pairs[0])
 
     def landmarks(self, placed: Mapping[int, Neighbour]) -> dict[int, Landmarks]:
-        """Points that two placed photographs see at one place, by the photograph."""
+        """Landmarks of each image with an accepted pose, triangulated from its matches with every
+        other.
+        """
         results: dict[int, list[tuple[Array, Integers]]] = {k: [] for k in placed}
         for one, other in combinations(placed, 2):
             j, k = self.shared(one, other)
@@ -216,12 +248,17 @@ class Surroundings:
         }
 
     def _beside(self, k: int, numbers: Integers, neighbour: Neighbour) -> Booleans:
+        """Mask (n,) of the features of image ``k`` that lie outside the machine's outline."""
         return beside_machine(self.texture(k).pixel[numbers], neighbour.camera, neighbour.legs)
 
     def place(self, one: int, landmarks: Mapping[int, Landmarks]) -> Array:
-        """The places T_camera_base (0 or 1, 4, 4) that landmarks give a photograph."""
+        """Camera pose T_camera_base (0 or 1, 4, 4) of an image from its matches with landmarks.
+
+        P3P in RANSAC, refined on the inliers; empty with fewer than FEWEST_POINT_PAIRS of them.
+        """
         import cv2
 
+        # correspondences of the image's features and the landmarks
         rays: list[Array] = [np.zeros((0, 3))]
         points: list[Array] = [np.zeros((0, 3))]
         for other, reference_values in landmarks.items():
@@ -234,6 +271,7 @@ class Surroundings:
         ray, point = ray[ahead], point[ahead]
         if len(ray) < FEWEST_POINT_PAIRS:
             return np.zeros((0, 4, 4))
+        # P3P with RANSAC on normalized image coordinates, then refinement on the inliers
         plane = np.ascontiguousarray(ray[:, :2] / ray[:, 2:])
         off = float(np.tan(EPIPOLAR_SPREADS[-1]))
         ok, turn, shift, inside = cv2.solvePnPRansac(
@@ -257,17 +295,19 @@ class Surroundings:
         legs: LegsInCamera,
         placed: Mapping[int, Neighbour],
     ) -> Array:
-        """Of the likeliest places of a photograph, those near by (n, 4, 4) that agree with the room
-        better: what the drawing has wrong, or clutter, turns a place that legs alone tell.
+        """Poses (n, 4, 4) near the likeliest hypotheses of an image that agree better with the
+        background.
 
-        legs : (H, L, 3) as each of the places has them.
+        Errors of the nominal model, or clutter, rotate a pose that is estimated from legs alone.
+
+        legs : (H, L, 3) for each of the hypotheses.
         """
         out = [np.zeros((0, 4, 4))]
         for h, T in enumerate(hypotheses.T_camera_base[:CANDIDATES_TESTED_BY_BACKGROUND]):
             to_base = inverse(T)
             middle = to_base[:3, :3] @ np.concatenate([legs.a[h], legs.b[h]]).mean(axis=0)
             middle = middle + to_base[:3, 3]
-            # about the camera's own axes x and y, through the machine's middle
+            # rotations about the camera's axes x and y, through the middle of the machine
             turn = rotation(TURN_GRID @ to_base[:3, :2].T)
             near = T @ pose(turn, middle - turn @ middle)
             gain = self._gain(near, one, camera, [legs[h]] * len(near), placed)
@@ -284,11 +324,14 @@ class Surroundings:
         legs: LegsInCamera,
         placed: Mapping[int, Neighbour],
     ) -> PoseHypotheses:
-        """The places of a photograph, weighed with what it shares with placed ones as well.
+        """Pose hypotheses of an image, with the log-likelihood ratio of the background added.
 
-        hypotheses : its evidence a log likelihood, unit 1. camera : the photograph's. legs : (H, L,
-        3) as each of the places has them. The room tells from which side the photograph was taken;
-        from where exactly, the legs.
+        The background determines from which side the image was taken; the legs determine the exact
+        pose. Hypotheses within SAME_PLACE_TURN of each other share the largest gain of the group.
+
+        hypotheses : log-likelihood ratios in unit 1.
+        camera : of this image.
+        legs : (H, L, 3) for each of the hypotheses.
         """
         if not placed:
             return hypotheses
@@ -308,8 +351,10 @@ class Surroundings:
         legs: Sequence[LegsInCamera],
         placed: Mapping[int, Neighbour],
     ) -> Array:
-        """Log likelihood (H,) of places of a photograph by the room, against chance. Any of those
-        that are placed may be the one that shows the same part of it.
+        """Log-likelihood ratio (H,) of camera poses by the background, against chance.
+
+        Any of the images with accepted poses may be the one that shows the same part of the room,
+        so their likelihoods are added.
         """
         texture = self.texture(one)
         gain = np.zeros((len(T_camera_base), len(placed)))
@@ -320,14 +365,17 @@ class Surroundings:
                 ok = beside & beside_machine(texture.pixel[j], camera, legs[h])
                 rays = texture.ray[j[ok]], self.texture(other).ray[k[ok]]
                 gain[h, n] = agreement(*rays, in_view.T_camera_base @ inverse(T))
-        # any turn of a place may be what agrees best, of any neighbour: tries are paid for
+        # the best of several rotations and neighbours is chosen: the number of trials is paid for
         tries = len(placed) * len(TURN_GRID)
         return np.maximum(np.logaddexp.reduce(gain, axis=1) - np.log(tries), 0.0)
 
 
 def _crossing(eye: Array, ray: Array, eye_b: Array, ray_b: Array) -> tuple[Array, Booleans]:
-    """Points (n, 3) halfway between rays (n, 3) where these are nearest, and where that is a place:
-    before both eyes (3,), seen so from both, from directions that differ.
+    """Midpoints (n, 3) of the common perpendiculars of rays (n, 3), and which of them are
+    landmarks.
+
+    A landmark lies in front of both centres ``eye`` (3,), within the largest spread of both rays,
+    and the rays differ by LEAST_LANDMARK_PARALLAX at least.
     """
     base = eye_b - eye
     cosine = dot(ray, ray_b)

@@ -1,10 +1,10 @@
-"""Picture edges of one station's photographs, ready to be looked up: how far is the nearest?
+"""Distance tables of one station's images: distances to the nearest image edge of each direction.
 
-Photographs are reduced, picture edges found, and for each of a few directions the distance to
-the nearest edge of about that direction is tabulated, as soon as one is asked for. A predicted
-silhouette then scores by the distances under its points, smooth enough to be descended from a
-hundred pixels away. Where a station took several photographs, edges that never move are left out:
-the floor and the wall do not say where the machine is.
+Images are reduced and their edges detected. For each of a few directions, the distance of every
+pixel to the nearest edge of about that direction is tabulated on first use. A predicted silhouette
+is then scored by the distances under its points; the distances vary smoothly enough for a descent
+from a hundred pixels away. Where a station has several images, edges that are the same in all of
+them are left out: the floor and the wall carry no information about the machine.
 """
 
 from __future__ import annotations
@@ -20,27 +20,28 @@ from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.observe.grey_levels import MOST_ROWS_INTERPOLATED, interpolated
 
 EDGE_DIRECTIONS = 8
-"""Edge directions told apart; each table takes the neighbouring directions in as well."""
+"""Number of edge directions; each table includes the neighbouring directions."""
 WORKING_WIDTH = 256
-"""Width in pixels that photographs are reduced to: fine enough for a leg's two edges to stay
-apart, coarse enough to search quickly."""
+"""Width in pixels to which images are reduced: fine enough to separate the two edges of a leg,
+coarse enough for a fast search."""
 STILL_LEVEL_DIFFERENCE = 5.0
-"""Levels from the station's median photograph within which a place counts as still."""
+"""Largest difference in grey levels from the station's median image at which a pixel counts as
+static."""
 ENOUGH_TO_COMPARE = 4
-"""Photographs from which a median is a picture of the background."""
+"""Fewest images whose median is taken as the background."""
 CANNY_SLOPES = (20, 40)
-"""Sobel slopes from which an edge goes on and begins: five times what the noise of a level, that a
-reduced photograph has at most, makes of it; from half of that to the double, little changes."""
+"""Canny thresholds on the Sobel slope, lower and upper: five times the slope caused by a noise
+of one level, the most in a reduced image. Half or twice these values change little."""
 FURTHEST_EDGE_DISTANCE = 32.0
-"""Reduced pixels beyond which distances are not told apart."""
+"""Reduced pixels beyond which distances share one bin of the chance histogram."""
 NO_EDGE_DISTANCE = 1e3
-"""Reduced pixels where a photograph has no edge of a direction."""
+"""Distance, in reduced pixels, where an image has no edge of a direction."""
 CHANCE_DISTANCE_BIN = 0.5
-"""Reduced pixels of a bin of the distances that chance gives."""
+"""Width, in reduced pixels, of a bin of the histogram of chance distances."""
 
 
 class PictureEdges(NamedTuple):
-    """Edge points of one reduced photograph: pixel (n, 2), reduced px, and unit normal (n, 2)."""
+    """Edge points of one reduced image: pixel (n, 2), reduced px, and unit normal (n, 2)."""
 
     pixel: Array
     normal: Array
@@ -48,14 +49,17 @@ class PictureEdges(NamedTuple):
 
 @dataclass(frozen=True)
 class DirectionTables:
-    """The tables of photographs. What belongs to a direction is worked out when an edge of that
-    direction is first looked for: the silhouettes of most machines have half of them.
+    """Distance tables of K images by edge direction, each computed on first use.
 
-    place, number : of each photograph's edge points, their pixels (n,), counted row after row, and
-    direction numbers (n,). picture : (rows, h, columns, EDGE_DIRECTIONS, w), in which the n-th
-    photograph's tables lie in row n % rows and column n // rows. chance : (EDGE_DIRECTIONS, bins)
-    of CHANCE_DISTANCE_BIN: how often a place taken anywhere has that distance. ready :
-    (EDGE_DIRECTIONS,) whether both are worked out.
+    The silhouettes of most machines have about half of the directions.
+
+    place, number : for each image the flat pixel indices (n,) of its edge points, row by row, and
+        their direction numbers (n,).
+    picture : (rows, h, columns, EDGE_DIRECTIONS, w). The tables of image n are at row n % rows and
+        column n // rows.
+    chance : (EDGE_DIRECTIONS, bins) density of the distances of arbitrary pixels, in bins of
+        CHANCE_DISTANCE_BIN.
+    ready : (EDGE_DIRECTIONS,) whether table and density of a direction are computed.
     """
 
     place: tuple[Integers, ...]
@@ -68,7 +72,7 @@ class DirectionTables:
     def of_edges(
         cls, place: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
     ) -> DirectionTables:
-        """Those of edge points, none ready. shape : EDGE_DIRECTIONS, h, w."""
+        """Tables of given edge points, none computed yet; shape : EDGE_DIRECTIONS, h, w."""
         directions, height, width = shape
         rows = min(len(place), MOST_ROWS_INTERPOLATED // height)
         columns = -(-len(place) // rows)
@@ -79,7 +83,7 @@ class DirectionTables:
         return cls(tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool))
 
     def get_ready(self, direction: Integers) -> None:
-        """Work out what there is not yet of directions (...)."""
+        """Compute the tables of directions (...) that are still missing."""
         if self.ready.take(direction).all():
             return
         missing = [k for k in np.unique(direction) if not self.ready[k]]
@@ -87,35 +91,39 @@ class DirectionTables:
             list(pool.map(self._work_out, missing))
 
     def _work_out(self, direction: int) -> None:
+        """Compute the table and the chance density of one direction."""
         rows, taken_in = len(self.picture), bin_neighbours(direction, len(self.ready))
-        counted = np.ones(self.chance.shape[1])  # what no place has is not impossible
+        counted = np.ones(self.chance.shape[1])  # a distance that does not occur is not impossible
         for n, (place, number) in enumerate(zip(self.place, self.number, strict=True)):
             table = self.picture[n % rows, :, n // rows, direction]
             write_distances(place[taken_in.take(number)], table)
-        for first in range(0, len(self.place), rows):  # so many at once, for threads take turns
+        # many images in one operation, for threads wait for each other in Python
+        for first in range(0, len(self.place), rows):
             tables = self.picture[: len(self.place) - first, :, first // rows, direction]
             counted += _counted(tables)
         self.chance[direction] = counted / counted.sum() / CHANCE_DISTANCE_BIN
-        self.ready[direction] = True  # at last, as others may look beside
+        self.ready[direction] = True  # last, because other threads read it
 
     def mirrored(self) -> DirectionTables:
-        """With left and right exchanged, none ready."""
+        """Tables of the images with left and right exchanged, none computed yet."""
         _, height, _, directions, width = self.picture.shape
         place = [p + width - 1 - 2 * (p % width) for p in self.place]
-        # the direction a becomes pi - a
+        # direction a becomes pi - a
         number = [directions - 1 - n for n in self.number]
         return self.of_edges(place, number, (directions, height, width))
 
 
 @dataclass(frozen=True)
 class DistanceTables:
-    """Distances in reduced pixels and the reduction factor.
+    """Distance tables, in reduced pixels, of some images of a station.
 
-    row : (K,) each photograph's number in the tables. edges : of each photograph.
-    moving : (h, w) share of the photographs in which each place differs from the others; where a
-    single one cannot tell, where it has edges. against : (n, h, w) of each in the tables, 1 where a
-    place is brighter than in the median photograph, -1 darker, 0 much the same, or where there is
-    no median.
+    row : (K,) each image's number in the tables.
+    scale : full-size pixels per reduced pixel.
+    edges : edge points of each image.
+    moving : (h, w) share of the images in which a pixel differs from the median or, with too few
+        images for a median, whether it changes at all; for a single image, 1 at its edges.
+    against : (n, h, w) of all images in the tables, 1 where a pixel is brighter than in the median
+        image, -1 where it is darker, 0 where it is about equal or there is no median.
     """
 
     tables: DirectionTables
@@ -126,16 +134,16 @@ class DistanceTables:
     against: Integers
 
     def direction(self, normal: Array) -> Integers:
-        """Direction number of edges whose image normals are (..., 2)."""
+        """Direction numbers of edges whose image normals are (..., 2)."""
         return direction_of(normal, len(self.tables.ready))
 
     def look_up(
         self, direction: Integers, pixel: Array, photograph: Integers, between: bool = False
     ) -> tuple[Array, Booleans]:
-        """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
+        """Distances (reduced px) at full-size pixels (..., 2), and which of these lie in the image.
 
-        direction, photograph : (...) table numbers. between : bilinear between table entries, else
-        the nearest.
+        direction, photograph : (...) direction numbers and image numbers.
+        between : interpolate bilinearly between table entries; otherwise take the nearest.
         """
         import cv2
 
@@ -146,8 +154,11 @@ class DistanceTables:
     def look_along(
         self, direction: Integers, pixel: Array, outward: Array, photograph: Integers
     ) -> tuple[Array, Array, Booleans]:
-        """As :meth:`look`, bilinear between table entries; with it how much the distance grows a
-        pixel along unit vectors (..., 2), from the entries a reduced pixel to both sides.
+        """Distances as in :meth:`look_up`, bilinear, with their derivatives along unit vectors
+        (..., 2).
+
+        The derivatives, per full-size pixel, are central differences over a reduced pixel to each
+        side. The third array is the mask of the pixels in the image.
         """
         import cv2
 
@@ -159,8 +170,10 @@ class DistanceTables:
         return here, np.clip((ahead - behind) / 2, -1, 1) / np.float32(self.scale), inside
 
     def brighter(self, pixel: Array, photograph: Integers) -> tuple[Integers, Booleans]:
-        """Whether places at full-size pixels (..., 2) are brighter (1) or darker (-1) than in the
-        median photograph, 0 outside, and which lie in the photograph.
+        """Sign of the difference from the median image at full-size pixels (..., 2), and which lie
+        inside.
+
+        1 is brighter, -1 darker, 0 about equal or outside the image.
         """
         height, width = self.against.shape[1:]
         x, y = ((pixel[..., i] + 0.5) / self.scale for i in (0, 1))
@@ -172,13 +185,15 @@ class DistanceTables:
     def _place(
         self, direction: Integers, pixel: Array, photograph: Integers
     ) -> tuple[Array, Array, Booleans]:
-        """Column and row (...) in the picture of all tables, and whether in the photograph."""
+        """Column and row (...) in the mosaic of all tables, and whether the pixel lies in its
+        image.
+        """
         self.tables.get_ready(direction)
         rows, height, _, count, width = self.tables.picture.shape
         x, y = ((pixel[..., i] + 0.5) / self.scale - 0.5 for i in (0, 1))
         with np.errstate(invalid="ignore"):
             inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
-        # in the single precision of a search, in which columns and rows below 2**15 lose nothing
+        # single precision is exact for columns and rows below 2**15 and sufficient for a search
         number = self.row[photograph].astype(np.int32)
         column = ((number // rows * count + direction) * width).astype(np.float32)
         line = (number % rows * height).astype(np.float32)
@@ -186,24 +201,26 @@ class DistanceTables:
         return x, y, inside
 
     def _interpolated(self, x: Array, y: Array, how: int) -> Array:
-        """The picture of all tables at columns and rows (...)."""
+        """Values of the mosaic of all tables at columns and rows (...)."""
         tables = self.tables.picture
         return interpolated(tables.reshape(tables.shape[0] * tables.shape[1], -1), x, y, how)
 
     def by_chance(self, direction: Integers, values: Array) -> Array:
-        """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
+        """Probability density, per reduced pixel, of distances (...) at arbitrary pixels."""
         self.tables.get_ready(direction)
         bins = self.tables.chance.shape[1]
         number = np.minimum(values / np.float32(CHANCE_DISTANCE_BIN), bins - 1).astype(np.int32)
         return self.tables.chance.take(direction * bins + number)
 
     def select(self, photographs: Integers) -> DistanceTables:
-        """Of some of the photographs; what moves and what chance gives, as all show it."""
+        """Tables of some of the images; ``moving`` and the chance densities stay those of all
+        images.
+        """
         edges = tuple(self.edges[k] for k in photographs)
         return replace(self, row=self.row[photographs], edges=edges)
 
     def mirrored(self) -> DistanceTables:
-        """Of the photographs with left and right exchanged."""
+        """Tables of the images with left and right exchanged."""
         width = self.moving.shape[1]
         edges = (
             PictureEdges(e.pixel * (-1, 1) + (width - 1, 0), e.normal * (-1, 1)) for e in self.edges
@@ -219,24 +236,26 @@ class DistanceTables:
 
 
 def direction_of(normal: Array, count: int = EDGE_DIRECTIONS) -> Integers:
-    """Direction number, of ``count``, of edges whose image normals are (..., 2); the sign does not
-    matter.
+    """Direction numbers, of ``count``, of edges with image normals (..., 2), regardless of their
+    sign.
     """
     turn = np.arctan2(normal[..., 1], normal[..., 0]) * (count / np.pi)
-    with np.errstate(invalid="ignore"):  # what is no number has any
+    with np.errstate(invalid="ignore"):  # the direction of a NaN is arbitrary
         return np.floor(turn).astype(np.int32) % count
 
 
 def bin_neighbours(direction: int, count: int) -> Booleans:
-    """Which direction numbers, of ``count``, a direction's table takes in: its own and the
-    neighbours'.
+    """Mask (count,) of the directions that a direction's table includes: itself and its two
+    neighbours.
     """
     return (np.arange(count) - (direction - 1)) % count < 3
 
 
 def write_distances(place: Integers, out: Array) -> None:
-    """Distance (h, w) of every pixel to the nearest of some, (n,), counted row after row; written
-    into ``out``, in single precision and each row in one piece.
+    """Write the distance (h, w) of every pixel to the nearest of some pixels into ``out``.
+
+    place : (n,) flat pixel indices, row by row.
+    out : single precision, each row contiguous.
     """
     import cv2
 
@@ -254,13 +273,14 @@ def distance_tables(
     width: int = WORKING_WIDTH,
     directions: int = EDGE_DIRECTIONS,
 ) -> DistanceTables:
-    """Tables of one station's photographs, K arrays (height, width) uint8 of one size, which are
-    looked at on threads.
+    """Distance tables of one station's images, K arrays (height, width) uint8 of equal size.
+
+    Images are decoded and reduced on several threads.
     """
     import cv2
 
     def reduced(number: int) -> tuple[Integers, float]:
-        image = images[number]  # each is decoded once, and only its reduction kept
+        image = images[number]  # decoded once; only the reduced image stays in memory
         scale = max(image.shape[1] / width, 1.0)
         size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
         return _levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)), scale
@@ -284,9 +304,8 @@ def distance_tables(
 
 
 def _against_median(small: Integers) -> Integers:
-    """Where photographs (K, h, w) are brighter (1) or darker (-1) than the median of all."""
-    # neighbours exchanged until all are in order: over pictures, thirty times as fast as sorting
-    # the levels of one place after the other
+    """Signs (K, h, w) of the difference of images (K, h, w) from their median."""
+    # odd-even transposition sort on whole images: thirty times as fast as sorting pixel by pixel
     order = small.copy()
     for turn in range(len(order)):
         low, high = order[turn % 2 : -1 : 2], order[turn % 2 + 1 :: 2]
@@ -294,16 +313,14 @@ def _against_median(small: Integers) -> Integers:
         np.maximum(low, high, out=high)
         low[...] = less
     n = len(order)
-    # twice the median, in whole levels
+    # twice the median, an integer
     twice = order[(n - 1) // 2].astype(np.int16) + order[n // 2]
     off = 2 * small.astype(np.int16) - twice
     return (off > 2 * STILL_LEVEL_DIFFERENCE).astype(np.int8) - (off < -2 * STILL_LEVEL_DIFFERENCE)
 
 
 def _moving(small: Integers, edges: PictureEdges) -> Array:
-    """Share (h, w) of photographs too few for a median in which each place differs from the others;
-    of one alone, where it has edges.
-    """
+    """Share (h, w) of changing pixels for images too few for a median; for one image, its edges."""
     if len(small) > 1:
         return (np.ptp(small.astype(float), axis=0) > STILL_LEVEL_DIFFERENCE).astype(float)
     out = np.zeros(small.shape[1:])
@@ -313,8 +330,10 @@ def _moving(small: Integers, edges: PictureEdges) -> Array:
 
 
 def _counted(tables: Array) -> Integers:
-    """How often each distance occurs in tables (n, h, w), (bins,); at every other place of every
-    other row: from fewer, what chance gives would differ between explanations of one picture.
+    """Histogram (bins,) of distances in tables (n, h, w), at every second pixel of every second
+    row.
+
+    With fewer samples the chance densities would differ between hypotheses about one image.
     """
     bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
     number = tables[:, ::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN)
@@ -323,14 +342,16 @@ def _counted(tables: Array) -> Integers:
 
 
 def _levels(image: Any) -> Integers:
-    """Grey levels (h, w) whose noise is even: a sensor's grows with the root of the light. So a
-    dark machine before a dark wall stands out as a bright one does in the sun.
+    """Grey levels (h, w) with even noise, the square root of the light.
+
+    A sensor's noise grows with the root of the light; after this, a dark machine in front of a dark
+    wall is as distinct as a bright one in the sun.
     """
     return np.rint(np.sqrt(255.0 * image.astype(np.float32))).astype(np.uint8)
 
 
 def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
-    """Edge points of one reduced photograph, where it differs from the others (h, w)."""
+    """Canny edge points of one reduced image, where it differs from the other images (h, w)."""
     import cv2
 
     dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)

@@ -1,8 +1,8 @@
-"""The photographs of stations, and how they are passed through: so many at a time as fit.
+"""Images of stations, and their division into batches that fit into memory.
 
-What is worked out of one photograph takes some megabytes, so those that are looked at are held a
-window at a time. Photographs of several stations are looked at together where one camera took them
-alike: what is done to six in one set of arrays takes a third as long as to one after the other.
+The intermediate results of one image take some megabytes, so images are processed in windows of
+limited size. Images of several stations share a window if the same camera took them: processing six
+images in one set of arrays takes a third of the time of processing them one by one.
 """
 
 from __future__ import annotations
@@ -19,19 +19,22 @@ from pkmcal.cameras.response import Response
 from pkmcal.observe.images import Selected, binned, fitting
 
 PHOTOGRAPHS_A_WINDOW = 32
-"""Photographs that are looked at together: their profiles take some 20 MB."""
+"""Largest number of images in a window; their profiles take some 20 MB."""
 WINDOW_BYTES = 96 * 2**20
-"""Bytes that these take as grey levels at most; one may take more."""
+"""Largest size of a window's grey levels in bytes; a single image may be larger."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """One station's photographs.
+    """Images of one station.
 
-    station : its number. configuration : (K,) rows of the session's joints. joints : (K, m).
-    images : K grey-level arrays (height, width), decoded or when they are looked at. response : how
-    their levels code light. binning : count of their pixels across, and down, that are one where
-    edges are looked for (:meth:`binned`).
+    station : its number in the session.
+    configuration : (K,) rows of the session's joints.
+    joints : (K, m) joint readings.
+    images : K grey-level arrays (height, width), decoded or decoded on access.
+    response : how grey levels encode light.
+    binning : pixels across, and down, that are averaged to one before edges are measured
+        (:meth:`binned`).
     """
 
     station: int
@@ -43,7 +46,7 @@ class Photographs:
     binning: int = 1
 
     def select(self, numbers: Integers) -> Photographs:
-        """Some of the photographs."""
+        """The images with these numbers."""
         return replace(
             self,
             configuration=self.configuration[numbers],
@@ -52,29 +55,31 @@ class Photographs:
         )
 
     def spread(self, most: int) -> Integers:
-        """Numbers of up to ``most`` photographs, evenly over all."""
+        """Numbers of up to ``most`` images, spread evenly over all."""
         return evenly(len(self.images), most)
 
     @property
     def window(self) -> int:
-        """How many photographs are looked at together."""
+        """Number of images in a window."""
         return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), PHOTOGRAPHS_A_WINDOW)
 
     def decoded(self) -> Photographs:
-        """The same with every photograph decoded; for no more than a window of them."""
+        """A copy with all images decoded; for at most one window of images."""
         return replace(self, images=list(self.images))
 
     def binned(self) -> Photographs:
-        """The same as edges are looked for in them, decoded; for no more than a window of them.
+        """A copy with all images decoded and binned; for at most one window of images.
 
-        Levels are averaged, not the light that they code: over the pixels of one bin, in which a
-        blurred edge rises by a third, the code bends by half a level.
+        The grey levels are averaged instead of the light that they encode: over the pixels of a
+        bin, in which a blurred edge rises by a third, the difference is half a level.
         """
         images = [binned(image, self.binning) for image in self.images]
         return replace(self, camera=self.camera.binned(self.binning), images=images, binning=1)
 
     def same_camera(self, other: Photographs) -> bool:
-        """Whether others were taken, and are looked at, as these: by one camera."""
+        """Whether the other station has the same camera parameters, image size, response and
+        binning.
+        """
         one, its = self.camera, other.camera
         return (
             type(one) is type(its)
@@ -85,8 +90,10 @@ class Photographs:
 
 
 class Placed(NamedTuple):
-    """A station's photographs, where its camera stands, T_camera_base (4, 4), and where the
-    platform is in each, T_base_platform (K, 4, 4).
+    """Images of a station with the poses from which edges are predicted.
+
+    T_camera_base : (4, 4).
+    poses : T_base_platform (K, 4, 4), one for each image.
     """
 
     photographs: Photographs
@@ -94,24 +101,31 @@ class Placed(NamedTuple):
     poses: Array
 
     def select(self, numbers: Integers) -> Placed:
-        """Some of the photographs."""
+        """The images with these numbers."""
         return Placed(self.photographs.select(numbers), self.T_camera_base, self.poses[numbers])
 
 
 def placed_at(
     photographs: Sequence[Photographs], T_camera_base: Array, poses: Array
 ) -> list[Placed]:
-    """Those of stations among all, (S, 4, 4), at poses of all configurations, (N, 4, 4)."""
+    """Images of stations with their poses.
+
+    T_camera_base : (S, 4, 4) of all stations of the session.
+    poses : T_base_platform (N, 4, 4) of all its configurations.
+    """
     return [Placed(p, T_camera_base[p.station], poses[p.configuration]) for p in photographs]
 
 
 @dataclass(frozen=True)
 class PhotographWindow:
-    """Photographs that are looked at together, as edges are looked for in them, decoded.
+    """Images that are processed together, decoded and binned.
 
-    camera, response : of all. binning : how many pixels became one. station, configuration : (K,)
-    of each, station after station. joints : (K, m). images : K arrays (height, width).
-    T_camera_base, poses : (K, 4, 4) where each was taken, and T_base_platform.
+    camera, response : common to all images; the camera is that of the binned images.
+    binning : pixels across that were averaged to one.
+    station, configuration : (K,) of each image, ordered by station.
+    joints : (K, m) joint readings.
+    images : K arrays (height, width).
+    T_camera_base, poses : (K, 4, 4) each; the latter are T_base_platform.
     """
 
     camera: Camera
@@ -126,7 +140,7 @@ class PhotographWindow:
 
     @classmethod
     def of(cls, placed: Sequence[Placed]) -> PhotographWindow:
-        """Of stations whose photographs are alike, no more than a window in all."""
+        """The window of stations with the same camera whose images fit into one window."""
         count = [len(one.photographs.images) for one in placed]
         in_view = [one.photographs.binned() for one in placed]
         return cls(
@@ -143,8 +157,9 @@ class PhotographWindow:
 
 
 def windows(placed: Sequence[Placed]) -> Iterator[PhotographWindow]:
-    """All photographs of stations, whose numbers differ, in their order; such as follow one another
-    and are alike share a window, as far as they fit.
+    """Windows over the images of several stations, in order; the stations' numbers must differ.
+
+    Consecutive stations with the same camera share a window as long as their images fit.
     """
     together: list[Placed] = []
     for one in placed:

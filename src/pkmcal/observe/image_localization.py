@@ -1,16 +1,16 @@
-"""The machine in one photograph alone, of which nothing is known: the places that it could show.
+"""Camera localization from a single image without a prior.
 
-Places all round the machine, at distances from which it fills the picture or a third of it, turns
-about the line of sight and places in the picture are tried, by the middles of the tubes on a chart
-of what could be tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as those of a
-station do (:mod:`pkmcal.observe.pose_likelihood`), on tables that tell three times as many
-directions apart; the best of these again on twice and four times as fine a picture, where texture
-yields far less evidence and the machine more.
+Camera positions all round the machine, at distances at which it fills the image or a third of it,
+rotations about the optical axis and positions in the image are scored by the middles of the tubes
+on a chart of possible tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as in the
+localization of a station (:mod:`pkmcal.observe.pose_likelihood`), on tables with three times as
+many edge directions. The best of these are refined on tables of twice and four times the
+resolution, where texture contributes much less log likelihood and the machine more.
 
-How surely the best is the machine, the second best tells: what is not the machine in a picture full
-of edges is rarely alone, and a machine of equal parts looks much the same from several sides. What
-the drawing has wrong moves all edges of a leg together, so each half of a leg counts as one
-measurement of that comparison.
+The second best hypothesis measures the certainty of the best: clutter rarely produces a single
+match, and a machine of equal parts looks nearly the same from several sides. An error of the
+nominal model moves all edges of a leg together, so in this comparison each half of a leg counts as
+one measurement.
 """
 
 from __future__ import annotations
@@ -38,49 +38,56 @@ from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.tubes import MAP_CELL_SIZE, PAIR_DIRECTIONS, TubeChart, tube_chart
 
 PICTURE_SHARES_FILLED = (0.3, 1.5)
-"""Share of the picture that the machine fills: from a third, to where its ends lie outside."""
+"""Smallest and largest share of the image that the machine fills: from a third, to ends outside
+the image."""
 WIDEST_HALF_ANGLE = 1.2
-"""Half the angle (rad) under which it is seen at most."""
+"""Largest half angle (rad) subtended by the machine."""
 NEXT_DISTANCE_FACTOR = 1.18
-"""Factor from one distance to the next: half of that moves a leg's end by half its width."""
+"""Ratio of successive distances: half a step moves the end of a leg by half its width."""
 CHART_SHARE_OFF_MIDDLE = 0.2
-"""Share of the chart's size by which the machine may lie off its middle, to each side."""
+"""Largest offset of the machine from the middle of the chart, to each side, as a share of the
+chart's size."""
 CHART_STRIDE_CELLS = 2
-"""Cells of the chart from one place in the picture to the next."""
+"""Chart cells between successive positions in the image."""
 PICTURE_PLACES_A_TURN = 2
-"""Places in the picture that are kept for each place and turn of the camera."""
+"""Number of image positions retained for each camera position and rotation."""
 HYPOTHESES_THAT_DESCEND = 2000
-"""Hypotheses that descend: in a cluttered laboratory the machine's is among the first thousand."""
+"""Number of hypotheses that are refined; in a cluttered laboratory the correct one is among the
+first thousand."""
 HYPOTHESES_ON_COARSE, HYPOTHESES_ON_FINER = 400, 120
-"""How many go on after the first descents, and to the finer picture."""
+"""Numbers of hypotheses retained after the first descent and for the tables of double
+resolution."""
 MANY_DIRECTIONS = 24
-"""Directions of the tables: each takes its neighbours in, so edges within 11 degrees count."""
+"""Number of edge directions of the tables: with the neighbours included, edges within 11 degrees
+count."""
 FINEST_TABLES = 4 * WORKING_WIDTH, MANY_DIRECTIONS
-"""Width (px) and directions of the tables on which places are weighed."""
+"""Width (px) and number of directions of the tables on which the final hypotheses are compared."""
 HYPOTHESES_ON_FINEST = 40
-"""How many go on to the finest picture, and beside them the look-alikes of the first two."""
+"""Number of hypotheses on the finest tables, besides the symmetric poses of the first two."""
 SAME_PLACE_TURN = np.radians(20.0)
-"""Turn within which two places are one: look-alikes are turned by 60 degrees at least."""
+"""Rotation within which two poses count as the same: symmetric poses differ by 60 degrees at
+least."""
 MACHINE_FOLDS = (2, 3, 4, 6)
-"""Equal parts that a machine may have."""
+"""Orders of rotational symmetry that are tried."""
 JOINT_ON_JOINT_DISTANCE = 0.2
-"""Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
-equal that they could be exchanged, and yet from a photograph they could."""
+"""Largest distance between a rotated joint and its counterpart in a symmetric pose, relative to
+the radius of the base. No real parts are exactly interchangeable, but in an image they look so."""
 NEAR_ROUNDS, NEAR_STARTS, NEAR_THAT_GO_ON = 3, 32, 8
-"""How often, and from how many places at once, the likeliest place near one is looked for; how many
-of these are settled closely."""
+"""For the search near a pose: number of rounds, of starts in each, and of starts that are
+refined to the end."""
 NEAR_TURN, NEAR_SHIFT = np.radians(5.0), np.array([0.005, 0.005, 0.03])
-"""How far these are turned about the machine (rad), and shifted, in the camera's distance: legs
-move by their own width then, by which the search that found the place may be off."""
+"""Standard deviations of these starts: rotation about the machine (rad), and shift relative to
+the camera's distance. Legs then move by their own width, the possible error of the first search."""
 PLACES_IN_A_BATCH = 214
-"""Places that are looked up together: some ten megabytes."""
+"""Number of camera positions scored together; they take some ten megabytes."""
 
 
 class PoseHypotheses(NamedTuple):
-    """Places that a photograph could show, the one with the most evidence first.
+    """Candidate poses of an image, by decreasing log-likelihood ratio.
 
-    T_camera_base : (H, 4, 4), none near the first. log_likelihood_ratio : (H,) as
-    :mod:`pkmcal.observe.pose_likelihood` has it. unit : evidence that counts as one measurement.
+    T_camera_base : (H, 4, 4), none near the first.
+    log_likelihood_ratio : (H,) against chance, as in :mod:`pkmcal.observe.pose_likelihood`.
+    unit : log-likelihood ratio that counts as one independent measurement.
     """
 
     T_camera_base: Array
@@ -89,7 +96,11 @@ class PoseHypotheses(NamedTuple):
 
     @property
     def rival_probability(self) -> float:
-        """Probability that the second is the machine's place and not the first."""
+        """Probability that the second hypothesis is the correct one, given that one of the first
+        two is.
+
+        Without a second hypothesis, the comparison is with chance.
+        """
         second = float(self.log_likelihood_ratio[1]) if len(self.log_likelihood_ratio) > 1 else 0.0
         return 1 / (
             1 + float(np.exp(min((self.log_likelihood_ratio[0] - second) / self.unit, 500.0)))
@@ -97,25 +108,35 @@ class PoseHypotheses(NamedTuple):
 
 
 def localize_image(view: StationView, image: Integers) -> PoseHypotheses:
-    """The likeliest places of the camera of one photograph; view : of it alone."""
+    """Pose hypotheses of the camera of one image, best first.
+
+    view : of this image alone.
+    """
     one = np.zeros(1, dtype=int)
     coarse = replace(view, tables=distance_tables([image], WORKING_WIDTH, MANY_DIRECTIONS))
     fine = replace(view, tables=distance_tables([image], 2 * WORKING_WIDTH, MANY_DIRECTIONS))
+    # chart of tubes, then robust descents on tables of the usual resolution
     hypotheses = _hypotheses(view, tube_chart(image, view.camera))
     hypotheses = refine_lm(coarse, hypotheses, one, 2, (16, 14, 12, 10))
     hypotheses = _most(coarse, hypotheses, 4, HYPOTHESES_ON_COARSE)
     hypotheses = refine_lm(coarse, hypotheses, one, 4, (8, 7, 6, 5, 5))
     hypotheses = _most(coarse, hypotheses, 5, HYPOTHESES_ON_FINER)
+    # maximum likelihood at twice the resolution
     hypotheses, log_likelihood_ratio = refine_ml(fine, hypotheses, one, 8, 6)
     hypotheses = hypotheses[np.argsort(-log_likelihood_ratio)]
     hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][:HYPOTHESES_ON_FINEST]
+    # and, with the symmetric poses of the best two, at four times
     return weighed_places(
         view, image, np.concatenate([hypotheses, symmetric_poses(view, hypotheses[:2])])
     )
 
 
 def weighed_places(view: StationView, image: Integers, values: Array) -> PoseHypotheses:
-    """Places (H, 4, 4) settled on the finest tables, those that are not the same place."""
+    """Hypotheses from poses (H, 4, 4) refined on the finest tables, duplicates removed.
+
+    Poses no likelier than chance are removed too, unless none remains; then the best one is
+    returned.
+    """
     one = np.zeros(1, dtype=int)
     view = replace(view, tables=distance_tables([image], *FINEST_TABLES))
     values, log_likelihood_ratio = refine_ml(view, values, one, 16, 6)
@@ -130,9 +151,9 @@ def weighed_places(view: StationView, image: Integers, values: Array) -> PoseHyp
 
 
 def distinct(view: StationView, values: Array) -> Integers:
-    """Of places (H, 4, 4), best first, those that are not the same place as a better one."""
+    """Indices of the poses (H, 4, 4), best first, that are not the same as a better one."""
     retained_rows = np.array(distinct_silhouettes(view, values, np.zeros(1, dtype=int)))
-    # near the first lies the same place, less well settled
+    # poses near the first are the same pose, refined less well
     return retained_rows[
         (angle_between(values[retained_rows], values[0]) >= SAME_PLACE_TURN) | (retained_rows == 0)
     ]
@@ -141,22 +162,28 @@ def distinct(view: StationView, values: Array) -> Integers:
 def finest_view(
     machine: Machine, photograph: Photographs, joints: Array, poses: Array
 ) -> StationView:
-    """What places of one photograph are weighed on; joints, poses : of all configurations."""
+    """View of one image with the finest tables.
+
+    joints, poses : of all configurations of the session; the latter are T_base_platform.
+    """
     tables = distance_tables([photograph.images[0]], *FINEST_TABLES)
     return StationView(machine, photograph.camera, photograph.configuration, joints, poses, tables)
 
 
 def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tuple[Array, float]:
-    """The place with the most evidence near one (4, 4), and its evidence: where a drawing has put
-    the camera, it may hold on to the wrong side of some legs.
+    """Likeliest pose near another (4, 4), and its log-likelihood ratio.
 
-    scatter : as :func:`refine_ml` takes it.
+    After a localization with the nominal model, some legs may be matched to the wrong side of a
+    tube; random starts around the pose find the correct match.
+
+    scatter : as the parameter ``widest`` of :func:`refine_ml`.
     """
     rng, one = np.random.default_rng(0), np.zeros(1, dtype=int)
     ends = view.machine.ends_at(view.joints, view.poses)
     middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
     best, most = T_camera_base, -np.inf
     for _ in range(NEAR_ROUNDS):
+        # rotations about the middle of the machine, and shifts; the first start is the best so far
         turn = rotation(rng.normal(size=(NEAR_STARTS, 3)) * NEAR_TURN)
         turn[0] = np.eye(3)
         starts = best @ pose(turn, middle - turn @ middle)
@@ -172,7 +199,9 @@ def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tup
 
 
 def _unit(view: StationView, values: Array) -> float:
-    """Reduced pixels of silhouette that count as one measurement: half a leg's."""
+    """Log-likelihood unit of a hypothesis: the mean length of half a leg's silhouette, reduced
+    pixels.
+    """
     edges = edge_points(
         view.machine, view.camera, legs_in_camera(view.machine, values[0], view.poses, view.joints),
         view.tubes, 2,
@@ -183,6 +212,7 @@ def _unit(view: StationView, values: Array) -> float:
 
 
 def _most(view: StationView, values: Array, samples: int, count: int) -> Array:
+    """The ``count`` poses with the largest log-likelihood ratio."""
     log_likelihood_ratio = log_likelihood_of(view, values, np.zeros(1, dtype=int), samples).sum(
         axis=-1
     )
@@ -190,10 +220,12 @@ def _most(view: StationView, values: Array, samples: int, count: int) -> Array:
 
 
 class _Tubes(NamedTuple):
-    """Tubes of the machine in the photograph's configuration, T of them, base frame.
+    """The machine's T tubes in the configuration of the image, base frame.
 
-    ends : (T, 3, 3) first, middle and last point that can be seen. radius : (T,). centre : (3,) of
-    all. size : m, from there to the furthest.
+    ends : (T, 3, 3) first, middle and last visible point of each axis.
+    radius : (T,) m.
+    centre : (3,) middle of the bounding box.
+    size : m, largest distance of a point from the centre.
     """
 
     ends: Array
@@ -203,10 +235,11 @@ class _Tubes(NamedTuple):
 
 
 def _hypotheses(view: StationView, chart: TubeChart) -> Array:
-    """Poses T_camera_base (HYPOTHESES_THAT_DESCEND, 4, 4), best first."""
+    """Camera poses T_camera_base (HYPOTHESES_THAT_DESCEND, 4, 4), best first."""
     tubes = _tubes(view)
     width, height = chart.size
     half = min(width, height) / 2 / chart.scale
+    # distances at which the machine fills the given shares of the image
     near, far = (
         tubes.size / np.sin(min(half * fill, WIDEST_HALF_ANGLE))
         for fill in reversed(PICTURE_SHARES_FILLED)
@@ -215,10 +248,11 @@ def _hypotheses(view: StationView, chart: TubeChart) -> Array:
     distance = np.geomspace(near, far, count)
     direction = sphere(CAMERA_DIRECTIONS)
     rotation_to = frame_of(-direction)
-    # what is looked up: each place in the picture is a shift of the maps
+    # a position in the image is a shift of the maps
     reach = [int(CHART_SHARE_OFF_MIDDLE * n / MAP_CELL_SIZE) for n in chart.size]
     steps = [np.arange(-cells, cells + 1, CHART_STRIDE_CELLS) for cells in reach]
     windows = _windows(chart.surprisal, steps)
+    # for each distance and rotation, the best positions in the image for all directions
     values: list[Array] = []
     shifts: list[Integers] = []
     for away in distance:
@@ -233,11 +267,12 @@ def _hypotheses(view: StationView, chart: TubeChart) -> Array:
                 shifts += [best]
                 values += [np.take_along_axis(score, best, axis=-1)]
                 np.put_along_axis(score, best, -np.inf, axis=-1)
-    # (distance * turn * PICTURE_PLACES_A_TURN, place)
+    # now (direction, distance x rotation x PICTURE_PLACES_A_TURN)
     value, best = (np.concatenate(part, axis=-1).T for part in (values, shifts))
     order = np.argsort(-value.ravel())[:HYPOTHESES_THAT_DESCEND]
     row, place = np.unravel_index(order, value.shape)
     step, shift = row // PICTURE_PLACES_A_TURN, best[row, place]
+    # poses from the indices: direction, roll about the optical axis, tilt to the image position
     dx, dy = steps[0][shift % len(steps[0])], steps[1][shift // len(steps[0])]
     x, y = (d * MAP_CELL_SIZE / chart.scale for d in (dx, dy))
     zero = np.zeros(len(order))
@@ -251,6 +286,7 @@ def _hypotheses(view: StationView, chart: TubeChart) -> Array:
 
 
 def _tubes(view: StationView) -> _Tubes:
+    """Tubes of the machine in the first configuration of the view."""
     tubes = view.tubes
     legs = legs_in_camera(view.machine, np.eye(4), view.poses[:1], view.joints[:1])
     one = np.flatnonzero(tubes.side == 0)
@@ -265,8 +301,9 @@ def _tubes(view: StationView) -> _Tubes:
 
 
 def _windows(surprisal: Integers, steps: Sequence[Integers]) -> Integers:
-    """The maps so that [width, direction, y, x] is a whole window of shifts, (Sy, Sx); y, x count
-    from the chart's corner less what :func:`_border` says.
+    """View of the maps in which [width, direction, y, x] is the window of all shifts, (Sy, Sx).
+
+    y and x count from the corner of the padded maps, see :func:`_border`.
     """
     border = _border(surprisal)
     padded = np.pad(surprisal, ((0, 0), (0, 0), (border, border), (border, border)))
@@ -286,26 +323,35 @@ def _windows(surprisal: Integers, steps: Sequence[Integers]) -> Integers:
 
 
 def _border(surprisal: Integers) -> int:
-    """Cells put about the maps, on which nothing is a tube."""
+    """Cells of padding around the maps, in which there is no tube."""
     return max(surprisal.shape[2:])
 
 
 def _scores(
     visibility: Array, radius: Array, turn: float, chart: TubeChart, windows: Integers
 ) -> Array:
-    """Mean worth (P, shifts) of the tubes' middles; visibility : (P, T, 3, 3) first, middle and
-    last points from each place. Long tubes count more.
+    """Mean map value (P, shifts) at the middles of the tubes, weighted by their length in the
+    image.
+
+    visibility : (P, T, 3, 3) first, middle and last points of the tubes in the camera frames of P
+        positions.
+    radius : (T,) m.
+    turn : rotation about the optical axis, rad.
+    windows : as :func:`_windows` returns them.
     """
+    # chart coordinates of the points: angle from the optical axis, rotated by the turn
     beside = np.hypot(visibility[..., 0], visibility[..., 1])
     angle = np.arctan2(beside, visibility[..., 2])
     cell = visibility[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
     cell = cell @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    # direction, apparent width and weight of each tube
     chord = cell[:, :, 2] - cell[:, :, 0]
     normal = np.arctan2(chord[..., 0], -chord[..., 1])
     number = np.rint(normal % np.pi * (PAIR_DIRECTIONS / np.pi)).astype(np.intp) % PAIR_DIRECTIONS
     width = 2 * radius * chart.scale / np.sqrt(dot(visibility[:, :, 1], visibility[:, :, 1]))
     weight = np.hypot(chord[..., 0], chord[..., 1])
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    # first cell of each tube's window of shifts
     at = np.floor((cell[:, :, 1] + chart.middle) / MAP_CELL_SIZE).astype(np.intp)
     shifts = windows.shape[-2:]
     first = _border(chart.surprisal) - CHART_STRIDE_CELLS * (np.array(shifts[::-1]) // 2)
@@ -321,13 +367,17 @@ def _scores(
 
 
 def symmetric_poses(view: StationView, values: Array) -> Array:
-    """Places (H, 4, 4) with the machine turned about its own axis onto itself, all such turns of
-    each: a machine of equal parts looks much the same from there.
+    """Poses (H n, 4, 4) of the machine rotated onto itself, from poses (H, 4, 4) and all n
+    rotations.
+
+    The rotations are about the normal of the plane of the base joints, by the angles of
+    MACHINE_FOLDS that map every base joint close to another; a machine of equal parts looks nearly
+    the same from there.
     """
     machine = view.machine
     base = machine.base_centers()
     middle = base.mean(axis=0)
-    axis = np.linalg.svd(base - middle)[2][2]  # across the plane in which they lie, nearly
+    axis = np.linalg.svd(base - middle)[2][2]  # normal of their approximate plane
     near = JOINT_ON_JOINT_DISTANCE * np.sqrt(dot(base - middle, base - middle).max())
     turns: list[Array] = []
     for angle in 2 * np.pi * np.unique([k / n for n in MACHINE_FOLDS for k in range(1, n)]):

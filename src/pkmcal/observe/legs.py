@@ -1,15 +1,15 @@
-"""Each leg found in each photograph, then its edges to sub-pixel: what one look at stations gives.
+"""Measurement of legs in images: search of each leg as a whole, then sub-pixel edges.
 
-The drawing's errors leave predictions a few pixels off, more than the distance to highlights,
-shadows and neighbours. But all edges of one leg, two to a tube, move together: so
+The errors of the nominal model shift predictions by a few pixels, more than the distance to
+highlights, shadows and neighbours. But all edges of one leg, two for each tube, move together: so
 :func:`search` shifts and tilts the leg as a whole until the grey-level gradients under all its
-edges are strongest. A highlight imitates one edge; four at the right distances it does not.
+edges are strongest. A highlight imitates one edge, but not four at the right distances.
 
-Where the prediction is good to a pixel, :func:`measure` fits every edge by itself, to the profiles
-across it (:mod:`pkmcal.observe.profiles`).
+Where the prediction is correct to a pixel, :func:`measure` fits every edge separately to the
+profiles across it (:mod:`pkmcal.observe.profiles`).
 
-Both take the photographs through in windows (:mod:`pkmcal.observe.image_batches`): what is worked
-out of one is forgotten with it, and a few hundred numbers of its edges remain.
+Both process images in windows (:mod:`pkmcal.observe.image_batches`); of each image only a few
+hundred numbers about its edges remain in memory.
 """
 
 from __future__ import annotations
@@ -50,48 +50,55 @@ from pkmcal.observe.profiles import (
 )
 
 USUAL_PICTURE_LENGTH = 1024
-"""Pixels along the longer side of pictures in which a drawing is off by pixels, tubes are some tens
-of them wide, and all lengths below are meant: photographs are binned to about as many."""
+"""Longer side, in pixels, of images in which errors of the nominal model are pixels and tubes
+are tens of pixels wide; the lengths below refer to it. Larger images are binned to about this
+size."""
 BLUR_ROUNDING = 1e-6
-"""Pixels by which the last of the blurs that are tried may be missed."""
+"""Tolerance in pixels of the comparison with the largest trial blur."""
 LEG_SEARCH_REACH = 10.0
-"""Pixels to each side that a leg is looked for: 2 mm of drawing error at 0.9 px/mm, several
-times over, and what the station's pose leaves."""
+"""Range of the leg search to each side, px: several times an error of the nominal model of 2 mm
+at 0.9 px/mm, and the remaining error of the station's pose."""
 REPEATED_SEARCH_REACH = 4.0
-"""The same once the other legs have told where it is: beyond lies a highlight, or a neighbour."""
+"""Range once the other legs have determined the position: further away are highlights and
+neighbours."""
 SEARCH_TILTS = np.arange(-4.0, 4.5, 1.0)
-"""Shifts of a leg's ends against its middle that are tried, px."""
+"""Trial shifts of a leg's ends relative to its middle, px."""
 LEG_SEARCH_BLUR = 1.0
-"""Pixels of blur (standard deviation) against the noise of dark photographs."""
+"""Standard deviation in pixels of a blur against the noise of dark images."""
 PEAK_HALF_WIDTH = 2
-"""Pixels to each side within which the steepest place counts most."""
+"""Pixels to each side within which the steepest point has the largest weight."""
 GRADIENT_HALF = 1.5
-"""Levels per pixel at which an edge counts half of a strong one: strong highlights must not outvote
-three weak edges. Levels are roots of grey levels (255 stays), whose noise is even: 0.3 a pixel once
-smoothed, so this is five times that."""
+"""Slope, in levels per pixel, at which an edge has half the strength of a strong one, so that
+strong highlights do not outweigh three weak edges. Levels are square roots of grey levels (255
+is unchanged), whose noise is even: 0.3 per pixel after smoothing, of which this is five times."""
 RIVAL_SCORE_SHARE = 0.95
-"""A second place with this share of the best one's score makes a leg ambiguous."""
+"""Ratio of the second best score to the best one from which a leg's position is ambiguous."""
 RIVAL_AWAY = 4.0
-"""Pixels from the best place at which another one is a rival, not its flank."""
+"""Distance in pixels from the best position at which another one is a rival instead of its
+flank."""
 FEWEST_POINTS = 8
-"""Edge points (of 12 an edge) without which a leg's place is not looked for."""
+"""Fewest visible edge points (of 12 on each edge) for the search of a leg."""
 SEARCH_SIGMA = 1.0
-"""Standard deviation (px) given to edges found this way: one step of the search."""
+"""Standard deviation (px) of edges from the search: one step of it."""
 SEARCH_SAMPLES = 12
+"""Number of points along an edge in the search."""
 LEG_TILTS = np.arange(-1.0, 1.25, 0.25)
-"""Shifts of a leg's ends against its middle that are tried once it is known to a pixel, px."""
+"""Trial shifts of a leg's ends relative to its middle, px, once its position is known to a
+pixel."""
 EDGE_SEGMENTS = 8
-"""Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
+"""Number of segments of an edge; a position is fitted to the mean profile of each."""
 POINTS_A_SEGMENT = 3
-"""Points along each that are predicted in full: an odd count, so one is its middle."""
+"""Number of points of each segment that are predicted: odd, so one is in the middle."""
 FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT = 3, 8
-"""Profiles taken about each of these: one a pixel on edges of 72 to 192 pixels. Faint edges need
-all of them, and more would look at the same pixels; shorter edges are looked at oftener, and of
-longer ones so many tell what shading leaves to be told."""
+"""Smallest and largest number of profiles around each of these points: one per pixel on edges of
+72 to 192 pixels. Faint edges need all of them, and more would sample the same pixels; shorter
+edges are sampled more densely, and on longer ones so many exhaust the information that shading
+leaves."""
 FEWEST_SHARE = 1 / 3
-"""Share of a segment's points that must be clear for its mean profile to count."""
+"""Smallest share of a segment's points that must be clear for its mean profile to be used."""
 OTHER_OUTLINE_CLEARANCE = 5.0
-"""Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
+"""Distance in pixels from the outlines of other legs: the outer reach of a profile and of the
+search around it."""
 
 OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
@@ -101,18 +108,19 @@ _NOT_ONE_EDGE = "its places do not lie on one edge"
 
 
 ImageBatchesInUse = Callable[[int], None]
-"""Called with how many photographs more were looked at."""
+"""Progress callback, called with the number of images processed since the last call."""
 
 
 def first_binning(image_size: tuple[int, int]) -> int:
-    """How many pixels of photographs of a size are one where their edges are looked for first."""
+    """Binning of images of a size in the first measurement pass."""
     return max(round(max(image_size) / USUAL_PICTURE_LENGTH), 1)
 
 
 def sharp_binning(binning: int, blur: float) -> int:
-    """How many pixels are one where edges, so blurred (px) at a binning, are as sharp as usual:
-    averaging fewer of those over which the lens spreads an edge tells no more of it. Twice as many
-    as now where edges are blurred beyond what profiles are explained with.
+    """Binning at which edges, with this blur (px) at a present binning, are as sharp as usual.
+
+    Smaller bins would resolve the lens's blur without further information. Twice the present
+    binning where the blur exceeds those that profiles can explain.
     """
     if blur > profiles.BLURS_TRIED[-1] - BLUR_ROUNDING:
         return 2 * binning
@@ -121,11 +129,13 @@ def sharp_binning(binning: int, blur: float) -> int:
 
 @dataclass(frozen=True)
 class LegPlaces:
-    """Where legs were found in photographs, arrays (K, L).
+    """Positions of legs found in images, arrays (K, L).
 
-    shift, tilt : px sideways, towards side 0, of the leg's middle, and of its visible end near
-    B against the middle. score : 0..1. share : of the leg's edge points that can be seen.
-    clear : False where the leg is hidden or its place ambiguous.
+    shift, tilt : px sideways, towards side 0, of the leg's middle, and of its visible end near B
+        relative to the middle.
+    score : 0 to 1.
+    share : of the leg's edge points that are visible.
+    clear : False where the leg is hidden or its position ambiguous.
     """
 
     shift: Array
@@ -135,7 +145,7 @@ class LegPlaces:
     clear: Booleans
 
     def outward(self, points: EdgePoints, visible: Booleans, tubes: TubeList) -> Array:
-        """Outward positions (K, E, n) px of all edges' points that these places mean."""
+        """Outward positions (K, E, n) px of all edge points at these positions of the legs."""
         along = place_on_leg(points.along, visible, tubes)
         shift, tilt = (v[:, tubes.leg][..., None] for v in (self.shift, self.tilt))
         return SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * along)
@@ -148,15 +158,18 @@ def search_legs(
     clear: Booleans,
     reach: float = LEG_SEARCH_REACH,
 ) -> LegPlaces:
-    """Shift and tilt of every leg in photographs.
+    """Shift and tilt of every leg in images, by exhaustive search.
 
-    images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
+    images : K arrays (height, width), float32 or uint8.
+    points, clear : predictions (K, E, n).
+    reach : range of shifts, px.
     """
     steps = np.arange(-reach, reach + 0.5)
     offsets = np.arange(steps[0] - SEARCH_TILTS[-1], steps[-1] + SEARCH_TILTS[-1] + 0.5)
+    # strength of image edges across every predicted point
     strength = np.zeros((*clear.shape, len(offsets)), np.float32)
     for k, (image, visible) in enumerate(zip(images, clear, strict=True)):
-        if not visible.any():  # no leg is in the picture
+        if not visible.any():  # no leg in the image
             continue
         at = points.pixel[k][visible], points.outward[k][visible]
         strength[k][visible] = gradient_strength(image, *at, offsets)
@@ -170,11 +183,14 @@ def search_legs(
 
 
 def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeList) -> Array:
-    """Sums (K, L, tilts, count) over all points of a leg, of values (K, E, n, steps) at steps
-    outward, for each shift and tilt of the whole leg towards side 0.
+    """Sums (K, L, tilts, count) over the points of a leg, for each of its shifts and tilts to side
+    0.
 
-    place : (K, E, n) of the points on their legs. tilts : in steps. The shifts, of which there are
-    fewer than steps, lie about the middle; beyond the steps, their last value holds.
+    values : (K, E, n, steps) at steps outward of each point.
+    place : (K, E, n) positions of the points on their legs, -1 to 1.
+    tilts : in steps.
+    count : number of shifts, fewer than steps and in the middle of them; beyond the steps their
+        last value holds.
     """
     towards = np.where((SIDE_SIGNS[tubes.side] > 0)[:, None, None], values, values[..., ::-1])
     room = (values.shape[-1] - count) // 2
@@ -183,6 +199,7 @@ def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeL
         ends = towards[..., :1], towards[..., -1:]
         wide = [np.broadcast_to(end, (*end.shape[:-1], beyond)) for end in ends]
         towards = np.concatenate([wide[0], towards, wide[1]], axis=-1)
+    # windows of all shifts; a tilt selects each point's window
     shifted = sliding_window_view(towards.reshape(-1, towards.shape[-1]), count, axis=-1)
     row = np.arange(place.size).reshape(place.shape)
     legs, first_edge = tubes.by_leg
@@ -195,9 +212,10 @@ def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeL
 
 
 def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Array) -> Array:
-    """Strength 0..1 of a photograph's edges across predicted ones, (n, offsets).
+    """Strength (n, offsets), 0 to 1, of image edges across predicted ones.
 
-    pixel, outward : (n, 2) of points of these. offsets : whole pixels outward, one by one.
+    pixel, outward : (n, 2) of points on the predicted edges.
+    offsets : consecutive whole pixels outward.
     """
     import cv2
 
@@ -212,17 +230,17 @@ def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Ar
 
 
 def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]:
-    """Columns and rows (n, offsets) of pixels (n, 2) moved so far along unit vectors (n, 2), single
+    """Columns and rows (n, offsets) of pixels (n, 2) displaced along unit vectors (n, 2), single
     precision.
     """
-    # one small matrix product a coordinate: eight times as fast as to spread and add
+    # a small matrix product for each coordinate: eight times as fast as broadcasting
     away = np.stack([np.ones(len(offsets)), offsets]).astype(np.float32)
     for k in (0, 1):
         yield np.stack([pixel[:, k], outward[:, k]], axis=1).astype(np.float32) @ away
 
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
-    """Place of every point between the ends of its leg's visible part, -1..1; (K, E, n)."""
+    """Position (K, E, n) of every point between the ends of its leg's visible part, -1 to 1."""
     legs, first_edge = tubes.by_leg
     ends: list[Array] = []
     for reduce, beyond in ((np.minimum, np.inf), (np.maximum, -np.inf)):
@@ -237,10 +255,15 @@ def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
 
 
 def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlaces:
-    """Best shift and tilt of each leg from scores (K, L, tilts, steps)."""
+    """Best shift and tilt of each leg from scores (K, L, tilts, steps).
+
+    total, share : (K, L) number and share of visible points.
+    steps : shifts, px.
+    """
     flat = scores.reshape(*scores.shape[:2], -1)
     tilt, step = np.unravel_index(np.argmax(flat, axis=-1), scores.shape[2:])
     best = flat.max(axis=-1)
+    # ambiguous: a rival far from the best, too few points, or the best at the end of the range
     away = np.abs(steps - steps[step][..., None]) >= RIVAL_AWAY
     rival = np.where(away, scores.max(axis=2), 0.0).max(axis=-1)
     inside = np.abs(steps[step]) < steps[-1]
@@ -250,11 +273,12 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
 
 @dataclass(frozen=True)
 class StationEdges:
-    """What one look gave, at one station or, before it is taken apart, at several.
+    """Edges from a measurement pass, of one station or, before it is split, of several.
 
-    points : (M, 2) px and point_edge (M,) the edge in ``edges`` that each supports.
-    blur : px, of the pictures' edges; nan where not estimated. shift : median distance (px) of
-    the edges from where they were predicted.
+    points, point_edge : (M, 2) px of the inliers, and (M,) the edge in ``edges`` that each
+        supports.
+    blur : px, of the image edges; NaN where not estimated.
+    shift : median distance (px) of the edges from their predictions.
     """
 
     edges: EdgeSet
@@ -265,7 +289,7 @@ class StationEdges:
     shift: float
 
     def of_station(self, station: int) -> StationEdges:
-        """What of a look at several is a station's; blur and moved as they are."""
+        """Edges of one station; blur and shift are unchanged."""
         mine = self.edges.station == station
         at, number = mine[self.point_edge], np.cumsum(mine) - 1
         return replace(
@@ -277,8 +301,10 @@ class StationEdges:
         )
 
     def unbinned(self, count: int) -> StationEdges:
-        """What was seen in binned photographs, in the whole ones: points in their pixels, and edges
-        by their camera's parameters. What is in pixels of an edge itself stays in binned ones.
+        """Edges in full-size images from those in binned ones.
+
+        Points and derivatives by the camera's parameters are converted to full-size pixels. Pixel
+        quantities of an edge itself stay in binned pixels.
         """
         if count == 1:
             return self
@@ -295,7 +321,7 @@ def search(
     poses: Array,
     reach: float = LEG_SEARCH_REACH,
 ) -> StationEdges:
-    """:func:`search_stations` of one station's photographs; poses : T_base_platform (K, 4, 4)."""
+    """:func:`search_stations` for one station's images; poses : T_base_platform (K, 4, 4)."""
     return search_stations([Placed(photographs, T_camera_base, poses)], machine, reach)[0]
 
 
@@ -305,19 +331,19 @@ def search_stations(
     reach: float = LEG_SEARCH_REACH,
     done: ImageBatchesInUse | None = None,
 ) -> list[StationEdges]:
-    """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel."""
+    """Edges of every leg to about a pixel, from shifting each leg as a whole."""
     passes: list[StationEdges] = []
     for window in windows(placed):
         passes.append(_searched(window, machine, reach))
         if done is not None:
             done(len(window.images))
-        del window  # before the next one is decoded
+        del window  # free before the next one is decoded
     every = joined_passes(passes, float("nan"), reach)
     return [every.of_station(one.photographs.station) for one in placed]
 
 
 def _searched(window: PhotographWindow, machine: Machine, reach: float) -> StationEdges:
-    """One window's part of :func:`search_stations`."""
+    """Edges of one window of images by :func:`search_stations`."""
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear, reach)
     valid = clear & places.clear[:, tubes.leg][..., None]
@@ -343,7 +369,7 @@ def measure(
     blur: float | None = None,
     refine_camera: bool = False,
 ) -> StationEdges:
-    """:func:`measure_stations` of one station's photographs; poses : T_base_platform (K, 4, 4)."""
+    """:func:`measure_stations` for one station's images; poses : T_base_platform (K, 4, 4)."""
     blur_by_station = {} if blur is None else {photographs.station: blur}
     placed = Placed(photographs, T_camera_base, poses)
     return measure_stations([placed], machine, blur_by_station, refine_camera)[0]
@@ -356,12 +382,13 @@ def measure_stations(
     refine_camera: bool = False,
     done: ImageBatchesInUse | None = None,
 ) -> list[StationEdges]:
-    """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
+    """Edges to sub-pixel accuracy, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
-    blur : from an earlier look; where a station has none, estimated from the profiles of as many of
-    its photographs as are looked at together, spread over all. refine_camera : also how the edges
-    depend on the camera's parameters.
+    blur : from an earlier measurement pass; for other stations it is estimated from the profiles of
+        one window of images, spread over all.
+    refine_camera : also compute the edges' derivatives by the camera's parameters.
     """
+    # blur of stations with several windows, from images spread over all of them
     numbers = dict(blur)
     for one in placed:
         p = one.photographs
@@ -380,7 +407,7 @@ def measure_stations(
         shifted.append(away)
         if done is not None:
             done(len(window.images))
-        del prediction, window  # before the next one is decoded
+        del prediction, window  # free before the next one is decoded
     every = joined_passes(passes, float("nan"), float("nan"))
     away, at = np.concatenate(shifted), every.edges.station[every.point_edge]
     out: list[StationEdges] = []
@@ -393,7 +420,7 @@ def measure_stations(
 
 
 def _blur_in(across: Profiles, stations: Sequence[int]) -> dict[int, float]:
-    """Px by station, as profiles tell it; where there are none, the usual one."""
+    """Blur (px) by station, estimated from its profiles; the usual one without profiles."""
     out: dict[int, float] = {}
     for station in stations:
         own = np.flatnonzero(across.station == station)
@@ -403,7 +430,7 @@ def _blur_in(across: Profiles, stations: Sequence[int]) -> dict[int, float]:
 
 
 def joined_passes(passes: Sequence[StationEdges], blur: float, shifted: float) -> StationEdges:
-    """One station's windows, or all stations, as one look."""
+    """Concatenation of the windows of one station, or of several stations."""
     first = np.cumsum([0, *(len(station_edges.edges) for station_edges in passes)])[:-1]
     number = [station_edges.point_edge + k for station_edges, k in zip(passes, first, strict=True)]
     return StationEdges(
@@ -422,8 +449,9 @@ def joined_passes(passes: Sequence[StationEdges], blur: float, shifted: float) -
 
 @dataclass(frozen=True)
 class _PredictedEdges:
-    """A window's predicted places along edges, and the profiles where they are clear, ``full``
-    (K, E, EDGE_SEGMENTS).
+    """Predicted positions along edges in one window, and the profiles at the clear ones.
+
+    full : (K, E, EDGE_SEGMENTS) segments with a profile.
     """
 
     tubes: TubeList
@@ -433,6 +461,7 @@ class _PredictedEdges:
 
 
 def _predicted_edges(window: PhotographWindow, machine: Machine) -> _PredictedEdges:
+    """Middles of all segments, and the mean profiles of those with enough clear points."""
     tubes, points, clear = predicted(window, machine, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     middles = np.arange(EDGE_SEGMENTS) * POINTS_A_SEGMENT + POINTS_A_SEGMENT // 2
     per_point = (f.name for f in fields(points) if f.name != "normal")
@@ -444,22 +473,25 @@ def _predicted_edges(window: PhotographWindow, machine: Machine) -> _PredictedEd
 def _measured(
     window: PhotographWindow, prediction: _PredictedEdges, blur: BlurByStation, refine_camera: bool
 ) -> tuple[StationEdges, Array]:
-    """One window's part of :func:`measure_stations`, and how far (px) each place was from its
-    prediction.
+    """Edges of one window by :func:`measure_stations`, and the distance (px) of each inlier from
+    its prediction.
     """
     tubes, places, full = prediction.tubes, prediction.places, prediction.full
+    # positions in the profiles, each near its leg's edge
     across, highlight = profiles.without_highlights(prediction.across, blur)
     curves = profiles.residual_curves(across, blur)
     about = _leg_lines(profiles.shift_log_likelihoods(across, curves), places.along, full, tubes)
     at = profiles.locate(across, curves, about)
     position, sigma, valid = np.zeros(full.shape), np.ones(full.shape), full.copy()
     position[full], sigma[full], valid[full] = at.position, at.sigma, at.valid & ~highlight
+    # planes through the positions, and their measurements
     fits = fit_edges(places, position, sigma, valid)
     by_camera = window.camera.project_jacobians(places.point)[1] if refine_camera else None
     names = window.station, window.configuration
     edges = edge_set(places, fits, tubes, *names, fits.good, by_camera)
     lamps = full.copy()
     lamps[full] = at.valid & highlight
+    # rejections, and pixels of the inliers
     rejected = _rejections(*names, tubes, full, valid, lamps, fits)
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]
@@ -471,7 +503,9 @@ def _measured(
 def predicted(
     window: PhotographWindow, machine: Machine, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
-    """The tubes' edges, some samples on each, and which of these (K, E, n) nothing obstructs."""
+    """Edges of all tubes, with ``samples`` points on each, and the mask (K, E, n) of unobstructed
+    ones.
+    """
     tubes = tubes_of(machine)
     legs = legs_in_camera(machine, window.T_camera_base, window.poses, window.joints)
     points = edge_points(machine, window.camera, legs, tubes, samples)
@@ -482,20 +516,23 @@ def predicted(
 def _segment_profiles(
     window: PhotographWindow, points: EdgePoints, clear: Booleans, half_width: Array
 ) -> tuple[Booleans, Profiles]:
-    """Mean profiles over each segment's clear samples.
+    """Mean profiles over the clear points of each segment.
 
-    Returns where there are enough of them, (K, E, EDGE_SEGMENTS), and the profiles there.
+    Returns the mask (K, E, EDGE_SEGMENTS) of segments with enough clear points, and their profiles.
     """
     visible = _by_segment(clear)
     full = visible.sum(axis=-1) >= FEWEST_SHARE * visible.shape[-1]
+    # profiles around each point, about one per pixel
     step = np.diff(_by_segment(points.pixel)[full], axis=1)
-    pitch = np.fmax.reduce(np.hypot(step[..., 0], step[..., 1]), axis=1)  # from point to point
-    pitch = np.nan_to_num(pitch, nan=MOST_PROFILES_A_POINT)  # next to none that has an image
+    pitch = np.fmax.reduce(np.hypot(step[..., 0], step[..., 1]), axis=1)  # px from point to point
+    pitch = np.nan_to_num(pitch, nan=MOST_PROFILES_A_POINT)  # NaN: no neighbour has an image
     each = np.clip(np.ceil(pitch), FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT).astype(int)
     count = each * visible[full].sum(axis=-1)
+    # position and direction of each profile
     which, at = _between(visible[full], each)
     pixel = window.camera.project(_on_edges(points, full, which, at))
     outward = _by_segment(points.outward.astype(np.float32))[full].reshape(-1, 2)[which]
+    # sums of the profiles of each segment, image by image
     offsets, explained = profiles.sampled_offsets(), len(profiles.profile_offsets())
     total = np.empty((len(count), len(offsets)), np.float32)
     clipped = np.zeros((len(count), explained), dtype=bool)
@@ -517,16 +554,18 @@ def _segment_profiles(
 
 
 def _by_segment(values: Array | Booleans) -> Any:
-    """Values (K, E, n, ...) of all edges' points, (K, E, EDGE_SEGMENTS, POINTS_A_SEGMENT, ...)."""
+    """Values (K, E, EDGE_SEGMENTS, POINTS_A_SEGMENT, ...) from the points' (K, E, n, ...)."""
     return values.reshape(*values.shape[:2], EDGE_SEGMENTS, -1, *values.shape[3:])
 
 
 def _between(visible: Booleans, each: Integers) -> tuple[Integers, Array]:
-    """M profiles about the points of N segments that are ``visible`` (N, points of one), ``each``
-    (N,) about a point.
+    """Distribution of profiles around the visible points of segments.
 
-    Returns the point of each profile (M,), counted through all segments, and the profile's place
-    (M,) from it, -1/2 to 1/2 of the way to the next.
+    Returns for each of M profiles the index (M,) of its point, counted over all segments, and its
+    position (M,) relative to that point, -1/2 to 1/2 of the distance to the next.
+
+    visible : (N, points of one segment).
+    each : (N,) profiles around a point.
     """
     times = (visible * each[:, None]).ravel()
     which = np.repeat(np.arange(times.size), times)
@@ -535,11 +574,12 @@ def _between(visible: Booleans, each: Integers) -> tuple[Integers, Array]:
 
 
 def _on_edges(points: EdgePoints, full: Booleans, which: Integers, at: Array) -> Array:
-    """Places (M, 3) of profiles, single precision. which, at : (M,) as :func:`_between` gives them
-    of the segments that are ``full``.
+    """Points (M, 3) of profiles on the edges, camera frame, single precision.
 
-    Points of an edge lie evenly on a line in space, so those between are interpolated there; the
-    profiles' directions hardly turn from one to the next.
+    Points of an edge are evenly spaced on a line in space, so positions in between are interpolated
+    there; the direction of the profiles hardly changes from one point to the next.
+
+    which, at : (M,) from :func:`_between` for the segments in ``full``.
     """
     k, e, _ = np.nonzero(full)
     step = (points.point[k, e, 1] - points.point[k, e, 0]).astype(np.float32)
@@ -550,10 +590,12 @@ def _on_edges(points: EdgePoints, full: Booleans, which: Integers, at: Array) ->
 
 
 def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList) -> Array:
-    """Where the edges of each profile's leg are by all profiles of the leg, px outward (N,).
+    """Position (N,), px outward, of each profile's edge according to all profiles of its leg.
 
-    likelihood : (N, shifts) of the profiles at ``full`` (K, E, n). A leg is shifted and tilted as a
-    whole: a highlight beside one edge is likelier there than the edge, but not for all of them.
+    A leg is shifted and tilted as a whole: a highlight beside one edge may be likelier there than
+    the edge, but not for all edges.
+
+    likelihood : (N, shifts) log-likelihoods of the profiles in ``full`` (K, E, n).
     """
     every = np.zeros((*full.shape, likelihood.shape[-1]), np.float32)
     every[full] = likelihood
@@ -576,7 +618,11 @@ def _rejections(
     lamps: Booleans,
     fits: EdgeFits,
 ) -> tuple[Rejection, ...]:
-    """Edges without a measurement, each with its reason. station, configuration : (K,)."""
+    """Rejections of edges without a measurement, each with its reason.
+
+    station, configuration : (K,).
+    full, valid, lamps : (K, E, n) segments with a profile, with an edge, and with a highlight.
+    """
     k, e = np.nonzero(~fits.good)
     visible, in_view, mirrored = (where[k, e].sum(axis=-1) for where in (full, valid, lamps))
     few = in_view < FEWEST_PLACES_FOR_TILT

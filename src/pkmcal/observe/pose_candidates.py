@@ -1,15 +1,16 @@
-"""Where a camera could stand of which nothing is said: places all round the machine, all turns.
+"""Candidate poses of a camera without a prior: positions all round the machine, all orientations.
 
-A central camera sees rays. From a place, the parts of the machine that its joints move spread over
-a part of the sphere about the camera: its middle tells where the camera must look, its width how
-far away it stands. Both are seen in photographs of several configurations without knowing what
-moves there. So of six unknowns four are tried, place by place on a sphere about the machine and
-turn by turn about the line of sight, and two nearly follow. A camera in the midst of the legs is
-the same case: there the sphere is small.
+Seen from a position, the moving parts of the machine spread over a part of the sphere around the
+camera. The middle of that part determines the direction in which the camera must look, its width
+the distance. Both are observed in images of several configurations, without knowing which pixels
+belong to the machine. Of six unknowns, four are therefore sampled, on a grid of positions around
+the machine and of rotations about the line of sight, and two nearly follow. A camera among the legs
+is the same case with a small sphere.
 
-All that is compared on a chart: angles from the middle of what moves, in units of its width. Turns
-are turns of the chart and a wrong line of sight a shift of it, whatever the lens or mirror, so a
-million hypotheses are looked up in a table of some ten thousand cells.
+Comparisons are made on a chart of angles from the middle of the moving region, in units of its
+width. A rotation of the camera is a rotation of the chart and an error of the line of sight a
+shift, for any lens or mirror, so a million hypotheses are evaluated by look-ups in a table of some
+ten thousand cells.
 """
 
 from __future__ import annotations
@@ -31,34 +32,39 @@ from pkmcal.observe.distance_tables import (
 from pkmcal.observe.predict import LegsInCamera, TubeList, visible_stretch
 
 CAMERA_DIRECTIONS = 642
-"""Directions from the machine to the camera: 8 degrees apart."""
+"""Number of directions from the machine to the camera: 8 degrees apart."""
 SIGHT_LINE_TURNS = 24
-"""Turns about the line of sight: 15 degrees apart."""
+"""Number of rotations about the line of sight: 15 degrees apart."""
 NEAREST_DISTANCE_TRIED, FURTHEST_DISTANCE_TRIED = 0.05, 30.0
-"""Distances from the machine's middle that are tried, in its own sizes."""
+"""Smallest and largest distance from the middle of the machine, relative to its size."""
 DISTANCES_TRIED = 28
+"""Number of distances between these, in geometric progression."""
 SPREAD_POINTS = 160
-"""Points of the legs, in all configurations, whose spread is looked at."""
+"""Number of points of the legs, over all configurations, from which the angular extent is
+computed."""
 WIDER_THAN_LEGS = (0.9, 1.2, 1.6)
-"""How much wider what moves may look than the legs do: shadows and cables move too."""
+"""Ratios of the width of the moving region to that of the legs that are tried: shadows and
+cables move too."""
 CHART_HALF_CELLS = 40
-"""Cells of the chart from its middle to its border."""
+"""Cells from the middle of the chart to its border."""
 CHART_HALF_WIDTHS = 3.0
-"""Widths of what moves from the chart's middle to its border."""
+"""Widths of the moving region from the middle of the chart to its border."""
 CHART_DISTANCE_CUT = 10
-"""Cells at which distances on the chart are cut off."""
+"""Largest distance on the chart, in cells."""
 CHART_BORDER_CELLS = CHART_DISTANCE_CUT
-"""Cells about the chart in which nothing is near."""
+"""Cells of padding around the chart, at the largest distance from any edge."""
 SIGHT_LINE_SHIFTS = np.stack(np.meshgrid(*[np.arange(-8, 9, 4)] * 2), axis=-1).reshape(-1, 2)
-"""Cells by which the line of sight may be off."""
+"""Errors of the line of sight that are tried, (n, 2) cells."""
 CHORD_ENDS_ALONG_LEG = np.array([0.05, 0.35, 0.65, 0.95])
-"""Places along a leg's visible part between which its chords lie."""
+"""Ends of the chords along the visible part of a leg, as shares of its length."""
 LONGEST_CHORD = CHART_HALF_WIDTHS * CHART_HALF_CELLS
-"""Cells that a chord counts for at most: from near by, a leg fills the sphere."""
+"""Largest weight of a chord, in cells: close to the camera, a leg fills the sphere."""
 
 
 class AngularExtent(NamedTuple):
-    """What moves, on the sphere about the camera: unit middle (..., 3) and width (...), rad."""
+    """Middle, unit vectors (..., 3), and width (...), rad, of what moves, on the sphere around the
+    camera.
+    """
 
     middle: Array
     width: Array
@@ -73,10 +79,12 @@ def global_candidates(
     photographs: Integers,
     keep: int,
 ) -> Array:
-    """The likeliest poses T_camera_base (keep, 4, 4), best first, with nothing known of any.
+    """Likeliest poses T_camera_base (keep, 4, 4) without a prior, best first.
 
-    legs : of all configurations in the base frame, (K, L). radius : (E,) m of the tubes. tables :
-    of the same K photographs, of which ``photographs`` are looked at.
+    radius : (E,) m of the tubes of each edge.
+    legs : (K, L) in the base frame, of all configurations.
+    tables : of the same K images.
+    photographs : numbers of the images that are scored.
     """
     in_view = _direction_spread(camera, tables)
     frame = frame_of(in_view.middle)
@@ -86,7 +94,8 @@ def global_candidates(
     best = np.argpartition(scores.ravel(), keep)[:keep]
     best = best[np.argsort(scores.ravel()[best])]
     place, turn, shift = np.unravel_index(best, scores.shape)
-    # the camera looks `off` away from the middle of what it sees, and is turned about that line
+    # shift of the line of sight and rotation about it, applied to the frame in which the camera
+    # looks at the middle of the legs
     off = SIGHT_LINE_SHIFTS[shift] * (CHART_HALF_WIDTHS / CHART_HALF_CELLS * float(in_view.width))
     zero = np.zeros(len(best))
     tilt = rotation(np.stack([-off[:, 1], off[:, 0], zero], axis=-1))
@@ -96,23 +105,28 @@ def global_candidates(
 
 
 def _direction_spread(camera: Camera, tables: DistanceTables) -> AngularExtent:
-    """What moves in the photographs."""
+    """Angular extent of the moving region in the images."""
     y, x = np.nonzero(tables.moving)
     corner = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
     pixel = (np.stack([x, y], axis=-1)[:, None] + corner + 0.5) * tables.scale - 0.5
     rays = camera.ray(pixel)
     ok = np.isfinite(rays).all(axis=(1, 2))
     rays, share = rays[ok], tables.moving[y[ok], x[ok]]
+    # solid angle of each pixel, times the share of images in which it moves
     area = np.cross(rays[:, 1] - rays[:, 0], rays[:, 2] - rays[:, 0])
     weight = share * np.sqrt(dot(area, area))
     return _spread(weight @ rays[:, 0], weight.sum())
 
 
 def _spread(total: Array, weight: Array) -> AngularExtent:
-    """Of unit rays whose weighted sum is (..., 3), and that of their weights (...)."""
+    """Mean direction and width of unit rays from their weighted sum (..., 3) and sum of weights
+    (...).
+
+    The width is the angle whose cosine is the length of the mean.
+    """
     mean = total / np.maximum(weight, 1e-300)[..., None]
     length = np.sqrt(dot(mean, mean))
-    middle = np.where(length[..., None] > 0, mean, [0.0, 0.0, 1.0])  # nothing moves: anywhere
+    middle = np.where(length[..., None] > 0, mean, [0.0, 0.0, 1.0])  # nothing moves: any direction
     middle = middle / np.sqrt(dot(middle, middle))[..., None]
     return AngularExtent(middle, np.arccos(np.clip(length, 0.0, 1 - 1e-9)))
 
@@ -120,8 +134,10 @@ def _spread(total: Array, weight: Array) -> AngularExtent:
 def _places(
     tubes: TubeList, radius: Array, legs: LegsInCamera, width: float
 ) -> tuple[Array, AngularExtent]:
-    """Places (P, 3) in the base frame from which what moves looks about as wide as it is seen, and
-    how it looks from there.
+    """Camera positions (P, 3), base frame, from which the legs have about the observed width.
+
+    For each direction and each ratio of WIDER_THAN_LEGS, the distance with the best width; with the
+    extent of the legs seen from each position.
     """
     one = np.flatnonzero(tubes.side == 0)
     a, b, u = (v[:, tubes.leg] for v in (legs.a, legs.b, legs.u))
@@ -132,27 +148,29 @@ def _places(
     point = (
         a[:, :, None] + (first[:, None] + length[..., None] * quarter)[..., None] * u[:, :, None]
     )
-    # a place is seen to move as far as it leaves where it was covered before
+    # a point counts as moving by the share of the tube's width that it leaves uncovered
     away = point - np.median(point, axis=0)
     wide = 2 * radius[one][:, None]
     moves = np.minimum(np.sqrt(dot(away, away)) / wide, 1.0)
     if not moves.any():
-        moves = np.ones_like(moves)  # one configuration: what has edges stands for what moves
+        moves = np.ones_like(moves)  # one configuration: all edges count as moving
     weight = (moves * wide * length[..., None]).ravel()
     point = point.reshape(-1, 3)
     centre = weight @ point / weight.sum()
     size = np.sqrt(weight @ dot(point - centre, point - centre) / weight.sum())
+    # extent from each position, weighted by the solid angle of the points
     few = evenly(len(point), SPREAD_POINTS)
     point, weight = point[few], weight[few]
     direction = sphere(CAMERA_DIRECTIONS)
     distance = size * np.geomspace(NEAREST_DISTANCE_TRIED, FURTHEST_DISTANCE_TRIED, DISTANCES_TRIED)
     place = centre + direction[:, None] * distance[:, None]
-    # one component after the other, and no ray by itself: there are a million of them
+    # component by component, because an array of a million rays would be slow
     square = sum((point[:, k] - place[..., k, None]) ** 2 for k in range(3))
     near = weight / square
     share = near / np.sqrt(square)
     total = share @ point - share.sum(axis=-1)[..., None] * place
     spread = _spread(total, near.sum(axis=-1))
+    # for each direction and ratio, the distance at which the width fits best
     nearest = [
         np.abs(np.log(spread.width) - np.log(width / wider)).argmin(axis=1)
         for wider in WIDER_THAN_LEGS
@@ -165,7 +183,7 @@ def _places(
 
 
 def sphere(count: int) -> Array:
-    """Unit directions (count, 3), evenly about the sphere: Fibonacci's lattice."""
+    """Unit directions (count, 3) evenly distributed on the sphere, a Fibonacci lattice."""
     k = np.arange(count) + 0.5
     z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
     flat = np.sqrt(1 - z * z)
@@ -173,7 +191,9 @@ def sphere(count: int) -> Array:
 
 
 def frame_of(middle: Array) -> Array:
-    """Rotations (..., 3, 3) from the frame of unit vectors (..., 3) to one whose z they are."""
+    """Rotations (..., 3, 3) from the frame of unit vectors (..., 3) to a frame with these as its z
+    axis.
+    """
     other = np.where(np.abs(middle[..., 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     x = np.cross(other, middle)
     x /= np.sqrt(dot(x, x))[..., None]
@@ -181,7 +201,7 @@ def frame_of(middle: Array) -> Array:
 
 
 def _on_chart(rays: Array, width: float) -> Array:
-    """Cells (..., 2) of unit rays (..., 3) in the chart's frame, from its middle."""
+    """Chart cells (..., 2), relative to the middle, of unit rays (..., 3) in the chart's frame."""
     away = np.sqrt(rays[..., 0] ** 2 + rays[..., 1] ** 2)
     angle = np.arctan2(away, rays[..., 2])
     cells = CHART_HALF_CELLS / CHART_HALF_WIDTHS / width
@@ -191,11 +211,12 @@ def _on_chart(rays: Array, width: float) -> Array:
 def _chart_tables(
     camera: Camera, tables: DistanceTables, photographs: Integers, frame: Array, width: float
 ) -> Integers:
-    """Distance tables (K, EDGE_DIRECTIONS, n, n) uint8 on the chart, of some photographs."""
+    """Distance tables (K, EDGE_DIRECTIONS, n, n) uint8 on the chart, in cells, of some images."""
     n = 2 * CHART_HALF_CELLS + 1
     out = np.empty((len(photographs), EDGE_DIRECTIONS, n, n), dtype=np.float32)
     for row, k in enumerate(photographs):
         edges = tables.edges[k]
+        # each edge point as a chord of one reduced pixel, which gives its direction on the chart
         along = np.stack([-edges.normal[:, 1], edges.normal[:, 0]], axis=-1) / 2
         ends = edges.pixel[:, None] + np.stack([-along, along], axis=1)
         rays = camera.ray((ends + 0.5) * tables.scale - 0.5)
@@ -219,11 +240,12 @@ def _scores(
     photographs: Integers,
     width: float,
 ) -> Array:
-    """Mean distance (P, SIGHT_LINE_TURNS, SIGHT_LINE_SHIFTS), in cells, of all legs' chords from
-    edges so directed.
+    """Mean distance (P, SIGHT_LINE_TURNS, SIGHT_LINE_SHIFTS), in cells, of the legs' chords to
+    edges of the same direction, weighted by the chords' lengths.
     """
     leg = np.unique(tubes.leg)
     a, b, u = (v[photographs][:, leg] for v in (legs.a, legs.b, legs.u))
+    # chords along the visible part of each leg, on the chart
     low = np.array([tubes.start[tubes.leg == j].min() for j in leg])
     high = np.array([tubes.stop[tubes.leg == j].max() for j in leg])
     high = np.minimum(high, np.sqrt(dot(b - a, b - a)))
@@ -235,17 +257,18 @@ def _scores(
     cell = cell.reshape(len(places), -1, len(CHORD_ENDS_ALONG_LEG), 2)
     chord = np.diff(cell, axis=-2).reshape(len(places), -1, 2)
     middle = ((cell[..., 1:, :] + cell[..., :-1, :]) / 2).reshape(len(places), -1, 2)
-    # one component after the other: NumPy is slow along an axis of two
+    # component by component: NumPy is slow along an axis of two
     x, y = (np.ascontiguousarray(middle[..., k]) for k in (0, 1))
     direction = (np.arctan2(chord[..., 1], chord[..., 0]) / np.pi + 0.5) * EDGE_DIRECTIONS
     weight = np.minimum(np.sqrt(dot(chord, chord)), LONGEST_CHORD)
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)[:, None]
     table = np.repeat(np.arange(len(chart)), chord.shape[1] // len(chart)) * EDGE_DIRECTIONS
-    # beyond the chart nothing is near; what lies further still is taken to its border
+    # beyond the chart there are no edges; chords further away are moved to its border
     shifted, n = _shifted(chart), chart.shape[-1] + 2 * CHART_BORDER_CELLS
     limit = n // 2 - np.abs(SIGHT_LINE_SHIFTS).max() - 1
     out = np.empty((len(places), SIGHT_LINE_TURNS, len(SIGHT_LINE_SHIFTS)), dtype=np.float32)
     for turn in range(SIGHT_LINE_TURNS):
+        # rotate the chords and look up all shifts of each
         angle = 2 * np.pi / SIGHT_LINE_TURNS * turn
         cos, sin = np.cos(angle), np.sin(angle)
         column, row = (
@@ -262,8 +285,10 @@ def _scores(
 
 
 def _shifted(chart: Integers) -> Array:
-    """Distances (cells, SIGHT_LINE_SHIFTS) by every line of sight, at each cell of charts (K,
-    EDGE_DIRECTIONS, n, n) with a border: what is looked up together lies together.
+    """Distances (cells, SIGHT_LINE_SHIFTS) at each cell of padded charts (K, EDGE_DIRECTIONS, n,
+    n), for every shift of the line of sight.
+
+    Values that are looked up together are adjacent in memory.
     """
     border = (CHART_BORDER_CELLS, CHART_BORDER_CELLS)
     around = ((0, 0), (0, 0), border, border)
@@ -272,5 +297,5 @@ def _shifted(chart: Integers) -> Array:
         SIGHT_LINE_SHIFTS[:, 1] * (chart.shape[-1] + 2 * CHART_BORDER_CELLS)
         + SIGHT_LINE_SHIFTS[:, 0]
     )
-    # nothing is looked up so near the corners that a step leaves the tables
+    # no cell near enough to the corners to leave the tables is ever looked up
     return flat.take(np.arange(flat.size)[:, None] + step, mode="clip")

@@ -1,10 +1,10 @@
-"""How much the edges of photographs speak for the machine at a place, and the descent to the most.
+"""Log-likelihood ratio of a camera pose by the edges of images, and its maximization.
 
-Places descend by damped steps on the distances of predicted silhouettes from picture edges
-(:mod:`pkmcal.observe.distance_tables`). A point of a predicted silhouette has either a picture edge
-of the machine near by, or what chance has put there: a mixture, whose two numbers each place may
-choose for itself. Its likelihood against chance alone is the evidence, counted by the length of the
-silhouettes.
+Poses descend by damped steps on the distances of predicted silhouettes from image edges
+(:mod:`pkmcal.observe.distance_tables`). Near a point of a predicted silhouette there is either an
+image edge of the machine or one by chance: a mixture whose two parameters are estimated for each
+pose. The likelihood of the mixture relative to chance alone, weighted by the length of the
+silhouettes, is the log-likelihood ratio of the pose.
 """
 
 from __future__ import annotations
@@ -34,32 +34,37 @@ from pkmcal.observe.predict import (
 )
 
 FIRST_DAMPING = 1e-3
-"""Of a step, relative to the normal equations' diagonal."""
+"""Initial Levenberg-Marquardt damping, relative to the diagonal of the normal equations."""
 DISTANCE_OUTSIDE_IMAGE = 1e4
-"""Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
+"""Distance, in reduced pixels, of points outside the image."""
 LEAST_LOG_LIKELIHOOD_GAIN = 0.1
-"""Evidence that a step has to gain for another one to follow; a measurement is tens of it."""
+"""Gain in log-likelihood ratio below which the maximization stops; one measurement contributes
+tens of it."""
 SILHOUETTE_PLACES_AT_ONCE = 30_000
-"""Places on silhouettes that are looked up together, so that what is worked out of them stays in
-the processor's cache."""
+"""Number of silhouette points processed together, so that intermediate results stay in the
+processor's cache."""
 LAST_REACH = 4.0
-"""Reduced pixels at which the final score cuts distances off."""
+"""Truncation distance of the final score, in reduced pixels."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
-"""Other readings for each photograph, which tell what evidence chance gives."""
+"""Fewest and most sets of other readings for each image, from which the distribution of the
+likelihood by chance is estimated."""
 ELSEWHERE_TURN_AND_SHIFT = np.repeat([0.2, 0.1], 3)
-"""Turn (rad) and shift (in distances of base and platform) of a platform that is elsewhere."""
+"""Standard deviations of the rotation (rad) and of the shift (relative to the distance between
+base and platform) of a randomly displaced platform."""
 SILHOUETTES_APART = 8.0
-"""Reduced pixels between two hypotheses' silhouettes from which they are not the same place."""
+"""Smallest median distance, in reduced pixels, between the silhouettes of two different poses."""
 
 
 @dataclass(frozen=True)
 class StationView:
-    """What the search looks at: one station's photographs and what should be in them.
+    """Input of the search: one station's images and the machine that they should show.
 
-    configuration : (K,) rows of the session's readings. all_joints : (M, m) these readings.
-    all_poses : T_base_platform (M, 4, 4) by the drawing. guessed : where the legs would be in the
-    photographs by hypotheses, (H, K, L), one for each place that is asked for; none where they are
-    as the readings say.
+    configuration : (K,) rows of the session's readings.
+    all_joints : (M, m) readings of the session.
+    all_poses : T_base_platform (M, 4, 4) by the nominal model.
+    tables : distance tables of the K images.
+    guessed : (H, K, L) hypothetical legs in the images, base frame, one for each candidate pose (or
+        H = 1); None where the legs follow the readings.
     """
 
     machine: Machine
@@ -77,46 +82,48 @@ class StationView:
 
     @property
     def joints(self) -> Array:
-        """Readings (K, m) of the photographs."""
+        """Readings (K, m) of the images."""
         return self.all_joints[self.configuration]
 
     @property
     def poses(self) -> Array:
-        """Poses (K, 4, 4) of the platform in the photographs."""
+        """Platform poses T_base_platform (K, 4, 4) of the images."""
         return self.all_poses[self.configuration]
 
     @cached_property
     def all_legs(self) -> LegsInCamera:
-        """The legs' axes in the base frame, (M, L), in the search's single precision."""
+        """Leg axes (M, L), base frame, in single precision."""
         return self.legs_at(self.all_poses, self.all_joints)
 
     def legs_at(self, poses: Array, joints: Array) -> LegsInCamera:
-        """The same at other poses (..., 4, 4) and readings (..., m)."""
+        """Leg axes (..., L), base frame, at poses (..., 4, 4) and readings (..., m), in single
+        precision.
+        """
         return legs_in_camera(self.machine, np.eye(4), poses, joints).single()
 
     def legs(self, photographs: Integers) -> LegsInCamera:
-        """Of some photographs (n,): (n, L), or (H, n, L) where they are guessed."""
+        """Leg axes (n, L) in some images, (n,); (H, n, L) for hypothetical legs."""
         if self.guessed is not None:
             return self.guessed[:, photographs]
         return self.all_legs[self.configuration[photographs]]
 
     def guess(self, which: slice | Integers) -> StationView:
-        """The same for some of the hypotheses that are guessed, if there are as many as places."""
+        """View with some of the hypothetical legs; unchanged if there is one set or none."""
         if self.guessed is None or len(self.guessed) == 1:
             return self
         return replace(self, guessed=self.guessed[which])
 
     def few(self, count: int) -> Integers:
-        """Numbers of up to ``count`` photographs, spread over all."""
+        """Numbers of up to ``count`` images, spread evenly over all."""
         return evenly(len(self.configuration), count)
 
     def with_joints(self, joints: Array) -> StationView:
-        """The same photographs with other readings (M, m)."""
+        """View of the same images with other readings (M, m)."""
         fk = self.machine.forward_result(joints).T_base_platform
         return replace(self, all_joints=joints, all_poses=fk)
 
     def select(self, photographs: Integers) -> StationView:
-        """Some of the photographs alone."""
+        """View of some of the images."""
         return replace(
             self,
             configuration=self.configuration[photographs],
@@ -125,9 +132,10 @@ class StationView:
         )
 
     def rivals(self, rng: np.random.Generator) -> LegsInCamera:
-        """Where legs would be at readings that are not the photographs' own, (R, K, L): each time
-        those of the configurations that follow by so many; where the session has few, on platforms
-        elsewhere too.
+        """Legs (R, K, L) at readings that are not the images' own.
+
+        Each set has the readings of the configurations that follow by a fixed number of rows; if
+        the session has few, randomly displaced platforms are added.
         """
         count, own = len(self.all_joints), self.configuration
         steps = np.unique(np.linspace(1, max(count - 1, 1), MOST_RIVALS).astype(int))
@@ -142,7 +150,10 @@ class StationView:
 
 
 def distinct_silhouettes(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
-    """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
+    """Indices of the candidates (H, 4, 4), best first, that are not the same as a better one.
+
+    Two poses are the same if the median distance of their silhouettes is SILHOUETTES_APART at most.
+    """
     if len(candidates) < 2:
         return list(range(len(candidates)))
     legs = view.legs(photographs).under(candidates)
@@ -159,11 +170,15 @@ def distinct_silhouettes(view: StationView, candidates: Array, photographs: Inte
 def score(
     view: StationView, T_camera_base: Array, photographs: Integers, reach: float, samples: int = 5
 ) -> Array:
-    """Mean distance from predicted edges to picture edges, cut off at ``reach``: (H,), 0 to 1,
-    which edges behind the camera count as.
+    """Mean truncated distance of predicted edges from image edges, relative to ``reach``: (H,), 0
+    to 1.
 
-    T_camera_base : (H, 4, 4) hypotheses. reach : reduced pixels. Edges are taken as the chords
-    between their ends, which is exact for a pinhole and near enough for this search elsewhere.
+    Edges behind the camera count as 1. Edges are approximated by the chords between their ends,
+    which is exact for a pinhole camera and close enough for this search otherwise.
+
+    T_camera_base : (H, 4, 4) hypotheses.
+    reach : truncation distance, reduced pixels.
+    samples : points along an edge.
     """
     parts = _parts(view, len(T_camera_base), len(photographs) * samples)
     if len(parts) > 1:
@@ -187,21 +202,23 @@ def score(
     cost = np.where(inside & ok, np.minimum(distance, reach) / reach, 1.0).mean(axis=0)
     weight = np.nan_to_num(np.hypot(chord[..., 0], chord[..., 1]))
     total = np.maximum(np.sum(weight, axis=(1, 2)), 1e-9)
-    before = np.mean(weight > 0, axis=(1, 2))  # or a camera among the legs would fit at once
+    before = np.mean(weight > 0, axis=(1, 2))  # or a camera among the legs would fit anything
     return before * (np.sum(cost * weight, axis=(1, 2)) / total) + (1 - before)
 
 
 class _Mixture(NamedTuple):
-    """What a hypothesis says of the distances found, (H,): the share that chance has put there, and
-    the standard deviation (reduced px) of the rest.
+    """Mixture parameters of each hypothesis, (H,).
+
+    share : of the distances that are by chance.
+    sigma : standard deviation (reduced px) of the others.
     """
 
     share: Array
     sigma: Array
 
     def likelier(self, at: Distances) -> Array:
-        """Density (H, E, n) of the distances found on the machine's edges, times the share that is
-        on these, by the density that chance gives.
+        """Density (H, E, n) of the distances from the machine's edges, times the share of these,
+        divided by the density of chance distances.
         """
         share, sigma = (v.astype(np.float32)[:, None, None] for v in self)
         near = np.exp(at.distance**2 * (-0.5 / sigma**2))
@@ -209,11 +226,12 @@ class _Mixture(NamedTuple):
 
 
 class Distances(NamedTuple):
-    """Distances found in the picture under predicted edges, of all photographs in a row, (H, E, n).
+    """Distances from predicted edges to image edges, (H, E, n), with the edges of all images in a
+    row.
 
-    distance : reduced pixels, DISTANCE_OUTSIDE_IMAGE outside the image. rare : one by the density
-    of such distances by chance. length : reduced pixels of silhouette for which each place stands,
-    none outside the image.
+    distance : reduced pixels, DISTANCE_OUTSIDE_IMAGE outside the image.
+    rare : reciprocal of the density of such distances by chance.
+    length : reduced pixels of silhouette that each point represents, 0 outside the image.
     """
 
     distance: Array
@@ -221,7 +239,10 @@ class Distances(NamedTuple):
     length: Array
 
     def mixture(self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH) -> _Mixture:
-        """The likeliest mixture, from another on (expectation and maximisation)."""
+        """Maximum-likelihood mixture, by expectation maximization from an initial one.
+
+        widest : upper bound of sigma.
+        """
         total = np.maximum(_summed(self.length), 1e-9)
         for _ in range(rounds):
             own = self.length * self.own(mixture)
@@ -232,20 +253,23 @@ class Distances(NamedTuple):
         return mixture
 
     def own(self, mixture: _Mixture) -> Array:
-        """Probability (H, E, n) of each place's edge being the machine's."""
+        """Probability (H, E, n) that each point's image edge belongs to the machine."""
         own = mixture.likelier(self)
         return own / (own + mixture.share.astype(np.float32)[:, None, None])
 
     def log_likelihood(self, mixture: _Mixture) -> Array:
-        """Log likelihood (H, E, n) of each place against chance."""
+        """Log-likelihood ratio (H, E, n) of each point against chance."""
         share = mixture.share.astype(np.float32)[:, None, None]
         return self.length * np.log(mixture.likelier(self) + share)
 
 
 class _Linearization(NamedTuple):
-    """What a place may descend by. slope : (H, E, n) of the distances found, by metres that the
-    edge moves outward. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the camera frame
-    does to an edge, in metres outward: at its first place, and how much more its turn at the last.
+    """Distances linearized in the camera pose.
+
+    slope : (H, E, n) derivative of the distances by an outward motion of the edge, per metre.
+    begins, grows : (H, 6, E) and (H, 3, E) derivative of the edge's outward position, m, by a
+        motion (omega, tau) of the camera frame: at the edge's first point, and the increase of its
+        rotational part to the last.
     """
 
     distances: Distances
@@ -254,16 +278,18 @@ class _Linearization(NamedTuple):
     grows: Array
 
     def weight(self, reach: float) -> Array:
-        """Geman-McClure: what is further than the reach is another edge."""
+        """Geman-McClure weights (H, E, n): beyond the reach a distance belongs to another edge."""
         return (1 + (self.distances.distance * (1 / reach)) ** 2) ** -2
 
     def cost(self, reach: float) -> Array:
-        """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
+        """Geman-McClure cost (H,), the mean over all points: 0 to 1, and 1 outside the image."""
         part = (self.distances.distance * (1 / reach)) ** 2
         return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
 
     def where(self, better: Booleans, other: _Linearization) -> _Linearization:
-        """Take some of the hypotheses from here, the rest from the other look."""
+        """Linearization of the hypotheses in ``better`` (H,) from here, of the rest from the other
+        one.
+        """
         if better.all():
             return self
 
@@ -281,7 +307,7 @@ class _Linearization(NamedTuple):
 
 
 def _summed(values: Array) -> Array:
-    """Sums (H,) over all places (H, E, n)."""
+    """Sums (H,) over all points (H, E, n)."""
     return values.reshape(len(values), -1).sum(axis=-1, dtype=float)
 
 
@@ -292,9 +318,9 @@ def refine_lm(
     samples: int,
     reaches: tuple[float, ...],
 ) -> Array:
-    """Levenberg-Marquardt on the distances, candidates (H, 4, 4) side by side, a step a reach.
+    """Levenberg-Marquardt descent of candidates (H, 4, 4), side by side, one step for each reach.
 
-    Upright legs hardly say where their camera stands; undamped, steps there go astray.
+    Vertical legs hardly determine the camera's position along them; undamped steps diverge there.
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
@@ -316,16 +342,17 @@ def refine_ml(
     steps: int,
     widest: float = LAST_REACH,
 ) -> tuple[Array, Array]:
-    """The same to the most evidence: how far edges scatter, up to ``widest`` reduced pixels, is
-    learnt on the way.
+    """Maximum-likelihood poses near candidates (H, 4, 4), and their log-likelihood ratios (H,).
 
-    Returns the places (H, 4, 4) and their evidence (H,).
+    Levenberg-Marquardt steps; the scatter of the edges, up to ``widest`` reduced pixels, is
+    estimated in alternation.
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
     mixture = first_mixture(len(candidates))
     last = float("inf")
     for _ in range(steps):
+        # mixture at the current poses, then one step of each
         mixture = linearization.distances.mixture(mixture, widest=widest)
         trial = _step(
             candidates,
@@ -343,41 +370,44 @@ def refine_ml(
         damping = np.where(better, 0.3, 10.0) * damping
         most = float(gain.max())
         if max(last, most) < LEAST_LOG_LIKELIHOOD_GAIN:
-            break  # one step may have been too long
+            break  # a single step may have been too long
         last = most
     mixture = linearization.distances.mixture(first_mixture(len(candidates)), 10, widest)
     return candidates, _summed(linearization.distances.log_likelihood(mixture))
 
 
 def first_mixture(count: int) -> _Mixture:
-    """Where each of so many places begins: half edges, half chance."""
+    """Initial mixture of ``count`` hypotheses: half of the distances by chance."""
     return _Mixture(np.full(count, 0.5), np.full(count, LAST_REACH / 2))
 
 
 def log_likelihood_of(
     view: StationView, candidates: Array, photographs: Integers, samples: int
 ) -> Array:
-    """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
+    """Log-likelihood ratio (H, K) of candidates (H, 4, 4) in each image."""
     count = distances_under(view, candidates, photographs, samples)
     mixture = count.mixture(first_mixture(len(candidates)), rounds=10)
     return by_photograph(count.log_likelihood(mixture), len(photographs))
 
 
 def by_photograph(log_likelihood_ratio: Array, count: int) -> Array:
-    """Sums (H, K) over each photograph's places, or each name's, (H, E, n) of all in a row."""
+    """Sums (H, K) over the points of each image, or each configuration, from (H, E, n) in a row."""
     return log_likelihood_ratio.reshape(len(log_likelihood_ratio), count, -1).sum(
         axis=-1, dtype=float
     )
 
 
 def log_likelihood_by_name(view: StationView, T_camera_base: Array, names: Integers) -> Array:
-    """Evidence (K, n) of a pose (4, 4) in each photograph under each of the names (n,), rows of the
-    readings; edges scatter as they do under the names that the view has.
+    """Log-likelihood ratio (K, n) of a pose (4, 4) in each image for each of some configurations.
+
+    The scatter of the edges is that with the images' own configurations.
+
+    names : (n,) rows of the readings.
     """
     every = view.few(len(view.configuration))
     own = distances_under(view, T_camera_base[None], every, 8)
     mixture = own.mixture(first_mixture(1), rounds=10)
-    # where the legs are under a name, they are so in any photograph
+    # the legs of a configuration are the same for every image
     legs = view.all_legs[names].under(T_camera_base[None])
     points = edge_points(view.machine, view.camera, legs, view.tubes, 8)
     direction = view.tables.direction(points.outward)
@@ -391,35 +421,36 @@ def log_likelihood_by_name(view: StationView, T_camera_base: Array, names: Integ
 
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
-    """The pose (4, 4) with the most evidence near another."""
+    """Maximum-likelihood pose (4, 4) near another one, from all images."""
     every = view.few(len(view.configuration))
     return refine_ml(view, T_camera_base[None], every, 8, 8)[0][0]
 
 
 def likelihood_from(view: StationView, places: Array) -> float:
-    """The most evidence, of all photographs, to which any of the places (H, 4, 4) settles.
+    """Largest log-likelihood ratio, in all images, that is reached from any of the poses (H, 4, 4).
 
-    Searches end up to fifty measurements apart, whatever they look for; so explanations of the same
-    photographs are compared from the same places.
+    Different searches end up to fifty measurements apart, so hypotheses about the same images are
+    compared from the same poses.
     """
     every = view.few(len(view.configuration))
     return float(refine_ml(view, places, every, 8, 8)[1].max())
 
 
 def correlation_length(view: StationView, T_camera_base: Array) -> float:
-    """Reduced pixels of half a predicted edge: what moves an edge moves its places together, so
-    each half counts as one measurement.
+    """Mean length of half a predicted edge, in reduced pixels.
+
+    The errors along an edge are correlated, so each half counts as one measurement.
     """
     every = view.few(len(view.configuration))
     length = distances_under(view, T_camera_base[None], every, 2).length[0]
     in_view = length[length > 0]
-    # two samples stand for an edge's length each; where no edge is in the picture none counts
+    # each of two samples represents one edge length; without any edge in the image the value is 1
     return float(in_view.mean()) / 2 if in_view.size else 1.0
 
 
 def _parts(view: StationView, count: int, places: int) -> list[slice]:
-    """Of so many hypotheses, or photographs, those that are looked at together, at so many places
-    of each edge.
+    """Slices of ``count`` hypotheses, or images, that are processed together, with ``places``
+    points on each edge.
     """
     each = max(places * len(view.tubes), 1)
     parts = max(min(round(count * each / SILHOUETTE_PLACES_AT_ONCE), count), 1)
@@ -430,7 +461,7 @@ def _parts(view: StationView, count: int, places: int) -> list[slice]:
 def distances_under(
     view: StationView, candidates: Array, photographs: Integers, samples: int
 ) -> Distances:
-    """Distances under the edges predicted from poses (H, 4, 4)."""
+    """Distances at the edges predicted from poses (H, 4, 4)."""
     parts = _parts(view, len(candidates), len(photographs) * samples)
     if len(parts) > 1:
         each = [distances_under(view.guess(k), candidates[k], photographs, samples) for k in parts]
@@ -443,7 +474,7 @@ def distances_under(
 def linearize_distances(
     view: StationView, candidates: Array, photographs: Integers, samples: int
 ) -> _Linearization:
-    """The same, and what places may descend by."""
+    """Distances at the edges predicted from poses (H, 4, 4), with their derivatives."""
     parts = _parts(view, len(candidates), len(photographs) * samples)
     if len(parts) > 1:
         passes = [
@@ -457,7 +488,7 @@ def linearize_distances(
         direction, points.pixel, points.outward, number
     )
     inside = inside & points.valid
-    # an edge moves outward by n . (omega x P + tau), of motions of the camera frame
+    # outward motion of an edge: n . (omega x P + tau) for a motion of the camera frame
     first, last = points.point[..., 0, :], points.point[..., -1, :]
     visible = np.any(inside, axis=-1, keepdims=True)[..., 0]
     return _Linearization(
@@ -471,7 +502,7 @@ def linearize_distances(
 def _edges_under(
     view: StationView, candidates: Array, photographs: Integers, samples: int
 ) -> tuple[EdgePoints, Integers, Integers]:
-    """Predicted edges (H, K, E, n), their directions, and the photographs' numbers (K, 1, 1)."""
+    """Predicted edges (H, K, E, n), their direction numbers, and the images' numbers (K, 1, 1)."""
     number = np.arange(len(view.configuration))[photographs][:, None, None]
     legs = view.legs(photographs).under(candidates)
     points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
@@ -481,8 +512,10 @@ def _edges_under(
 def _distances(
     view: StationView, points: EdgePoints, direction: Integers, values: Array, inside: Booleans
 ) -> Distances:
-    """Distances that were ``values`` (H, K, E, n) at predicted points, and where these are
-    ``inside``, of all photographs in a row.
+    """Distances, with chance densities and lengths, from table values (H, K, E, n), images in a
+    row.
+
+    inside : which points have an image and lie in it.
     """
     shape = (len(values), -1, values.shape[-1])
     inside = np.broadcast_to(inside, values.shape)
@@ -497,7 +530,9 @@ def _distances(
 
 
 def _stacked(vectors: tuple[Array, ...], visible: Booleans) -> Array:
-    """Components (H, 3 n, E) of n vectors (H, K, E, 3) of all edges in a row, 0 where not seen."""
+    """Components (H, 3 n, E) of n vectors (H, K, E, 3), edges of all images in a row; 0 if not
+    visible.
+    """
     out = np.zeros((len(visible), 3 * len(vectors), visible[0].size), np.float32)
     for k, vector in enumerate(vectors):
         for c in range(3):
@@ -509,15 +544,23 @@ def _stacked(vectors: tuple[Array, ...], visible: Booleans) -> Array:
 def _step(candidates: Array, station_edges: _Linearization, weight: Array, damping: Array) -> Array:
     """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4).
 
-    weight : (H, E, n) of the places. damping : (H,).
+    With t = 0..1 along an edge, its outward motion by the camera's (omega, tau) is
+
+        (begins + t [grows; 0]) . (omega, tau)
+
+    so the normal equations need only the sums over t^0, t and t^2 of the weighted squares.
+
+    weight : (H, E, n) of the points.
+    damping : (H,).
     """
-    # the places of an edge lie evenly between its first and its last
+    # points are evenly spaced from the first to the last of an edge
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
     powers = np.stack([at**0, at, at**2], axis=-1)
     weighted = weight * station_edges.slope
     one, both, two = ((weighted * station_edges.slope) @ powers).transpose(2, 0, 1)[:, :, None]
     here, there = ((weighted * station_edges.distances.distance) @ powers[:, :2]).transpose(2, 0, 1)
     begins, grows = station_edges.begins, station_edges.grows
+    # normal equations, of which omega's block has the terms in t
     normal = (begins * one) @ begins.mT
     mixed = (grows * both) @ begins.mT
     normal[:, :3] += mixed
@@ -526,9 +569,10 @@ def _step(candidates: Array, station_edges: _Linearization, weight: Array, dampi
     right = begins @ here[..., None]
     right[:, :3] += grows @ there[..., None]
     normal, right = normal.astype(float), right.astype(float)
+    # damped solution
     diagonal = np.einsum("hii->hi", normal) + 1e-12
     normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
     step = -np.linalg.solve(normal, right)[..., 0]
-    step = np.clip(step, -0.1, 0.1)  # further, the tables' slopes say nothing
-    # turn about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
+    step = np.clip(step, -0.1, 0.1)  # the tables' slopes are valid nearby only
+    # rotation about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
     return pose(rotation(step[:, :3]), step[:, 3:]) @ candidates

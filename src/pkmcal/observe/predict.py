@@ -1,8 +1,7 @@
-"""Where the edges of every leg should lie in every photograph, from what is known so far.
+"""Prediction of the edges of every leg in every image.
 
-Arrays have the axes (..., E edges of a machine, n samples along an edge), with K photographs before
-them; the E edges are the same in every photograph: each visible tube of each
-leg, side 0 then side 1.
+Arrays have the axes (..., E edges of a machine, n samples along an edge), preceded by K images. The
+E edges are the same in every image: each visible tube of each leg, side 0 then side 1.
 """
 
 from __future__ import annotations
@@ -21,15 +20,16 @@ from pkmcal.geometry.rigid import apply, cross, dot, of_components
 from pkmcal.mechanisms import Machine
 
 JOINT_MARGIN = 0.006
-"""Metres left out at both ends of a tube: collars and joint housings hide or imitate edges."""
+"""Length (m) left out at both ends of a tube: collars and joint housings hide or imitate edges."""
 
 
 @dataclass(frozen=True)
 class TubeList:
-    """The visible tubes of a machine, E = 2 x tubes edges.
+    """Edges of the visible tubes of a machine, E = 2 x tubes.
 
-    leg, tube, side : (E,). start, stop : (E,) m along the leg from A. radius : (E,) position of
-    the radius among the machine's parameters.
+    leg, tube, side : (E,).
+    start, stop : (E,) m along the leg from A.
+    radius : (E,) index of the radius among the machine's parameters.
     """
 
     leg: Integers
@@ -44,12 +44,12 @@ class TubeList:
 
     @cached_property
     def by_leg(self) -> tuple[Integers, Integers]:
-        """Legs with tubes, and the first edge of each: edges come leg by leg."""
+        """Legs with tubes, and the index of the first edge of each; edges are ordered by leg."""
         return np.unique(self.leg, return_index=True)
 
 
 def tubes_of(machine: Machine) -> TubeList:
-    """Every edge that the drawing promises, in the order leg, tube, side."""
+    """Edges of all tubes of the nominal model, ordered by leg, tube and side."""
     rows = [
         (j, t, side, tube.start, tube.stop, machine.layout.radius[j][t])
         for j, leg in enumerate(machine.document.legs)
@@ -63,43 +63,52 @@ def tubes_of(machine: Machine) -> TubeList:
 
 @dataclass(frozen=True)
 class LegsInCamera:
-    """Leg axes as a station sees them: ends a, b and directions u, (..., L, 3), camera frame."""
+    """Leg axes in a camera's frame: ends a, b and unit directions u from a to b, each (..., L, 3).
+
+    The precision of the arrays is that of all results derived from them.
+    """
 
     a: Array
     b: Array
     u: Array
 
     def __getitem__(self, which: Any) -> LegsInCamera:
-        """Some of them, by their leading axes."""
+        """Select along the leading axes."""
         return LegsInCamera(self.a[which], self.b[which], self.u[which])
 
     def __len__(self) -> int:
         return len(self.a)
 
     def single(self) -> LegsInCamera:
-        """The same in single precision, which is enough for a search in reduced photographs."""
+        """A copy in single precision, which suffices for a search in reduced images."""
         return LegsInCamera(*(v.astype(np.float32) for v in (self.a, self.b, self.u)))
 
     def joined(self, other: LegsInCamera) -> LegsInCamera:
-        """Both, along their first axis."""
+        """Concatenation along the first axis."""
         pairs = (self.a, other.a), (self.b, other.b), (self.u, other.u)
         return LegsInCamera(*(np.concatenate(pair) for pair in pairs))
 
     def under(self, T_camera_base: Array) -> LegsInCamera:
-        """Legs (K, L) or (H, K, L) of another frame as cameras (H, 4, 4) see them, (H, K, L)."""
+        """Legs (H, K, L) in the frames of cameras (H, 4, 4), from legs (K, L) or (H, K, L) in the
+        base frame.
+        """
         T = T_camera_base.astype(self.a.dtype)
         shape = self.a.shape[-3:-1]
         lead = self.a.shape[:-3] or (1,)
         own = np.stack([self.a, self.b, self.u]).reshape(3, *lead, shape[0] * shape[1], 3)
-        in_view = T[:, :3, :3] @ own.mT  # (3, H, 3, K L): one component after the other
-        in_view[:2] += T[:, :3, 3:]  # directions do not shift
+        in_view = T[:, :3, :3] @ own.mT  # (3, H, 3, K L), component by component
+        in_view[:2] += T[:, :3, 3:]  # translation applies to points, not to directions
         return LegsInCamera(*in_view.reshape(3, len(T), 3, *shape).transpose(0, 1, 3, 4, 2))
 
 
 def legs_in_camera(
     machine: Machine, T_camera_base: Array, T_base_platform: Array, joints: Array
 ) -> LegsInCamera:
-    """Leg axes in a camera's frame; T_camera_base (..., 4, 4) and poses (K, 4, 4) broadcast."""
+    """Leg axes in a camera's frame; T_camera_base (..., 4, 4) and T_base_platform (K, 4, 4)
+    broadcast.
+
+    joints : (K, m) readings.
+    """
     ends, camera = machine.ends_at(joints, T_base_platform), T_camera_base[..., None, :, :]
     a, b = np.broadcast_arrays(apply(camera, ends.a), apply(camera, ends.b))
     return LegsInCamera(a, b, line_through(a, b)[0])
@@ -107,13 +116,16 @@ def legs_in_camera(
 
 @dataclass(frozen=True)
 class EdgePoints:
-    """Points along predicted edges, and how the picture of each moves.
+    """Points along predicted edges, with their derivatives in the image.
 
-    normal : (..., E, 3) edge planes, camera frame. along : (..., E, n) place on the leg, m from
-    A. point : (..., E, n, 3) on the cylinder where the view ray grazes it, camera frame.
-    pixel : (..., E, n, 2). outward : (..., E, n, 2) unit normals of the edge in the image, away
-    from the leg. across : (..., E, n, 3) outward motion of the pixel (px) by the point's (m).
-    gain : (..., E, n) px per metre across the leg. valid : (..., E, n) has an image.
+    normal : (..., E, 3) unit normals of the edge planes, camera frame.
+    along : (..., E, n) position on the leg, m from A.
+    point : (..., E, n, 3) point of the cylinder where the viewing ray is tangent to it, camera
+        frame.
+    pixel : (..., E, n, 2).
+    outward : (..., E, n, 2) unit normals of the edge in the image, away from the leg.
+    gain : (..., E, n) px per metre of motion along the normal.
+    valid : (..., E, n) whether the point has an image.
     """
 
     normal: Array
@@ -126,15 +138,16 @@ class EdgePoints:
 
     @property
     def across(self) -> Array:
-        """Outward motion of the pixel (px) by the point's (m), (..., E, n, 3): motions within the
-        edge's plane do not leave the edge.
+        """Derivative (..., E, n, 3) of the outward position of the pixel (px) by the point (m).
+
+        Motions within the edge's plane have no effect.
         """
         return self.gain[..., None] * self.normal[..., None, :]
 
     def by_normal(self) -> Array:
-        """Outward motion of the edge (px) by a change of its plane's normal, (..., E, n, 3).
+        """Derivative (..., E, n, 3) of the outward position of the edge (px) by its plane's normal.
 
-        The plane n . x = 0 turned by dn passes P + e n with e = -dn . P.
+        The plane n . x = 0 rotated by dn contains P + e n with e = -dn . P.
         """
         return -self.point * self.gain[..., None]
 
@@ -142,8 +155,9 @@ class EdgePoints:
 def edge_points(
     machine: Machine, camera: Camera, legs: LegsInCamera, tubes: TubeList, samples: int
 ) -> EdgePoints:
-    """``samples`` points spaced evenly along every edge; leading axes, and the numbers' precision,
-    as ``legs`` has them.
+    """Points on all edges, ``samples`` on each, evenly spaced over the visible stretch.
+
+    Leading axes and precision are those of ``legs``.
     """
     radius = machine.values[tubes.radius].astype(legs.a.dtype)
     a, b, u = of_edges(legs, tubes)
@@ -153,9 +167,10 @@ def edge_points(
     along = first[:, None] + np.maximum(last - first, 0.0)[..., None] * fraction
     base = a + radius[:, None] * normal
     point = of_components(*(base[..., None, k] + along * u[..., None, k] for k in range(3)))
+    # image, its derivative along the leg and along the normal
     pixel, by_place, by_shift = camera.project_along(point, u[..., None, :], normal[..., None, :])
     x, y = by_place[..., 0], by_place[..., 1]
-    # beside the camera nothing has an image, and what almost has one lies anywhere
+    # points beside the camera have no image, and those nearby have arbitrary ones
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         length = np.sqrt(y * y + x * x)
         outward = of_components(-y / length, x / length)
@@ -166,13 +181,17 @@ def edge_points(
 
 
 def of_edges(legs: LegsInCamera, tubes: TubeList) -> Iterator[Array]:
-    """The legs' ends a, b and directions u for every edge, (..., E, 3)."""
+    """Ends a, b and directions u of the leg of every edge, (..., E, 3) each."""
     for vectors in (legs.a, legs.b, legs.u):
         yield of_components(*(vectors[..., k].take(tubes.leg, axis=-1) for k in range(3)))
 
 
 def normals_of_edges(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[Array, Booleans]:
-    """Edge planes (..., E, 3) of axes given per edge, and where the leg can be seen at all."""
+    """Normals (..., E, 3) of the edge planes, and whether each leg has a silhouette ([B] eq. 3).
+
+    a, u : (..., E, 3) of each edge's leg.
+    radius : (E,) m.
+    """
     m = cross(a, u)
     ok = has_silhouette(m, radius)
     sign = SIDE_SIGNS.astype(a.dtype)[tubes.side]
@@ -180,7 +199,10 @@ def normals_of_edges(a: Array, u: Array, radius: Array, tubes: TubeList) -> tupl
 
 
 def visible_stretch(a: Array, b: Array, tubes: TubeList) -> tuple[Array, Array]:
-    """First and last place of each tube that can be seen, m from A; (E,) and (..., E)."""
+    """First position, (E,), and last position, (..., E), of each tube's visible stretch, m from A.
+
+    Both are JOINT_MARGIN within the tube; the last one also within the leg.
+    """
     length = np.sqrt(dot(b - a, b - a))
     start, stop = (place.astype(length.dtype) for place in (tubes.start, tubes.stop))
     return start + JOINT_MARGIN, np.minimum(stop, length) - JOINT_MARGIN
@@ -194,11 +216,12 @@ def unobstructed(
     edges: EdgePoints,
     clearance: float,
 ) -> Booleans:
-    """Points in the image, not behind another leg nor within ``clearance`` px of its outline.
+    """Mask (K, E, n) of the points in the image that no other leg hides or disturbs.
 
-    The ray to the point passes another leg's axis at some distance. Nearer than that leg's
-    radius, the leg hides the point or stands behind it; a leg behind only matters where its own
-    outline spoils the point's background. (K, E, n).
+    The viewing ray of a point passes the axis of another leg at some distance. If the distance is
+    less than that leg's radius, the leg hides the point or lies behind it. A leg behind only
+    matters if its own outline disturbs the point's background, which is within ``clearance`` px of
+    it.
     """
     clear = edges.valid & camera.in_image(edges.pixel, margin=4.0)
     reach = np.sqrt(dot(edges.point, edges.point))
@@ -211,11 +234,13 @@ def unobstructed(
         a, b, u = (v[:, None, None, j] for v in (legs.a, legs.b, legs.u))
         length, start = np.sqrt(dot(b - a, b - a)), dot(u, a)
         cosine, ahead = dot(rays, u), dot(rays, a)
-        # the place on the leg's axis, m from a, that is nearest to the ray; depth is along the ray
+        # position on the other leg's axis, m from a, nearest to the ray; depth is along the ray
         place = (cosine * ahead - start) / np.maximum(1 - cosine**2, 1e-9)
         place = np.clip(place, 0, length)
         depth = ahead + place * cosine
+        # squared distance between ray and axis
         distance2 = dot(a, a) + place * (2 * start + place) - depth**2
+        # in front: within the outline and its clearance; behind: only near the outline
         spoiled = (depth > 0) & (distance2 < (others.max() + room) ** 2)
         within = others.min() - room
         spoiled &= (depth < reach) | (distance2 > within * np.abs(within))

@@ -1,13 +1,13 @@
-"""Sub-pixel edge positions from grey-level profiles, free of the shading's bias.
+"""Sub-pixel edge positions from grey-level profiles, without the bias of shading.
 
 A profile across a silhouette is not a step: a cylinder's shading changes fastest just inside its
-limb. At a depth d px inside, the surface has turned by an angle e from the limb with
-cos e = 1 - d / w (w: half the leg's width in px), and diffuse light on it is a sum of 1, cos e and
-sin e: brightness c0 + c1 d + c2 sqrt(d (2 w - d)). Outside, the background is b0 + b1 d. The
-strongest gradient of such an edge, blurred by lens and pixel, lies up to a pixel off the edge
-itself; this model, blurred alike, does not. For a given edge position it is linear in its five
-brightnesses, so every trial position is one projection, the same for all profiles of a width: the
-residual over a grid of positions is a matrix product, and its minimum is the edge.
+limb. At a depth d px inside, the surface normal is rotated by an angle e from the limb's, with cos
+e = 1 - d / w (w: half the leg's width in px), and diffuse light on it is a sum of 1, cos e and sin
+e, so the brightness is c0 + c1 d + c2 sqrt(d (2 w - d)). Outside, the background is b0 + b1 d. The
+steepest gradient of such an edge, blurred by lens and pixel, is up to a pixel off the edge itself;
+this model, with the same blur, is unbiased. For a given edge position it is linear in its five
+brightnesses (variable projection), so a trial position is one projection, the same for all profiles
+of a width: the residual over a grid of positions is a matrix product, and its minimum is the edge.
 """
 
 from __future__ import annotations
@@ -27,80 +27,90 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import EdgePoints, TubeList
 
 PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE = 3.0, 3.0
-"""Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
-other features and neighbours."""
+"""Pixels of a profile, inside and outside, that the model explains: with fewer the fit is
+ill-conditioned, with more it meets other features of the leg and its neighbours."""
 SAMPLED_INSIDE = 6.0
-"""Pixels inside to which profiles are sampled: beyond what is explained, a highlight ends."""
+"""Pixels inside to which profiles are sampled: highlights end beyond the modelled part."""
 MODELLED_LIMB_SHARE = 0.45
-"""Share of a leg's half width, from its limb inwards, that the model explains: highlights of bare
-metal begin further in. On slim legs this is less than PROFILE_REACH_INSIDE."""
+"""Share of a leg's half width, inwards from its limb, that the model explains: highlights of
+bare metal begin further inside. On slim legs this is less than PROFILE_REACH_INSIDE."""
 LEAST_INSIDE = 1.25
-"""Pixels inside that are used in any case: less would not hold the limb's own brightness."""
+"""Smallest depth in pixels that is used: less would not contain the brightness of the limb
+itself."""
 CLEAR_OUTSIDE = 1.0
-"""Pixels outward of the predicted edge from which samples are taken for the background's level."""
+"""Distance in pixels outward of the predicted edge from which samples belong to the background."""
 HIGHLIGHT_DEVIATIONS = 3.0
-"""Standard deviations by which the brightness inside has to come back to be a highlight's."""
+"""Standard deviations by which the brightness must return towards the background further inside
+for a strip to be detected."""
 PROFILE_STEP = 0.5
+"""Spacing of the samples of a profile, px."""
 EDGE_SHIFTS = np.arange(-1.5, 1.55, 0.1)
 """Trial positions of the edge about the predicted one, px."""
 PROFILE_MODEL_PITCH = 0.05
-"""Pixels from one place to the next at which the model is worked out: in steps and shifts it goes
-without remainder, so that all samples of all trial positions are such places."""
+"""Spacing in pixels at which the model is tabulated; it divides PROFILE_STEP and the steps of
+EDGE_SHIFTS, so all samples of all trial positions are on the grid."""
 BRIGHTNESS_UNKNOWNS = 5
-"""Linear unknowns of the model: three inside the limb, two outside."""
+"""Number of linear unknowns of the model: three inside the limb, two outside."""
 HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
-"""Half widths w (px) of legs for which the model is tabulated; the nearest is used."""
+"""Half widths w (px) of legs for which the model is tabulated; the nearest one is used."""
 _BETWEEN_HALF_WIDTHS = np.sqrt(HALF_WIDTHS[1:] * HALF_WIDTHS[:-1])
-"""Half widths (px) from which the next one is nearer, by ratio."""
+"""Boundaries (px) between successive half widths, their geometric means."""
 BLURS_TRIED = np.arange(0.45, 1.5, 0.1)
-"""Blurs (px, standard deviation, lens and pixel and interpolation together) that may be tried."""
+"""Trial values of the blur (px, standard deviation; lens, pixel and interpolation together)."""
 USUAL_BLUR = 0.7
-"""Blur (px) that is tried first, and assumed where no profile tells it: lens 0.6, pixel 0.3."""
+"""Blur (px) that is tried first, and the default where no profile determines it: lens 0.6, pixel
+0.3."""
 BLURS_BESIDE = 2
-"""Blurs to both sides of the best that are tried: the next tell its place between them, and how
-little each profile can leave; with further ones it moves by less than profiles tell it to, and of a
-hundred poor profiles the next ones alone may mistake a dent for it."""
+"""Trial values on both sides of the best one: the neighbours determine its position between
+them, and the smallest residual of each profile. Further values move the estimate by less than
+its uncertainty; with the nearest neighbours alone, a local minimum of a hundred poor profiles
+may be mistaken for the best."""
 ENOUGH_FOR_BLUR = 500
-"""Profiles that tell the blur to a hundredth of a pixel; more only take time."""
+"""Number of profiles that determine the blur to a hundredth of a pixel; more only take time."""
 FEWEST_FOR_BLUR = 100
-"""Profiles without which no blur is told: where fewer are whole, as those of the one wide leg among
-slim ones, others tell it with them."""
+"""Fewest profiles for an estimate of the blur: if fewer are uncut, as those of a single wide leg
+among slim ones, the profiles with the next larger cuts are added."""
 GREY_NOISE = 0.6
-"""Least standard deviation (grey levels) believed of a profile's samples: 8-bit rounding and
-what the model leaves out; keeps a chance perfect fit from counting for everything."""
+"""Lower bound of the standard deviation (grey levels) of a profile's samples: 8-bit rounding and
+model errors. It limits the weight of a fit that is perfect by chance."""
 PROFILE_MODEL_ERROR = 0.01
-"""Share of the contrast by which real profiles differ from the model; weighs the two beliefs."""
+"""Share of the contrast by which real profiles differ from the model; the scale of the two
+shading priors."""
 SHADING_SLOPE, SHADING_ROOT = 0.3, 1.0
-"""Believed spread (in contrasts) of the shading's linear part per pixel, and of its root part at
-a pixel's depth. Whole profiles hardly feel it; where the leg is overexposed, and only its limb's
-flank is left, it says how much shading may hide there, so the position's sigma grows honestly."""
+"""Prior sigma (in contrasts) of the shading's linear part per pixel, and of its root part at a
+depth of a pixel. Complete profiles are hardly affected; where the leg is overexposed and only
+the flank of the limb is left, the priors bound the hidden shading, so that the position's sigma
+grows realistically."""
 SATURATED_GREY_LEVEL = 250
-"""Grey level from which a sample is taken as clipped."""
+"""Smallest grey level of a clipped sample."""
 MOST_CUT = -0.25
-"""Place (px) beyond which a profile must be free of saturation: its edge itself."""
+"""Position (px) beyond which a profile must be free of saturation: the edge itself."""
 OWN_EDGE_WINDOW = 0.5
-"""Pixels about the place of its leg as a whole within which a profile's own edge is looked for:
-further off lie highlights, which all places of an edge may show alike."""
+"""Largest distance in pixels of a profile's edge from that of its leg as a whole: further away
+are highlights, which all points of an edge may show consistently."""
 FAINT_EDGE_SIGMA = 0.5
-"""Standard deviation (px) of a position above which a profile shows no edge: the window's half."""
+"""Standard deviation (px) of a position above which a profile has no edge: half the window."""
 EDGE_SIGMA_FLOOR = 0.02
-"""Pixels below which no position is believed, however crisp the profile."""
+"""Lower bound in pixels of a position's standard deviation, however sharp the profile."""
 MEASUREMENTS_AN_EDGE = 2.0
-"""Independent measurements that an edge counts as, whatever its length. Shading and paint move
-all positions along an edge together, so they do not average out: an edge is one line measured
-once at each of two halves, not three hundred points."""
+"""Effective sample size of an edge, whatever its length. Shading and paint shift all positions
+along an edge together, so they do not average out: an edge is one line measured once at each of
+two halves, not three hundred points."""
 FEWEST_PLACES_FOR_TILT = 3
-"""Places along an edge without which its tilt is a guess."""
+"""Fewest positions along an edge from which its tilt is estimated."""
 
 
 BlurByStation = Mapping[int, float]
-"""Px, standard deviation, of the edges in a station's photographs."""
+"""Blur (px, standard deviation) of the edges in the images of each station."""
 
 
 @dataclass(frozen=True)
 class ProfileEdges:
-    """Edge positions in profiles: position (...) px outward from the predicted edge, its
-    standard deviation sigma (...) px from grey-level noise, and found (...).
+    """Edge positions in profiles.
+
+    position : (...) px outward from the predicted edge.
+    sigma : (...) standard deviation, px, from grey-level noise.
+    valid : (...) whether the profile shows an edge.
     """
 
     position: Array
@@ -109,25 +119,27 @@ class ProfileEdges:
 
 
 def sampled_offsets() -> Array:
-    """Places along a profile that are sampled, px outward from the predicted edge."""
+    """Sample positions of a profile, px outward from the predicted edge."""
     return np.arange(-SAMPLED_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
 
 
 def profile_offsets() -> Array:
-    """Places of a profile that the model explains, the outermost of those that are sampled."""
+    """Sample positions that the model explains, the outermost of :func:`sampled_offsets`."""
     return np.arange(-PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
 
 
 @lru_cache(maxsize=512)
 def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
-    """Places x (px outward of the edge), (n,), and the five brightnesses there, blurred, (n, 5)."""
+    """Positions x (px outward of the edge), (n,), and the five blurred basis functions there, (n,
+    5).
+    """
     place = np.arange(-PROFILE_REACH_INSIDE - 8, PROFILE_REACH_OUTSIDE + 8, PROFILE_MODEL_PITCH)
     inside = (place < 0).astype(float)
     inside[np.abs(place) < PROFILE_MODEL_PITCH / 2] = 0.5
     depth = np.clip(-place, 0.0, 2 * half_width)
     root = np.sqrt(depth * (2 * half_width - depth))
     columns = [inside, depth, root, 1 - inside, np.maximum(place, 0.0)]
-    # an odd count: np.convolve centres an even one half a pitch aside, and the edge with it
+    # odd length: np.convolve shifts an even kernel, and the edge with it, by half a pitch
     half = int(np.ceil(5 * blur / PROFILE_MODEL_PITCH))
     kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * PROFILE_MODEL_PITCH / blur) ** 2)
     smooth = [np.convolve(c, kernel / kernel.sum(), mode="same") for c in columns]
@@ -136,12 +148,17 @@ def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=2048)
 def _projections(blur: float, half_width: float, cut: int) -> Array:
-    """Orthonormal bases of the model's profiles at each trial position, (samples, 5 x shifts):
-    the first basis of all positions, then the second.
+    """Orthonormal bases of the model at each trial position, (samples, 5 x shifts).
+
+    The first basis vectors of all positions come first, then the second ones. The priors of the
+    shading are two rows below the samples, with zero data; only the rows of the samples are
+    returned, which suffices for the projection of such data.
+
+        [ samples         ]
+        [ prior of slope  ]  =  Q R,   of Q the rows of the samples
+        [ prior of root   ]
 
     cut : samples at the inner end that are not used; their rows are zero.
-    The weak beliefs about the shading are rows below the samples, whose data are zero; only the
-    samples' rows are returned, which is all that a projection of such data needs.
     """
     place, model = _blurred_model(blur, half_width)
     at = profile_offsets() - EDGE_SHIFTS[:, None]
@@ -155,11 +172,13 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
 
 
 class _Kinds(NamedTuple):
-    """Profiles by kind: of each station a few dozen combinations of half width and cut.
+    """Profiles sorted by kind, a combination of station, half width and cut; a station has a few
+    dozen.
 
-    scaled : (N, samples) in contrasts, less the outermost, in the order of the kinds. square : (N,)
-    sums of their squares. order : (N,) the profile that each is. parts : the first and the end of
-    each kind, and its station, half width (px) and cut.
+    scaled : (N, samples) divided by the contrast, less the outermost sample, sorted by kind.
+    square : (N,) sums of squares.
+    order : (N,) index of each sorted profile.
+    parts : for each kind its first and end row, station, half width (px) and cut.
     """
 
     scaled: Array
@@ -170,12 +189,15 @@ class _Kinds(NamedTuple):
 
 @dataclass(frozen=True)
 class Profiles:
-    """Averaged profiles across edges, N of them.
+    """N averaged profiles across edges.
 
-    grey : (N, samples) at :func:`profile_offsets`. count : (N,) photograph profiles that each
-    averages. half_width : (N,) of the legs there, px. cut : (N,) samples at the inner end that
-    are not used: clipped at the camera's brightest level, or too deep inside a slim leg.
-    station : (N,) whose blur each has. strip, bright : (N,), see :func:`strips`.
+    grey : (N, samples) at :func:`profile_offsets`.
+    count : (N,) number of image profiles in each average.
+    half_width : (N,) of the leg there, px.
+    cut : (N,) samples at the inner end that are not used: clipped at the camera's brightest level,
+        or too deep inside a slim leg.
+    station : (N,) station, which determines the blur.
+    strip, bright : (N,), see :func:`strips`.
     """
 
     grey: Array
@@ -190,26 +212,28 @@ class Profiles:
     def of(
         cls, grey: Array, clipped: Booleans, count: Array, half_width: Array, station: Integers
     ) -> Profiles:
-        """From grey (N, samples) at :func:`sampled_offsets`, and whether it is clipped at
-        :func:`profile_offsets`.
+        """Profiles from grey levels and clipping.
+
+        grey : (N, samples) at :func:`sampled_offsets`.
+        clipped : (N, samples) at :func:`profile_offsets`.
         """
         explained, cut = grey[:, -clipped.shape[1] :], cut_of(clipped, half_width)
         strip = strips(grey, count, half_width)
         return cls(explained, count, half_width, cut, station, *strip)
 
     def select(self, keep: Booleans | Integers) -> Profiles:
-        """The profiles at a mask or at positions."""
+        """The profiles at a mask or at indices."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     @cached_property
     def contrast(self) -> Array:
-        """Largest grey-level difference in each profile, (N,)."""
+        """Largest grey-level difference of each profile, (N,)."""
         return _contrast(self.grey)
 
     @cached_property
     def by_kind(self) -> _Kinds:
-        """The profiles as one projection a kind takes them."""
-        # what a good fit leaves is a millionth of the profile: too little for single precision
+        """Profiles sorted such that each kind takes one projection."""
+        # double precision: the residual of a good fit is a millionth of the profile
         scaled = (self.grey - self.grey[:, -1:]).astype(float)
         scaled /= self.contrast[:, None]
         samples = scaled.shape[1]
@@ -230,10 +254,13 @@ class Profiles:
 
 
 def cut_of(saturated: Booleans, half_width: Array) -> Integers:
-    """Samples (N,) to leave out at the inner end of profiles.
+    """Number (N,) of samples that are not used at the inner end of profiles.
 
-    Up to the outermost saturated one of ``saturated`` (N, samples), and what lies deeper than the
-    limb of a leg of ``half_width`` (N,) px.
+    These are the samples up to the outermost saturated one, and those deeper than the modelled
+    limb.
+
+    saturated : (N, samples).
+    half_width : (N,) of the leg, px.
     """
     count = saturated.shape[-1]
     last = count - np.argmax(saturated[..., ::-1], axis=-1)
@@ -243,26 +270,31 @@ def cut_of(saturated: Booleans, half_width: Array) -> Integers:
 
 
 def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Booleans]:
-    """Samples (N,) of :func:`profile_offsets` inward of the middle of a strip within the limb, 0
-    where there is none, and strips that are brighter than what lies behind the leg (N,).
+    """Bright or dark strips within the limb of profiles.
 
-    grey : (N, samples) at :func:`sampled_offsets`. count, half_width : (N,), as of `Profiles`.
-    A strip is where, further in, the departure from the background is less again by more than
-    diffuse light as a rule allows, whose cosine changes by MODELLED_LIMB_SHARE down to that depth,
-    and by more than noise.
+    Returns the number of samples (N,) of :func:`profile_offsets` inward of the middle of a strip, 0
+    without one, and whether the strip is brighter than the background (N,).
+
+    A strip is detected where, further inside, the deviation from the background decreases by more
+    than diffuse light usually allows, whose cosine changes by MODELLED_LIMB_SHARE down to that
+    depth, and by more than noise.
+
+    grey : (N, samples) at :func:`sampled_offsets`.
+    count, half_width : (N,), as in `Profiles`.
     """
     offsets = sampled_offsets()
     background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
     inside = np.flatnonzero(offsets <= -PROFILE_STEP)[::-1]  # from the limb inwards
     violation = grey[:, inside] - background
     away = np.abs(violation)
+    # decrease of the deviation from its running maximum
     most = np.maximum.accumulate(away, axis=1)
     contrast = _contrast(grey[:, offsets >= -PROFILE_REACH_INSIDE])
     noise = (np.hypot(_noise(contrast, count), PROFILE_MODEL_ERROR) * contrast)[:, None]
     less = most - away > np.maximum(HIGHLIGHT_DEVIATIONS * noise, MODELLED_LIMB_SHARE * most)
     depth = np.maximum(MODELLED_LIMB_SHARE * half_width, PROFILE_REACH_INSIDE)
     less &= -offsets[inside] <= depth[:, None]
-    # the last place that was its own largest before it was less
+    # last running maximum before the decrease
     before = np.arange(len(inside)) < np.argmax(less, axis=1)[:, None]
     largest = len(inside) - 1 - np.argmax(((away == most) & before)[:, ::-1], axis=1)
     there, which = less.any(axis=1), np.arange(len(grey))
@@ -272,14 +304,13 @@ def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Bool
 
 
 def without_highlights(profiles: Profiles, blur: BlurByStation) -> tuple[Profiles, Booleans]:
-    """Profiles without what lies deeper than a strip's middle, and those (N,) that show a
-    highlight for the limb.
+    """Profiles cut to exclude samples deeper than a strip, and mask (N,) of those with a highlight.
 
-    A lamp's picture in polished metal, some way inside the limb, is none of the model's, and with
-    its far side in the profile its near border is the likelier edge. Between that and the limb
-    the metal is as dark as what lies behind the leg: the edge itself is not to be seen. Paint with
-    the light behind it has a bright strip as well, but one that the model explains to its usual
-    error; a highlight it does not.
+    The reflection of a lamp in polished metal, at some depth inside the limb, is not in the model;
+    if the profile contains its far side, its near side is the likelier edge. Between highlight and
+    limb the metal is as dark as the background, so the edge itself is invisible. Paint lit from
+    behind has a bright strip as well, but one that the model explains to its usual error; a
+    highlight it does not.
     """
     bright, odd = np.flatnonzero(profiles.bright), np.zeros(len(profiles.cut), dtype=bool)
     if bright.size:
@@ -291,10 +322,11 @@ def without_highlights(profiles: Profiles, blur: BlurByStation) -> tuple[Profile
 
 
 def residual_curves(profiles: Profiles, blur: BlurByStation) -> Array:
-    """Sum of squared residuals (N, shifts) at every trial position, in squares of the contrast."""
+    """Sum of squared residuals (N, shifts) at every trial position, in squared contrasts."""
     kinds, shifts = profiles.by_kind, len(EDGE_SHIFTS)
     explained = np.empty((len(kinds.scaled), shifts))
     for (first, end), station, half_width, cut in kinds.parts:
+        # explained = sum of squares of the projections on the five basis vectors
         bases = _projections(round(float(blur[station]), 3), half_width, cut)
         along = (kinds.scaled[first:end] @ bases).reshape(-1, BRIGHTNESS_UNKNOWNS, shifts)
         np.einsum("nbs,nbs->ns", along, along, out=explained[first:end])
@@ -304,10 +336,11 @@ def residual_curves(profiles: Profiles, blur: BlurByStation) -> Array:
 
 
 def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
-    """Log likelihood (N, shifts) of every trial position, the noise's size unknown, less its
-    largest value; 0 of profiles that are clipped up to their edge.
+    """Log-likelihood (N, shifts) of every trial position with unknown noise, less its maximum.
 
-    curves : of :func:`residual_curves`.
+    Zero for profiles that are clipped up to their edge.
+
+    curves : (N, shifts), :func:`residual_curves`.
     """
     samples = np.maximum(profiles.grey.shape[-1] - profiles.cut, 1)
     floor = samples * (_noise(profiles.contrast, profiles.count) ** 2 + PROFILE_MODEL_ERROR**2)
@@ -317,11 +350,12 @@ def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
 
 
 def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
-    """Edge positions of profiles, each within OWN_EDGE_WINDOW of where its leg is, ``about`` (N,)
-    px.
+    """Edge positions of profiles, each within OWN_EDGE_WINDOW of its leg's edge.
 
-    curves : of :func:`residual_curves`.
+    curves : (N, shifts), :func:`residual_curves`.
+    about : (N,) position of the leg's edge, px outward.
     """
+    # lowest trial position within the window
     step = EDGE_SHIFTS[1] - EDGE_SHIFTS[0]
     half = round(OWN_EDGE_WINDOW / step)
     middle = np.rint((about - EDGE_SHIFTS[0]) / step).astype(int)
@@ -329,6 +363,7 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
     near = middle[:, None] + np.arange(-half, half + 1)
     lowest = np.argmin(np.take_along_axis(curves, near, axis=-1), axis=-1)
     best = middle - half + np.clip(lowest, 1, 2 * half - 1)
+    # parabola through the minimum and its neighbours
     left, here, right = (
         np.take_along_axis(curves, (best + d)[..., None], -1)[..., 0] for d in (-1, 0, 1)
     )
@@ -345,40 +380,43 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
 
 
 def _contrast(grey: Array) -> Array:
+    """Largest difference of grey levels (N,), at least 1e-3."""
     return np.maximum(np.ptp(grey, axis=-1), 1e-3)
 
 
 def _noise(contrast: Array, count: Array) -> Array:
-    """Least noise (N,) believed of a sample, in contrasts."""
+    """Lower bound (N,) of a sample's noise, in contrasts."""
     return GREY_NOISE / contrast / np.sqrt(np.maximum(count, 1))
 
 
 def _freedom(profiles: Profiles) -> Array:
-    """Degrees of freedom (N,) that the model leaves. Neighbouring samples of a profile at half a
-    pixel share their noise: two count as one.
+    """Degrees of freedom (N,) of the residuals.
+
+    Neighbouring samples at half a pixel have correlated noise: two count as one.
     """
     samples = profiles.grey.shape[-1] - profiles.cut
     return np.maximum(samples * PROFILE_STEP - BRIGHTNESS_UNKNOWNS, 1.0)
 
 
 def _shows_its_edge(profiles: Profiles) -> Booleans:
-    """Profiles (N,) that are not clipped up to their edge."""
+    """Mask (N,) of the profiles that are not clipped up to their edge."""
     return profiles.cut < np.searchsorted(profile_offsets(), MOST_CUT)
 
 
 def estimate_blur(profiles: Profiles) -> float:
-    """The blur (px) with which the model leaves least, over the profiles of one station.
+    """Blur (px) that minimizes the residuals of the model over the profiles of one station.
 
-    Contrast differs by edge, so each profile's residual is taken relative to its best; the
-    median over profiles decides, so that half of them may be anything. Those of which least is
-    cut off are looked at. From the usual blur on, the next ones are tried towards the best.
+    Contrast differs between edges, so each profile's residual is divided by its smallest one; the
+    median over profiles is minimized, so up to half of them may be outliers. The profiles with the
+    smallest cuts are used. The search starts at the usual blur and moves towards the minimum.
     """
     few = min(FEWEST_FOR_BLUR, len(profiles.cut))
     whole = np.flatnonzero(profiles.cut <= np.sort(profiles.cut)[few - 1]) if few else np.array([])
     if whole.size:
         profiles = profiles.select(whole[evenly(whole.size, ENOUGH_FOR_BLUR)])
+    # walk to the minimum, evaluating its neighbours only
     floor = (GREY_NOISE / profiles.contrast) ** 2
-    costs = np.full((len(profiles.cut), len(BLURS_TRIED)), np.inf)  # until they are tried
+    costs = np.full((len(profiles.cut), len(BLURS_TRIED)), np.inf)  # inf: not evaluated
     k = int(np.argmin(np.abs(BLURS_TRIED - USUAL_BLUR)))
     while True:
         for near in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS_TRIED))):
@@ -390,6 +428,7 @@ def estimate_blur(profiles: Profiles) -> float:
         if best == k:
             break
         k = best
+    # parabola through the minimum and its neighbours
     k = int(np.clip(k, 1, len(BLURS_TRIED) - 2))
     left, here, right = total[k - 1 : k + 2]
     bend = max(left - 2 * here + right, 1e-12)
@@ -401,11 +440,15 @@ def estimate_blur(profiles: Profiles) -> float:
 
 @dataclass(frozen=True)
 class EdgeFits:
-    """Planes fitted to positions along edges; all (K, E, ...).
+    """Planes fitted to positions along edges; all arrays (K, E, ...).
 
-    turn : (2,) of the normal in ``basis`` (3, 2). covariance : (2, 2). operator : (2, n) turn by
-    the positions at the n samples, with the final weights. used : samples taken as the edge's.
-    good : enough of them.
+    turn : (2,) rotation of the normal in ``basis``, rad.
+    basis : (3, 2) tangent basis of the predicted normal.
+    covariance : (2, 2) of the rotation.
+    operator : (2, n) derivative of the rotation by the positions at the n samples, with the final
+        weights.
+    used : (n,) inliers.
+    good : whether there are enough inliers.
     """
 
     turn: Array
@@ -419,17 +462,21 @@ class EdgeFits:
 def fit_edges(
     points: EdgePoints, position: Array, sigma: Array, valid: Booleans, rounds: int = 8
 ) -> EdgeFits:
-    """Robust weighted line through positions (K, E, n) px outward, in the plane's two turns.
+    """Robust weighted fit of edge planes, two rotations each, to positions along the edges.
 
-    Cauchy weights against positions on highlights and neighbours. The scatter about the fit,
-    where it exceeds the stated sigmas, enlarges the covariance.
+    IRLS with Cauchy weights, against positions on highlights and neighbours. A scatter about the
+    fit above the stated sigmas enlarges the covariance.
+
+    position, sigma : (K, E, n) px outward, and standard deviations.
+    valid : (K, E, n).
+    rounds : number of reweighting steps.
     """
     middle = _middle_ray(points)
     basis = tangent_basis(points.normal, middle)
     rows = np.where(valid[..., None], np.nan_to_num(points.by_normal() @ basis), 0.0)
     value = np.where(valid, position, 0.0)
     base = np.where(valid, 1 / (sigma**2 + EDGE_SIGMA_FLOOR**2), 0.0)
-    # all edges side by side, place after place: what is added up then lies in one piece
+    # sample by sample for all edges, so that sums run over contiguous memory
     one, two, at, sure = (
         np.ascontiguousarray(v.reshape(-1, v.shape[-1]).T)
         for v in (rows[..., 0], rows[..., 1], value, base)
@@ -443,10 +490,11 @@ def fit_edges(
     weight = sure
     inverse, turn, off2 = fitted(weight)
     for _ in range(rounds):
-        weight = sure / (1 + off2 / 4.0)  # Cauchy, two sigmas
+        weight = sure / (1 + off2 / 4.0)  # Cauchy, scale two sigmas
         inverse, turn, off2 = fitted(weight)
     shape = valid.shape[:-1]
     off2, weight = (v.T.reshape(valid.shape) for v in (off2, weight))
+    # inliers within three sigmas; scatter and correlation enlarge the covariance
     used = valid & (off2 < 9.0)
     count = used.sum(axis=-1)
     scatter = np.sum(used * off2, axis=-1) / np.maximum(count - 2, 1)
@@ -460,16 +508,17 @@ def fit_edges(
 
 
 def _middle_ray(points: EdgePoints) -> Array:
+    """Unit ray (..., E, 3) to the middle sample of each edge."""
     ray = points.point[..., points.point.shape[-2] // 2, :]
     return ray / np.sqrt(dot(ray, ray))[..., None]
 
 
 def _solved(squares: Array, weight: Array) -> tuple[Array, Array]:
-    """Weighted least squares of n values on two unknowns each, N times over: the inverses (2, 2, N)
-    of the normal matrices, and the unknowns (2, N).
+    """N weighted least-squares problems of n equations in two unknowns: inverses (2, 2, N) of the
+    normal matrices, and unknowns (2, N).
 
-    squares : (5, n, N) products of the rows' entries, then of these with the values. weight :
-    (n, N).
+    squares : (5, n, N) products of the rows' entries with each other, then with the values.
+    weight : (n, N).
     """
     a, b, c, p, q = np.einsum("pnx,nx->px", squares, weight)
     ridge = 1e-12 * (a + c) + 1e-30
@@ -487,11 +536,12 @@ def edge_set(
     keep: Booleans,
     by_parameters: Array | None = None,
 ) -> EdgeSet:
-    """The fits at ``keep`` (K, E) as measurements; station, configuration : (K,) of the
-    photographs.
+    """Measurements from the fits at ``keep`` (K, E).
 
-    by_parameters : (K, E, n, 2, p) motion of the predicted pixels by the camera's parameters,
-    where the intrinsics are to be refined: the measured places then move the other way.
+    station, configuration : (K,) of the images.
+    by_parameters : (K, E, n, 2, p) derivative of the predicted pixels by the camera's parameters,
+        where the intrinsics are refined; the measured positions then move in the opposite
+        direction.
     """
     k, e = np.nonzero(keep)
     basis = fits.basis[k, e]
@@ -506,7 +556,7 @@ def edge_set(
         tube=tubes.tube[e],
         side=tubes.side[e],
         normal=normal,
-        # the turn is a few milliradians: the same two coordinates serve at the turned normal
+        # the rotation is a few milliradians: the same two coordinates serve at the rotated normal
         basis=tangent_basis(normal, middle),
         covariance=fits.covariance[k, e],
         shift=fits.operator[k, e].sum(axis=-1),
@@ -516,7 +566,9 @@ def edge_set(
 
 
 def _by_intrinsics(points: EdgePoints, fits: EdgeFits, by_parameters: Array | None) -> Array:
-    """Turn of the fitted planes by the camera's parameters, the pixels held; (K, E, 2, p)."""
+    """Derivative (K, E, 2, p) of the fitted planes' rotation by the camera's parameters, pixels
+    fixed.
+    """
     if by_parameters is None:
         return np.zeros((*fits.turn.shape, 0))
     outward = (points.outward[..., None, :] @ by_parameters)[..., 0, :]

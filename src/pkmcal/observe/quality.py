@@ -1,4 +1,4 @@
-"""What photographs are like where it counts: on the legs, once the machine was recognised."""
+"""Quality of images on the legs of a localized machine: exposure, blur, occlusion and contrast."""
 
 from __future__ import annotations
 
@@ -15,33 +15,37 @@ from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
 from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
 
 BLACK_GREY_LEVEL = 8
-"""Grey level up to which a sample is taken as black: shading and edges drown in the noise."""
+"""Largest grey level of a black sample: shading and edges are lost in noise."""
 DEPTHS_INSIDE_EDGE = np.array([0.25, 0.6, 1.0])
-"""Depths inside an edge, in half widths of the leg, at which its grey levels are looked at."""
+"""Depths inside an edge at which exposure is sampled, in half widths of the leg."""
 BLUR_PROFILE_REACH, BLUR_PROFILE_PITCH = 8.0, 0.5
-"""Pixels to each side of an edge, and between samples, of the profiles that tell the blur."""
+"""Extent to each side of an edge, and spacing, of the profiles from which the blur is estimated,
+px."""
 EDGE_FLANK_WIDTH = 6.0
-"""Pixels from the steepest place within which a blurred edge has its whole contrast."""
+"""Pixels from the steepest point within which a blurred edge attains its full contrast."""
 LEAST_BLUR_CONTRAST = 30.0
-"""Grey levels that an edge needs to tell the blur in spite of noise."""
+"""Smallest contrast, in grey levels, of an edge from which the blur is estimated in spite of
+noise."""
 LENS_WIDTH_PERCENTILE = 25.0
-"""Percentile of the edges' widths that is the lens's: shading makes the others wider."""
+"""Percentile of the edges' widths that is taken as the lens's blur; shading widens the other
+edges."""
 BESIDE_EDGE_RANGE = (1.5, 4.0)
-"""Pixels to each side of an edge between which its two levels are looked at: beyond the blur, and
-before what lies next."""
+"""Range of distances from an edge, px, over which its two grey levels are averaged: beyond the
+blur, and before the next feature."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """By photograph (K,) of one station.
+    """Quality of the K images of one station, with L legs and E edges.
 
-    legs : (K, L) True where a leg was found; all False where the machine was not recognised.
-    saturated, black : share of the legs' pixels that are so; of all pixels where there are no
-    legs. blur : standard deviation of the sharper edges, px; NaN where no edge tells.
-    hidden : (K, L) share of a leg's edges behind other legs or outside the photograph, NaN of legs
-    without tubes. level, behind : (K, E) grey levels beside each edge, on the leg and on what lies
-    behind it, in the order of ``tubes_of``; NaN where nothing of it is seen. half_width : (K, E)
-    px of the tube there.
+    legs : (K, L) True where a leg was measured; all False where the machine was not localized.
+    saturated, black : (K,) share of such samples on the legs or, without legs, of all pixels.
+    blur : (K,) standard deviation of the sharper edges, px; NaN where no edge has enough contrast.
+    hidden : (K, L) share of a leg's edges behind other legs or outside the image; NaN for legs
+        without tubes.
+    level, behind : (K, E) grey levels beside each edge, on the leg and on its background, in the
+        order of ``tubes_of``; NaN where no point of the edge is visible.
+    half_width : (K, E) px of the tube there.
     """
 
     legs: Booleans
@@ -55,14 +59,18 @@ class Quality:
 
     @property
     def contrast(self) -> Array:
-        """Grey levels (K, E) by which each leg stands out at its edges."""
+        """Grey-level difference (K, E) between each leg and its background."""
         return np.abs(self.level - self.behind)
 
 
 def quality(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
 ) -> Quality:
-    """Quality on the legs; poses : T_base_platform (K, 4, 4) of the photographs."""
+    """Quality on the legs of one station's images.
+
+    T_camera_base : (4, 4).
+    poses : T_base_platform (K, 4, 4), one for each image.
+    """
     placed = Placed(photographs, T_camera_base, poses)
     parts = [_quality(window, machine) for window in windows([placed])]
     each = (f.name for f in fields(Quality))
@@ -75,7 +83,8 @@ def quality(
 
 
 def _quality(window: PhotographWindow, machine: Machine) -> Quality:
-    """The same of one window."""
+    """Quality on the legs in one window of images."""
+    # edges found by the search, and the widths of their legs
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear)
     edge = places.outward(points, clear, tubes)[..., None]
@@ -86,6 +95,7 @@ def _quality(window: PhotographWindow, machine: Machine) -> Quality:
         pairs = zip(window.images, pixel, strict=True)
         return np.stack([levels_at(im, p[..., 0], p[..., 1]) for im, p in pairs])
 
+    # exposure inside the legs, and profiles across the edges
     inside = measure(edge - DEPTHS_INSIDE_EDGE * half_width)
     offsets = np.arange(
         -BLUR_PROFILE_REACH, BLUR_PROFILE_REACH + BLUR_PROFILE_PITCH / 2, BLUR_PROFILE_PITCH
@@ -109,7 +119,7 @@ def _quality(window: PhotographWindow, machine: Machine) -> Quality:
 
 
 def unrecognised_quality(images: Sequence[Integers], n_legs: int) -> Quality:
-    """Quality of photographs in which the machine was not found: of the whole pictures."""
+    """Quality of images in which the machine was not localized: exposure of all pixels."""
     count = len(images)
     shares = np.array(
         [
@@ -127,7 +137,7 @@ def unrecognised_quality(images: Sequence[Integers], n_legs: int) -> Quality:
 
 
 def _middle(values: Array, clear: Booleans) -> Array:
-    """Median (K, E) of values (K, E, n) at the clear points; NaN where there are none."""
+    """Median (K, E) of values (K, E, n) over the clear points; NaN where there are none."""
     some = clear.any(axis=-1)
     out = np.full(some.shape, np.nan)
     out[some] = np.nanmedian(np.where(clear, values, np.nan)[some], axis=-1)
@@ -135,16 +145,19 @@ def _middle(values: Array, clear: Booleans) -> Array:
 
 
 def _share(is_so: Booleans, clear: Booleans) -> Array:
-    """Share of the samples (K, E, n, depths) that are so, of those at clear edge points, (K,)."""
+    """Share (K,) of True samples (K, E, n, depths) among those at clear edge points."""
     count = np.maximum(clear.sum(axis=(1, 2)), 1) * is_so.shape[-1]
     return np.sum(is_so & clear[..., None], axis=(1, 2, 3)) / count
 
 
 def _blur(profiles: Array) -> float:
-    """Blur s (px) of profiles (N, n): a step of contrast C has the slope C / (s sqrt(2 pi))."""
+    """Blur s (px) from profiles (N, n): a step of contrast C has the slope C / (s sqrt(2 pi)).
+
+    NaN where no profile has enough contrast.
+    """
     flank = round(EDGE_FLANK_WIDTH / BLUR_PROFILE_PITCH)
     slope = np.abs(profiles[:, 2:] - profiles[:, :-2]) / (2 * BLUR_PROFILE_PITCH)
-    # Near the middle, so that most of the contrast around it lies in the profile.
+    # near the middle, so that the profile contains most of the contrast around
     near = slope[:, flank // 2 : -(flank // 2)]
     steepest = near.argmax(axis=1) + flank // 2
     around = steepest[:, None] + 1 + np.arange(-flank, flank + 1)

@@ -1,12 +1,11 @@
-"""Repeated photographs of a configuration: one edge of several, with the noise that they show.
+"""Combination of repeated images of a configuration, with the noise estimated from the repeats.
 
-[A] 4.2 measures the noise by repeats. A photograph's own profiles tell how well an edge agrees
-with its model; what differs from one photograph to the next (sensor noise, vibration, air, light)
-only repeats tell. What they have in common, such as shading, does not average out. So with n
-repeats, of which each has the stated covariance C and scatters with the covariance S about their
-mean,
+[A] 4.2 measures noise by repeats. An image's own profiles determine how well an edge agrees with
+its model; variations between images (sensor noise, vibration, air, light) are observed by repeats
+only. Errors that the repeats have in common, such as shading, do not average out. For n repeats,
+each with the stated covariance C and with the covariance S of their scatter about the mean,
 
-    covariance of the mean = (the part of C that repeats have in common) + S / n.
+    covariance of the mean = (the part of C that the repeats have in common) + S / n.
 """
 
 from __future__ import annotations
@@ -22,15 +21,17 @@ from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe.legs import StationEdges
 
 SCATTER_PRIOR_FREEDOM = 10.0
-"""Degrees of freedom that the wider group's scatter counts for in a narrower one's: an edge of few
-repeats has the scatter of its leg's, a leg of few configurations its station's."""
+"""Degrees of freedom with which the scatter of a wider group enters that of a narrower one: an
+edge with few repeats has the scatter of its leg, a leg with few configurations that of its
+station."""
 FAR_REPEAT_DEVIATIONS = 5.0
-"""Standard deviations of a repeat from the others beyond which it is not one of them."""
+"""Distance of a repeat from the others, in standard deviations, beyond which it is rejected."""
 HARMLESS_REPEAT_DEVIATIONS = 1.0
-"""Stated standard deviations within which a repeat stays, however well the others agree."""
+"""Distance, in stated standard deviations, within which a repeat is an inlier however well the
+others agree."""
 MAJORITY_OF_REPEATS = 0.5
-"""Share of a configuration's repeats of which more must show an edge: those that show now and then
-are faint, and lie a pixel off as easily as not."""
+"""Share of a configuration's repeats that must be exceeded by those with an edge: edges that are
+measured now and then are faint, and may well be a pixel off."""
 _RARE = "seen in only {} of {} repeats"
 _OUT = "a repeat lies {:.1f} standard deviations from the others, which are used without it"
 _DISPUTED = "its repeats lie up to {:.1f} standard deviations off, and no majority agrees"
@@ -38,9 +39,11 @@ _DISPUTED = "its repeats lie up to {:.1f} standard deviations off, and no majori
 
 @dataclass(frozen=True)
 class Groups:
-    """N things in G groups.
+    """Partition of N items into G groups.
 
-    first : (G,) one thing of each. member : (N,) the group of each thing. count : (G,) their size.
+    first : (G,) one item of each group.
+    member : (N,) group of each item.
+    count : (G,) sizes.
     """
 
     first: Integers
@@ -66,7 +69,7 @@ class Groups:
         return (ordered[low] + ordered[high]) / 2
 
     def exchanged(self, rng: np.random.Generator) -> Integers:
-        """Positions (N,) of the things with those of each group exchanged at random."""
+        """Indices (N,) of the items, randomly permuted within each group."""
         inside = np.argsort(self.member, kind="stable")
         out = np.empty_like(inside)
         out[inside] = np.lexsort((rng.random(len(inside)), self.member))
@@ -74,7 +77,7 @@ class Groups:
 
 
 def groups_of(*keys: Integers) -> Groups:
-    """Groups of things whose keys, each (N,), are the same."""
+    """Groups of items with equal keys; each key is (N,)."""
     _, first, member, count = np.unique(
         np.stack(keys, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
     )
@@ -82,16 +85,21 @@ def groups_of(*keys: Integers) -> Groups:
 
 
 def same_edges(edges: EdgeSet) -> Groups:
-    """Repeats of one edge: the same station, configuration, leg, tube and side."""
+    """Groups of the repeats of an edge: same station, configuration, leg, tube and side."""
     return groups_of(edges.station, edges.configuration, edges.leg, edges.tube, edges.side)
 
 
 def combined(station_edges: StationEdges) -> StationEdges:
-    """One edge for all repeats of it, at their mean; a look without repeats as it is."""
+    """Edges of a measurement pass with the repeats of each edge replaced by their mean.
+
+    Outlying repeats are rejected first, with a reason. A pass without repeats is returned
+    unchanged.
+    """
     groups = same_edges(station_edges.edges)
     if len(groups.first) == len(station_edges.edges):
         return station_edges
     odd = odd_ones(station_edges.edges, groups)
+    # reject outliers and renumber the points' edges
     keep = ~odd.any
     edges = station_edges.edges.select(keep)
     groups = same_edges(edges)
@@ -102,21 +110,21 @@ def combined(station_edges: StationEdges) -> StationEdges:
     return replace(
         station_edges,
         edges=mean_edges(edges, groups),
-        rejected=tuple(dict.fromkeys(text)),  # what is hidden is so in every repeat
+        rejected=tuple(dict.fromkeys(text)),  # a hidden edge is hidden in every repeat
         points=station_edges.points[point_edge >= 0],
         point_edge=point_edge[point_edge >= 0],
     )
 
 
 def mean_edges(edges: EdgeSet, groups: Groups) -> EdgeSet:
-    """The mean edge (G,) of each group of repeats, with the noise that the repeats show."""
+    """Mean edge (G,) of each group of repeats, with a covariance from their scatter."""
     normal = groups.mean(edges.normal)
     normal /= np.sqrt(dot(normal, normal))[:, None]
     stated = groups.mean(edges.covariance)
     return replace(
         edges.select(groups.first),
         normal=normal,
-        # repeats lie milliradians apart: the coordinates of one serve for all
+        # repeats differ by milliradians: the tangent basis of one serves for all
         basis=tangent_basis(normal, edges.basis[groups.first, :, 0]),
         covariance=mean_covariance(stated, repeat_scatter(edges, groups), groups.count),
         shift=groups.mean(edges.shift),
@@ -126,12 +134,16 @@ def mean_edges(edges: EdgeSet, groups: Groups) -> EdgeSet:
 
 
 def mean_covariance(stated: Array, scatter: Array, count: Integers) -> Array:
-    """Covariance (G, 2, 2) of the mean of ``count`` (G,) repeats, from those of a single one.
+    """Covariance (G, 2, 2) of the mean of ``count`` (G,) repeats from the covariances of one
+    repeat.
 
-    Along each principal axis of the scatter S in units of the stated C, S = s C: sensor noise is
-    in C, for it roughens profiles as well, and 1 - s of C remains common; where s > 1, C cannot
-    have held it (a shaken camera leaves crisp profiles), and all of C remains. Between, where it
-    may be either, s of C remains, so that a half is the least.
+    S is evaluated along its principal axes in units of C, S = s C. Sensor noise is part of C,
+    because it also roughens profiles, so 1 - s of C remains common. Where s > 1, the scatter cannot
+    be part of C (a shaken camera leaves crisp profiles), and all of C remains. In between either
+    may hold, and s of C remains, so that the common part is a half at least.
+
+    stated : (G, 2, 2), C.
+    scatter : (G, 2, 2), S.
     """
     root = np.linalg.cholesky(stated)
     back = np.linalg.inv(root)
@@ -143,16 +155,20 @@ def mean_covariance(stated: Array, scatter: Array, count: Integers) -> Array:
 
 
 def turns_from_first(edges: EdgeSet, groups: Groups) -> Array:
-    """Turn (N, 2), rad, of each edge from the first of its group, in that one's tangent basis."""
+    """Rotation (N, 2), rad, of each edge from the first of its group, in the latter's tangent
+    basis.
+    """
     reference = groups.first[groups.member]
     turn = edges.normal - edges.normal[reference]
     return (turn[:, None, :] @ edges.basis[reference])[:, 0]
 
 
 def pixel_units(edges: EdgeSet) -> Array:
-    """Turns (N, 2), rad, of a shift by a pixel, and of a tilt by as much over the edge's length.
+    """Rotations (N, 2), rad, that correspond to a shift by one pixel and to a tilt of one pixel
+    over the edge's length.
 
-    The tilt up to a factor, the leg's distance. So edges scatter alike whatever their length.
+    The tilt is up to a factor, the leg's distance. In these units edges of different lengths have
+    the same scatter.
     """
     pixel = np.sqrt(dot(edges.shift, edges.shift))
     length = np.maximum(edges.span[:, 1] - edges.span[:, 0], 1e-3)
@@ -160,11 +176,13 @@ def pixel_units(edges: EdgeSet) -> Array:
 
 
 def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
-    """Covariance (G, 2, 2), rad^2, of a single repeat of each edge, from the repeats alone.
+    """Covariance (G, 2, 2), rad^2, of a single repeat of each edge, estimated from the repeats
+    alone.
 
-    An edge's own scatter, drawn towards that of its leg's same edge in all configurations, and
-    that towards its station's, by their degrees of freedom.
+    An edge's own scatter is shrunk towards that of the same edge in all configurations, and this
+    towards that of its station, by degrees of freedom.
     """
+    # deviations from the means, in pixels, and their products
     unit = groups.mean(pixel_units(edges))
     turn = turns_from_first(edges, groups)
     turn = (turn - groups.mean(turn)[groups.member]) / unit[groups.member]
@@ -175,6 +193,7 @@ def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
         groups_of(first.station, first.leg, first.tube, first.side),
         groups_of(np.arange(len(first))),
     )
+    # from station to edge, each level with the wider one as its prior
     scatter, prior = np.zeros_like(squares), 0.0
     for level in levels:
         total, number = level.total(squares), level.total(np.asarray(freedom))
@@ -186,11 +205,13 @@ def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
 
 @dataclass(frozen=True)
 class OddOnes:
-    """Repeats that are left out, all (N,).
+    """Rejected repeats, all arrays (N,).
 
-    off : stated standard deviations from the middle of the repeats. out : far from a majority that
-    agrees. disputed : one of repeats without such a majority. rare : of an edge that shows in few
-    of the repeats, of which ``most`` show others.
+    off : distance from the median of the repeats, in stated standard deviations.
+    out : far from a majority that agrees.
+    disputed : one of a group without such a majority.
+    rare : of an edge that was measured in at most half of the repeats.
+    most : number of repeats of the configuration, counted by its most often measured edge.
     """
 
     off: Array
@@ -201,12 +222,12 @@ class OddOnes:
 
     @property
     def any(self) -> Booleans:
-        """Whether a repeat is left out, for whatever reason."""
+        """Whether a repeat is rejected for any reason."""
         return self.out | self.disputed | self.rare
 
 
 def odd_ones(edges: EdgeSet, groups: Groups) -> OddOnes:
-    """Repeats of one station that lie further from the median of theirs than noise explains."""
+    """Repeats of one station that are further from their group's median than noise explains."""
     turn, unit = turns_from_first(edges, groups), pixel_units(edges)
     away = np.abs(turn - groups.median(turn)[groups.member])
     stated = np.sqrt(edges.covariance[:, [0, 1], [0, 1]])
@@ -223,15 +244,15 @@ def odd_ones(edges: EdgeSet, groups: Groups) -> OddOnes:
     disputed = (
         groups.total((~far).astype(float))[groups.member] <= MAJORITY_OF_REPEATS * count
     ) & ~rare
-    # a lone photograph is its own majority
+    # a single image is its own majority
     rare &= most > 1
     return OddOnes((away / stated).max(axis=1), far & ~disputed & ~rare, disputed, rare, most)
 
 
 def _typical_spread(turn: Array, groups: Groups) -> Array:
-    """Standard deviation (2,) of a repeat of a typical edge, not moved by a few bad ones.
+    """Standard deviation (2,) of a repeat of a typical edge, robust against a few bad ones.
 
-    The median over edges of their variances, which lies below the mean (Wilson-Hilferty).
+    The median of the edges' variances, corrected by the ratio of median and mean (Wilson-Hilferty).
     """
     several = groups.count > 1
     freedom = np.maximum(groups.count - 1.0, 1.0)[:, None]
@@ -243,7 +264,7 @@ def _typical_spread(turn: Array, groups: Groups) -> Array:
 
 
 def _rejections(edges: EdgeSet, odd: OddOnes) -> list[Rejection]:
-    """What was left out and why: each repeat that is out, each other edge once."""
+    """Rejections with their reasons: one for each repeat that is out, one for each other edge."""
     out = [edges.rejection(k, _OUT.format(odd.off[k])) for k in np.flatnonzero(odd.out).tolist()]
     for kind in (odd.disputed, odd.rare):
         rows = np.flatnonzero(kind)

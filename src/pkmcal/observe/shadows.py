@@ -1,10 +1,11 @@
-"""A machine's shadow, which may look as much like the machine as it does itself.
+"""Detection of the machine's shadow among candidate poses.
 
-Legs that move in a plane throw shadows on a parallel one that are their exact image elsewhere, with
-edges often clearer than their own. But a shadow darkens what it falls on, always. So of two places
-of the machine, turned alike, one of which lies on what has become darker and the other on what has
-become brighter than in the other photographs, the darker one is the other's shadow; for what is
-bright could not be explained by a machine in the dark. Of dark machines nothing can be said so.
+Legs that move in a plane cast shadows on a parallel plane that have exactly the machine's shape,
+often with clearer edges than the machine itself. A shadow always darkens the surface. So of two
+poses with similar orientation, one on pixels that have become darker and the other on pixels that
+have become brighter than in the other images, the darker one is the shadow of the other: brighter
+pixels could not be explained by a machine at the darker pose. Nothing follows for machines that are
+darker than their background.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
 
 PLACES_ALONG_TUBE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Places along the middle of a tube's visible part that are looked at."""
+"""Sampled positions along the axis of a tube, as shares of its visible part."""
 MOSTLY_CHANGED_SHARE = 0.5
-"""Share of these, in all photographs, that have become darker, or brighter, than elsewhere."""
+"""Share of these, over all images, above which a pose lies on pixels that became darker, or
+brighter."""
 SHADOW_TURN = np.radians(20.0)
-"""Turn within which a place can be the other's shadow: its planes are nearly parallel."""
+"""Largest rotation between a pose and its shadow's, whose planes are nearly parallel."""
 
 
 def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: DistanceTables) -> Array:
-    """How much of the legs' middles is brighter than there in the median of all photographs, less
-    what is darker, (H,), -1 to 1.
+    """Mean sign (H,) of the brightness change on the legs' axes against the median image, -1 to 1.
 
-    legs : camera frame, (H, K, L), of the K photographs of ``tables``.
+    legs : (H, K, L) camera frame, in the K images of ``tables``.
     """
     a, b, u = of_edges(legs, tubes)
     first, last = visible_stretch(a, b, tubes)
@@ -42,8 +43,8 @@ def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: Dista
 
 
 def without_shadows(places: Array, light: Array) -> Integers:
-    """Numbers of those places (H, 4, 4) that are no other one's shadow; light : (H,) as `lightness`
-    says.
+    """Indices of the poses (H, 4, 4) that are not the shadow of another one; light : (H,),
+    `lightness`.
     """
     casts = (light > MOSTLY_CHANGED_SHARE) & (angle_between(places[:, None], places) < SHADOW_TURN)
     return np.flatnonzero((light > -MOSTLY_CHANGED_SHARE) | ~casts.any(axis=1))

@@ -1,11 +1,11 @@
-"""Edges of a whole machine in one photograph, coarse: where its silhouettes lie on picture edges.
+"""Coarse edges of a whole machine in one image: its silhouettes, fitted to nearby image edges.
 
-A place was compared with others by how well the machine's silhouettes lie on the edges of the
-picture (:mod:`pkmcal.observe.pose_likelihood`). The same distances, each counted by the probability
-that it is the machine's own edge and not what chance has put there, say where the silhouettes
-should have been: an edge a tube's side, to a pixel. In a cluttered picture of polished legs that is
-three times as many edges as can be measured one by one, and enough to tell the machine together
-with the places.
+Candidate poses are compared by the distances of the machine's silhouettes from image edges
+(:mod:`pkmcal.observe.pose_likelihood`). The same distances, each weighted by the probability that
+the image edge belongs to the machine and is not a chance match, locate the silhouettes: one edge
+for each side of a tube, to a pixel. In a cluttered image of polished legs this gives three times as
+many edges as can be measured individually, and enough to estimate the machine together with the
+poses.
 """
 
 from __future__ import annotations
@@ -21,21 +21,25 @@ from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed
 from pkmcal.observe.profiles import edge_set, fit_edges
 
 SILHOUETTE_SAMPLES = 40
-"""Places along an edge at which the picture is asked."""
+"""Number of samples along an edge."""
 LEAST_OWN = 0.05
-"""Probability of being the machine's from which a place counts: those that hardly are weigh little,
-and leaving out more of them makes edges come and go from look to look."""
+"""Smallest weight with which a sample is used: lower ones contribute little, and a higher limit
+would make edges appear and disappear from one measurement pass to the next."""
 WIDEST_SCATTER = 2.0
-"""Reduced pixels within which silhouettes scatter about the picture's edges at most, where the
-machine is known to a few pixels."""
+"""Largest scatter of silhouettes about image edges, in reduced pixels, once the machine is
+accurate to a few pixels."""
 
 
 def silhouette_edges(
     view: StationView, T_camera_base: Array, station: int, refine_camera: bool = False
 ) -> StationEdges:
-    """Edges of one photograph, taken from near a place (4, 4). view : of it alone. refine_camera :
-    also how the edges depend on the camera's parameters.
+    """Edges of one image, measured from a nearby camera pose (4, 4).
+
+    view : of this image alone.
+    station : number of the station in the returned edges.
+    refine_camera : also compute the edges' derivatives by the camera's parameters.
     """
+    # distances along the predicted silhouettes, and their mixture of own and chance edges
     tubes = view.tubes
     linearization = linearize_distances(
         view, T_camera_base[None], np.zeros(1, dtype=int), SILHOUETTE_SAMPLES
@@ -46,14 +50,16 @@ def silhouette_edges(
     points = edge_points(view.machine, view.camera, legs, tubes, SILHOUETTE_SAMPLES)
     clear = unobstructed(view.machine, view.camera, legs, tubes, points, OTHER_OUTLINE_CLEARANCE)
     scale = view.tables.scale
-    # how a distance grows as the edge moves outward by a pixel of the tables
+    # derivative of a distance by an outward motion of the edge, in pixels of the tables
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.nan_to_num(np.clip(linearization.slope * scale / points.gain, -1, 1))
+    # outward positions with weights; the slope's square is the information of a distance
     position = -scale * distances.distance * np.sign(slope)
     weight = distances.own(mixture) * slope**2
     valid = clear & (distances.length > 0) & (weight > LEAST_OWN)
     position = np.where(valid, position, 0.0)
     sigma = scale * mixture.sigma[:, None, None] / np.sqrt(np.where(valid, weight, 1.0))
+    # planes through the positions, as measurements marked coarse
     fits = fit_edges(points, position, sigma, valid)
     by_camera = view.camera.project_jacobians(points.point)[1] if refine_camera else None
     names = np.array([station]), view.configuration

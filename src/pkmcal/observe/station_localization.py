@@ -1,14 +1,14 @@
-"""Where a station's camera stands: a coarse search for the machine in its photographs.
+"""Localization of a station: a coarse search for the machine in its images.
 
-About a rough pose many are tried at random, first a few as near as the right one most often is; of
-a station without one, places all round the machine (:mod:`pkmcal.observe.pose_candidates`). The
-best descend (:mod:`pkmcal.observe.pose_likelihood`) on more and more photographs, with distances
-cut off ever nearer.
+Around a rough pose, poses are drawn at random, first a few with the usual error of a good prior.
+Without a rough pose, they cover all directions round the machine
+(:mod:`pkmcal.observe.pose_candidates`). The best are refined
+(:mod:`pkmcal.observe.pose_likelihood`) on an increasing number of images, with decreasing distance
+limits.
 
-What was found is weighed. The most evidence is found in any picture, machine or not. So the place
-is searched in some of the photographs, and the others are asked: at that place, do their own
-readings fit better than those that other photographs of the session bear? Without the machine they
-do not.
+The result is then tested, for every image has a most likely pose, with or without a machine. The
+pose is searched in some of the images and tested on the others: at this pose, do their own readings
+fit better than the readings of other images of the session? Without the machine they do not.
 """
 
 from __future__ import annotations
@@ -39,9 +39,13 @@ from pkmcal.observe.shadows import lightness, without_shadows
 
 
 class _SearchRadius(NamedTuple):
-    """How far about a pose by hand is searched: the spread (6,) of rad and m by which the poses
-    are drawn that are tried, how many these are, and how many of them descend. enough : probability
-    by chance, of some of the photographs, from which the others need not be searched.
+    """Extent of the search around a rough pose.
+
+    spread : (6,) standard deviations, rad and m, of the poses that are drawn.
+    tried : number of poses drawn.
+    descending : number of poses that are refined.
+    enough : probability by chance, from some of the images, below which the others are not
+        searched.
     """
 
     spread: Array
@@ -50,8 +54,8 @@ class _SearchRadius(NamedTuple):
     enough: float
 
     def reaches(self, T_camera_base: Array, other: Array) -> bool:
-        """Whether another pose is no further from one, (4, 4) both, than those drawn are on
-        average, turn and shift together.
+        """Whether two poses (4, 4) differ by less than the drawn poses do on average, rotation and
+        shift together.
         """
         turn, shift = angle_between(T_camera_base, other), T_camera_base @ inverse(other)
         square = (turn / self.spread[0]) ** 2 + np.sum((shift[:3, 3] / self.spread[3:]) ** 2)
@@ -59,59 +63,65 @@ class _SearchRadius(NamedTuple):
 
 
 FAR = _SearchRadius(np.repeat([np.radians(15.0), 0.15], 3), 3200, 48, 1e-6)
-"""The spread's norm over three axes is 26 degrees and 26 cm; of poses that are 30 degrees and 30 cm
-off, 97 of 100 lead to the right place. A place that fits about a pose that is wrong by more than
-was searched is not known from the right one: before clutter its photographs confirm it to one in
-ten thousand."""
+"""Wide search. The norm of the spread over three axes is 26 degrees and 26 cm; of poses that are
+30 degrees and 30 cm off, 97 of 100 lead to the correct one. A rough pose that is off by more
+than the search covers cannot be distinguished from a correct one: in clutter, images confirm the
+pose that fits near it with a probability by chance down to one in ten thousand."""
 NEAR = _SearchRadius(FAR.spread / 3, 160, 8, 1e-3)
-"""Asked first, and where one of thirty hypotheses is looked at. Where a pose is wrong by more, a
-search does not end so near to it by chance."""
+"""Narrow search, done first, and for each of some thirty hypotheses. If the rough pose is off by
+more, a search rarely ends this close to it by chance."""
 
 
 class _PosePrior(NamedTuple):
-    """A rough pose (4, 4), and how far about it is searched."""
+    """A rough pose (4, 4), and the extent of the search around it."""
 
     T_camera_base: Array
     nearness: _SearchRadius
 
 
 POSES_FOR_RESCORING = 8
-"""One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
+"""Ratio of the poses drawn to those that are scored on four images instead of two, which
+discriminate nearly as well."""
 GLOBAL_CANDIDATES_REFINED, GLOBAL_CANDIDATES_RETAINED = 1200, 300
-"""Poses from all round the machine that descend, and how many of them go on: before a descent the
-pictures hardly tell which is near, least of all of three legs that are alike."""
+"""Numbers of candidates without a prior that are refined, and that are retained afterwards:
+before the refinement the images hardly distinguish poses that are near the correct one, least of
+all with three equal legs."""
 SHAKEN_SPREAD = np.repeat([np.radians(2.0), 0.02], 3)
+"""Standard deviations, rad and m, of perturbed poses around the best ones."""
 PERTURBED_POSES_TRIED, PERTURBED_POSES_RETAINED = 48, 16
-"""Poses beside the best ones that are tried before the last descent, how far (rad and m) from
-these, and of how many two steps have shown that they may be the best."""
+"""Number of perturbed poses tried before the last refinement, and how many are retained after
+two steps."""
 LIKELIEST_PLACES_SETTLED = 4
-"""Of the likeliest places, where all are one, those that are settled without a look beside them."""
+"""Number of likeliest poses, if they are all the same, that are refined without perturbed ones."""
 FEW_GLOBAL_CANDIDATES, FEW_CANDIDATES_RETAINED = 160, 16
-"""Where one of thirty hypotheses is looked at."""
+"""Numbers of candidates scored and retained without a prior, for each of some thirty hypotheses."""
 NEARBY_PLACES_SETTLED, HYPOTHESES_SETTLED = 8, 8
-"""Places of each of thirty hypotheses that are settled, and of how many beside the first: three are
-searched in full."""
+"""Number of poses refined for each of some thirty hypotheses, and of hypotheses refined besides
+the first; three are searched completely."""
 FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_WITH_PRIOR = 7, 5, 4
-"""Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
-each in its turn. About a known pose two are enough to be searched."""
+"""Fewest images from which a half, a third or, with a prior, a half are held out for the test;
+with fewer, each image is held out in turn. Around a rough pose two images suffice for a search."""
 EARLY_DECISION = 1e-4
-"""Probability by chance, of some of the photographs, from which the others need not be searched
-where nothing is told of the pose."""
+"""Probability by chance, from some of the images, below which the others are not searched
+without a prior."""
 BY_CHANCE, BY_CHANCE_WITH_PRIOR = 1e-3, 1e-2
-"""Probability of as much evidence by chance, below which the machine is recognised: anywhere, and
-where it was looked for about a pose by hand, which says much the same already."""
+"""Probability of so large a likelihood by chance below which the machine is localized: without a
+prior, and near a hand-placed pose, which is evidence itself."""
 RIVAL_POSE_PROBABILITY = 0.05
-"""Probability of a second place being as good above which neither is believed."""
+"""Probability of a second pose above which neither is accepted."""
 
 
 @dataclass(frozen=True)
 class LocalizedPose:
-    """A found pose T_camera_base (4, 4) and its score: 0 perfect, 1 nothing fits.
+    """Localized pose of a station.
 
-    log_likelihood_ratio : log likelihood against chance, by reduced pixels of silhouette. by_chance
-    : probability of as much without the machine. second : probability that another place is as
-    good. has_prior : whether it was looked for about a pose that is known. correlation_length :
-    reduced pixels of silhouette that count as one measurement.
+    T_camera_base : (4, 4).
+    score : mean truncated distance to image edges, 0 perfect, 1 nothing fits.
+    log_likelihood_ratio : against chance, by reduced pixels of silhouette.
+    by_chance : probability of so large a likelihood without the machine.
+    second : probability that another pose is the correct one.
+    has_prior : whether the search was around a rough pose.
+    correlation_length : reduced pixels of silhouette that count as one measurement.
     """
 
     T_camera_base: Array
@@ -123,22 +133,22 @@ class LocalizedPose:
     correlation_length: float = 1.0
 
     def likelier(self, other: LocalizedPose) -> float:
-        """Log odds of this explanation of the photographs against another one of the same."""
+        """Log odds of this explanation of the images against another one of the same images."""
         return (self.log_likelihood_ratio - other.log_likelihood_ratio) / self.correlation_length
 
     @property
     def limit(self) -> float:
-        """What ``by_chance`` must stay below."""
+        """Upper bound of ``by_chance`` for acceptance."""
         return BY_CHANCE_WITH_PRIOR if self.has_prior else BY_CHANCE
 
     @property
     def good(self) -> bool:
-        """Whether the machine was recognised, and at one place only."""
+        """Whether the machine is localized, at one pose only."""
         return self.by_chance < self.limit and self.second < RIVAL_POSE_PROBABILITY
 
     @property
     def sure(self) -> bool:
-        """Whether it was recognised without what is said of the pose."""
+        """Whether the machine would be localized without the prior."""
         return self.by_chance < BY_CHANCE and self.second < RIVAL_POSE_PROBABILITY
 
 
@@ -148,15 +158,19 @@ def find_station(
     rng: np.random.Generator,
     near_prior: bool = False,
 ) -> LocalizedPose:
-    """The pose near a rough one, or anywhere, from half of the photographs, or all but one or two
-    of few; what the others say of it decides, each in its turn. Then every photograph takes part.
+    """Camera pose of a station near a rough pose, or anywhere.
 
-    near_prior : look beside the likeliest places though they are one, as is done of searches from
-    nothing, and be as sure as a wide search has to be, for evidence that is to be compared.
+    The pose is searched in half of the images or, with few, in all but one or two, and tested on
+    the held-out ones; each part is held out in turn. Then the pose is refined on all images.
+
+    T_camera_base : rough pose (4, 4); None searches everywhere.
+    near_prior : also try perturbed poses where the likeliest are all the same, as in a search
+        without a prior, and require the certainty of a wide search, for log-likelihoods that are to
+        be compared.
     """
     if T_camera_base is None:
         return _localize(view, None, rng, near_prior)
-    if len(view.configuration) > 1:  # one alone confirms nothing
+    if len(view.configuration) > 1:  # a single image has no held-out test
         near = _localize(view, _PosePrior(T_camera_base, NEAR), rng, near_prior)
         if near.sure and NEAR.reaches(T_camera_base, near.T_camera_base):
             return near
@@ -166,7 +180,7 @@ def find_station(
 def _localize(
     view: StationView, prior: _PosePrior | None, rng: np.random.Generator, near_prior: bool
 ) -> LocalizedPose:
-    """What one search finds: about a pose by hand, as far as is told with it, or anywhere."""
+    """Result of one search, around a rough pose or anywhere."""
     count = len(view.configuration)
     number = np.arange(count)
     halves = FEWEST_FOR_HALVES_WITH_PRIOR if prior else FEWEST_FOR_HALVES
@@ -177,13 +191,14 @@ def _localize(
     held_out = [number % folds == fold for fold in range(folds if count > 1 else 0)]
     parts = [
         (np.flatnonzero(~part), np.flatnonzero(part)) for part in held_out
-    ]  # one alone has none
+    ]  # a single image has no folds
     for searched, other in parts:
         value = _search(view.select(searched), prior, rng, near_prior)
         retained.append(value)
         surely.append(_z_scores(view, value[0], searched, other, rng))
         if _by_chance(surely) < enough:
             break
+    # refine the results of all folds on all images, and drop shadows
     candidates = np.concatenate(retained) if retained else _search(view, prior, rng, near_prior)
     every = view.few(count)
     candidates, log_likelihood_ratio = refine_ml(view, candidates, every, 8, 8)
@@ -191,14 +206,16 @@ def _localize(
     legs = view.legs(every).under(candidates[order])
     light = lightness(view.camera, view.tubes, legs, view.tables)
     order = order[without_shadows(candidates[order], light)]
+    # probability by chance, from the folds that ended at the best pose
     first = np.cumsum([0, *(len(value) for value in retained)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
     if parts and not prior and confirmed >= BY_CHANCE:
         confirmed = min(confirmed, _second_search(view, candidates[order], parts, rng))
+    # distinct poses, and a robust refinement of the best
     order = order[distinct_silhouettes(view, candidates[order], every)]
     candidates, log_likelihood_ratio = candidates[order], log_likelihood_ratio[order]
-    # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
-    # tell the place better
+    # the likeliest pose uses all edges; where hidden ones were matched by chance, the nearby edges
+    # alone determine the pose better
     best = candidates[:1]
     nearer = refine_lm(view, best, every, 8, (5, 3, 2, 1.5))
     ends = np.concatenate([nearer, best])
@@ -217,19 +234,22 @@ def _localize(
 def _search(
     view: StationView, prior: _PosePrior | None, rng: np.random.Generator, near_prior: bool
 ) -> Array:
-    """Up to three places (H, 4, 4), the one with the most evidence first."""
+    """Up to three poses (H, 4, 4) from one search, the likeliest first."""
     few, more = view.few(4), view.few(8)
     if prior is None:
-        each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
+        # more candidates for fewer images, which discriminate less and cost less
+        each = 4 // len(few)
         candidates = _anywhere(view, few, each * GLOBAL_CANDIDATES_REFINED)
         candidates = refine_lm(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
         candidates = _best(view, candidates, few, reach=8, keep=each * GLOBAL_CANDIDATES_RETAINED)
     else:
         candidates = _random_search(view, prior, rng)
+    # robust refinement, then the best on more images
     candidates = refine_lm(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=24)
     likelier = candidates[: len(candidates) // 2]
-    # of photographs that all took part in the descents none could disagree, but for the pose's word
+    # if all images took part in the refinement, none is left to disagree, unless the prior is
+    # narrow
     near = prior is not None and prior.nearness is NEAR
     near_prior = near_prior or prior is None or (not near and len(more) == len(few))
     if not near_prior and len(distinct_silhouettes(view, likelier, more)) == 1:
@@ -237,6 +257,7 @@ def _search(
         candidates = candidates[[*range(LIKELIEST_PLACES_SETTLED), *others]]
     else:
         candidates = _best_about(view, candidates, more, rng)
+    # maximum likelihood
     candidates, log_likelihood_ratio = refine_ml(view, candidates, more, 5, 5)
     candidates = candidates[np.argsort(-log_likelihood_ratio)]
     return candidates[distinct_silhouettes(view, candidates, more)[:3]]
@@ -245,11 +266,13 @@ def _search(
 def _best_about(
     view: StationView, candidates: Array, photographs: Integers, rng: np.random.Generator
 ) -> Array:
-    """The likeliest places (H, 4, 4) that candidates descend to, and beside these."""
+    """Likeliest poses (PERTURBED_POSES_RETAINED, 4, 4) among refined candidates and perturbations
+    of them.
+    """
     candidates = refine_lm(view, candidates, photographs, 5, (5, 4, 4, 3))
     candidates = _best(view, candidates, photographs, reach=3, keep=24)
     candidates = candidates[distinct_silhouettes(view, candidates, photographs)[:4]]
-    # the picture is rugged: what lies beside a good place may be better
+    # the likelihood has many local maxima: a pose beside a good one may be better
     beside = candidates[rng.integers(0, len(candidates), PERTURBED_POSES_TRIED)]
     steps = rng.normal(size=(PERTURBED_POSES_TRIED, 6)) * SHAKEN_SPREAD
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
@@ -260,7 +283,7 @@ def _best_about(
 
 
 def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
-    """Candidates (keep, 4, 4) from all round the machine."""
+    """Candidates (keep, 4, 4) without a prior, all round the machine."""
     legs = view.legs(np.arange(len(view.configuration)))
     legs = legs if view.guessed is None else legs[0]
     radius = view.machine.values[view.tubes.radius]
@@ -268,8 +291,8 @@ def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
 
 
 def _random_search(view: StationView, prior: _PosePrior, rng: np.random.Generator) -> Array:
-    """Candidates (``descending``, 4, 4) about a pose: a wide random draw, then a narrower one
-    around its best.
+    """Candidates (``descending``, 4, 4) around a rough pose: a wide random draw, then a narrower
+    one around the best of it.
     """
     T_base_camera, (spread, tried, descending, _) = inverse(prior.T_camera_base), prior.nearness
 
@@ -279,7 +302,7 @@ def _random_search(view: StationView, prior: _PosePrior, rng: np.random.Generato
     few = view.few(4)
 
     def likely(steps: Array, reach: float, keep: int) -> Array:
-        # two photographs and few places tell which of them are not worth a closer look
+        # two images and few samples suffice to discard most poses
         first = np.argsort(score(view, shifted(steps), few[::2], reach, 3))
         steps = steps[first[: max(len(steps) // POSES_FOR_RESCORING, keep)]]
         return steps[np.argsort(score(view, shifted(steps), few, reach))[:keep]]
@@ -295,6 +318,7 @@ def _random_search(view: StationView, prior: _PosePrior, rng: np.random.Generato
 def _best(
     view: StationView, candidates: Array, photographs: Integers, reach: float, keep: int
 ) -> Array:
+    """The ``keep`` candidates with the smallest mean distance."""
     order = np.argsort(score(view, candidates, photographs, reach))
     return candidates[order[:keep]]
 
@@ -307,11 +331,14 @@ def likelihood_nearby(
     few: Integers,
     rng: np.random.Generator,
 ) -> Array:
-    """What a short search from poses (S, 4, 4) finds in some photographs, ``few``, with each of
-    several readings (N, K, m) of all, (N,); from none, anywhere. Of many, those that are far from
-    the best, and not the first, find nothing (minus infinity).
+    """Log-likelihood ratios (N,) that a short search reaches for each of several sets of readings.
 
-    wide : look about the starts first, as about a pose by hand.
+    With many sets, those far from the best, except the first, are minus infinity.
+
+    readings : (N, K, m) of all images.
+    starts : (S, 4, 4) poses; empty searches everywhere.
+    wide : draw poses around the starts first, as around a hand-placed pose.
+    few : numbers of the images that are used.
     """
     few_readings = readings if not len(starts) else readings[:, few]
     fk = view.machine.forward_result(
@@ -325,6 +352,7 @@ def likelihood_nearby(
         near = [_about(replace(view, guessed=legs[k : k + 1]), few, starts, rng)
                 for k in range(len(legs))]  # fmt: skip
         each = np.stack(near)
+    # all hypotheses side by side: robust refinement, then maximum likelihood for the best
     count = each.shape[1]
     view = replace(view, guessed=legs[np.repeat(np.arange(len(legs)), count)])
     ends = refine_lm(view, each.reshape(-1, 4, 4), few, 4, (12, 8, 5))
@@ -340,9 +368,7 @@ def likelihood_nearby(
 
 
 def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Generator) -> Array:
-    """Places (H, 4, 4) that are worth a descent, about poses (S, 4, 4), or anywhere, by one
-    guess.
-    """
+    """Poses (H, 4, 4) worth refining around poses (S, 4, 4), or anywhere, for one set of legs."""
     if not len(starts):
         places = _anywhere(view, few, FEW_GLOBAL_CANDIDATES)
         return _best(view, places, few, reach=12, keep=FEW_CANDIDATES_RETAINED)
@@ -356,20 +382,25 @@ def _z_scores(
     other: Integers,
     rng: np.random.Generator,
 ) -> Array:
-    """How surely each of some photographs shows the machine at a pose (4, 4) that was found from
-    others, ``searched``: standard normal (K,) where it does not.
+    """Standard normal scores (K,) of held-out images for the machine at a pose (4, 4).
 
-    Without the machine, a photograph's own readings fit it no better than others do; by how much
-    they do, in units of the others' scatter, has Student's distribution.
+    Without the machine, an image's own readings fit no better than other readings. The difference
+    in log likelihood, in units of the other readings' scatter, has Student's distribution, which is
+    mapped to a standard normal score.
+
+    searched : numbers of the images from which the pose was estimated.
+    other : numbers of the held-out images.
     """
     from scipy.special import ndtri, stdtr
 
+    # scatter of the machine's edges, from the images that were searched
     mine = distances_under(view, T_camera_base[None], searched, 8)
     mixture = mine.mixture(first_mixture(1), rounds=10)
     every = np.arange(len(view.configuration))
     guessed = view.legs(every)[None].joined(view.rivals(rng))
     places = np.broadcast_to(T_camera_base, (len(guessed), 4, 4))
     distances = distances_under(replace(view, guessed=guessed), places, other, 8)
+    # own readings against the others
     own, *rivals = by_photograph(distances.log_likelihood(mixture), len(other))
     count, fits = len(rivals), np.stack(rivals)
     scatter = np.maximum(fits.std(axis=0, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
@@ -378,9 +409,7 @@ def _z_scores(
 
 
 def _second(log_likelihood_ratio: Array, correlation_length: float) -> float:
-    """Probability that the second of places is the machine's and not the first, by their evidence
-    (H,).
-    """
+    """Probability that the second pose is the correct one, from log-likelihood ratios (H,)."""
     if len(log_likelihood_ratio) < 2:
         return 0.0
     return 1 / (
@@ -396,11 +425,14 @@ def _second(log_likelihood_ratio: Array, correlation_length: float) -> float:
 
 
 def _confirmed(view: StationView, place: Array, distances: Array, surely: list[Array]) -> float:
-    """Probability by chance of what photographs said of a pose (4, 4), which was chosen from those
-    (F, 4, 4) that they were asked about, ``surely`` (K,) of each.
+    """Probability by chance of a pose (4, 4), from the held-out tests of several poses.
 
-    A search that ended elsewhere has asked about another place, which says nothing of this one. But
-    from so many different ones this was chosen, and any may be confirmed by chance.
+    A test of another pose carries no information about this one and is left out. But this pose was
+    chosen among several different ones, any of which may be confirmed by chance (Bonferroni).
+
+    place : the pose, T_camera_base (4, 4).
+    distances : (F, 4, 4) poses that were tested.
+    surely : scores (K,) of each test.
     """
     every = view.few(len(view.configuration))
     own = [
@@ -419,11 +451,12 @@ def _second_search(
     parts: Sequence[tuple[Integers, Integers]],
     rng: np.random.Generator,
 ) -> float:
-    """Probability by chance of what photographs say of the first of some places (H, 4, 4), where a
-    search in a part of them ended beside it, at a place that the rest do not confirm.
+    """Probability by chance of the first of some poses (H, 4, 4), by a second search that starts at
+    it.
 
-    It is searched in each part alone, from the place that all have led to, and the rest are asked.
-    All have chosen it: from so many places, and in a second attempt.
+    Used where a search in a part of the images ended beside this pose, at one that the rest do not
+    confirm. The pose is refined in each part alone and tested on the rest. It was chosen by all
+    images among several poses, and this is a second attempt; the probability is multiplied by both.
     """
     surely: list[Array] = []
     for searched, other in parts:
@@ -438,7 +471,7 @@ def _second_search(
 
 
 def _by_chance(parts: list[Array]) -> float:
-    """Probability of so sure photographs, (K,) of each part, taken together, by chance."""
+    """Probability by chance of the sum of standard normal scores, (K,) from each part."""
     if not parts:
         return 1.0
     surely = np.concatenate(parts)

@@ -1,13 +1,15 @@
-"""Where tubes could lie in one photograph: two parallel edges at a tube's width, and how rare.
+"""Chart of possible tubes in one image: pairs of parallel edges at a tube's width, scored by
+rarity.
 
-Nothing moves in a single photograph, so nothing tells the machine from what stands about it but its
-looks: a leg shows two straight edges side by side, the one from dark to bright, the other back. For
-each of a few widths and directions a map tells how well a place is the middle of such a pair, along
-a stretch of some widths. A shelf shows many pairs upright and level, and few oblique: so what a
-place is worth is how rarely its width and direction are found so clear in this photograph.
+Nothing moves in a single image, so only appearance distinguishes the machine from its surroundings:
+a leg has two parallel straight edges, one from dark to bright and the other back. For each of a few
+widths and directions, a map gives the evidence that a point is the middle of such a pair along a
+stretch of a few widths. Shelves show many vertical and horizontal pairs and few oblique ones; the
+value of a point is therefore how rarely its width and direction occur with such clarity in this
+image.
 
-All that is on a chart of angles from the middle of the picture, the same for any lens, on which a
-turn of the camera is nearly a shift.
+The chart is in angles from the middle of the image, the same for any lens, in which a rotation of
+the camera is nearly a shift.
 """
 
 from __future__ import annotations
@@ -21,36 +23,41 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
 
 FINE_CHART_CELLS = 384
-"""Cells of the fine chart along the longer side of the picture: a leg that is a fiftieth of the
-picture wide, as where a machine fills it, has its edges eight cells apart."""
+"""Cells of the fine chart along the image's longer side: the edges of a leg whose width is a
+fiftieth of the image, as where a machine fills it, are eight cells apart."""
 MAP_CELL_SIZE = 6
-"""Fine cells that are one cell of the maps, which are looked up 15 degrees and 8 degrees apart."""
+"""Fine cells per cell of the maps, which are evaluated at steps of 15 degrees and 8 degrees."""
 SUPPORT_SPACING = 2
-"""Fine cells between the places whose support is worked out."""
+"""Fine cells between the points at which support is computed."""
 PAIR_DIRECTIONS = 24
-"""Directions of a pair: 7.5 degrees apart."""
+"""Number of directions of a pair: 7.5 degrees apart."""
 PAIR_WIDTHS = 3.2 * np.sqrt(2.0) ** np.arange(6)
-"""Widths (fine cells) of a pair: nearer, its edges run together."""
+"""Widths (fine cells) of a pair; the edges of narrower ones merge."""
 SUPPORT_LENGTH_WIDTHS = 4.0
-"""Length, in widths, along which a pair's support is averaged: tubes are longer."""
+"""Length, in widths, along which a pair's support is averaged; tubes are longer."""
 SHORTEST_SUPPORT_LENGTH = 12.0
-"""Fine cells along which it is averaged at least."""
+"""Smallest averaging length in fine cells."""
 HALF_STRENGTH_SLOPE = 2.5
-"""Levels a fine cell at which an edge counts half of a strong one: levels are roots (255 stays),
-whose noise is even and half a level at most, so five times that."""
+"""Slope, in levels per fine cell, at which an edge has half the strength of a strong one. Levels
+are square roots of grey levels (255 is unchanged), whose noise is even and half a level at most;
+this is five times that."""
 SLOPE_ALONG_WEIGHT = 2.0
-"""Times that a slope along a pair counts against one across it: directions within 27 degrees."""
+"""Weight of a slope along a pair against one across it: directions within 27 degrees pass."""
 LEAST_PAIR_SUPPORT = 0.24
-"""Support below which a place is no pair at all: one place in four of its length."""
+"""Support below which a point has no value: one in four points of its length."""
 GREATEST_SURPRISAL = 4.0
-"""Logarithm of rarity beyond which rarer ones count no more: one leg must not outvote six."""
+"""Largest negative logarithm of rarity; one leg must not outweigh six."""
 SURPRISAL_STEPS = 60
-"""Steps of the maps' numbers for each factor of e in rarity."""
+"""Integer steps of the maps per unit of the negative logarithm."""
 
 
 class TubeChart(NamedTuple):
-    """surprisal : (W, D, h, w) uint8, minus the logarithm of how rare so clear a pair is, in steps.
-    scale : fine cells a radian. size : (w, h) of the fine chart.
+    """Maps of possible tubes.
+
+    surprisal : (W, D, h, w) uint8, negative logarithm of the share of points with such clear a
+        pair, in steps of 1 / SURPRISAL_STEPS.
+    scale : fine cells per radian.
+    size : (w, h) of the fine chart.
     """
 
     surprisal: Integers
@@ -59,37 +66,41 @@ class TubeChart(NamedTuple):
 
     @property
     def middle(self) -> Array:
-        """The chart's middle, fine cells (2,)."""
+        """Middle of the chart, fine cells (2,)."""
         return (np.array(self.size) - 1) / 2
 
     def width_number(self, width: Array) -> Integers:
-        """The numbers of widths (...), fine cells."""
+        """Indices (...) of the tabulated widths nearest to widths (...) in fine cells, by ratio."""
         apart = np.abs(np.log(np.maximum(width, 1e-9))[..., None] - np.log(PAIR_WIDTHS))
         return apart.argmin(axis=-1)
 
 
 def tube_chart(image: Integers, camera: Camera) -> TubeChart:
-    """Of one photograph (height, width)."""
+    """Chart of one image (height, width)."""
     grey, scale = _on_chart(image, camera)
     return TubeChart(_rarity(_support(grey)), scale, (grey.shape[1], grey.shape[0]))
 
 
 def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
-    """Levels (h, w) on the fine chart: angles from the optical axis, evenly; and its scale."""
+    """Levels (h, w) on the fine chart, equidistant angles from the optical axis, and cells per
+    radian.
+    """
     import cv2
 
     height, width = image.shape
     across = np.stack([np.linspace(0, width - 1, 65), np.full(65, (height - 1) / 2)], axis=-1)
     along = np.stack([np.full(65, (width - 1) / 2), np.linspace(0, height - 1, 65)], axis=-1)
     half = [float(np.nanmax(np.abs(_angle(camera.ray(line))))) for line in (across, along)]
+    # angular extent along the image's two middle lines gives scale and size
     scale = FINE_CHART_CELLS / (2 * max(half))
     w, h = (int(2 * angle * scale) for angle in half)
     x, y = np.meshgrid((np.arange(w) - (w - 1) / 2) / scale, (np.arange(h) - (h - 1) / 2) / scale)
     away = np.hypot(x, y)
+    # pixel of each cell
     sine = np.sinc(away / np.pi)
     pixel = camera.project(np.stack([x * sine, y * sine, np.cos(away)], axis=-1))
     pixel = np.nan_to_num(pixel, nan=-1e4).astype(np.float32)
-    blur = 0.4 * width / w  # of what a cell of the chart cannot show
+    blur = 0.4 * width / w  # against aliasing
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur) if blur > 0.4 else image
     smooth = np.asarray(smooth, dtype=np.float32)
     grey = cv2.remap(
@@ -100,13 +111,14 @@ def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
 
 
 def _angle(rays: Array) -> Array:
-    """Angles (...) of rays (..., 3) from the optical axis."""
+    """Angles (...) of rays (..., 3) from the optical axis, rad."""
     return np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
 
 
 def _support(grey: Array) -> Array:
-    """How clear a pair lies about each place, (PAIR_WIDTHS, PAIR_DIRECTIONS, h, w), 0 to 1; places
-    lie SUPPORT_SPACING fine cells apart.
+    """Clarity of a pair at each point, (PAIR_WIDTHS, PAIR_DIRECTIONS, h, w), 0 to 1.
+
+    Points are SUPPORT_SPACING fine cells apart.
     """
     import cv2
 
@@ -119,14 +131,17 @@ def _support(grey: Array) -> Array:
     for k in range(PAIR_DIRECTIONS):
         angle = np.pi * k / PAIR_DIRECTIONS
         n = np.array([np.cos(angle), np.sin(angle)])
+        # strength of rising and falling edges with normal n
         slope, other = dx * n[0] + dy * n[1], np.abs(dy * n[0] - dx * n[1])
         rising, falling = (_strength(sign * slope - SLOPE_ALONG_WEIGHT * other) for sign in (1, -1))
         for w, wide in enumerate(PAIR_WIDTHS):
-            # at x + n wide/2 and x - n wide/2: a bright tube rises inwards, a dark one falls
+            # edges at x + n wide/2 and x - n wide/2: those of a bright tube rise inwards, of a dark
+            # one fall
             step = np.rint(n * wide / 2).astype(int)
             bright = np.minimum(_shifted(falling, step), _shifted(rising, -step))
             dark = np.minimum(_shifted(rising, step), _shifted(falling, -step))
             pair = np.maximum(bright, dark)[: height * SUPPORT_SPACING, : width * SUPPORT_SPACING]
+            # largest value of each block of SUPPORT_SPACING cells, averaged along the pair
             rows = reduce(np.maximum, (pair[n::SUPPORT_SPACING] for n in range(SUPPORT_SPACING)))
             pair = reduce(np.maximum, (rows[:, n::SUPPORT_SPACING] for n in range(SUPPORT_SPACING)))
             length = max(SUPPORT_LENGTH_WIDTHS * wide, SHORTEST_SUPPORT_LENGTH) / SUPPORT_SPACING
@@ -135,7 +150,7 @@ def _support(grey: Array) -> Array:
 
 
 def _strength(slope: Array) -> Array:
-    """Strength 0 to 1 of edges; a cell beside one counts too."""
+    """Strength of edges, 0 to 1, from slopes (h, w); dilated by one cell."""
     import cv2
 
     up = np.square(np.maximum(slope, 0.0))
@@ -144,7 +159,7 @@ def _strength(slope: Array) -> Array:
 
 
 def _shifted(values: Array, step: Integers) -> Array:
-    """Values (h, w) at x + step, zero beyond the border."""
+    """Values (h, w) at x + step, zero outside."""
     x, y = (int(s) for s in step)
     height, width = values.shape
     out = np.zeros_like(values)
@@ -155,7 +170,7 @@ def _shifted(values: Array, step: Integers) -> Array:
 
 
 def _line(along: Array, length: float) -> Array:
-    """Weights that average along a line."""
+    """Kernel that averages along a line of a direction (2,) and a length in cells."""
     half = int(np.ceil(length / 2))
     kernel = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
     for place in np.linspace(-length / 2, length / 2, 8 * half):
@@ -165,9 +180,10 @@ def _line(along: Array, length: float) -> Array:
 
 
 def _rarity(support: Array) -> Integers:
-    """The maps of :class:`TubeChart` from supports (W, PAIR_DIRECTIONS, h, w).
+    """Maps of :class:`TubeChart` from supports (W, PAIR_DIRECTIONS, h, w).
 
-    A cell takes the best about it, and neighbouring directions, for hypotheses lie so far apart.
+    A map cell takes the maximum over its surroundings and the neighbouring directions, the spacing
+    of the hypotheses.
     """
     import cv2
 
@@ -182,6 +198,7 @@ def _rarity(support: Array) -> Integers:
     level = np.rint(255 * np.clip(best, 0, 1)).astype(np.intp)
     out = np.empty(best.shape, dtype=np.uint8)
     for place in np.ndindex(level.shape[:2]):
+        # share of the points with at least this support
         count = np.bincount(level[place].ravel(), minlength=256)
         share = count[::-1].cumsum()[::-1] / count.sum()
         worth = np.minimum(-np.log(np.maximum(share, 1e-9)), GREATEST_SURPRISAL)
