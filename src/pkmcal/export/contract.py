@@ -91,14 +91,14 @@ def exporters() -> dict[str, Exporter]:
 
 def exporter_of(name: str) -> Exporter:
     """Format by name. Raises InputError for an unknown name."""
-    known_formats = exporters()
-    if name in known_formats:
-        return known_formats[name]
-    guess = closest(name, known_formats)
+    formats = exporters()
+    if name in formats:
+        return formats[name]
+    guess = closest(name, formats)
     raise InputError(
         "there is no such format to export to",
         found=name,
-        expected=(f"{guess}, or another of " if guess else "") + listed(list(known_formats), 20),
+        expected=(f"{guess}, or another of " if guess else "") + listed(list(formats), 20),
     )
 
 

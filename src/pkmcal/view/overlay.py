@@ -30,8 +30,8 @@ STATION_POSE_DECIMALS = 4
 
 def pane_of(viewed: Viewed, request: ViewRequest) -> Pane:
     """Machine of a request, in front of the camera at the pose of the files."""
-    machine_shown = viewed.calibrated if request.shown == "calibration" else viewed.drawn
-    return machine_shown(request.station, request.photograph)
+    pane_at = viewed.calibrated if request.shown == "calibration" else viewed.drawn
+    return pane_at(request.station, request.photograph)
 
 
 def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
