@@ -23,13 +23,13 @@ from pkmcal.boards.fit import (
     views_of,
 )
 from pkmcal.boards.selection import (
-    _tries,
     best_of,
     camera_candidates,
     first_fit,
     is_worse,
     line_offsets,
     positions,
+    starting_cameras,
     thinned,
 )
 from pkmcal.cameras import camera_models
@@ -438,7 +438,9 @@ def test_tries_that_do_not_see_a_whole_view_are_no_start(monkeypatch):
     monkeypatch.setitem(DEPTH, "pinhole", 1.2)
     poses = poses_for(TRUE["pinhole"], 25, seed=5)
     views = views_of(detections(TRUE["pinhole"], poses), BOARD)
-    finite = [np.isfinite(c.ray(views.pixels)).all(axis=-1) for c in _tries("unified", SIZE)]
+    finite = [
+        np.isfinite(c.ray(views.pixels)).all(axis=-1) for c in starting_cameras("unified", SIZE)
+    ]
     assert any((rays.sum(axis=-1) < 4).any() for rays in finite)
     fit = first_fit("unified", views, SIZE)
     assert fit is not None

@@ -77,7 +77,7 @@ def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers
 def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFit | None:
     """Best fit without distortion; None if no starting value gives finite pixels."""
     scored: list[tuple[float, Camera, Array]] = []
-    for camera in _starting_cameras(model, image_size):
+    for camera in starting_cameras(model, image_size):
         rays = camera.ray(views.pixels)
         if np.isfinite(rays).all(axis=-1).sum(axis=-1).min() < LEAST_RAYS:
             continue  # this camera has no rays for the corners, and so no initial poses
@@ -104,7 +104,7 @@ def extended(fit: CameraFit, views: Views, terms: tuple[str, ...]) -> CameraFit:
     return fit_camera(fit.camera, positions(fit.camera, terms), views, fit.T_camera_board)
 
 
-def _starting_cameras(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
+def starting_cameras(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
     """Starting values of a model without distortion: a grid of focal lengths, and of xi."""
     width, height = image_size
     kind = camera_models()[model]
