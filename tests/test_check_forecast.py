@@ -140,12 +140,12 @@ def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
 
 def test_a_second_place_is_advised_where_it_is_worth_it(found):
     values = replace(found.forecast, position=2e-4, second=1e-4)
-    (text,) = words._second_place(values)
+    (text,) = words._second_station(values)
     assert text.code == "images.second_place"
     assert (text.facts["tool_sigma"], text.facts["tool_sigma_before"]) == (1e-4, 2e-4)
     assert text.facts["number"] == 15
-    assert words._second_place(replace(values, second=1.8e-4)) == []
-    assert words._second_place(replace(values, second=float("nan"))) == []
+    assert words._second_station(replace(values, second=1.8e-4)) == []
+    assert words._second_station(replace(values, second=float("nan"))) == []
 
 
 def test_stations_on_one_side_are_told(found):
@@ -162,12 +162,12 @@ def test_stations_on_one_side_are_told(found):
 
 def test_slim_tubes_are_told(found):
     """Advice by the nominal width in the images; wide tubes need none."""
-    assert words._slim(found.look) == []
+    assert words._slim_tubes(found.look) == []
     first, *others = found.look.stations
     half_width = np.where(tubes_of(found.look.session.machine).tube == 1, 2.25, 9.0)
     every = np.broadcast_to(half_width, first.quality.half_width.shape)
     slim = replace(first, quality=replace(first.quality, half_width=every))
-    (text,) = words._slim(replace(found.look, stations=(slim, *others)))
+    (text,) = words._slim_tubes(replace(found.look, stations=(slim, *others)))
     assert (text.code, text.station) == ("images.slim", first.name)
     assert text.facts["tubes"] == ["tube 2 4.5 px"]
 
@@ -180,9 +180,9 @@ def test_hidden_legs_are_told_where_no_station_sees_them(found):
 
     stations = found.look.stations
     one = replace(found.look, stations=(hiding(stations[0], 3, 0.8), hiding(stations[1], 0, 0.8)))
-    assert words._hidden(one) == []
+    assert words._hidden_legs(one) == []
     every = replace(found.look, stations=tuple(hiding(s, 3, 0.8) for s in stations))
-    (text,) = words._hidden(every)
+    (text,) = words._hidden_legs(every)
     assert (text.code, text.subject, text.station) == ("images.hidden", "leg 4", "station1")
     assert text.facts["share"] == pytest.approx(0.8)
 
@@ -206,11 +206,11 @@ def test_why_edges_are_lost(found, level, behind, code):
     own[:, ::2], other[:, ::2] = level, behind
     station = replace(station, quality=replace(station.quality, level=own, behind=other))
     edges = EdgesOf(np.array([0]), np.ones_like(lost), ~lost)
-    (one,) = words._lost(found.look, station, edges)
+    (one,) = words._lost_edges(found.look, station, edges)
     assert (one.code, one.station) == (code, "station1")
     assert one.facts["share"] == pytest.approx(0.5)
     assert one.facts.get("sheet", "dark") == "dark"
-    assert words._lost(found.look, station, replace(edges, valid=np.ones_like(lost))) == []
+    assert words._lost_edges(found.look, station, replace(edges, valid=np.ones_like(lost))) == []
 
 
 # ------------------------------------------------------------------ pictures
