@@ -13,6 +13,7 @@ import os
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
@@ -122,7 +123,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         atexit.register(gc.freeze)
     # What OpenCV cannot read is told in sentences of our own.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    with withstanding():
+    with withstanding(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"PIL\.")  # such as of EXIF that is cut short
         try:
             code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
             sys.stdout.flush()

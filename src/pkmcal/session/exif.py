@@ -11,15 +11,13 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.errors import InputError
-from pkmcal.files import read_exif
+from pkmcal.files import open_image, read_exif
 from pkmcal.session.image_files import photograph_header
 
 EXIF_CAMERA_WORD = "exif"
 """The word in place of a camera's file."""
 FILM_DIAGONAL = hypot(36.0, 24.0)
 """Diagonal (mm) of the film that the focal length is told for."""
-EXIF_HEAD_BYTES = 1 << 17
-"""Bytes from a file's beginning that hold its EXIF: a segment has 64 kB at most."""
 FOCAL_SIGMA = 0.03
 """Standard deviation of that focal length, relative: it is a whole number, 2 % of a telephone's 26
 mm, and some makers go by the width of the film in place of its diagonal, 4 % for 4:3 pictures."""
@@ -43,7 +41,7 @@ def camera_by_exif(photographs: list[tuple[Path, str]], where: str) -> Camera:
     for path, label in photographs:
         width, height = photograph_header(path, label)
         with path.open("rb") as stream:
-            focal = read_exif(stream.read(EXIF_HEAD_BYTES)).focal_35mm
+            focal = read_exif(open_image(stream, label)).focal_35mm
         if focal is None:
             raise InputError(
                 "the photograph does not tell the focal length it was taken with",
