@@ -32,6 +32,11 @@ LEAST_FOCAL = 0.05
 of its 180 degrees in the picture has a third, a mirror a fifth."""
 
 
+FOCAL, CENTER, PIXEL_PARAMETERS = slice(0, 2), slice(2, 4), slice(0, 4)
+"""Parameters of every model: the focal lengths, the principal point, and both, which are in
+pixels."""
+
+
 class CameraSchema(Schema):
     """The fields that every camera file has; a model's own schema adds to them."""
 
@@ -167,6 +172,30 @@ class Camera(ABC):
         return cls(document.image_size, np.concatenate([document.focal, document.center, own, k]))
 
     @property
+    def focal(self) -> Array:
+        """(2,) focal lengths, px."""
+        return self.parameters[FOCAL]
+
+    @property
+    def center(self) -> Array:
+        """(2,) principal point, px."""
+        return self.parameters[CENTER]
+
+    def shifted(self, offset: Array) -> Self:
+        """The camera of images shifted by ``offset`` (2,), px: with another principal point."""
+        parameters = self.parameters.copy()
+        parameters[CENTER] += offset
+        return replace(self, parameters=parameters)
+
+    def resampled(self, factor: float, image_size: tuple[int, int]) -> Self:
+        """The camera of images with ``factor`` pixels in place of one, of another size."""
+        parameters = self.parameters.copy()
+        parameters[PIXEL_PARAMETERS] *= factor
+        # pixel centres are at integers, so the image's corner is at -0.5
+        camera = replace(self, image_size=image_size, parameters=parameters, covariance=None)
+        return camera.shifted(np.full(2, (factor - 1) / 2))
+
+    @property
     def focal_part(self) -> Array:
         """(n,) the parameters with all but the focal lengths zero: their change when the lengths
         grow by their own size.
@@ -193,7 +222,7 @@ class Camera(ABC):
         return (
             LensViolation("focal", self.focal_part[:, None], USUAL_FOCAL),
             LensViolation("aspect", self.aspect_part[:, None], USUAL_ASPECT),
-            LensViolation("centre", eye[:, 2:4], USUAL_CENTRE * self.image_size[0]),
+            LensViolation("centre", eye[:, CENTER], USUAL_CENTRE * self.image_size[0]),
             LensViolation(
                 "distortion",
                 eye[:, lens : lens + 1],
@@ -230,20 +259,16 @@ class Camera(ABC):
         """
         if count == 1:
             return self
-        parameters = self.parameters.copy()
-        parameters[:4] /= count
-        parameters[2:4] += (1 / count - 1) / 2  # pixel centres are at integers
-        size = self.image_size[0] // count, self.image_size[1] // count
-        return replace(self, image_size=size, parameters=parameters, covariance=None)
+        width, height = self.image_size
+        return self.resampled(1 / count, (width // count, height // count))
 
     def turned_by_half(self) -> Self:
         """The camera of pictures that are turned by half, itself turned by half about its axis."""
         sign = np.where(np.isin(self.parameter_names, self.odd), -1.0, 1.0)
-        sign[2:4] = -1.0
-        parameters = sign * self.parameters
-        parameters[2:4] += np.asarray(self.image_size) - 1.0
+        sign[CENTER] = -1.0
         covariance = None if self.covariance is None else self.covariance * np.outer(sign, sign)
-        return replace(self, parameters=parameters, covariance=covariance)
+        reflected = replace(self, parameters=sign * self.parameters, covariance=covariance)
+        return reflected.shifted(np.asarray(self.image_size) - 1.0)
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
         """True where pixels (..., 2) lie in the image, ``margin`` px from its border; (...)."""
