@@ -37,6 +37,7 @@ from pkmcal.outcome import Part, Row, Table
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
+from pkmcal.solver.ranks import nonzero
 
 CAUSE_NAMED_SHARE = 0.3
 """Share of the scatter, above what chance explains, from which its cause is told."""
@@ -61,8 +62,6 @@ REPEATS_TABLE_LEGEND = (
 LEVEL_AXIS_SINE = float(np.sin(np.deg2rad(10.0)))
 """Part u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2) lies
 far away or nowhere (errata)."""
-_RANK = 1e-9
-"""Singular values below this part of the largest are those of motions that no edge shows."""
 
 
 @dataclass(frozen=True)
@@ -434,7 +433,7 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
     normal = groups.total(rows.mT @ rows)
     right = groups.total((white[:, None, :] @ rows)[:, 0])
     values, axes = np.linalg.eigh(normal)
-    visible = values > _RANK * values[:, -1:]
+    visible = nonzero(values)  # the others are motions that no edge shows
     along = (axes.mT @ right[..., None])[..., 0]
     along = np.where(visible, along / np.where(visible, values, 1.0), 0.0)
     motion = (axes @ along[..., None])[..., 0]

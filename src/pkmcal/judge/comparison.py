@@ -11,6 +11,7 @@ from pkmcal.arrays import Array, Integers, rms
 from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.ranks import nonzero
 
 RATIO_BOOTSTRAP_DRAWS = 4000
 """Bootstrap draws: percentiles of the ratio are then known to a hundredth or two."""
@@ -21,8 +22,6 @@ UNEXPLAINED_RESIDUAL_CHANCE = 1e-3
 ALLOWED_RESIDUAL_EXCESS = 1.5
 """Factor by which residuals may exceed the deviations: these cover noise, and a few tenths more
 come from shading and lenses in any photographs."""
-NULL_EIGENVALUE_SHARE = 1e-9
-"""Share of the largest eigenvalue, of scaled residuals, below which nothing can deviate."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +248,7 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
     shape, covariance = residuals.shape, noise + machine
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
-    above_limit = values > NULL_EIGENVALUE_SHARE * values[-1]
+    above_limit = nonzero(values)
     whiten = (vectors[:, above_limit] / np.sqrt(values[above_limit])).T / scale
     white = whiten @ residuals.reshape(-1)
     design = whiten @ np.tile(np.eye(shape[1]), (shape[0], 1))
