@@ -10,8 +10,9 @@ import pytest
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.papers.registration import Dense, minimise_dense
 from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
+from pkmcal.solver.kernels import final_weights, geman_mcclure_weights
 from pkmcal.solver.ranks import column_space, inverse_root, normal_root
-from pkmcal.solver.search import Stop, final_weights, minimise, of_runs, put, soft_weights, take
+from pkmcal.solver.search import Stop, minimise, of_runs, put, take
 from pkmcal.solver.strips import Compact, StripLayout, Strips, compact, normal_equations
 from test_identify_scene import guess, make_scene
 
@@ -319,5 +320,5 @@ def test_weights_fall_from_one_to_zero():
     distance = np.array([0.0, 4.0, 5.25, 6.5, 100.0, np.nan])
     np.testing.assert_allclose(final_weights(distance), [1, 1, 0.5, 0, 0, 0], atol=1e-15)
     np.testing.assert_allclose(
-        soft_weights(np.array([0.0, 2.0, 6.0, np.nan]), 2.0), [1, 0.25, 0.01, 0]
+        geman_mcclure_weights(np.array([0.0, 2.0, 6.0, np.nan]), 2.0), [1, 0.25, 0.01, 0]
     )

@@ -23,8 +23,9 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, rotation, skew
 from pkmcal.solver.elimination import Linear, eliminate
+from pkmcal.solver.kernels import final_weights
 from pkmcal.solver.ranks import NORMAL_RANK_TOLERANCE, normal_root
-from pkmcal.solver.search import Stop, Values, final_weights, minimise
+from pkmcal.solver.search import Stop, Values, minimise
 
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""

@@ -28,6 +28,7 @@ from pkmcal.observe.legs import (
     measure,
     search,
 )
+from pkmcal.solver.kernels import cauchy_weights
 
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
@@ -234,7 +235,7 @@ def corrected_pose(
     leg, misfit, information = view.legs[rows.leg[use]], rows.misfit[use], rows.information[use]
     jac = rows.by_b[use] @ (rot @ c.b_by_pose[leg]) @ motion
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
-    weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
+    weight = cauchy_weights(square / max(float(np.median(square)), 2.0))
     to_right = jac.mT @ information * weight[:, None, None]
     closing = c.rows.by_pose @ motion / READINGS_LAG_SIGMA
     normal = np.sum(to_right @ jac, axis=0) + closing.T @ closing

@@ -33,7 +33,7 @@ from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import linear
-from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
+from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
 
 MOST_GAUSS_NEWTON_STEPS, MOST_VARIANCE_ROUNDS = 30, 30
 """Most Gauss-Newton steps with given variances, and most rounds of variances."""

@@ -2,9 +2,6 @@
 
 **States and data of many runs** are arrays, or frozen dataclasses or named tuples of arrays, whose
 leading axis counts the runs; see :func:`take`, :func:`put` and :func:`of_runs`.
-
-**Robust weights**, one for a search that lets go of what does not fit (:func:`soft_weights`), one
-for its end (:func:`final_weights`).
 """
 
 from __future__ import annotations
@@ -48,11 +45,6 @@ COST_ROUNDING = 1e-13
 CACHED_PROBLEM_PARTS = 16
 """Parts of a problem of which is kept what their residuals took, so that the next step goes on from
 it: some 5 MB each. Of those of a larger problem it is found again, so that memory does not grow."""
-
-FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE = 4.0, 6.5
-"""Final weights are 1 up to FULL_WEIGHT_DISTANCE and 0 from NO_WEIGHT_DISTANCE standard deviations:
-of clean pairs of residuals 3 in 10^4 lose part of their weight and none all of it, so efficiency is
-above 0.999."""
 
 Runs = TypeVar("Runs")
 """An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""
@@ -421,36 +413,3 @@ def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
     if small and damping < STRONG_DAMPING:
         return Stop.CONVERGED
     return Stop.STALLED if not accepted and damping >= MOST_DAMPING else Stop.RUNNING
-
-
-def soft_weights(distance: Array, scale: Array | float) -> Array:
-    """Geman-McClure weights ``(c^2 / (c^2 + d^2))^2`` of distances; 0 where nothing can be
-    predicted. A search begins with a scale so wide that everything counts, and narrows it.
-    """
-    square = scale**2
-    weight = (square / (square + np.nan_to_num(distance) ** 2)) ** 2
-    return np.where(np.isfinite(distance), weight, 0.0)
-
-
-def final_weights(distance: Array) -> Array:
-    """Weights of distances in standard deviations: 1 up to FULL_WEIGHT_DISTANCE, a cosine's way
-    down to 0 at NO_WEIGHT_DISTANCE; 0 where nothing can be predicted.
-    """
-    x = np.clip(
-        (distance - FULL_WEIGHT_DISTANCE) / (NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE), 0, 1
-    )
-    return np.where(np.isfinite(distance), 0.5 * (1 + np.cos(np.pi * x)), 0.0)
-
-
-def final_loss(distance: Array) -> Array:
-    """The robust loss of distances whose weights are :func:`final_weights`, in the place of their
-    squares: ``2 int_0^d w(t) t dt``. It ends at a constant, the loss of a measurement that is
-    rejected; so much where nothing can be predicted.
-    """
-    width = NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE
-    x = np.minimum(np.where(np.isfinite(distance), distance, np.inf), NO_WEIGHT_DISTANCE)
-    angle = np.pi * (x - FULL_WEIGHT_DISTANCE) / width
-    beyond = (x**2 + FULL_WEIGHT_DISTANCE**2) / 2 + width / np.pi * (
-        x * np.sin(angle) + width / np.pi * (np.cos(angle) - 1)
-    )
-    return np.where(x < FULL_WEIGHT_DISTANCE, x**2, beyond)
