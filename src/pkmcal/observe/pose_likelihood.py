@@ -32,9 +32,8 @@ from pkmcal.observe.predict import (
     tubes_of,
     visible_stretch,
 )
+from pkmcal.solver.marquardt import Damping
 
-FIRST_DAMPING = 1e-3
-"""Of a step, relative to the normal equations' diagonal."""
 DISTANCE_OUTSIDE_IMAGE = 1e4
 """Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
 LEAST_LOG_LIKELIHOOD_GAIN = 0.1
@@ -297,14 +296,14 @@ def refine_lm(
     Upright legs hardly say where their camera stands; undamped, steps there go astray.
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
-    damping = np.full(len(candidates), FIRST_DAMPING)
+    damping = Damping.first(len(candidates))
     for reach in reaches:
         trial = _step(candidates, linearization, linearization.weight(reach), damping)
         in_view = linearize_distances(view, trial, photographs, samples)
         better = in_view.cost(reach) < linearization.cost(reach)
         candidates = np.where(better[:, None, None], trial, candidates)
         linearization = in_view.where(better, linearization)
-        damping = np.where(better, 0.3, 10.0) * damping
+        damping = damping.after(better)
     return candidates
 
 
@@ -322,7 +321,7 @@ def refine_ml(
     Returns the places (H, 4, 4) and their evidence (H,).
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
-    damping = np.full(len(candidates), FIRST_DAMPING)
+    damping = Damping.first(len(candidates))
     mixture = first_mixture(len(candidates))
     last = float("inf")
     for _ in range(steps):
@@ -340,7 +339,7 @@ def refine_ml(
         better = gain > 0
         candidates = np.where(better[:, None, None], trial, candidates)
         linearization = in_view.where(better, linearization)
-        damping = np.where(better, 0.3, 10.0) * damping
+        damping = damping.after(better)
         most = float(gain.max())
         if max(last, most) < LEAST_LOG_LIKELIHOOD_GAIN:
             break  # one step may have been too long
@@ -506,10 +505,12 @@ def _stacked(vectors: tuple[Array, ...], visible: Booleans) -> Array:
     return out
 
 
-def _step(candidates: Array, station_edges: _Linearization, weight: Array, damping: Array) -> Array:
-    """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4).
+def _step(
+    candidates: Array, station_edges: _Linearization, weight: Array, damping: Damping
+) -> Array:
+    """One Levenberg-Marquardt step of every candidate's pose, (H, 4, 4).
 
-    weight : (H, E, n) of the places. damping : (H,).
+    weight : (H, E, n) of the samples along the edges.
     """
     # the places of an edge lie evenly between its first and its last
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
@@ -525,10 +526,7 @@ def _step(candidates: Array, station_edges: _Linearization, weight: Array, dampi
     normal[:, :3, :3] += (grows * two) @ grows.mT
     right = begins @ here[..., None]
     right[:, :3] += grows @ there[..., None]
-    normal, right = normal.astype(float), right.astype(float)
-    diagonal = np.einsum("hii->hi", normal) + 1e-12
-    normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
-    step = -np.linalg.solve(normal, right)[..., 0]
+    step = -damping.step(normal.astype(float), right[..., 0].astype(float))
     step = np.clip(step, -0.1, 0.1)  # further, the tables' slopes say nothing
     # turn about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
     return pose(rotation(step[:, :3]), step[:, 3:]) @ candidates

@@ -8,5 +8,6 @@ acceptance and stop, and no loop goes over runs or configurations.
 
 Bottom to top: ``ranks`` and inverses of scaled matrices; ``elimination`` of the configurations' own
 unknowns; ``strips`` of rows that depend on few shared unknowns, and the normal equations of all;
-``search``, the damped steps and why they end. Beside them ``kernels``, the robust weights.
+``search``, the damped steps and why they end. Beside them ``kernels``, the robust
+weights, and ``marquardt``, steps of many small problems that share nothing.
 """
