@@ -1,9 +1,9 @@
-"""What every central camera offers, whatever its lens or mirror.
+"""Contract of a central camera model.
 
-A central camera maps rays through one point to pixels. Everything behind the image works
-with rays, so a camera model is three functions, which tell its field as well. A model is one
-file in this folder with one final subclass; :func:`camera_models` finds it, the conformance
-test runs over it, nothing else is edited.
+A central camera maps rays through one point to pixels. All other code works with rays, so that a
+model is its projection, the inverse and their Jacobians, NaN outside the valid field. A model is
+one file in this folder with one final subclass; :func:`camera_models` finds it, and the conformance
+test runs over it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)
 PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
 
 LEAST_FOCAL = 0.05
-"""Share of the image's width below which a focal length is none in pixels: a fisheye lens with all
-of its 180 degrees in the picture has a third, a mirror a fifth."""
+"""Share of the image's width below which a focal length cannot be in pixels: a fisheye lens with
+all of its 180 degrees in the image has a third, a mirror a fifth."""
 
 
 FOCAL, CENTER, PIXEL_PARAMETERS = slice(0, 2), slice(2, 4), slice(0, 4)
@@ -38,7 +38,7 @@ pixels."""
 
 
 class CameraSchema(Schema):
-    """The fields that every camera file has; a model's own schema adds to them."""
+    """Fields of every camera file; the schema of a model adds its own."""
 
     covariance: tuple[tuple[float, ...], ...] | None = Field(
         default=None, description="the parameters' covariance, one row a parameter"
@@ -50,7 +50,7 @@ class CameraSchema(Schema):
     @field_validator("image_size")
     @classmethod
     def _of_some_pixels(cls, size: tuple[int, int]) -> tuple[int, int]:
-        """No more than an image may have."""
+        """Check the number of pixels."""
         if (pixels := size[0] * size[1]) > MOST_PIXELS:
             raise ValueError(f"too many pixels; found {pixels}, expected at most {MOST_PIXELS}")
         return size
@@ -58,7 +58,9 @@ class CameraSchema(Schema):
     @field_validator("focal")
     @classmethod
     def _in_pixels(cls, focal: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
-        """No lens or mirror sees so much that its focal length is a twentieth of the width."""
+        """Check that focal lengths are in pixels: no field of view is so wide that they are less
+        than a twentieth of the width.
+        """
         width = info.data.get("image_size", (0, 0))[0]
         if min(focal) < LEAST_FOCAL * width:
             raise ValueError(
@@ -69,18 +71,18 @@ class CameraSchema(Schema):
 
 
 USUAL_FOCAL, USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION = 0.005, 0.001, 0.01, 0.05
-"""Standard deviations of a camera whose file states none: of its focal lengths, relative, and of
-their ratio; of its centre, in parts of the picture's width; of its first term of distortion. A zoom
-ring turned by a hair, pixels that are square to a thousandth, a sensor that is not centred behind
-its lens, and the distortion of most lenses."""
+"""Standard deviations for a camera whose file has no covariance: relative, of the focal lengths and
+of their ratio; of the principal point, in image widths; of the first distortion coefficient. They
+stand for a zoom ring turned by a hair, pixels square to a thousandth, a sensor off the lens's axis,
+and the distortion of most lenses."""
 
 
 class LensViolation(NamedTuple):
-    """How a camera may be another than its file says, by k numbers.
+    """Model violation of a camera file by k numbers, the amplitudes.
 
-    columns : (n, k) change of its parameters by them. usual : their standard deviation where nobody
-    calibrated the camera with care. facts : of its finding, beside the estimates. code : the last
-    part of the finding's.
+    columns : (n, k) change of the camera's parameters by the amplitudes. usual : their standard
+    deviation for a camera that was not calibrated carefully. facts : of the finding, beside the
+    estimates. code : last part of the finding's code.
     """
 
     code: str
@@ -93,12 +95,12 @@ class LensViolation(NamedTuple):
 class Camera(ABC):
     """Intrinsics of one central camera.
 
-    covariance : (n, n) of the parameters by the camera's calibration, where it is known.
+    covariance : (n, n) of the parameters from the camera's calibration; None where unknown.
     image_size : (width, height) in pixels.
     parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
         center, none for the rest. Pixel centres are at integers, as in OpenCV.
     own : fields of the model's file between ``center`` and ``distortion``. odd : names of the
-        parameters that change their sign as the picture is turned by half.
+        parameters whose sign changes when the image is rotated by 180 degrees.
     """
 
     model: ClassVar[str]
@@ -126,11 +128,11 @@ class Camera(ABC):
         """Derivatives of :meth:`project`: by the point (..., 2, 3), by parameters (..., 2, n)."""
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
-        """:meth:`project` (..., 2), and how it moves (..., 2) as points move along each of some
-        directions (..., 3), px by the unit of the points.
+        """:meth:`project` (..., 2) and its directional derivatives (..., 2), px per unit of the
+        points, along each of some directions (..., 3).
 
-        What a search asks for thousands of times; a model may have it for less, in the precision of
-        the points.
+        The inner loop of searches: a model may override it with a cheaper version in the precision
+        of the points.
         """
         by_point = self.project_jacobians(points)[0]
         shifted = (
@@ -145,8 +147,8 @@ class Camera(ABC):
     def ray_jacobians(self, pixels: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`ray`: by the pixel (..., 3, 2), by parameters (..., 3, n).
 
-        From the implicit function project(ray) = pixel, so no model writes it again: with
-        J = d project/d ray, a change of the pixel turns the ray by J's inverse on the ray's
+        From the implicit function project(ray) = pixel, so that no model has to implement them:
+        with J = d project/d ray, a change of the pixel turns the ray by J's inverse on the ray's
         tangent plane, a change of the parameters by minus that times d project/d parameters.
         """
         rays = self.ray(pixels)
@@ -161,9 +163,9 @@ class Camera(ABC):
 
     @classmethod
     def from_document(cls, document: Any) -> Self:
-        """The camera of a file's fields, checked by the model's ``schema``.
+        """The camera of a file's fields, validated by the model's ``schema``.
 
-        Parameters stand in the order of the fields: focal, center, the model's ``own``, distortion,
+        Parameters are in the order of the fields: focal, center, the model's ``own``, distortion,
         which may be absent or shorter.
         """
         own = [getattr(document, name) for name in cls.own]
@@ -197,9 +199,7 @@ class Camera(ABC):
 
     @property
     def focal_part(self) -> Array:
-        """(n,) the parameters with all but the focal lengths zero: their change when the lengths
-        grow by their own size.
-        """
+        """(n,) change of the parameters when the focal lengths grow by their own size."""
         focal = [name.startswith("focal.") for name in self.parameter_names]
         return np.where(focal, self.parameters, 0.0)
 
@@ -214,8 +214,8 @@ class Camera(ABC):
         return np.array(direction) * self.parameters
 
     def violations(self) -> tuple[LensViolation, ...]:
-        """What is wrong first, where anything is: focus, pixels that are not as square as stated,
-        the picture cut otherwise, a lens whose distortion was left out.
+        """The usual model violations: another focus, another aspect of pixels, an image cropped
+        differently, distortion left out.
         """
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
         name, before = self.parameter_names[lens], float(self.parameters[lens])
@@ -232,7 +232,7 @@ class Camera(ABC):
         )
 
     def usual_covariance(self) -> Array:
-        """(n, n) of the parameters where no calibration tells it: of what departs first."""
+        """Covariance (n, n) of the parameters without a calibration, from the usual violations."""
         parts = [part.usual * part.columns for part in self.violations()]
         columns = np.concatenate(parts, axis=1)
         return columns @ columns.T
@@ -251,11 +251,11 @@ class Camera(ABC):
         }
 
     def binned(self, count: int) -> Self:
-        """The camera of pictures in which ``count`` x ``count`` pixels are averaged to one; what is
-        left of a row or a column at its end is not in them.
+        """The camera of images with ``count`` x ``count`` pixels averaged to one; incomplete bins
+        at the ends of rows and columns are cut off.
 
-        Derivatives by its parameters are by the binned ones, of which focal lengths and centre,
-        always the first four, are smaller.
+        Its derivatives are by the binned parameters, of which PIXEL_PARAMETERS are smaller by
+        ``count``.
         """
         if count == 1:
             return self
@@ -263,7 +263,7 @@ class Camera(ABC):
         return self.resampled(1 / count, (width // count, height // count))
 
     def turned_by_half(self) -> Self:
-        """The camera of pictures that are turned by half, itself turned by half about its axis."""
+        """The camera of images rotated by 180 degrees: the camera, rotated about its axis."""
         sign = np.where(np.isin(self.parameter_names, self.odd), -1.0, 1.0)
         sign[CENTER] = -1.0
         covariance = None if self.covariance is None else self.covariance * np.outer(sign, sign)
@@ -271,7 +271,7 @@ class Camera(ABC):
         return reflected.shifted(np.asarray(self.image_size) - 1.0)
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
-        """True where pixels (..., 2) lie in the image, ``margin`` px from its border; (...)."""
+        """Whether pixels (..., 2) are in the image, ``margin`` px or more inside; (...)."""
         limit = np.asarray(self.image_size) - 1.0 - margin
         with np.errstate(invalid="ignore"):
             return np.all((pixels >= margin) & (pixels <= limit), axis=-1)
@@ -279,7 +279,7 @@ class Camera(ABC):
 
 @cache
 def camera_models() -> dict[str, type[Camera]]:
-    """Every camera model of this folder, by its name in camera files."""
+    """All camera models of this folder, by their names in camera files."""
     package = __name__.rpartition(".")[0]
     path = importlib.import_module(package).__path__
     for module in pkgutil.iter_modules(path):
