@@ -354,6 +354,15 @@ def test_a_binned_camera_sees_the_same_in_larger_pixels(case):
     assert camera.binned(1) is camera
 
 
+def test_a_shifted_camera_sees_the_same_at_shifted_pixels(case):
+    _, camera = case
+    points, offset = seen_points(camera, 0), np.array([3.0, -7.5])
+    shifted = camera.shifted(offset)
+    np.testing.assert_allclose(shifted.center, camera.center + offset)
+    np.testing.assert_allclose(shifted.project(points), camera.project(points) + offset, atol=1e-9)
+    np.testing.assert_array_equal(shifted.focal, camera.focal)
+
+
 def test_a_camera_turned_by_half_takes_the_same_picture_upside_down(case):
     """With its whole covariance; turned twice the camera is itself."""
     _, camera = case

@@ -15,7 +15,8 @@ from pkmcal.identify.confirmation import FAR_FROM_NOMINAL, rejections_of
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE
 from pkmcal.measurements.rows import Kinds
 from pkmcal.printers.session import write_printer_session
-from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_loss, minimise
+from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_loss
+from pkmcal.solver.search import minimise
 
 SAYS = printers.Settings(radius=118.0, rod=(240.0,) * 3, endstop=(260.0,) * 3)
 WRONG = 3

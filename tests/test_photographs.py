@@ -2,6 +2,7 @@
 
 import os
 import struct
+import sys
 import zlib
 
 import cv2
@@ -49,7 +50,9 @@ def test_sizes_of_headers_that_opencv_does_not_write(tmp_path):
     for start, order in ((b"II*\0", "<"), (b"MM\0*", ">")):
         entries = struct.pack(order + "HHIHH", 256, 3, 1, 37, 0)
         entries += struct.pack(order + "HHII", 257, 4, 1, 21)
-        ifd = struct.pack(order + "IH", 8, 2) + entries
+        entries += struct.pack(order + "HHIHH", 262, 3, 1, 1, 0)  # black is zero
+        entries += struct.pack(order + "HHII", 273, 4, 1, 100)  # where its one strip begins
+        ifd = struct.pack(order + "IH", 8, 4) + entries
         assert size(start + ifd) == (37, 21)
 
 
@@ -75,6 +78,15 @@ def test_other_formats_are_not_read(tmp_path):
     image(tmp_path / "a.webp", 37, 21)
     with pytest.raises(InputError, match="not an image that can be read"):
         image_header(tmp_path / "a.webp")
+
+
+def test_heif_without_its_package_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)  # importing it fails
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    for read in (image_header, lambda path: decode(path, (4, 4), path.name)):
+        text = fault(read, tmp_path / "a.heic")
+        assert "need the package pillow-heif" in text
+        assert "pip install '.[heic]'" in text
 
 
 def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):

@@ -16,14 +16,13 @@ from pkmcal.identify.robust import anneal, robust_cost, robust_start
 from pkmcal.identify.start import start_state
 from pkmcal.printers.session import write_printer_session
 from pkmcal.session.load import load_session
-from pkmcal.solver.search import (
+from pkmcal.solver.kernels import (
     FULL_WEIGHT_DISTANCE,
     NO_WEIGHT_DISTANCE,
     final_loss,
     final_weights,
-    of_runs,
-    take,
 )
+from pkmcal.solver.search import of_runs, take
 
 SAYS = printers.Settings(radius=118.0, rod=(240.0,) * 3, endstop=(260.0,) * 3)
 

@@ -15,7 +15,7 @@ from pkmcal.geometry.cylinders import contour_point, edge_normal_jacobians
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose_difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import closure
-from pkmcal.session.load import load_session, look_at_pose
+from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
 from pkmcal.simulation import (
     EdgeNoise,
@@ -446,7 +446,7 @@ def test_a_session_loads_back(simulated, machine):
         assert np.linalg.norm(off[3:]) == pytest.approx(0.05, abs=1e-3)
         assert np.rad2deg(np.linalg.norm(off[:3])) == pytest.approx(5.0, abs=0.1)
     pose = truth.rough[0]
-    T_rough = look_at_pose(pose.position, pose.look_at, pose.up)
+    T_rough = look_at(pose.position, pose.look_at, pose.up)
     np.testing.assert_allclose(T_rough, session.stations[0].T_camera_base, atol=1e-9)
 
 

@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.papers.registration import Dense, minimise_dense
 from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
+from pkmcal.solver.kernels import final_weights, geman_mcclure_weights
+from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space, inverse_root, normal_root
-from pkmcal.solver.search import Stop, final_weights, minimise, of_runs, put, soft_weights, take
+from pkmcal.solver.search import Stop, minimise, of_runs, put, take
 from pkmcal.solver.strips import Compact, StripLayout, Strips, compact, normal_equations
 from test_identify_scene import guess, make_scene
 
@@ -319,5 +322,31 @@ def test_weights_fall_from_one_to_zero():
     distance = np.array([0.0, 4.0, 5.25, 6.5, 100.0, np.nan])
     np.testing.assert_allclose(final_weights(distance), [1, 1, 0.5, 0, 0, 0], atol=1e-15)
     np.testing.assert_allclose(
-        soft_weights(np.array([0.0, 2.0, 6.0, np.nan]), 2.0), [1, 0.25, 0.01, 0]
+        geman_mcclure_weights(np.array([0.0, 2.0, 6.0, np.nan]), 2.0), [1, 0.25, 0.01, 0]
     )
+
+
+def test_many_small_problems_at_once_reach_what_scipy_reaches():
+    """Amplitude and rate of noisy decays, from far starts; one problem has no data at all."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(0, 2, 12)
+    true = rng.uniform([1.0, 0.5], [3.0, 2.0], (30, 2))
+    y = true[:, :1] * np.exp(-true[:, 1:] * t) + rng.normal(0, 0.01, (30, 12))
+    used = np.ones((30, 1))
+    used[-1] = 0
+
+    def linear(p):
+        decay = np.exp(-p[:, 1:] * t) * used
+        return y * used - p[:, :1] * decay, np.stack([decay, -p[:, :1] * t * decay], axis=-1)
+
+    p, damping = np.tile([0.3, 4.0], (30, 1)), Damping.first(30)
+    residual, jac = linear(p)
+    for _ in range(40):
+        trial = p + damping.step(jac.mT @ jac, (jac.mT @ residual[..., None])[..., 0])
+        better = np.sum(linear(trial)[0] ** 2, axis=1) < np.sum(residual**2, axis=1)
+        p, damping = np.where(better[:, None], trial, p), damping.after(better)
+        residual, jac = linear(p)
+    for k in range(29):
+        best = least_squares(lambda q, k=k: q[0] * np.exp(-q[1] * t) - y[k], true[k], xtol=1e-12)
+        np.testing.assert_allclose(p[k], best.x, rtol=1e-6)
+    np.testing.assert_array_equal(p[-1], [0.3, 4.0])

@@ -21,6 +21,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
+from pkmcal.solver.marquardt import Damping
 
 CORNER_FIT_STEPS = 12
 CORNER_FIT_SETTLED = 1e-3
@@ -539,7 +540,7 @@ class _Fit(NamedTuple):
     residual: Array
     by: Array
     cost: Array
-    damping: Array
+    damping: Damping
 
     @classmethod
     def begun(cls, grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fit:
@@ -558,7 +559,7 @@ class _Fit(NamedTuple):
         residual = grey - level[:, None] - amplitude[:, None] * form
         cost = np.sum(weight * residual**2, axis=1)
         return cls(
-            np.arange(len(p)), p, grey, weight, shape, residual, by, cost, np.full(len(p), 1e-3)
+            np.arange(len(p)), p, grey, weight, shape, residual, by, cost, Damping.first(len(p))
         )
 
     @property
@@ -568,10 +569,8 @@ class _Fit(NamedTuple):
 
     def stepped(self) -> tuple[_Fit, Array]:
         """After a damped step, where it is better, and that step (k, 7)."""
-        normal, right = self.normal, self.by @ (self.weight * self.residual)[..., None]
-        diagonal = np.einsum("nii->ni", normal)
-        normal = normal + (self.damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
-        step = np.clip(np.linalg.solve(normal, right)[..., 0], -LONGEST_STEP, LONGEST_STEP)
+        right = (self.by @ (self.weight * self.residual)[..., None])[..., 0]
+        step = np.clip(self.damping.step(self.normal, right), -LONGEST_STEP, LONGEST_STEP)
         value, by = _model(self.p + step, self.shape)
         residual = self.grey - value
         cost = np.sum(self.weight * residual**2, axis=1)
@@ -581,7 +580,7 @@ class _Fit(NamedTuple):
             residual=_taken(better, residual, self.residual),
             by=_taken(better, by, self.by),
             cost=np.where(better, cost, self.cost),
-            damping=self.damping * np.where(better, 0.1, 10.0),
+            damping=self.damping.after(better),
         )
         return after, step
 
@@ -589,8 +588,10 @@ class _Fit(NamedTuple):
         """Of some of the corners."""
         if keep.all():
             return self
-        parts = self._replace(shape=self.shape.select(keep))._asdict()
-        return _Fit(**{n: v if n == "shape" else v[keep] for n, v in parts.items()})
+        parts = self._asdict().items()
+        return _Fit(
+            **{n: v.select(keep) if n in ("shape", "damping") else v[keep] for n, v in parts}
+        )
 
 
 def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fitted:

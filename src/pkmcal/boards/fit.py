@@ -23,11 +23,10 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, rotation, skew
 from pkmcal.solver.elimination import Linear, eliminate
-from pkmcal.solver.ranks import normal_root
-from pkmcal.solver.search import Stop, Values, final_weights, minimise
+from pkmcal.solver.kernels import final_weights
+from pkmcal.solver.ranks import NORMAL_RANK_TOLERANCE, normal_root
+from pkmcal.solver.search import Stop, Values, minimise
 
-LEAST_EIGENVALUE_SHARE = 1e-14
-"""Eigenvalue of the scaled normal matrix, of the largest, below which nothing is known."""
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""
 LEAST_VIEWS_ELSEWHERE = 2
@@ -266,7 +265,7 @@ def covariance_of(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
 
 def inverted(normal: Array) -> Array:
     """Inverse of a normal matrix; what is not determined becomes very uncertain, not an error."""
-    half = normal_root(normal, LEAST_EIGENVALUE_SHARE, loose=True)
+    half = normal_root(normal, NORMAL_RANK_TOLERANCE, loose=True)
     return half @ half.mT
 
 

@@ -26,7 +26,7 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.solver.elimination import eliminate
-from pkmcal.solver.search import NO_WEIGHT_DISTANCE
+from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE
 
 FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of starting values for the pixels per radian at the image's centre, as a share of its

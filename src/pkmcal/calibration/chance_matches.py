@@ -18,7 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.refinement import FEW_MEASURED, RefinementResult
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs, placed_at
+from pkmcal.observe.image_batches import placed_at
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.station_localization import BY_CHANCE
 from pkmcal.outcome.finding import Finding, wrong
@@ -115,12 +115,11 @@ def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> i
     edges are in.
     """
     state = turns.estimate.state
-    shifted: list[Photographs] = []
-    for p in turns.photographs:
-        if p.station in stations:
-            parameters = p.camera.parameters.copy()
-            parameters[2:4] += p.binning * offset  # the centre, always third and fourth
-            shifted.append(replace(p, camera=replace(p.camera, parameters=parameters)))
+    shifted = [
+        replace(p, camera=p.camera.shifted(p.binning * offset))
+        for p in turns.photographs
+        if p.station in stations
+    ]
     placed = placed_at(shifted, state.T_camera_base, state.T_base_platform)
     passes = legs.measure_stations(placed, turns.estimate.machine, turns.blur)
     return sum(

@@ -37,7 +37,8 @@ from pkmcal.observe import legs
 from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_batches import Photographs
-from pkmcal.observe.image_localization import SAME_PLACE_TURN, PoseHypotheses, localize_image
+from pkmcal.observe.image_localization import PoseHypotheses, localize_image
+from pkmcal.observe.pose_candidates import SAME_POSE_TURN, same_pose
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.outcome.finding import Finding, note
@@ -56,7 +57,7 @@ EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
 """Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
 CAMERA_TURNED_REASON = "all photographs together turn its camera by more than ten degrees"
 """Reason for rejecting an image that has a single candidate pose and does not belong there."""
-MOST_TURN = SAME_PLACE_TURN / 2
+MOST_TURN = SAME_POSE_TURN / 2
 """Largest rotation (rad) by which the joint estimate may change the localized pose of an image."""
 FEWEST_LEGS, FEWEST_EDGES = 4, 4
 """Fewest legs of an image, if the machine has so many, and fewest edges that determine its pose.
@@ -396,14 +397,14 @@ def _on_board(
             hypotheses[k].T_camera_base,
             hypotheses[k].log_likelihood_ratio,
         )
-        same = angle_between((T @ T_board_base)[:, None], places) < SAME_PLACE_TURN
+        same = same_pose((T @ T_board_base)[:, None], places)
         worth = np.where(same, np.maximum(log_likelihood_ratio, 0.0), 0.0)
         total += worth.max(axis=1)
         best = np.argmax(worth, axis=1)
         agrees = np.take_along_axis(worth, best[:, None], axis=1) > 0
         own[k] = np.where(agrees[..., None], places[best], T @ T_board_base)
     order = np.argsort(-total, kind="stable")
-    near = angle_between(T_board_base[order], T_board_base[order[0]]) < SAME_PLACE_TURN
+    near = same_pose(T_board_base[order], T_board_base[order[0]])
     order = order[~near | (np.arange(len(order)) == 0)]
     return {k: PoseHypotheses(T[order], total[order], 1.0) for k, T in own.items()}
 

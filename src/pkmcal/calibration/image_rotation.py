@@ -20,6 +20,7 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.model_violations import CameraChange
 from pkmcal.calibration.refinement import RefinementResult
 from pkmcal.cameras import Camera
+from pkmcal.cameras.contract import CENTER
 from pkmcal.cameras.files import written_camera
 from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.score import ScoreTests
@@ -115,13 +116,13 @@ def _file_sigma(camera: Camera) -> float:
     """Standard deviation of how far along the way a camera may be from what its file says, by its
     centre.
     """
-    centre = _half_turn_change(camera)[2:4]
+    centre = _half_turn_change(camera)[CENTER]
     length = float(np.linalg.norm(centre))
     if not length:
         return np.inf
     if camera.covariance is None:
         return USUAL_CENTRE_ERROR / length
-    reference_values = camera.covariance[2:4, 2:4] + LEAST_CENTRE_ERROR**2 * np.eye(2)
+    reference_values = camera.covariance[CENTER, CENTER] + LEAST_CENTRE_ERROR**2 * np.eye(2)
     return float(centre @ np.linalg.solve(reference_values, centre)) ** -0.5
 
 

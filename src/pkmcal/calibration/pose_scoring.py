@@ -27,7 +27,6 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import PriorScene
 from pkmcal.errors import PkmcalError
-from pkmcal.geometry.rigid import angle_between
 from pkmcal.identify.bundle import bundle, marginalize_to_machine
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
@@ -36,13 +35,13 @@ from pkmcal.measurements import EdgeSet, Measurements, of_stations
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import Photographs
 from pkmcal.observe.image_localization import (
-    SAME_PLACE_TURN,
     PoseHypotheses,
     distinct,
     finest_view,
     refine_local,
     symmetric_poses,
 )
+from pkmcal.observe.pose_candidates import same_pose
 from pkmcal.observe.pose_likelihood import (
     StationView,
     correlation_length,
@@ -270,11 +269,8 @@ def _weighed(view: StationView, scores: ScoredPoses, unit: float) -> PoseHypothe
     edge = correlation_length(view, at[np.argmax(log_likelihood_ratio)])
     by_edges, by_legs = log_likelihood_ratio / edge - paid, log_likelihood_ratio / unit - paid
     first = at[np.argmax(by_edges)]
-    turned = angle_between(at[:, None], symmetric_poses(view, first[None])).min(
-        axis=1, initial=np.inf
-    )
-    here = angle_between(at, first) < SAME_PLACE_TURN
-    same = here | (turned < SAME_PLACE_TURN)
+    here = same_pose(at, first)
+    same = here | same_pose(at[:, None], symmetric_poses(view, first[None])).any(axis=1)
     worth = np.where(same, by_edges - by_edges.max() + by_legs[here].max(), by_legs)
     order = np.argsort(-worth, kind="stable")
     order = order[distinct(view, at[order])]

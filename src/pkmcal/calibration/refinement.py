@@ -52,7 +52,7 @@ from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.outcome.finding import Finding, note, wrong
 from pkmcal.session.load import Session
-from pkmcal.solver.ranks import RANK_TOLERANCE
+from pkmcal.solver.ranks import nonzero
 from pkmcal.wording import listed
 
 MOST_MEASUREMENT_PASSES = 3
@@ -306,8 +306,8 @@ def _variance(changes: Array, measurements: Measurements, estimate: Estimate) ->
     size = np.sqrt(np.diag(covariance))
     size[size == 0] = np.inf  # of what is exactly known
     value, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-    nonzero = value > RANK_TOLERANCE * value[-1]
-    white = vectors[:, nonzero] / np.sqrt(value[nonzero]) / size[:, None]
+    above_rounding = nonzero(value)
+    white = vectors[:, above_rounding] / np.sqrt(value[above_rounding]) / size[:, None]
     trace = max(float(np.trace(white.T @ noise @ white)), 1.0)
     return float(np.mean(np.sum((changes @ white) ** 2, axis=1))) / trace
 

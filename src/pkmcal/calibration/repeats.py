@@ -37,6 +37,7 @@ from pkmcal.outcome import Part, Row, Table
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
+from pkmcal.solver.ranks import nonzero
 
 CAUSE_NAMED_SHARE = 0.3
 """Share of the scatter, above chance, from which a motion is reported as its cause."""
@@ -65,9 +66,6 @@ REPEATS_TABLE_LEGEND = (
 LEVEL_AXIS_SINE = float(np.sin(np.deg2rad(10.0)))
 """Component u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2)
 is far away or does not exist (errata)."""
-_RANK = 1e-9
-"""Eigenvalues of the normal equations below this share of the largest one belong to motions that
-affect no edge."""
 
 
 @dataclass(frozen=True)
@@ -473,7 +471,7 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
     normal = groups.total(rows.mT @ rows)
     right = groups.total((white[:, None, :] @ rows)[:, 0])
     values, axes = np.linalg.eigh(normal)
-    visible = values > _RANK * values[:, -1:]
+    visible = nonzero(values)  # the others are motions that no edge shows
     along = (axes.mT @ right[..., None])[..., 0]
     along = np.where(visible, along / np.where(visible, values, 1.0), 0.0)
     motion = (axes @ along[..., None])[..., 0]

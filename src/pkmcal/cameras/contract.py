@@ -1,10 +1,9 @@
-"""Contract of all central cameras, whatever their lens or mirror.
+"""Contract of a central camera model.
 
-A central camera maps rays through one point to pixels. Everything outside this package works with
-rays, so a camera model consists of three functions (projection, its Jacobians, its inverse), which
-also define its field of view by returning NaN outside. A model is one file in this folder with one
-final subclass of :class:`Camera`. :func:`camera_models` finds it and the conformance test runs over
-it; no other file is edited.
+A central camera maps rays through one point to pixels. All other code works with rays, so that a
+model is its projection, the inverse and their Jacobians, NaN outside the valid field. A model is
+one file in this folder with one final subclass; :func:`camera_models` finds it, and the conformance
+test runs over it.
 """
 
 from __future__ import annotations
@@ -29,13 +28,17 @@ PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)
 PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
 
 LEAST_FOCAL = 0.05
-"""Shortest focal length in pixels, as a share of the image's width. A fisheye lens with a field of
-180 degrees inside the image has a third, a mirror a fifth; below that the file is likely in
-millimetres."""
+"""Share of the image's width below which a focal length cannot be in pixels: a fisheye lens with
+all of its 180 degrees in the image has a third, a mirror a fifth."""
+
+
+FOCAL, CENTER, PIXEL_PARAMETERS = slice(0, 2), slice(2, 4), slice(0, 4)
+"""Parameters of every model: the focal lengths, the principal point, and both, which are in
+pixels."""
 
 
 class CameraSchema(Schema):
-    """Fields common to all camera files; the schema of each model adds its own."""
+    """Fields of every camera file; the schema of a model adds its own."""
 
     covariance: tuple[tuple[float, ...], ...] | None = Field(
         default=None, description="the parameters' covariance, one row a parameter"
@@ -47,7 +50,7 @@ class CameraSchema(Schema):
     @field_validator("image_size")
     @classmethod
     def _of_some_pixels(cls, size: tuple[int, int]) -> tuple[int, int]:
-        """Refuse images with more than MOST_PIXELS pixels."""
+        """Check the number of pixels."""
         if (pixels := size[0] * size[1]) > MOST_PIXELS:
             raise ValueError(f"too many pixels; found {pixels}, expected at most {MOST_PIXELS}")
         return size
@@ -55,7 +58,9 @@ class CameraSchema(Schema):
     @field_validator("focal")
     @classmethod
     def _in_pixels(cls, focal: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
-        """Refuse focal lengths below LEAST_FOCAL of the width, which are likely millimetres."""
+        """Check that focal lengths are in pixels: no field of view is so wide that they are less
+        than a twentieth of the width.
+        """
         width = info.data.get("image_size", (0, 0))[0]
         if min(focal) < LEAST_FOCAL * width:
             raise ValueError(
@@ -66,19 +71,18 @@ class CameraSchema(Schema):
 
 
 USUAL_FOCAL, USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION = 0.005, 0.001, 0.01, 0.05
-"""Prior sigmas of a camera whose file has no covariance: of the focal lengths (relative), of their
-ratio, of the centre (share of the image's width), and of the first distortion coefficient. They
-stand for a zoom ring turned slightly, pixels square to a thousandth, a sensor not centred behind
-its lens, and the distortion of most lenses."""
+"""Standard deviations for a camera whose file has no covariance: relative, of the focal lengths and
+of their ratio; of the principal point, in image widths; of the first distortion coefficient. They
+stand for a zoom ring turned by a hair, pixels square to a thousandth, a sensor off the lens's axis,
+and the distortion of most lenses."""
 
 
 class LensViolation(NamedTuple):
-    """Deviation of a camera's parameters from its file, along k directions.
+    """Model violation of a camera file by k numbers, the amplitudes.
 
-    code : last part of the finding's code.
-    columns : (n, k) derivative of the parameters by the k numbers.
-    usual : prior sigma of these numbers for a camera that was not calibrated carefully.
-    facts : facts of the finding besides the estimates.
+    columns : (n, k) change of the camera's parameters by the amplitudes. usual : their standard
+    deviation for a camera that was not calibrated carefully. facts : of the finding, beside the
+    estimates. code : last part of the finding's code.
     """
 
     code: str
@@ -91,12 +95,12 @@ class LensViolation(NamedTuple):
 class Camera(ABC):
     """Intrinsics of a central camera.
 
+    covariance : (n, n) of the parameters from the camera's calibration; None where unknown.
     image_size : (width, height) in pixels.
-    parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and center,
-        dimensionless otherwise. Pixel centres are at integers, as in OpenCV.
-    covariance : (n, n) of the parameters from the camera's calibration, or None.
-    own : fields of the model's file between ``center`` and ``distortion``.
-    odd : names of the parameters that change sign when the image is rotated by 180 degrees.
+    parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
+        center, none for the rest. Pixel centres are at integers, as in OpenCV.
+    own : fields of the model's file between ``center`` and ``distortion``. odd : names of the
+        parameters whose sign changes when the image is rotated by 180 degrees.
     """
 
     model: ClassVar[str]
@@ -126,11 +130,11 @@ class Camera(ABC):
         """
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
-        """Pixels (..., 2) of points and their directional derivatives (..., 2) along directions
-        (..., 3), px per unit of the points.
+        """:meth:`project` (..., 2) and its directional derivatives (..., 2), px per unit of the
+        points, along each of some directions (..., 3).
 
-        Searches call this function thousands of times. A model may override it with a cheaper
-        version, in the precision of the points.
+        The inner loop of searches: a model may override it with a cheaper version in the precision
+        of the points.
         """
         by_point = self.project_jacobians(points)[0]
         derivatives = (
@@ -145,10 +149,9 @@ class Camera(ABC):
     def ray_jacobians(self, pixels: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`ray` by the pixel (..., 3, 2) and by the parameters (..., 3, n).
 
-        They follow from the implicit function project(ray) = pixel, so models do not implement
-        them. Let J = d project / d ray. The derivative by the pixel is the inverse of J on the
-        ray's tangent plane; the derivative by the parameters is minus this inverse times d project
-        / d parameters.
+        From the implicit function project(ray) = pixel, so that no model has to implement them:
+        with J = d project/d ray, a change of the pixel turns the ray by J's inverse on the ray's
+        tangent plane, a change of the parameters by minus that times d project/d parameters.
         """
         rays = self.ray(pixels)
         by_point, by_parameters = self.project_jacobians(rays)
@@ -162,11 +165,10 @@ class Camera(ABC):
 
     @classmethod
     def from_document(cls, document: Any) -> Self:
-        """Camera from the fields of a file that the model's ``schema`` has validated.
+        """The camera of a file's fields, validated by the model's ``schema``.
 
-        The parameters are in the order of the fields: focal, center, the model's ``own``,
-        distortion. Distortion may be absent or shorter than the model's; missing coefficients are
-        zero.
+        Parameters are in the order of the fields: focal, center, the model's ``own``, distortion,
+        which may be absent or shorter.
         """
         own = [getattr(document, name) for name in cls.own]
         k = np.zeros(len(cls.parameter_names) - 4 - len(own))
@@ -174,10 +176,32 @@ class Camera(ABC):
         return cls(document.image_size, np.concatenate([document.focal, document.center, own, k]))
 
     @property
+    def focal(self) -> Array:
+        """(2,) focal lengths, px."""
+        return self.parameters[FOCAL]
+
+    @property
+    def center(self) -> Array:
+        """(2,) principal point, px."""
+        return self.parameters[CENTER]
+
+    def shifted(self, offset: Array) -> Self:
+        """The camera of images shifted by ``offset`` (2,), px: with another principal point."""
+        parameters = self.parameters.copy()
+        parameters[CENTER] += offset
+        return replace(self, parameters=parameters)
+
+    def resampled(self, factor: float, image_size: tuple[int, int]) -> Self:
+        """The camera of images with ``factor`` pixels in place of one, of another size."""
+        parameters = self.parameters.copy()
+        parameters[PIXEL_PARAMETERS] *= factor
+        # pixel centres are at integers, so the image's corner is at -0.5
+        camera = replace(self, image_size=image_size, parameters=parameters, covariance=None)
+        return camera.shifted(np.full(2, (factor - 1) / 2))
+
+    @property
     def focal_part(self) -> Array:
-        """Parameters (n,) with all but the focal lengths set to zero: the derivative by the
-        relative change of both focal lengths.
-        """
+        """(n,) change of the parameters when the focal lengths grow by their own size."""
         focal = [name.startswith("focal.") for name in self.parameter_names]
         return np.where(focal, self.parameters, 0.0)
 
@@ -192,15 +216,15 @@ class Camera(ABC):
         return np.array(direction) * self.parameters
 
     def violations(self) -> tuple[LensViolation, ...]:
-        """Likely deviations of the camera from its file: focal length (focus), aspect ratio of the
-        pixels, centre (cropped images), first distortion coefficient (distortion left out).
+        """The usual model violations: another focus, another aspect of pixels, an image cropped
+        differently, distortion left out.
         """
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
         name, before = self.parameter_names[lens], float(self.parameters[lens])
         return (
             LensViolation("focal", self.focal_part[:, None], USUAL_FOCAL),
             LensViolation("aspect", self.aspect_part[:, None], USUAL_ASPECT),
-            LensViolation("centre", eye[:, 2:4], USUAL_CENTRE * self.image_size[0]),
+            LensViolation("centre", eye[:, CENTER], USUAL_CENTRE * self.image_size[0]),
             LensViolation(
                 "distortion",
                 eye[:, lens : lens + 1],
@@ -210,9 +234,7 @@ class Camera(ABC):
         )
 
     def usual_covariance(self) -> Array:
-        """Prior covariance (n, n) of the parameters of a camera without a stated one, from
-        :meth:`violations`.
-        """
+        """Covariance (n, n) of the parameters without a calibration, from the usual violations."""
         parts = [part.usual * part.columns for part in self.violations()]
         columns = np.concatenate(parts, axis=1)
         return columns @ columns.T
@@ -231,35 +253,27 @@ class Camera(ABC):
         }
 
     def binned(self, count: int) -> Self:
-        """Camera of images in which ``count`` x ``count`` pixels are averaged to one; incomplete
-        blocks at the ends of rows and columns are dropped.
+        """The camera of images with ``count`` x ``count`` pixels averaged to one; incomplete bins
+        at the ends of rows and columns are cut off.
 
-        Its parameters, and derivatives by them, are those of the binned image: focal lengths and
-        centre, always the first four parameters, are smaller.
+        Its derivatives are by the binned parameters, of which PIXEL_PARAMETERS are smaller by
+        ``count``.
         """
         if count == 1:
             return self
-        parameters = self.parameters.copy()
-        parameters[:4] /= count
-        parameters[2:4] += (1 / count - 1) / 2  # pixel centres are at integers
-        size = self.image_size[0] // count, self.image_size[1] // count
-        return replace(self, image_size=size, parameters=parameters, covariance=None)
+        width, height = self.image_size
+        return self.resampled(1 / count, (width // count, height // count))
 
     def turned_by_half(self) -> Self:
-        """Camera of the images rotated by 180 degrees, itself rotated by 180 degrees about its
-        optical axis.
-        """
+        """The camera of images rotated by 180 degrees: the camera, rotated about its axis."""
         sign = np.where(np.isin(self.parameter_names, self.odd), -1.0, 1.0)
-        sign[2:4] = -1.0
-        parameters = sign * self.parameters
-        parameters[2:4] += np.asarray(self.image_size) - 1.0
+        sign[CENTER] = -1.0
         covariance = None if self.covariance is None else self.covariance * np.outer(sign, sign)
-        return replace(self, parameters=parameters, covariance=covariance)
+        reflected = replace(self, parameters=sign * self.parameters, covariance=covariance)
+        return reflected.shifted(np.asarray(self.image_size) - 1.0)
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
-        """Whether pixels (..., 2) are inside the image, at least ``margin`` px from its border;
-        (...).
-        """
+        """Whether pixels (..., 2) are in the image, ``margin`` px or more inside; (...)."""
         limit = np.asarray(self.image_size) - 1.0 - margin
         with np.errstate(invalid="ignore"):
             return np.all((pixels >= margin) & (pixels <= limit), axis=-1)

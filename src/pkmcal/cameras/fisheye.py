@@ -51,9 +51,10 @@ class Fisheye(Camera):
         """Pixels (..., 2) of points (..., 3); NaN outside the field of view."""
         angle, across = _angle(points)
         ratio = _radius_ratio(self._radius(angle), across, points)
-        focal, center = self.parameters[:2], self.parameters[2:4]
         good = self._in_field(angle, points)[..., None]
-        return np.where(good, focal * (points[..., :2] * ratio[..., None]) + center, np.nan)
+        return np.where(
+            good, self.focal * (points[..., :2] * ratio[..., None]) + self.center, np.nan
+        )
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and by the parameters
@@ -71,7 +72,7 @@ class Fisheye(Camera):
         by_point[..., 0, 0], by_point[..., 1, 1] = ratio + along * x * x, ratio + along * y * y
         by_point[..., 0, 1] = by_point[..., 1, 0] = along * x * y
         by_point[..., 0, 2], by_point[..., 1, 2] = -slope * x / far, -slope * y / far
-        focal = self.parameters[:2]
+        focal = self.focal
         by_parameters = np.zeros((*points.shape[:-1], 2, 8))
         by_parameters[..., 0, 0], by_parameters[..., 1, 1] = ratio * x, ratio * y
         by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
@@ -88,7 +89,7 @@ class Fisheye(Camera):
         """Unit viewing rays (..., 3) of pixels (..., 2), by Newton's method; NaN outside the image
         circle.
         """
-        xy = (pixels - self.parameters[2:4]) / self.parameters[:2]
+        xy = (pixels - self.center) / self.focal
         radius = np.sqrt(np.sum(xy * xy, axis=-1))
         limit = self._limit()
         table = np.linspace(0.0, limit, _TABLE)

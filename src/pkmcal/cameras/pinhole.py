@@ -216,7 +216,7 @@ class Pinhole(Camera):
 
     def ray(self, pixels: Array) -> Array:
         """Unit viewing rays (..., 3) of pixels (..., 2); NaN beyond the fold of the distortion."""
-        xy = undistort((pixels - self.parameters[2:4]) / self.parameters[:2], self.parameters[4:])
+        xy = undistort((pixels - self.center) / self.focal, self.parameters[4:])
         rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
@@ -227,7 +227,7 @@ class Pinhole(Camera):
         if by_xy is None:
             by_xy = np.broadcast_to(np.eye(2), (*z.shape, 2, 2))
         out = np.empty((2, 3, *z.shape))
-        for row, own, focal in zip(out, (0, 1), self.parameters[:2], strict=True):
+        for row, own, focal in zip(out, (0, 1), self.focal, strict=True):
             scale = focal / z
             row[0] = scale * by_xy[..., own, 0]
             row[1] = scale * by_xy[..., own, 1]

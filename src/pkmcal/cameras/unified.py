@@ -105,9 +105,7 @@ class Unified(Camera):
 
     def ray(self, pixels: Array) -> Array:
         """Unit viewing rays (..., 3) of pixels (..., 2); NaN outside the image of the mirror."""
-        xy = undistort(
-            (pixels - self.parameters[2:4]) / self.parameters[:2], self._five_coefficients()
-        )
+        xy = undistort((pixels - self.center) / self.focal, self._five_coefficients())
         r2 = np.sum(xy * xy, axis=-1)
         with np.errstate(invalid="ignore"):
             root = np.sqrt(1 + (1 - self.xi**2) * r2)

@@ -14,6 +14,7 @@ import os
 import re
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
@@ -128,7 +129,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         atexit.register(gc.freeze)
     # pkmcal reports itself what OpenCV cannot read.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    with withstanding():
+    with withstanding(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"PIL\.")  # such as of EXIF that is cut short
         try:
             code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
             sys.stdout.flush()

@@ -29,6 +29,7 @@ from pkmcal.observe.legs import (
     measure,
     search,
 )
+from pkmcal.solver.kernels import cauchy_weights
 
 SAME_ASSEMBLY_ANGLE = float(np.deg2rad(5.0))
 """Angle between a measured and a predicted leg, median over the legs, up to which the assembly mode
@@ -243,7 +244,7 @@ def corrected_pose(
     leg, misfit, information = view.legs[rows.leg[use]], rows.misfit[use], rows.information[use]
     jac = rows.by_b[use] @ (rot @ c.b_by_pose[leg]) @ motion
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
-    weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
+    weight = cauchy_weights(square / max(float(np.median(square)), 2.0))
     to_right = jac.mT @ information * weight[:, None, None]
     # readings: the closure equations with READINGS_LAG_SIGMA
     closing = c.rows.by_pose @ motion / READINGS_LAG_SIGMA

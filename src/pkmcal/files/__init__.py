@@ -17,8 +17,15 @@ from pkmcal.files.documents import (
     yaml_text,
 )
 from pkmcal.files.edits import with_numbers
-from pkmcal.files.exif import Exif, read_exif, with_exif
-from pkmcal.files.headers import IMAGE_FILE_ENDINGS, stated_size
+from pkmcal.files.images import (
+    IMAGE_ERRORS,
+    IMAGE_FILE_ENDINGS,
+    Exif,
+    open_image,
+    read_exif,
+    sensor_size,
+    with_exif,
+)
 from pkmcal.files.limits import (
     LARGEST_WRITTEN_FILE,
     MOST_HANDHELD_IMAGES,
@@ -61,6 +68,7 @@ from pkmcal.files.writing import (
 )
 
 __all__ = [
+    "IMAGE_ERRORS",
     "IMAGE_FILE_ENDINGS",
     "LARGEST_UNITLESS_LENGTH",
     "LARGEST_WRITTEN_FILE",
@@ -96,6 +104,7 @@ __all__ = [
     "json_value",
     "next_step_after",
     "no_such",
+    "open_image",
     "output_lock",
     "parse_yaml",
     "place_below",
@@ -110,9 +119,9 @@ __all__ = [
     "remembered",
     "remove_folder",
     "resolved",
+    "sensor_size",
     "staged_file",
     "staged_folder",
-    "stated_size",
     "validated_document",
     "wanted_file",
     "with_exif",

@@ -1,6 +1,6 @@
-"""What takes a while to make and comes out the same each time, kept in the user's cache folder.
+"""Cache of slow, reproducible results in the user's cache folder.
 
-Nothing depends on it: where the folder cannot be read or written, all is made anew.
+The program works without the folder: where it cannot be read or written, results are made anew.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def remembered(name: str) -> bytes | None:
-    """What is kept under a name; None for nothing."""
+    """Cached content under a name, or None."""
     try:
         return (cache_folder() / name).read_bytes()
     except OSError:
@@ -19,7 +19,7 @@ def remembered(name: str) -> bytes | None:
 
 
 def remember(name: str, content: bytes) -> None:
-    """Keep it, whole or not at all, for this user alone to read: code is kept, and a key."""
+    """Cache content, whole or not at all, readable by this user alone: it may be code, or a key."""
     place = cache_folder()
     new = place / f"{name}.{os.getpid()}"
     with suppress(OSError):

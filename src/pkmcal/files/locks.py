@@ -18,21 +18,21 @@ from pkmcal.files.cache import cache_folder
 FOLDER_LOCK_FILE = "lock"
 """An empty file in a folder in which one process at a time works; it stays there."""
 LONGEST_WAIT_FOR_OUTPUT = 60.0
-"""Seconds that a process waits for another one to move its files: this takes a second or so."""
+"""Seconds that a process waits while another one moves its files, which takes a second or so."""
 LOCK_ATTEMPT_INTERVAL = 0.05
 """Seconds between two attempts."""
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
 """Flag of os.open by which a link is not followed, where the operating system has it."""
 
 _PLACES: ContextVar[frozenset[str]] = ContextVar("_PLACES", default=frozenset())
-"""Folders around outputs that this thread has locked."""
+"""Parent folders of outputs that this context has locked."""
 
 
 def lock(file: int) -> bool | None:
-    """Lock an open file, by its descriptor, for as long as this process keeps it open.
+    """Lock an open file, by its descriptor, until this process closes it.
 
-    False where another process has locked it; None where the file system has no locks at all, as
-    some of a network have none.
+    Returns False where another process has locked it, None where the file system has no locks, as
+    some network file systems.
     """
     try:
         if sys.platform == "win32":
@@ -51,10 +51,10 @@ def lock(file: int) -> bool | None:
 
 @contextmanager
 def output_lock(output: Path) -> Generator[None]:
-    """Look at an output and move files to it while no other process does; wait for one that does.
+    """Exclusive access to an output, to inspect it and to move files to it.
 
-    Raises `InputError` where that takes longer than LONGEST_WAIT_FOR_OUTPUT. Without effect inside
-    itself, and where there are no locks.
+    Waits for another process, and raises `InputError` after LONGEST_WAIT_FOR_OUTPUT. Reentrant;
+    without effect where the file system has no locks.
     """
     place = _place(output)
     if place in _PLACES.get():
@@ -86,12 +86,12 @@ def output_busy(output: Path) -> bool:
 
 
 def _place(output: Path) -> str:
-    """The folder around an output, of which there is one lock."""
+    """The parent folder of an output, which has one lock."""
     return str(Path(os.path.realpath(output)).parent)
 
 
 def _locked_file(place: str, output: Path) -> int | None:
-    """An open file with the lock of a folder, None without one."""
+    """An open file that holds the lock of a folder, or None where there are no locks."""
     end = time.monotonic() + LONGEST_WAIT_FOR_OUTPUT
     for file in _lockable_files(place):
         while (success := lock(file)) is False:
@@ -110,8 +110,8 @@ def _locked_file(place: str, output: Path) -> int | None:
 
 
 def _lockable_files(place: str) -> Iterator[int]:
-    """The folder itself, so that no file is left in it; where a folder cannot be opened or locked,
-    as in Windows, a file of the user's cache folder.
+    """Open files to lock for a folder: the folder itself, so that no lock file remains in it; then
+    a file in the user's cache folder, for systems such as Windows that cannot open folders.
     """
     with suppress(OSError):
         yield os.open(place, os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""What stands under a file's name: a file, or something that reading would wait for for ever."""
+"""Checks that a path is a regular file; reading a pipe or a device could block for ever."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _KINDS = (
 
 
 def resolved(path: Path) -> Path:
-    """The absolute path with its links followed, as far as they lead: of a link that leads to
-    itself, the link. `Path.resolve` raises an error of its own kind there.
+    """Absolute path with links followed; a link to itself stays as it is, where `Path.resolve`
+    raises an error of its own kind.
     """
     return Path(os.path.realpath(path))
 
 
 def check_regular(path: Path, label: str) -> None:
-    """Raise `InputError` where `path` is there and is no file, before it is opened.
+    """Raise `InputError` where `path` exists and is not a regular file, before it is opened.
 
-    label : its name in messages. Raises FileNotFoundError where nothing is there.
+    label : the file's name in messages. Raises FileNotFoundError where nothing exists.
     """
     try:
         mode = path.stat().st_mode

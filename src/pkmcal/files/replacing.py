@@ -1,4 +1,4 @@
-"""New files moved to their places in a folder that holds others already.
+"""Transactional replacement of files in a folder that already holds others.
 
 A replacement is committed by one rename: a complete folder of new files, with a journal of what is
 to be moved and removed, becomes COMMITTED_FOLDER of the output. From then on it has to be
@@ -37,11 +37,11 @@ LARGEST_JOURNAL = 2**24
 """Bytes; of a hundred thousand files."""
 JOURNAL_KEY_NAME, JOURNAL_KEY_BYTES = "journal-key", 32
 LONGEST_WAIT_FOR_MOVES = 10.0
-"""Seconds that a reader waits while another process moves its files, which takes milliseconds."""
+"""Seconds that a reader waits while another process moves files, which takes milliseconds."""
 
 
 class _Journal(NamedTuple):
-    """What a replacement does. digests : by the names of new files. gone : names to be removed."""
+    """Plan of a replacement. digests : by the names of new files. gone : names to be removed."""
 
     digests: Mapping[str, str]
     gone: Sequence[str]
@@ -109,13 +109,13 @@ def finish_replacement(folder: Path) -> None:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """All files in a folder and its folders."""
+    """All files in a folder and its subfolders."""
     return [path for path in sorted(folder.rglob("*")) if not path.is_dir()]
 
 
 def _unfinished(folder: Path) -> bool:
-    """Whether anything stands under COMMITTED_FOLDER but an empty folder, which is a finished one's
-    last trace.
+    """Whether COMMITTED_FOLDER exists and is not empty; an empty one is left by a finished
+    replacement.
     """
     place = folder / COMMITTED_FOLDER
     if not os.path.lexists(place):
@@ -129,9 +129,9 @@ def _unfinished(folder: Path) -> bool:
 
 
 def _signed_journal(folder: Path) -> _Journal | None:
-    """The journal of a replacement that this user began in this place, None of any other.
+    """Journal of a replacement that this user began in this folder; None for any other.
 
-    What is there of the new files is as it was then, and no link stands where files go.
+    The new files that are present are checked against their digests, and their targets for links.
     """
     place = folder / COMMITTED_FOLDER
     try:
@@ -161,7 +161,7 @@ def _signed_journal(folder: Path) -> _Journal | None:
 
 
 def _move(folder: Path, journal: _Journal) -> None:
-    """Move what has not been moved yet; a rename replaces a link, and does not follow it."""
+    """Move the files that remain to be moved; a rename replaces a link and does not follow it."""
     place = folder / COMMITTED_FOLDER
     try:
         for name in journal.gone:
@@ -209,9 +209,10 @@ def _check_target(folder: Path, name: str) -> None:
 
 
 def _signature(payload: bytes) -> bytes:
-    """Of a journal, with the key of this user, which is made when first needed.
+    """Signature of a journal with this user's key, which is made when first needed.
 
-    Where no key can be kept, each signature has its own, and nothing is ever finished later.
+    Where no key can be stored, each signature has a key of its own, and no replacement can be
+    finished later.
     """
     key = remembered(JOURNAL_KEY_NAME)
     if key is None or len(key) != JOURNAL_KEY_BYTES:

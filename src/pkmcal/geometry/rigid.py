@@ -10,9 +10,12 @@ Perturbation, defined here for the whole project: six numbers ``delta = (omega, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.errors import InputError
 
 _CROSSED = -np.array([[[0, 0, 0], [0, 0, 1], [0, -1, 0]],
                       [[0, 0, -1], [0, 0, 0], [1, 0, 0]],
@@ -21,6 +24,13 @@ _CROSSED = -np.array([[[0, 0, 0], [0, 0, 1], [0, -1, 0]],
 v."""
 LEAST_ANGLE = 1e-150
 """Rotation angle (rad) below which the rotation is the identity."""
+LEAST_VIEW_DISTANCE = 1e-6
+"""Distance (m) from a camera to the point that it looks at, below which they are one point."""
+LEAST_UP_ANGLE = float(np.deg2rad(1.0))
+"""Angle (rad) between the line of sight and the direction up below which a direction of a few
+digits does not determine the camera's turn about its axis."""
+VectorLike = Array | Sequence[float]
+"""(3,) numbers."""
 
 
 def skew(v: Array) -> Array:
@@ -215,16 +225,32 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
     return pose(rot, mean_t - (rot @ mean_s[..., None])[..., 0])
 
 
-def look_at(position: Array, target: Array, up: Array) -> Array:
-    """``T_camera_base`` (4, 4) of a camera at ``position`` that looks at ``target``
-    (base frame, m).
+def look_at(position: VectorLike, target: VectorLike, up: VectorLike) -> Array:
+    """Pose T_camera_base (4, 4) of a camera at ``position`` with ``target`` in the image's middle.
 
-    Camera axes as in OpenCV: z forward, x right, y down; ``up`` points upwards in the image. The
-    caller ensures that ``up`` is not parallel to the viewing direction.
+    All in base coordinates, m. Camera axes as OpenCV: z forward, x right, y down; ``up`` points to
+    the image's upper edge and need not be square to the view. Raises InputError where the three do
+    not determine a pose.
     """
-    forward = np.asarray(target, dtype=float) - position
+    eye, above = np.asarray(position, dtype=float), np.asarray(up, dtype=float)
+    forward = np.asarray(target, dtype=float) - eye
+    if np.linalg.norm(forward) < LEAST_VIEW_DISTANCE:
+        raise InputError(
+            "the camera looks at its own position",
+            found=f"look_at {list(target)}",
+            expected="a point in the middle of the image, away from position",
+        )
+    # lengths taken out first, so that the angle below is one between unit vectors
     forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, up)
+    above = above / max(float(np.abs(above).max()), np.finfo(float).tiny)
+    right = np.cross(forward, above)
+    angle = np.arctan2(np.linalg.norm(right), abs(float(forward @ above)))
+    if angle < LEAST_UP_ANGLE:
+        raise InputError(
+            "up does not fix how the camera is turned about its view",
+            found=f"up {list(up)}, {np.rad2deg(angle):.2g} degrees from the line of sight",
+            expected="a direction across the view, towards the image's upper edge",
+        )
     right = right / np.linalg.norm(right)
-    rot = np.stack([right, np.cross(forward, right), forward])
-    return pose(rot, -rot @ np.asarray(position, dtype=float))
+    R_camera_base = np.stack([right, np.cross(forward, right), forward])
+    return pose(R_camera_base, -R_camera_base @ eye)

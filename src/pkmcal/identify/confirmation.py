@@ -38,7 +38,7 @@ from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
-from pkmcal.solver.search import NO_WEIGHT_DISTANCE, final_loss
+from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE, final_loss
 
 FAR_FROM_NOMINAL = 5.0
 """Tolerances by which a value may leave the nominal model before a person should look."""

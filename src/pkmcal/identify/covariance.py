@@ -41,9 +41,9 @@ from pkmcal.solver.elimination import (
 )
 from pkmcal.solver.ranks import (
     NORMAL_RANK_TOLERANCE,
-    RANK_TOLERANCE,
     column_space,
     inverse_root,
+    nonzero,
     normal_inverse,
     normal_root,
 )
@@ -299,7 +299,7 @@ def identifiability(info: Information, machine: Machine) -> Identifiability:
     _, s, vt = np.linalg.svd(np.linalg.qr(remainder @ basis, mode="r"), full_matrices=True)
     s = np.pad(s, (0, len(vt) - len(s)))
     directions = vt @ basis.T
-    lost = s < RANK_TOLERANCE * s[0]
+    lost = ~nonzero(s)
     vectors = (directions * tolerance) @ problem.free.T
     made = [
         _direction(table, d, v, float(x)) for d, v, x in zip(directions, vectors, s, strict=True)

@@ -33,7 +33,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.reduced_edges import ReducedEdges, reduced_edges
 from pkmcal.identify.scatter import NUMBERS_AN_EDGE, shift_squares
-from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE
+from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE
 
 NOTICED_DISTANCE = (FULL_WEIGHT_DISTANCE + NO_WEIGHT_DISTANCE) / 2
 """Standard deviations of its residual at which an edge has lost half of its weight."""

@@ -32,6 +32,7 @@ from pkmcal.identify.gauge import (
     moved_centres,
 )
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.ranks import numerical_rank
 
 NULL_VARIANCE_SHARE = 0.99
 """Part of the drawing's variance that is left, from which on data say nothing of a direction."""
@@ -94,7 +95,7 @@ def machine_change(
     frames = generators(layout, a.values) @ freedoms(held)
     own = inward @ frames
     remainder, s, _ = np.linalg.svd(own)
-    rest = remainder[:, np.count_nonzero(s > 1e-9 * max(float(s.max(initial=0.0)), 1e-12)) :]
+    rest = remainder[:, numerical_rank(s) :]
     step = np.linalg.lstsq(own, inward @ (there - a.values), rcond=1e-9)[0]
     there = there - frames @ step
     change = there - a.values

@@ -22,15 +22,13 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements.rows import Kinds, RowsOfKind
-from pkmcal.solver.search import (
+from pkmcal.solver.kernels import (
     FULL_WEIGHT_DISTANCE,
     final_loss,
     final_weights,
-    minimise,
-    put,
-    soft_weights,
-    take,
+    geman_mcclure_weights,
 )
+from pkmcal.solver.search import minimise, put, take
 
 CLEAN_TAIL_SHARE = float(np.exp(-(FULL_WEIGHT_DISTANCE**2) / 2))
 """Share of two clean residuals' norms beyond FULL_WEIGHT_DISTANCE, where weights begin to fall."""
@@ -233,7 +231,9 @@ def anneal(problem: Problem, start: BatchState) -> RobustStart:
         new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new
-        weight = Kinds(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
+        weight = Kinds(
+            *(geman_mcclure_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True))
+        )
         searched = problem.weighted(weight).as_noisy_as_at(state)
         solution = minimise(searched, state, max_steps=most)
         state, steps = solution.state, steps + int(solution.steps.max())

@@ -18,6 +18,7 @@ from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold
+from pkmcal.solver.ranks import nonzero
 
 POSES_AROUND_SESSION = 40
 """Poses around the session's: what a session's few poses hide, others show."""
@@ -62,7 +63,7 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     shifted = shifted.reshape(-1, shifted.shape[-1])
     frames = frames.reshape(len(shifted), -1)
     u, s, _ = np.linalg.svd(frames, full_matrices=False)
-    u = u[:, s > 1e-9 * max(float(s.max(initial=0.0)), 1e-12)]
+    u = u[:, nonzero(s)]
     shifted = shifted - u @ (u.T @ shifted)
     return shifted / np.sqrt(len(poses) * machine.n_legs)
 

@@ -24,6 +24,7 @@ from pkmcal.identify.motions import NamedChanges, Situation, all_radii, candidat
 from pkmcal.identify.sentences import OpenMotion, Sentence, few, sentence
 from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.ranks import nonzero
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
@@ -182,7 +183,7 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
     held = effect @ every @ every[[table.index(name) for name in table.fixed]].T
     free = effect @ table.free_matrix()
     q, s, _ = np.linalg.svd(free, full_matrices=False)
-    q = q[:, s > 1e-9 * s.max(initial=0.0)]
+    q = q[:, nonzero(s)]
     residual = held - q @ (q.T @ held)
     # a metre moves joints by about a metre: without effect is without effect in metres
     alone = np.linalg.norm(residual, axis=0) < CONVENTION_NULL_SHARE

@@ -13,6 +13,7 @@ from pkmcal.arrays import Array, Integers, rms
 from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.ranks import nonzero
 
 RATIO_BOOTSTRAP_DRAWS = 4000
 """Number of bootstrap draws: percentiles of the ratio are known to a hundredth or two."""
@@ -24,8 +25,6 @@ ALLOWED_RESIDUAL_EXCESS = 1.5
 """Accepted ratio of residuals to standard deviations: the latter cover noise, and shading and
 lenses add a few tenths in any images.
 """
-NULL_EIGENVALUE_SHARE = 1e-9
-"""Relative size of eigenvalues of the scaled covariance below which a direction has no variance."""
 
 
 @dataclass(frozen=True)
@@ -258,7 +257,7 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
     # Whitening of the directions with a variance.
     scale = np.sqrt(np.diag(covariance))
     eigenvalues, eigenvectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
-    significant = eigenvalues > NULL_EIGENVALUE_SHARE * eigenvalues[-1]
+    significant = nonzero(eigenvalues)
     whiten = (eigenvectors[:, significant] / np.sqrt(eigenvalues[significant])).T / scale
     # Chi-square of all residuals, and generalised least squares for their common offsets.
     white = whiten @ residuals.reshape(-1)

@@ -32,7 +32,7 @@ from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
-from pkmcal.solver.ranks import RANK_TOLERANCE, column_space
+from pkmcal.solver.ranks import column_space, nonzero
 from pkmcal.solver.search import Stop, minimise
 from pkmcal.wording import named
 
@@ -269,7 +269,7 @@ def change_evidence(held: Held, prior: CalibrationPrior) -> Evidence:
     by = rows * size
     by[:, :n] = rows[:, :n] @ _across_axes(machine) * size[:n]
     u, s, vt = np.linalg.svd(by, full_matrices=False)
-    observable = s > RANK_TOLERANCE * s.max(initial=0.0)
+    observable = nonzero(s)
     # noise is drawn in this basis: signs must not depend on rounding
     sign = np.sign(vt[np.arange(len(vt)), np.abs(vt).argmax(axis=1)])[observable]
     by = (sign * s[observable])[:, None] * vt[observable] / size

@@ -21,8 +21,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import angle_between, cross, dot, inverse, pose, rotation
-from pkmcal.observe.image_localization import SAME_PLACE_TURN, PoseHypotheses
+from pkmcal.geometry.rigid import cross, dot, inverse, pose, rotation
+from pkmcal.observe.image_localization import PoseHypotheses
+from pkmcal.observe.pose_candidates import same_pose
 from pkmcal.observe.predict import LegsInCamera
 
 LARGEST_TEXTURE_SIDE = 1600
@@ -337,7 +338,7 @@ class Surroundings:
             return hypotheses
         T = hypotheses.T_camera_base
         gain = self._gain(T, one, camera, [legs[h] for h in range(len(T))], placed)
-        same = angle_between(T[:, None], T) < SAME_PLACE_TURN
+        same = same_pose(T[:, None], T)
         worth = hypotheses.log_likelihood_ratio + np.where(same, gain, -np.inf).max(axis=1)
         order = np.argsort(-worth, kind="stable")
         order = order[~same[order, order[0]] | (order == order[0])]

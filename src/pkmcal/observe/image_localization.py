@@ -22,11 +22,17 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.geometry.rigid import angle_between, dot, inverse, pose, rotation
+from pkmcal.geometry.rigid import dot, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import WORKING_WIDTH, distance_tables
 from pkmcal.observe.image_batches import Photographs
-from pkmcal.observe.pose_candidates import CAMERA_DIRECTIONS, SIGHT_LINE_TURNS, frame_of, sphere
+from pkmcal.observe.pose_candidates import (
+    CAMERA_DIRECTIONS,
+    SIGHT_LINE_TURNS,
+    frame_of,
+    same_pose,
+    sphere,
+)
 from pkmcal.observe.pose_likelihood import (
     StationView,
     distinct_silhouettes,
@@ -64,9 +70,6 @@ FINEST_TABLES = 4 * WORKING_WIDTH, MANY_DIRECTIONS
 """Width (px) and number of directions of the tables on which the final hypotheses are compared."""
 HYPOTHESES_ON_FINEST = 40
 """Number of hypotheses on the finest tables, besides the symmetric poses of the first two."""
-SAME_PLACE_TURN = np.radians(20.0)
-"""Rotation within which two poses count as the same: symmetric poses differ by 60 degrees at
-least."""
 MACHINE_FOLDS = (2, 3, 4, 6)
 """Orders of rotational symmetry that are tried."""
 JOINT_ON_JOINT_DISTANCE = 0.2
@@ -154,9 +157,7 @@ def distinct(view: StationView, values: Array) -> Integers:
     """Indices of the poses (H, 4, 4), best first, that are not the same as a better one."""
     retained_rows = np.array(distinct_silhouettes(view, values, np.zeros(1, dtype=int)))
     # poses near the first are the same pose, refined less well
-    return retained_rows[
-        (angle_between(values[retained_rows], values[0]) >= SAME_PLACE_TURN) | (retained_rows == 0)
-    ]
+    return retained_rows[~same_pose(values[retained_rows], values[0]) | (retained_rows == 0)]
 
 
 def finest_view(

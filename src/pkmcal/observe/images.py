@@ -1,155 +1,158 @@
-"""Photographs from disk to grey-level arrays; files that are not what they should be are named.
+"""Images from disk as grey levels, decoded by Pillow; broken files are named with their fault.
 
-Six thousand photographs do not fit into memory, and an ordinary session's should not be decoded at
-every look: so the first that fit into CACHED_IMAGE_BYTES bytes are kept, and the others decoded
-when they are looked at and forgotten again. What looks at many does so in windows
+Pillow and not OpenCV decodes: the levels are the same, but the decoders behind OpenCV report
+faults on standard error instead of to their caller, and OpenCV reads no HEIF.
+
+Six thousand images do not fit into memory, and an ordinary session's should not be decoded in each
+measurement pass. So the first that fit into CACHED_IMAGE_BYTES bytes are kept, and the others are
+decoded each time they are needed. Code that needs many works in windows
 (`pkmcal.observe.image_batches`).
 """
 
 from __future__ import annotations
 
-import zlib
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from pkmcal.arrays import THREADS, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import MOST_PIXELS, check_count, check_regular, read_exif, stated_size
-from pkmcal.observe.codec_stderr import decoded_and_fault
+from pkmcal.files import IMAGE_ERRORS, check_regular, open_image, read_exif, sensor_size
+
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile
 
 CACHED_IMAGE_BYTES = 128 * 2**20
-"""Bytes of decoded photographs that are kept: 160 of 1024x768, 10 of a telephone's."""
-PNG_START = 8
-"""Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
+"""Bytes of decoded images that are kept: 160 of 1024x768, 10 of a telephone's."""
 CAMERA_BIT_DEPTHS, UNSHIFTED_GREY_LEVEL = (8, 10, 12), 15
-"""Bits that cameras measure and programs put into 16 without shifting them up, and the highest of
+"""Bit depths of cameras whose levels programs store in 16 bits without a shift, and the highest of
 256 grey levels that is left of them then."""
-JPEG_END = b"\xff\xd9"
+JPEG_MARKER = re.compile(rb"\xff+[\x01-\xfe]")
+"""A marker in a JPEG file's image data: behind a byte 255 of the data themselves stands 0."""
+MISSING_LEVEL = 128
+"""Grey level of the blocks that a sequential JPEG file's data do not reach."""
+MORE_SCAN_DATA = bytes(range(1, 255))
+"""Bytes that a JPEG decoder takes for more of an unfinished scan."""
 
 
 def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
-    """One photograph as grey levels (height, width), uint8.
+    """Grey levels (height, width), uint8, of one image file, as the sensor has them.
 
-    image_size : (width, height) that the camera file states. A photograph with the two exchanged
-    was turned by a quarter after it was taken, or its camera was calibrated from turned ones: it is
-    turned as EXIF asks viewers to, and where EXIF says nothing, as telephones that are held upright
-    are: landscape clockwise, portrait the other way.
+    image_size : (width, height) that the camera file states. An image with the two exchanged was
+    turned by a quarter after it was taken, or its camera was calibrated from turned images: it is
+    turned as EXIF asks viewers to, and without EXIF as a telephone's that is held upright:
+    landscape clockwise, portrait the other way.
     Raises InputError for a file that is absent, cut short, no image, or of another size.
     """
-    import cv2
-
     try:
         check_regular(path, label)
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=label) from None
-    if data[:4] == b"\x89PNG":
-        _check_png(data, label)
-    if data[:2] == b"\xff\xd8" and not _jpeg_reaches_its_end(data):
-        raise _broken(label, "a JPEG file that ends early")
-    # before decoding, which takes the memory that the header asks for
-    size = stated_size(BytesIO(data))
-    if min(size) == 0:
-        raise _broken(label, "no readable image")
-    check_count(size[0] * size[1], MOST_PIXELS, "pixels", label)
+    image = open_image(BytesIO(data), label)
+    size = sensor_size(image)  # before decoding, which takes memory for the header's size
     if tuple(image_size) not in (size, size[::-1]):
-        raise _other_size(label, size, image_size)
-    # a turned picture would no longer be its camera's: flags that ask for turning are ignored where
-    # the size is the camera's
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    image: Any = None
-    fault = ""
-    with suppress(cv2.error):  # a size beyond what OpenCV takes on: a spoilt header
-        image, fault = decoded_and_fault(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags))
-    if fault:
-        kind = "PNG" if data[:4] == b"\x89PNG" else "JPEG"
-        raise _broken(label, f"a {kind} file that is damaged ({fault})")
-    if image is None:
-        raise _broken(label, "no readable image")
-    if image.max() <= UNSHIFTED_GREY_LEVEL:
-        _check_depth(data, label)
-    if image.shape == tuple(image_size) and image_size[0] != image_size[1]:
-        clockwise = {6: True, 8: False}.get(read_exif(data).orientation)
-        if clockwise is None:
-            clockwise = image.shape[1] > image.shape[0]
-        direction = cv2.ROTATE_90_CLOCKWISE if clockwise else cv2.ROTATE_90_COUNTERCLOCKWISE
-        return np.ascontiguousarray(cv2.rotate(image, direction), np.uint8)
-    if (image.shape[1], image.shape[0]) != tuple(image_size):
-        raise _other_size(label, (image.shape[1], image.shape[0]), image_size)
-    return image.astype(np.uint8, copy=False)  # as it was decoded
+        raise InputError(
+            "the photograph has another size than its camera",
+            where=label,
+            found=f"{size[0]}x{size[1]} pixels",
+            expected=f"{image_size[0]}x{image_size[1]}, the camera file's image_size",
+            next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
+        )
+    exif = read_exif(image) if size != tuple(image_size) else None
+    grey = _checked_grey(data, image, label)
+    if exif is None:
+        return grey
+    clockwise = {6: True, 8: False}.get(exif.orientation, size[0] > size[1])
+    return np.ascontiguousarray(np.rot90(grey, -1 if clockwise else 1))
 
 
-def _check_depth(data: bytes, label: str) -> None:
-    """Raise `InputError` for a 16-bit file whose levels fill its lowest bits alone: of the 8 bits
-    that all else works on, next to nothing is left.
+def _checked_grey(data: bytes, image: ImageFile, label: str) -> Integers:
+    """Grey levels of an opened file. Raises InputError where any of its image data is damaged."""
+    kind = image.format
+    try:
+        if kind == "PNG":
+            image.verify()  # the checksums of its chunks, which decoding does not read
+            image = open_image(BytesIO(data), label)
+        sixteen_bits = ";16" in str(image.tile[:1])  # Pillow's raw modes I;16B, RGB;16N, ...
+        grey = _grey(image)
+        whole = kind != "JPEG" or _scan_is_whole(data, grey, label)
+    except IMAGE_ERRORS as error:
+        early = "truncated" in str(error).lower()
+        fault = "ends early" if early else f"is damaged ({error})"
+        raise _undecodable(label, f"a {kind} file that {fault}") from None
+    if not whole:
+        raise _undecodable(label, "a JPEG file that is damaged (its scan ends early)")
+    if sixteen_bits and grey.max() <= UNSHIFTED_GREY_LEVEL:
+        raise _too_dark(label, (int(grey.max()) << 8) + 255)
+    return grey
+
+
+def _grey(image: ImageFile) -> Integers:
+    """Grey levels (height, width), uint8, of an opened file, as the sensor has them."""
+    from PIL import Image
+
+    image.draft("L", None)  # a JPEG file's luminance as it is stored
+    image.info.pop("transparency", None)
+    if image.mode.startswith("I"):
+        levels = np.asarray(image)
+        if levels.min() < 0 or levels.max() >= 2**16:
+            raise ValueError("levels of more than 16 bits")
+        return (levels >> 8).astype(np.uint8)
+    if image.mode == "F":
+        raise ValueError("levels that are no whole numbers")
+    grey = image if image.mode == "L" else image.convert("L")
+    turn = {
+        3: Image.Transpose.ROTATE_180,
+        6: Image.Transpose.ROTATE_90,
+        8: Image.Transpose.ROTATE_270,
+    }.get(image.info.get("original_orientation", 1))
+    return np.asarray(grey if turn is None else grey.transpose(turn))
+
+
+def _scan_is_whole(data: bytes, grey: Integers, label: str) -> bool:
+    """Whether a JPEG file's image data reach its last pixel.
+
+    At the next marker decoders fill what is missing, and do not report it. Bytes put before the
+    marker are skipped where the data are complete, and decoded to pixels where they are not.
     """
-    import cv2
+    stream = BytesIO(data)
+    image = open_image(stream, label)  # which stops behind the header of the first scan
+    if grey[-1, -1] != MISSING_LEVEL and "progressive" not in image.info:
+        return True
+    start = stream.tell()
+    longer = data[:start] + JPEG_MARKER.sub(lambda mark: MORE_SCAN_DATA + mark[0], data[start:])
+    return np.array_equal(_grey(open_image(BytesIO(longer), label)), grey)
 
-    raw: Any = cv2.imdecode(
-        np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE
+
+def _undecodable(label: str, found: str) -> InputError:
+    return InputError(
+        "the photograph cannot be decoded",
+        where=label,
+        found=found,
+        expected="a whole PNG or JPEG file",
+        next_step="Copy it again from the camera, or remove it: an absent photograph is allowed",
     )
-    if raw.dtype != np.uint16:
-        return
-    highest = int(raw.max())
+
+
+def _too_dark(label: str, highest: int) -> InputError:
+    """The error about a 16-bit file whose levels fill only its lowest bits: of the 8 bits that
+    pkmcal works with, next to nothing is left.
+    """
     bits = next(bits for bits in CAMERA_BIT_DEPTHS if highest < 2**bits)
-    raise InputError(
+    return InputError(
         f"the photograph is nearly black: a 16-bit file whose grey levels fill {bits} bits",
         where=label,
         found=f"levels up to {highest}",
         expected="levels up to 65535, or an 8-bit file",
         next_step=f"If the camera measures {bits} bits, multiply by {2 ** (16 - bits)} when they"
         " are saved, or save 8 bits; if this photograph alone is dark, remove it",
-    )
-
-
-def _check_png(data: bytes, label: str) -> None:
-    """Raise `InputError` where a PNG file is cut short, or a byte of it is not what it was."""
-    at, whole = PNG_START, memoryview(data)
-    while (end := at + 12 + int.from_bytes(data[at : at + 4])) <= len(data):
-        if zlib.crc32(whole[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
-            raise _broken(label, "a PNG file that is damaged")
-        if data[at + 4 : at + 8] == b"IEND":
-            return
-        at = end
-    raise _broken(label, "a PNG file that ends early")
-
-
-def _other_size(label: str, value: tuple[int, int], image_size: tuple[int, int]) -> InputError:
-    return InputError(
-        "the photograph has another size than its camera",
-        where=label,
-        found=f"{value[0]}x{value[1]} pixels",
-        expected=f"{image_size[0]}x{image_size[1]}, the camera file's image_size",
-        next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
-    )
-
-
-def _jpeg_reaches_its_end(data: bytes) -> bool:
-    """Whether the end mark follows the picture's data: cameras put a preview, which has one too,
-    before it, and phones append what they like behind.
-    """
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:  # segments up to the start of the scan
-        if data[at + 1] == 0xDA:
-            return JPEG_END in data[at:]
-        at += 1 if data[at + 1] == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4])
-    return at + 4 <= len(data)  # no JPEG as we know it: the decoder judges
-
-
-def _broken(label: str, text: str) -> InputError:
-    return InputError(
-        "the photograph cannot be decoded",
-        where=label,
-        found=text,
-        expected="a whole PNG or JPEG file",
-        next_step="Copy it again from the camera, or remove it: an absent photograph is allowed",
     )
 
 

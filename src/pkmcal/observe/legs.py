@@ -23,6 +23,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras.contract import PIXEL_PARAMETERS
 from pkmcal.cameras.response import light_of_levels
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
@@ -309,7 +310,7 @@ class StationEdges:
         if count == 1:
             return self
         by_intrinsics = self.edges.by_intrinsics.copy()
-        by_intrinsics[..., :4] /= count  # as in `Camera.binned`
+        by_intrinsics[..., PIXEL_PARAMETERS] /= count  # as in `Camera.binned`
         edges = replace(self.edges, by_intrinsics=by_intrinsics)
         return replace(self, edges=edges, points=(self.points + 0.5) * count - 0.5)
 

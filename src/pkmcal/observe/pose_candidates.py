@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers, evenly
+from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import dot, pose, rotation
+from pkmcal.geometry.rigid import angle_between, dot, pose, rotation
 from pkmcal.observe.distance_tables import (
     EDGE_DIRECTIONS,
     DistanceTables,
@@ -59,6 +59,14 @@ CHORD_ENDS_ALONG_LEG = np.array([0.05, 0.35, 0.65, 0.95])
 """Ends of the chords along the visible part of a leg, as shares of its length."""
 LONGEST_CHORD = CHART_HALF_WIDTHS * CHART_HALF_CELLS
 """Largest weight of a chord, in cells: close to the camera, a leg fills the sphere."""
+SAME_POSE_TURN = np.radians(20.0)
+"""Turn within which two pose candidates are one: those of a machine of equal parts are turned by 60
+degrees at least."""
+
+
+def same_pose(one: Array, other: Array) -> Booleans:
+    """Whether pose candidates (..., 4, 4) are the same pose, more or less well refined; (...)."""
+    return angle_between(one, other) < SAME_POSE_TURN
 
 
 class AngularExtent(NamedTuple):

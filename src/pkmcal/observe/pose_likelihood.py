@@ -32,9 +32,8 @@ from pkmcal.observe.predict import (
     tubes_of,
     visible_stretch,
 )
+from pkmcal.solver.marquardt import Damping
 
-FIRST_DAMPING = 1e-3
-"""Initial Levenberg-Marquardt damping, relative to the diagonal of the normal equations."""
 DISTANCE_OUTSIDE_IMAGE = 1e4
 """Distance, in reduced pixels, of points outside the image."""
 LEAST_LOG_LIKELIHOOD_GAIN = 0.1
@@ -323,14 +322,14 @@ def refine_lm(
     Vertical legs hardly determine the camera's position along them; undamped steps diverge there.
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
-    damping = np.full(len(candidates), FIRST_DAMPING)
+    damping = Damping.first(len(candidates))
     for reach in reaches:
         trial = _step(candidates, linearization, linearization.weight(reach), damping)
         in_view = linearize_distances(view, trial, photographs, samples)
         better = in_view.cost(reach) < linearization.cost(reach)
         candidates = np.where(better[:, None, None], trial, candidates)
         linearization = in_view.where(better, linearization)
-        damping = np.where(better, 0.3, 10.0) * damping
+        damping = damping.after(better)
     return candidates
 
 
@@ -348,7 +347,7 @@ def refine_ml(
     estimated in alternation.
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
-    damping = np.full(len(candidates), FIRST_DAMPING)
+    damping = Damping.first(len(candidates))
     mixture = first_mixture(len(candidates))
     last = float("inf")
     for _ in range(steps):
@@ -367,7 +366,7 @@ def refine_ml(
         better = gain > 0
         candidates = np.where(better[:, None, None], trial, candidates)
         linearization = in_view.where(better, linearization)
-        damping = np.where(better, 0.3, 10.0) * damping
+        damping = damping.after(better)
         most = float(gain.max())
         if max(last, most) < LEAST_LOG_LIKELIHOOD_GAIN:
             break  # a single step may have been too long
@@ -541,8 +540,10 @@ def _stacked(vectors: tuple[Array, ...], visible: Booleans) -> Array:
     return out
 
 
-def _step(candidates: Array, station_edges: _Linearization, weight: Array, damping: Array) -> Array:
-    """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4).
+def _step(
+    candidates: Array, station_edges: _Linearization, weight: Array, damping: Damping
+) -> Array:
+    """One Levenberg-Marquardt step of every candidate's pose, (H, 4, 4).
 
     With t = 0..1 along an edge, its outward motion by the camera's (omega, tau) is
 
@@ -551,7 +552,6 @@ def _step(candidates: Array, station_edges: _Linearization, weight: Array, dampi
     so the normal equations need only the sums over t^0, t and t^2 of the weighted squares.
 
     weight : (H, E, n) of the points.
-    damping : (H,).
     """
     # points are evenly spaced from the first to the last of an edge
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
@@ -568,11 +568,7 @@ def _step(candidates: Array, station_edges: _Linearization, weight: Array, dampi
     normal[:, :3, :3] += (grows * two) @ grows.mT
     right = begins @ here[..., None]
     right[:, :3] += grows @ there[..., None]
-    normal, right = normal.astype(float), right.astype(float)
-    # damped solution
-    diagonal = np.einsum("hii->hi", normal) + 1e-12
-    normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
-    step = -np.linalg.solve(normal, right)[..., 0]
+    step = -damping.step(normal.astype(float), right[..., 0].astype(float))
     step = np.clip(step, -0.1, 0.1)  # the tables' slopes are valid nearby only
     # rotation about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
     return pose(rotation(step[:, :3]), step[:, 3:]) @ candidates

@@ -25,6 +25,7 @@ from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import EdgePoints, TubeList
+from pkmcal.solver.kernels import cauchy_weights
 
 PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE = 3.0, 3.0
 """Pixels of a profile, inside and outside, that the model explains: with fewer the fit is
@@ -490,7 +491,7 @@ def fit_edges(
     weight = sure
     inverse, turn, off2 = fitted(weight)
     for _ in range(rounds):
-        weight = sure / (1 + off2 / 4.0)  # Cauchy, scale two sigmas
+        weight = sure * cauchy_weights(off2)
         inverse, turn, off2 = fitted(weight)
     shape = valid.shape[:-1]
     off2, weight = (v.T.reshape(valid.shape) for v in (off2, weight))

@@ -14,8 +14,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import angle_between
 from pkmcal.observe.distance_tables import DistanceTables
+from pkmcal.observe.pose_candidates import same_pose
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
 
 PLACES_ALONG_TUBE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
@@ -23,8 +23,6 @@ PLACES_ALONG_TUBE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
 MOSTLY_CHANGED_SHARE = 0.5
 """Share of these, over all images, above which a pose lies on pixels that became darker, or
 brighter."""
-SHADOW_TURN = np.radians(20.0)
-"""Largest rotation between a pose and its shadow's, whose planes are nearly parallel."""
 
 
 def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: DistanceTables) -> Array:
@@ -43,8 +41,10 @@ def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: Dista
 
 
 def without_shadows(places: Array, light: Array) -> Integers:
-    """Indices of the poses (H, 4, 4) that are not the shadow of another one; light : (H,),
-    `lightness`.
+    """Indices of the pose candidates (H, 4, 4) that are not another one's shadow.
+
+    light : (H,) as `lightness` returns. A shadow's candidate is turned little against the
+    machine's, for the two planes are nearly parallel.
     """
-    casts = (light > MOSTLY_CHANGED_SHARE) & (angle_between(places[:, None], places) < SHADOW_TURN)
+    casts = (light > MOSTLY_CHANGED_SHARE) & same_pose(places[:, None], places)
     return np.flatnonzero((light > -MOSTLY_CHANGED_SHARE) | ~casts.any(axis=1))

@@ -37,6 +37,7 @@ from pkmcal.measurements import Measurements
 from pkmcal.measurements.poses import PoseBlocks, PoseData, pose_rows
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.elimination import Linear
+from pkmcal.solver.kernels import cauchy_weights
 from pkmcal.solver.search import Values, minimise, take
 
 DRAWN_POSE_TURN_SIGMA = 0.03
@@ -144,9 +145,8 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     for _ in range(HAND_EYE_ROUNDS):
         every = minimise(problem, every).state
         apart = np.linalg.norm(problem.differences(every), axis=-1)
-        # Cauchy weights relative to the median error
         usual = np.maximum(np.median(apart, axis=1, keepdims=True), 1e-9)
-        problem = replace(problem, weight=1 / (1 + (apart / (2.4 * usual)) ** 2))
+        problem = replace(problem, weight=cauchy_weights((apart / usual) ** 2))
     # start with the smallest median error, for each run
     best = np.argmin(np.median(apart, axis=1).reshape(n, runs), axis=0)
     chosen = best * runs + np.arange(runs)

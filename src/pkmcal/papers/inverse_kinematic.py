@@ -36,6 +36,7 @@ from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.measured_platform import MeasuredPlatform, Taken, measured_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
 from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
+from pkmcal.solver.ranks import numerical_rank
 from pkmcal.solver.search import Solution, Stop, Values, minimise, of_runs, take
 
 PoseFitForm = Literal["joint", "implicit"]
@@ -47,9 +48,6 @@ WHITENING_ROUNDS = 2
 MOST_POSE_FIT_STEPS = 100
 PLACEMENT_PRIOR_SIGMA = 0.1
 """Prior sigma of stations and mounts, in rad and m, far larger than a nominal model's."""
-POSE_FIT_RANK_TOLERANCE = 1e-8
-"""Singular values of the scaled Jacobian, relative to the largest, below which they are zero: with
-exact derivatives at data without noise, rounding leaves 1e-12."""
 
 
 # ------------------------------------------------------------------ the rows
@@ -446,7 +444,7 @@ def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
     extreme = np.abs(jac).max(axis=0)
     extreme = np.where(extreme > 0, extreme, 1.0)
     s, vt = np.linalg.svd(jac / extreme)[1:]
-    rank = int(np.sum(s > POSE_FIT_RANK_TOLERANCE * s[0]))
+    rank = numerical_rank(s)
     return rank, vt[rank:] / (extreme * sizes)
 
 

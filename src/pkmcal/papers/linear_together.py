@@ -40,7 +40,7 @@ from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import linear
-from pkmcal.solver.search import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
+from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
 
 MOST_GAUSS_NEWTON_STEPS, MOST_VARIANCE_ROUNDS = 30, 30
 """Maximum number of Gauss-Newton steps with given variances, and of updates of the variances."""

@@ -28,7 +28,7 @@ from pkmcal.papers.four_step_base import with_boards
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.inverse_kinematic import inverse_kinematic
 from pkmcal.papers.linear_together import base_together
-from pkmcal.solver.search import NO_WEIGHT_DISTANCE
+from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE
 
 Repeated = Literal["four-step", "inverse-kinematic"]
 SIGMA_REPETITIONS = 60

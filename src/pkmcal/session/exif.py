@@ -11,16 +11,13 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.errors import InputError
-from pkmcal.files import read_exif
+from pkmcal.files import open_image, read_exif
 from pkmcal.session.image_files import image_header
 
 EXIF_CAMERA_WORD = "exif"
 """Word in session.yaml in place of a camera's file."""
 FILM_DIAGONAL = hypot(36.0, 24.0)
 """Diagonal (mm) of the 35 mm film to which the EXIF focal length refers."""
-EXIF_HEAD_BYTES = 1 << 17
-"""Bytes at the beginning of a file that contain its EXIF data, of which a segment has at most 64
-kB."""
 FOCAL_SIGMA = 0.03
 """Prior sigma of the EXIF focal length, relative. It is a whole number, 2 % of a telephone's 26 mm,
 and some makers refer to the width of the film instead of its diagonal, a difference of 4 % for 4:3
@@ -46,7 +43,7 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
     for path, label in images:
         width, height = image_header(path, label)
         with path.open("rb") as stream:
-            focal = read_exif(stream.read(EXIF_HEAD_BYTES)).focal_35mm
+            focal = read_exif(open_image(stream, label)).focal_35mm
         if focal is None:
             raise InputError(
                 "the photograph does not tell the focal length it was taken with",

@@ -14,12 +14,12 @@ from pkmcal.errors import InputError
 from pkmcal.files import (
     IMAGE_FILE_ENDINGS,
     MOST_IMAGES,
-    MOST_PIXELS,
     check_count,
     check_regular,
     closest,
+    open_image,
     quoted,
-    stated_size,
+    sensor_size,
 )
 from pkmcal.wording import listed
 
@@ -93,31 +93,19 @@ def find_images(
 
 
 def image_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
-    """Size (width, height) in pixels of an image as stored, before any EXIF rotation.
+    """(width, height) in pixels of an image file, as the sensor has it, before EXIF's orientation.
 
-    Reads only the header of PNG, JPEG, TIFF, BMP and PGM files.
-    label : the file's name in messages, by default the path.
-    Raises InputError if the path is no regular file or no image, or if the stated size exceeds the
-    file's data.
+    label : the file's name in messages; the path by default.
+    Raises InputError for what is no file, no image, or has a size that its bytes cannot fill.
     """
     path = Path(path)
     label = label or str(path)
     try:
         check_regular(path, label)
         with path.open("rb") as stream:
-            size = stated_size(stream)
-        empty = path.stat().st_size == 0
+            return sensor_size(open_image(stream, label))
     except OSError as error:
         raise InputError(f"the image cannot be read ({error.strerror})", where=label) from None
-    if min(size) > 0:
-        check_count(size[0] * size[1], MOST_PIXELS, "pixels", label)
-        return size
-    raise InputError(
-        "the image file is empty" if empty else "the file is not an image that can be read",
-        where=label,
-        expected="a PNG or JPEG file",
-        next_step="Copy it from the camera again, or remove it",
-    )
 
 
 def label_of(folder: Path, path: Path) -> str:

@@ -41,7 +41,7 @@ from pkmcal.files import (
     wanted_file,
     written_unit,
 )
-from pkmcal.geometry.rigid import pose
+from pkmcal.geometry.rigid import look_at
 from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.measurements.heights import Heights
@@ -56,7 +56,6 @@ from pkmcal.session.schema import (
     BoardBody,
     SessionDocument,
     StationDocument,
-    Vector,
     session_schema,
 )
 from pkmcal.wording import count, listed
@@ -65,10 +64,6 @@ SESSION_FILE_NAME = "session.yaml"
 SESSION_FILE_VERSION = 1
 SHORTEST_PATH = 3
 """Fewest configurations of a straight path; two points are always on a line."""
-# Least distance between position and look_at; below it both are the same point.
-_NEAREST = 1e-6  # m
-# Least angle between view and up; below it, an up of a few digits does not determine the roll.
-_LEAST_ANGLE = np.deg2rad(1.0)
 
 
 @dataclass(frozen=True)
@@ -341,38 +336,6 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     )
 
 
-def look_at_pose(position: Vector, look_at: Vector, up: Vector) -> Array:
-    """Pose T_camera_base (4, 4) of a camera at `position` with `look_at` in the middle of its
-    image.
-
-    Base coordinates, m. Camera axes: z forward, x right, y down. `up` points to the image's upper
-    edge and need not be orthogonal to the view.
-    Raises InputError if the three vectors do not determine a pose.
-    """
-    eye, target, above = (np.asarray(v, dtype=float) for v in (position, look_at, up))
-    forward = target - eye
-    if np.linalg.norm(forward) < _NEAREST:
-        raise InputError(
-            "the camera looks at its own position",
-            found=f"look_at {list(look_at)}",
-            expected="a point in the middle of the image, away from position",
-        )
-    # Normalise first: the angle below is between directions.
-    forward = forward / np.linalg.norm(forward)
-    above = above / max(float(np.abs(above).max()), np.finfo(float).tiny)
-    right = np.cross(forward, above)
-    angle = np.arctan2(np.linalg.norm(right), abs(float(forward @ above)))
-    if angle < _LEAST_ANGLE:
-        raise InputError(
-            "up does not fix how the camera is turned about its view",
-            found=f"up {list(up)}, {np.rad2deg(angle):.2g} degrees from the line of sight",
-            expected="a direction across the view, towards the image's upper edge",
-        )
-    right = right / np.linalg.norm(right)
-    R_camera_base = np.stack([right, np.cross(forward, right), forward])
-    return pose(R_camera_base, -R_camera_base @ eye)
-
-
 def _session_document(folder: Path) -> tuple[Path, Document]:
     """Folder and session.yaml of a session, its format version checked before its content."""
     if folder.name == SESSION_FILE_NAME and folder.is_file():
@@ -581,7 +544,7 @@ def _stations(
                 next_step="Write it with its unit, such as 1250 mm, or divide by 1000",
             )
         try:
-            T_camera_base = look_at_pose(**station.pose.model_dump())
+            T_camera_base = look_at(station.pose.position, station.pose.look_at, station.pose.up)
         except InputError as error:
             raise error.located(document.where(*keys, "pose")) from None
     whole = Station(

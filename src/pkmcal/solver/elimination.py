@@ -1,9 +1,8 @@
-"""The own unknowns of each configuration eliminated.
+"""Elimination of the own unknowns (nuisance parameters) of each configuration.
 
-The Schur complement of rows that depend on everything is formed as a square root: with
-``by_own = Q R`` the reduced rows are ``(I - Q Q^T) by_shared``. Subtracting normal matrices instead
-would cancel half the digits, since readings a thousand times sharper than edges dominate both
-terms.
+The Schur complement is formed as a square root: with ``by_own = Q R`` the reduced rows are
+``(I - Q Q^T) by_shared``. The difference of normal matrices would cancel half the digits, because
+readings a thousand times sharper than edges dominate both terms.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 
 SOLVER_ROWS_AT_ONCE = 2**15
-"""Rows that are worked on at once: as many runs, or configurations of one, as have so many. A call
-of NumPy then costs little beside its arithmetic, and what it works on stays in the processor."""
+"""Rows in one call of NumPy, of several runs or of several configurations of one run: so many that
+the call costs little beside its arithmetic, and so few that they stay in the processor's cache."""
 TALL_BLOCK_ROWS = 512
-"""Rows of a block that is condensed by itself, where there are many: of fewer unknowns it takes a
-third of the time."""
+"""Rows of a block that is condensed by itself where there are many rows; with fewer unknowns than
+rows this takes a third of the time."""
 
 
 class Linear(NamedTuple):
@@ -41,8 +40,8 @@ class Linear(NamedTuple):
 class Reduced(NamedTuple):
     """The problem after elimination of the own unknowns.
 
-    rows : (B, K, r, na) reduced Jacobian. value : (B, K, r) what of the residuals the own unknowns
-    cannot take up. q, r : QR factors of the own Jacobian.
+    rows : (B, K, r, na) reduced Jacobian. value : (B, K, r) residuals projected off the own
+    Jacobian. q, r : QR factors of the own Jacobian.
     """
 
     rows: Array
@@ -52,7 +51,7 @@ class Reduced(NamedTuple):
 
 
 def eliminate(linear: Linear) -> Reduced:
-    """Own unknowns eliminated."""
+    """Eliminate the own unknowns of all configurations."""
     q, r = np.linalg.qr(linear.by_own)
     none = ~linear.by_own.any(axis=(-2, -1), keepdims=True)
     if none.any():  # nothing to eliminate; the factors of zeros are any orthonormal columns
@@ -68,8 +67,9 @@ def flat(rows: Array) -> Array:
 
 
 def rows_on_shared(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
-    """All rows on the shared unknowns, the own ones eliminated: Jacobian (B, n, na)
-    and residuals (B, n). The configurations' rows come first, those on shared unknowns only last.
+    """Jacobian (B, n, na) and residuals (B, n) on the shared unknowns after the elimination.
+
+    The configurations' rows come first, those on shared unknowns only last.
     """
     n_runs = len(reduced.rows)
     shared = np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape))
@@ -79,8 +79,9 @@ def rows_on_shared(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
 
 
 def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
-    """Rows (B, n, m) and residuals (B, n) as m + 1 with the same normal matrix, gradient and sum of
-    squares: the triangle of their QR decomposition.
+    """Condense rows (B, n, m) and residuals (B, n) to m + 1 rows by their QR decomposition.
+
+    Normal matrix, gradient and sum of squares stay the same.
     """
     both = np.concatenate([rows, value[..., None]], axis=-1)
     n_runs, n, m = both.shape
@@ -96,8 +97,6 @@ def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
 
 
 def divisions(count: int, rows: int) -> list[slice]:
-    """Configurations, of so many rows each, that are worked on together; see
-    SOLVER_ROWS_AT_ONCE.
-    """
+    """Slices of ``count`` items of ``rows`` rows each, of SOLVER_ROWS_AT_ONCE rows together."""
     each = max(1, SOLVER_ROWS_AT_ONCE // max(1, rows))
     return [slice(first, min(first + each, count)) for first in range(0, count, each)]

@@ -1,5 +1,5 @@
-"""Ranks and inverses of matrices whose columns are scaled to length one first: unknowns in metres,
-radians and pixels are not to be compared otherwise.
+"""Numerical ranks and inverses of matrices whose columns are first scaled to length one, so that
+unknowns in metres, radians and pixels can be compared.
 """
 
 from __future__ import annotations
@@ -9,27 +9,37 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 
 SINGULAR_VALUE_FLOOR = 1e-150
-"""Of a singular value or an eigenvalue; where all are zero nothing is known, and that is finite."""
+"""Least singular value or eigenvalue in a division: variances stay finite where all are zero."""
 DOUBLE_EPSILON = float(np.finfo(float).eps)
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
 there with exact derivatives, and real directions are many orders above."""
 NORMAL_RANK_TOLERANCE = 1e-13
-"""Same, for eigenvalues of the scaled normal matrix, which hold half of the digits."""
+"""The same for eigenvalues of the scaled normal matrix, which hold half of the digits."""
+
+
+def nonzero(values: Array, tolerance: float = RANK_TOLERANCE) -> Booleans:
+    """Which singular values or eigenvalues (..., m) are above ``tolerance`` of the largest."""
+    return values > tolerance * values.max(axis=-1, keepdims=True, initial=0.0)
+
+
+def numerical_rank(values: Array, tolerance: float = RANK_TOLERANCE) -> int:
+    """Number of singular values or eigenvalues (m,) above ``tolerance`` of the largest."""
+    return int(np.count_nonzero(nonzero(values, tolerance)))
 
 
 def column_space(columns: Array) -> Array:
-    """An orthonormal basis (n, k) of what columns (n, m) can make together."""
+    """Orthonormal basis (n, k) of the space that columns (n, m) span."""
     norm = np.linalg.norm(columns, axis=0)
     u, s, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
-    return u[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
+    return u[:, nonzero(s)]
 
 
 def scaled_directions(rows: Array) -> tuple[Array, Array, Array]:
-    """How well rows (..., n, m) know each direction of their unknowns, columns made of length one.
+    """Singular value decomposition of rows (..., n, m) with their columns scaled to length one.
 
-    Singular values s (..., m), right vectors vt (..., m, m), and the columns' lengths scale
-    (..., m), 1 for those that are zero.
+    Returns the singular values s (..., m), the right singular vectors vt (..., m, m), and the
+    columns' lengths (..., m), 1 for columns that are zero.
     """
     scale = np.sqrt(np.sum(rows**2, axis=-2))
     scale = np.where(scale > 0, scale, 1.0)
@@ -39,10 +49,10 @@ def scaled_directions(rows: Array) -> tuple[Array, Array, Array]:
 
 
 def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
-    """F (..., m, m) with ``F F^T = (rows^T rows)^-1``, columns of rows (..., n, m) scaled.
+    """Factor F (..., m, m) with ``F F^T = (rows^T rows)^-1``, columns of rows (..., n, m) scaled.
 
-    Directions below ``least`` of the largest singular value are not known. loose : they get a huge
-    variance; otherwise none, as in a pseudo-inverse.
+    Directions whose singular value is below ``least`` of the largest are not determined. loose :
+    whether they get a huge variance; otherwise they get none, as in a pseudo-inverse.
     """
     s, vt, scale = scaled_directions(rows)
     limit = least * s[..., :1]
@@ -51,13 +61,14 @@ def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
 
 
 def rank_of_normal(normal: Array) -> int:
-    """Number of directions that a normal matrix (m, m) knows."""
-    values = np.linalg.eigvalsh(unit_diagonal(normal)[0])
-    return int(np.sum(values > NORMAL_RANK_TOLERANCE * values.max(initial=0.0)))
+    """Number of directions that a normal matrix (m, m) determines."""
+    return numerical_rank(np.linalg.eigvalsh(unit_diagonal(normal)[0]), NORMAL_RANK_TOLERANCE)
 
 
 def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
-    """The same of a normal matrix (..., m, m), by its eigenvalues; they hold half of the digits."""
+    """:func:`inverse_root` of a normal matrix (..., m, m), by its eigenvalues, which hold half of
+    the digits.
+    """
     scaled, scale = unit_diagonal(normal)
     values, vectors = np.linalg.eigh(scaled)
     limit = least * values[..., -1:]
@@ -70,7 +81,7 @@ def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
 
 
 def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
-    """Inverses of normal matrices (B, m, m), unknowns scaled, and where they hold half of their
+    """Inverses of normal matrices (B, m, m), unknowns scaled, and whether they hold half of their
     digits or more, (B,).
     """
     scaled, scale = unit_diagonal(normal)
@@ -84,7 +95,7 @@ def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
 
 
 def _safe_inverse(values: Array, limit: Array) -> Array:
-    """1 / values where they are above the limit, else 0."""
+    """1 / values where the values are above the limit, else 0."""
     above_limit = values > limit
     return np.where(above_limit, 1 / np.where(above_limit, values, 1.0), 0.0)
 

@@ -1,10 +1,7 @@
-"""The search: damped steps of all runs at once, each of which stops on its own.
+"""Levenberg-Marquardt search of all runs at once, each with its own damping and stop.
 
 **States and data of many runs** are arrays, or frozen dataclasses or named tuples of arrays, whose
 leading axis counts the runs; see :func:`take`, :func:`put` and :func:`of_runs`.
-
-**Robust weights**, one for a search that lets go of what does not fit (:func:`soft_weights`), one
-for its end (:func:`final_weights`).
 """
 
 from __future__ import annotations
@@ -28,38 +25,33 @@ from pkmcal.solver.strips import (
 )
 
 LEAST_DAMPING = 1e-14
-"""Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
-step is the best, and any damping costs steps along what is known little of."""
+"""First damping, practically none: most starts are near the solution, where a full step is best,
+and damping costs steps along directions that are poorly determined."""
 DAMPING_GROWTH = 8.0
-"""Factor on it after a step that was refused, and that factor's after each more in a row: from
-nothing to a hundredth in five."""
+"""Factor on the damping after a refused step, and on this factor after each further one in a row:
+from LEAST_DAMPING to 0.01 in five steps."""
 STRONG_DAMPING = 1e-2
-"""Damping from which on a step is small anywhere, so that its size tells nothing."""
+"""Damping from which on every step is small, so that a small step is no sign of convergence."""
 MOST_DAMPING = 1e9
-"""Damping beyond which a step is below rounding: nothing downhill was found."""
+"""Damping beyond which steps are below rounding: no step downhill exists."""
 STEP_TOLERANCE = 1e-7
-"""A step that changes all fitted values together by less, in standard deviations, ends the
-search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
+"""A search ends with a step whose change of all fitted values together, in standard deviations, is
+smaller: a ten-millionth of the noise, and above the rounding of some 1e-9."""
 REFUSED_STEP_TOLERANCE = 1e-3
-"""The same of a step that the residuals refuse, though the linear model promises something: so
-little is their rounding, where a direction is a millionth as well known as the others."""
+"""The same for a step that raises the cost although the linear model predicts a decrease: the
+residuals' rounding is so large where a direction is a million times less determined than others."""
 COST_ROUNDING = 1e-13
-"""Of the cost, relative."""
+"""Relative rounding error of the cost."""
 CACHED_PROBLEM_PARTS = 16
-"""Parts of a problem of which is kept what their residuals took, so that the next step goes on from
-it: some 5 MB each. Of those of a larger problem it is found again, so that memory does not grow."""
-
-FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE = 4.0, 6.5
-"""Final weights are 1 up to FULL_WEIGHT_DISTANCE and 0 from NO_WEIGHT_DISTANCE standard deviations:
-of clean pairs of residuals 3 in 10^4 lose part of their weight and none all of it, so efficiency is
-above 0.999."""
+"""Parts of a problem whose intermediate results of the residuals, some 5 MB each, are kept for the
+Jacobian. Parts beyond are computed again, so that memory does not grow with the problem."""
 
 Runs = TypeVar("Runs")
 """An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""
 
 
 class Stop(Enum):
-    """Why a search ended; the text is what the user reads."""
+    """Reason why a search ended; the text is the user's message."""
 
     CONVERGED = "converged"
     STALLED = (
@@ -74,7 +66,7 @@ class Stop(Enum):
 class Values(NamedTuple):
     """Residuals alone: value (B, K, r) with NaN where nothing can be predicted, shared (B, c).
 
-    rows : gives the Jacobian there, where it costs less to go on from what these took.
+    rows : the Jacobian there, where intermediate results of the residuals make it cheaper.
     """
 
     value: Array
@@ -83,7 +75,7 @@ class Values(NamedTuple):
 
 
 class LeastSquares(Protocol):
-    """What the solver needs of a problem; ``state`` is the problem's own, opaque here."""
+    """Interface of a problem; the solver does not look into ``state``."""
 
     def residuals(self, state: Any) -> Values:
         """Residuals at a state."""
@@ -94,40 +86,40 @@ class LeastSquares(Protocol):
         ...
 
     def retract(self, state: Any, shared: Array, own: Array) -> Any:
-        """The state moved by steps (B, na) and (B, K, d)."""
+        """Retract the state along steps (B, na) and (B, K, d)."""
         ...
 
     def select(self, runs: Integers) -> LeastSquares:
-        """The problem of some runs only."""
+        """The problem of some of the runs."""
         ...
 
 
 class Divisible(LeastSquares, Protocol):
-    """A problem of which some configurations can be looked at alone, so that the Jacobian of all
-    never stands in memory at once.
+    """A problem that can be linearized for some configurations at a time, so that the Jacobian of
+    all is never in memory at once.
     """
 
     def among(self, configurations: slice) -> Divisible:
-        """The problem of some configurations, with all that they share."""
+        """The problem of some configurations, with all shared unknowns."""
         ...
 
     def state_among(self, state: Any, configurations: slice) -> Any:
-        """What that problem needs of a state."""
+        """The part of a state that the problem of these configurations needs."""
         ...
 
     def compact(self, state: Any) -> Compact:
-        """As :meth:`linearize`."""
+        """Residuals and Jacobian with strips."""
         ...
 
     @property
     def extent(self) -> tuple[int, int]:
-        """Configurations K and rows of each, r."""
+        """Number of configurations K, and of rows of each, r."""
         ...
 
 
 def _is_divisible(problem: LeastSquares) -> TypeGuard[Divisible]:
-    """Whether a problem is one: told by a method, since asking a protocol takes a tenth of the
-    millisecond that a small step does.
+    """Whether a problem is divisible, by one method: an isinstance check of the protocol takes a
+    tenth of the millisecond of a small step.
     """
     return hasattr(problem, "state_among")
 
@@ -149,12 +141,12 @@ def put(state: Runs, runs: Integers, part: Runs) -> Runs:
 
 
 def of_runs(data: Runs, runs: Integers) -> Runs:
-    """The measured numbers of some runs; what all runs share (a leading axis of 1) stays."""
+    """The data of some runs; arrays that all runs share (a leading axis of 1) stay."""
     return _each(lambda array: array if len(array) == 1 else array[runs], data)
 
 
 def _count(state: Any) -> int:
-    """Runs of a state."""
+    """Number of runs of a state."""
     if isinstance(state, np.ndarray):
         return len(state)
     first = state[0] if isinstance(state, tuple) else getattr(state, fields(state)[0].name)
@@ -162,7 +154,7 @@ def _count(state: Any) -> int:
 
 
 def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
-    """A function of the arrays of states, array by array."""
+    """Apply a function to the arrays of states, array by array."""
     if isinstance(first, np.ndarray):
         return cast(Runs, function(first, *others))
     states: tuple[Any, ...] = (first, *others)
@@ -176,9 +168,8 @@ def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
 class Solution:
     """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop.
 
-    cost : of a search whose last step needed no trial, as the linear model says.
-    normal : (B, na, na) the reduced normal matrix where the last step was made, which is at the end
-    but for that step.
+    cost : where the last step was taken without a trial, the linear model's. normal : (B, na, na)
+    reduced normal matrix at the state before the last step.
     """
 
     state: Any
@@ -194,9 +185,9 @@ def minimise(
     max_steps: int = 100,
     tolerance: float = STEP_TOLERANCE,
 ) -> Solution:
-    """Least squares from ``start``, all runs at once; each stops on its own.
+    """Minimize the sum of squares from ``start``, all runs at once; each stops on its own.
 
-    tolerance : in the place of STEP_TOLERANCE, where less will do.
+    tolerance : of the last step, instead of STEP_TOLERANCE.
     """
     values: list[Values] | None = None
     if _is_divisible(problem):
@@ -223,28 +214,26 @@ def minimise(
 
 
 class _Divided(NamedTuple):
-    """A problem with its parts of some configurations, small enough for the processor's cache."""
+    """A problem and its parts, of some configurations each, that fit into the processor's cache."""
 
     problem: LeastSquares
     parts: list[tuple[slice, LeastSquares]]
 
     @classmethod
     def of(cls, problem: LeastSquares, n_runs: int, count: int, rows: int) -> _Divided:
-        """A problem of so many runs and configurations of so many rows, divided where it can be."""
+        """Divide a problem of ``count`` configurations of ``rows`` rows, where it is divisible."""
         cuts = divisions(count, n_runs * rows)
         if not _is_divisible(problem) or len(cuts) < 2:
             return cls(problem, [(slice(0, count), problem)])
         return cls(problem, [(cut, problem.among(cut)) for cut in cuts])
 
     def select(self, runs: Integers) -> _Divided:
-        """The same of some runs."""
+        """The divided problem of some runs."""
         parts = [(cut, part.select(runs)) for cut, part in self.parts]
         return self._replace(problem=self.problem.select(runs), parts=parts)
 
     def rows(self, state: Any, values: list[Values] | None) -> Iterator[Compact]:
-        """Residuals and Jacobian of one part after the other; values : the residuals there, where
-        they are known.
-        """
+        """Residuals and Jacobian of one part after another; values : residuals there, if known."""
         for k, (cut, part) in enumerate(self.parts):
             reference_values = values[k].rows if values else None
             if reference_values:
@@ -255,7 +244,7 @@ class _Divided(NamedTuple):
                 yield compact(part.linearize(state))
 
     def residuals(self, state: Any) -> list[Values]:
-        """Residuals of each part; those of shared unknowns only in the first."""
+        """Residuals of each part; rows on shared unknowns only are in the first part."""
         results = [self.parts[0][1].residuals(self._state_among(state, 0))]
         for k in range(1, len(self.parts)):
             values = self.parts[k][1].residuals(self._state_among(state, k))
@@ -264,7 +253,7 @@ class _Divided(NamedTuple):
         return results
 
     def _state_among(self, state: Any, k: int) -> Any:
-        """What a part needs of a state."""
+        """The part of a state that part k of the problem needs."""
         cut, part = self.parts[k]
         if len(self.parts) > 1 and _is_divisible(part):
             return part.state_among(state, cut)
@@ -278,7 +267,7 @@ def _minimised(
     max_steps: int,
     tolerance: float,
 ) -> Solution:
-    """The same of few runs; values : the residuals at the start, where they are known."""
+    """:func:`minimise` of a few runs; values : residuals at the start, if known."""
     n_runs = _count(start)
     cost, steps = np.full(n_runs, np.inf), np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
@@ -308,7 +297,7 @@ def _minimised(
 
 
 def _accepted_state(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values] | None]:
-    """The state with the steps that were accepted, and the residuals there where they are known."""
+    """The state with accepted steps applied, and the residuals there if known."""
     if gain.accepted.all():
         return new, gain.values
     runs = np.flatnonzero(gain.accepted)
@@ -316,10 +305,10 @@ def _accepted_state(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values]
 
 
 class _Search(NamedTuple):
-    """Where a search stands, (B,) each.
+    """State of the step control, (B,) each.
 
-    damping : of the next step. growth : by how much more of it, should that be refused. size : of
-    the last step's change of all residuals; infinite where it was damped or refused.
+    damping : of the next step. growth : factor on the damping if that step is refused. size : norm
+    of the last step's change of all residuals; infinite where it was damped or refused.
     """
 
     damping: Array
@@ -328,11 +317,11 @@ class _Search(NamedTuple):
 
     @classmethod
     def begun(cls, n_runs: int) -> _Search:
-        """Before the first step."""
+        """Step control before the first step."""
         return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, DAMPING_GROWTH, np.inf)))
 
     def after(self, accepted: Booleans, ratio: Array, size: Array) -> _Search:
-        """After a step of a size that kept a ratio of what it promised."""
+        """Step control after a step; ratio : actual by predicted decrease of the cost."""
         less = np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2.0))
         damping = self.damping * np.where(accepted, less, self.growth)
         return _Search(
@@ -343,20 +332,21 @@ class _Search(NamedTuple):
 
     @property
     def undamped(self) -> Booleans:
-        """Whether the next step is a full one."""
+        """Whether the next step is a full Gauss-Newton step."""
         return self.damping <= LEAST_DAMPING
 
     def remaining(self, size: Array) -> Array:
-        """How much is left to go after a full step of this size. Steps that shrink by a factor q
-        each leave ``q / (1 - q)`` of the last (Hairer and Wanner, Solving Ordinary Differential
-        Equations II, IV.8).
+        """Estimated distance to the solution after a full step of this size.
+
+        Steps that shrink by a factor q each leave ``q / (1 - q)`` of the last (Hairer and Wanner,
+        Solving Ordinary Differential Equations II, IV.8).
         """
         shrinking = self.undamped & np.isfinite(self.size) & (size < self.size)
         return np.where(shrinking, size**2 / np.where(shrinking, self.size - size, 1.0), np.inf)
 
 
 class _Gain(NamedTuple):
-    """What came of a step. values : each part's residuals after it; None where it was not tried."""
+    """Result of a step. values : each part's residuals after it; None where it was not tried."""
 
     accepted: Booleans
     values: list[Values] | None
@@ -373,9 +363,9 @@ def _try(
     search: _Search,
     tolerance: float,
 ) -> tuple[Any, _Gain]:
-    """One damped step of every run; returns the states after it and what came of it.
+    """Try one damped step of every run; returns the states after the step, and its result.
 
-    values : the residuals at the state, where they are known.
+    values : residuals at the state, if known.
     """
     damping = search.damping
     normal = normal_equations(problem.rows(state, values), damping)
@@ -421,36 +411,3 @@ def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
     if small and damping < STRONG_DAMPING:
         return Stop.CONVERGED
     return Stop.STALLED if not accepted and damping >= MOST_DAMPING else Stop.RUNNING
-
-
-def soft_weights(distance: Array, scale: Array | float) -> Array:
-    """Geman-McClure weights ``(c^2 / (c^2 + d^2))^2`` of distances; 0 where nothing can be
-    predicted. A search begins with a scale so wide that everything counts, and narrows it.
-    """
-    square = scale**2
-    weight = (square / (square + np.nan_to_num(distance) ** 2)) ** 2
-    return np.where(np.isfinite(distance), weight, 0.0)
-
-
-def final_weights(distance: Array) -> Array:
-    """Weights of distances in standard deviations: 1 up to FULL_WEIGHT_DISTANCE, a cosine's way
-    down to 0 at NO_WEIGHT_DISTANCE; 0 where nothing can be predicted.
-    """
-    x = np.clip(
-        (distance - FULL_WEIGHT_DISTANCE) / (NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE), 0, 1
-    )
-    return np.where(np.isfinite(distance), 0.5 * (1 + np.cos(np.pi * x)), 0.0)
-
-
-def final_loss(distance: Array) -> Array:
-    """The robust loss of distances whose weights are :func:`final_weights`, in the place of their
-    squares: ``2 int_0^d w(t) t dt``. It ends at a constant, the loss of a measurement that is
-    rejected; so much where nothing can be predicted.
-    """
-    width = NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE
-    x = np.minimum(np.where(np.isfinite(distance), distance, np.inf), NO_WEIGHT_DISTANCE)
-    angle = np.pi * (x - FULL_WEIGHT_DISTANCE) / width
-    beyond = (x**2 + FULL_WEIGHT_DISTANCE**2) / 2 + width / np.pi * (
-        x * np.sin(angle) + width / np.pi * (np.cos(angle) - 1)
-    )
-    return np.where(x < FULL_WEIGHT_DISTANCE, x**2, beyond)

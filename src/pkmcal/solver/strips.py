@@ -1,9 +1,9 @@
-"""Rows that are many and depend on few shared unknowns, and the normal equations of all.
+"""Strips of rows that depend on few shared unknowns, and the normal equations of all rows.
 
-Such rows are in *strips* (:class:`Strips`), of which only products are formed
-(:attr:`Eliminated.strips_normal`): a tenth of the arithmetic, and as many digits as of the reduced
-rows themselves, as no sharp row is among them. With the rows besides they make the normal equations
-of a step.
+Most rows depend on few shared unknowns and stand in *strips* (:class:`Strips`), of which only
+products are formed (:attr:`Eliminated.strips_normal`): a tenth of the arithmetic, and no digits are
+lost against reduced rows, because no strip holds sharp rows such as readings. Together with the
+other rows they make the normal equations of a step.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from pkmcal.solver.ranks import unit_diagonal
 
 @dataclass(frozen=True)
 class StripLayout:
-    """Where the rows of N strips belong; the same for all runs.
+    """Indices of the rows and columns of N strips, the same for all runs.
 
-    A strip is n rows of one configuration that depend on w of the shared unknowns, as all edges of
-    one leg in one photograph do. Strips with the same columns stand side by side.
+    A strip is n rows of one configuration that depend on w of the shared unknowns, such as all
+    edges of one leg in one image. Strips with the same columns stand side by side.
 
     n_shared, n_own : na, d. configuration : (N,), of ``count``. rows : (N, n) which of the
     configuration's each is, -1 for padding. groups : strips with the same columns. columns :
     (groups, w), na where there are fewer. linked : (count, d) shared columns of each configuration
-    whose own unknowns are shared, -1 for all others; None where there is none.
+    whose own unknowns are shared, -1 for the other configurations; None where there are none.
     """
 
     n_shared: int
@@ -50,8 +50,8 @@ class StripLayout:
 
     @cached_property
     def own_target(self) -> Integers:
-        """Where the products (N, d + w + 1, d) of all a strip's columns with its own unknowns' are
-        summed, out of (K, d, d + na + 2): own unknowns, shared ones, none, and the residual.
+        """Flat indices, in sums (K, d, d + na + 2), of the strips' products (N, d + w + 1, d) with
+        the own unknowns' columns: own unknowns, shared unknowns, padding, residual.
         """
         d, na = self.n_own, self.n_shared
         column = np.empty((len(self.configuration), d + self.columns.shape[1] + 1), dtype=int)
@@ -64,7 +64,7 @@ class StripLayout:
 
     @cached_property
     def shared_target(self) -> Integers:
-        """The same of the groups' products by shared unknowns, out of (na + 2, na + 2)."""
+        """Flat indices, in sums (na + 2, na + 2), of the groups' products by shared unknowns."""
         residual = np.full((len(self.columns), 1), self.n_shared + 1)
         column = np.concatenate([self.columns, residual], axis=1)
         return (column[:, :, None] * (self.n_shared + 2) + column[:, None]).ravel()
@@ -79,8 +79,8 @@ class StripLayout:
 
 
 class Strips(NamedTuple):
-    """Strips' numbers (B, d + w + 1, N, n): by the own unknowns, by the shared ones of their
-    columns, and the residual.
+    """Numbers (B, d + w + 1, N, n) of strips: derivatives by the own unknowns, by the shared
+    unknowns of their columns, and the residual.
     """
 
     layout: StripLayout
@@ -88,7 +88,7 @@ class Strips(NamedTuple):
 
 
 class Compact(NamedTuple):
-    """As :class:`Linear`, but for the rows of strips; those that are in none come last among the
+    """Residuals and Jacobian as :class:`Linear`, with strips; rows in no strip come last among the
     rows of their configuration.
 
     n_shared : na. by_shared : (B, K, r', na) and by_own : (B, K, r', d) of the rows in no strip.
@@ -103,7 +103,7 @@ class Compact(NamedTuple):
     by_own: Array
 
     def linear(self) -> Linear:
-        """The same with the Jacobian in memory as a whole."""
+        """Residuals and Jacobian as dense arrays."""
         layout, numbers = self.strips
         (*batch, n_rows), d, na = self.value.shape, layout.n_own, layout.n_shared
         by_own, by_shared = (
@@ -126,7 +126,7 @@ class Compact(NamedTuple):
 
 
 def compact(linear: Linear) -> Compact:
-    """The same of a Jacobian that stands in memory."""
+    """A dense Jacobian as `Compact`, without strips."""
     (*_, n_own), (n_runs, count, _, n_shared) = linear.by_own.shape, linear.by_shared.shape
     layout = StripLayout.none(n_shared, n_own, count)
     strips = Strips(layout, np.zeros((n_runs, n_own + 1, 0, 0)))
@@ -135,18 +135,18 @@ def compact(linear: Linear) -> Compact:
 
 
 class Eliminated(NamedTuple):
-    """Configurations with their own unknowns eliminated, ``by_own = Q R``.
+    """Configurations after the elimination of their own unknowns, ``by_own = Q R``.
 
     inverse : (B, K, d, d) of R. along : Q^T J, (B, K, d, na), with J the Jacobian by the shared
     unknowns. fitted : Q^T value, (B, K, d). damped : (B, K, d) the damping of the own unknowns'
     squares.
 
-    Of rows in no strip q (B, K, r', d), the reduced rows (B, K, r', na) and what of their residuals
-    is left, (B, K, r').
+    For rows in no strip: q (B, K, r', d), the reduced rows (B, K, r', na) and their reduced
+    residuals (B, K, r').
 
-    Of the strips' rows J_s what their products need, which is far less than the rows themselves:
-    normal J_s^T J_s (B, na, na), slope J_s^T value (B, na), along_strips Q_s^T J_s (B, K, d, na),
-    own Q_s^T Q_s (B, K, d, d), to which the damping's rows count, which have no J.
+    For the strips' rows J_s only their products, which are far smaller than the rows: normal
+    J_s^T J_s (B, na, na), slope J_s^T value (B, na), along_strips Q_s^T J_s (B, K, d, na), own
+    Q_s^T Q_s (B, K, d, d), which includes the damping's rows, for which J is zero.
     """
 
     inverse: Array
@@ -166,8 +166,8 @@ class Eliminated(NamedTuple):
         """Normal matrices (B, na, na) of the strips' reduced rows ``J_s - Q_s W`` with W = Q^T J:
         ``J_s^T J_s - V^T W - W^T V`` with ``V = Q_s^T J_s - Q_s^T Q_s W / 2``.
 
-        Readings a thousand times sharper than edges have no part in these differences: W is in
-        units of the own unknowns' directions, of which edges see as much as of the shared ones.
+        Readings a thousand times sharper than edges do not cancel in these differences: W is in
+        units of the own unknowns' directions, which edges determine as well as the shared ones.
         """
         half = self.along_strips - 0.5 * (self.own @ self.along)
         both = flat(half).mT @ flat(self.along)
@@ -175,16 +175,16 @@ class Eliminated(NamedTuple):
 
     @property
     def rows_normal(self) -> Array:
-        """The same of the rows in no strip."""
+        """Normal matrices (B, na, na) of the reduced rows in no strip."""
         rows = flat(self.rows)
         return rows.mT @ rows
 
 
 def eliminated(rows: Compact, damping: Array) -> Eliminated:
-    """Own unknowns eliminated with Marquardt damping (B,), zero for none.
+    """Eliminate the own unknowns with Marquardt damping (B,), zero for none.
 
-    The damping's rows sqrt(damping) diag(column norms) are appended, so a configuration that its
-    data do not fix stays solvable.
+    The damping's rows sqrt(damping) diag(column norms) are appended, so that a configuration that
+    its data do not determine stays solvable.
     """
     (layout, numbers), by_own = rows.strips, rows.by_own
     n_runs, d, na = len(numbers), layout.n_own, layout.n_shared
@@ -240,7 +240,7 @@ def _group_sums(layout: StripLayout, numbers: Array) -> tuple[Array, Array]:
 
 
 def _summed(parts: Array, target: Integers, shape: tuple[int, ...]) -> Array:
-    """Numbers (B, ...) of each run summed where ``target`` says."""
+    """Sums of the shape (B, ...): the parts of each run added at the flat indices ``target``."""
     out = np.zeros(shape)
     for total, own in zip(out.reshape(len(out), -1), parts.reshape(len(out), -1), strict=True):
         np.add.at(total, target, own)
@@ -257,8 +257,8 @@ def _root(square: Array) -> Array:
 
 
 class NormalPart(NamedTuple):
-    """The normal equations of some configurations' rows, their own unknowns eliminated, and what a
-    step needs of them once the rows are forgotten.
+    """Reduced normal equations of some configurations' rows, and the factors from which their own
+    unknowns' step follows, so that the rows need not be kept.
 
     matrix : (B, na, na) and gradient (B, na) of the shared unknowns. cost : (B,). usable :
     (B, K, r). along, fitted, inverse, damped : see :class:`Eliminated`.
@@ -280,7 +280,7 @@ class NormalPart(NamedTuple):
 
 
 def _part(rows: Compact, damping: Array) -> NormalPart:
-    """A part's normal equations."""
+    """Reduced normal equations of one part."""
     eliminated_part = eliminated(rows, damping)
     taken_up = flat(eliminated_part.along_strips).mT @ flat(eliminated_part.fitted[..., None])
     residual = flat(rows.by_shared).mT @ flat(eliminated_part.residual[..., None])
@@ -300,7 +300,7 @@ def _part(rows: Compact, damping: Array) -> NormalPart:
 
 
 class NormalEquations(NamedTuple):
-    """The normal equations of all parts; see :class:`NormalPart`."""
+    """Reduced normal equations of all parts; see :class:`NormalPart`."""
 
     matrix: Array
     gradient: Array
@@ -317,11 +317,11 @@ class NormalEquations(NamedTuple):
         return shared, [part.own(shared) for part in self.parts]
 
     def promise(self, shared: Array, own: list[Array]) -> tuple[Array, Array]:
-        """By how much the linear model lessens the cost along a step, to first order, and the
-        square of its change of all residuals, (B,) each.
+        """Decrease of the linear model's cost along a step to first order, and the squared norm of
+        its change of all residuals, (B,) each.
 
         With ``by_own = Q R`` the residuals' change is ``rows shared - Q fitted``, so that both
-        follow from what is left of the rows; the damping's own share is taken out.
+        follow from the reduced rows; the damping's own part is subtracted.
         """
         fitted = total(np.sum(part.fitted**2, axis=(1, 2)) for part in self.parts)
         damped = zip(self.parts, own, strict=True)
@@ -332,12 +332,12 @@ class NormalEquations(NamedTuple):
 
 
 def total(parts: Iterable[Array]) -> Array:
-    """Their sum."""
+    """Sum of arrays."""
     return reduce(np.add, parts)
 
 
 def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquations:
-    """The normal equations of all parts, each reduced before the next is asked for."""
+    """Normal equations of all parts, each reduced before the next one is formed."""
     done: list[NormalPart] = []
     for rows in parts:
         if done:  # the rows on shared unknowns only stand in the first part
@@ -350,7 +350,7 @@ def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquation
 
 
 def cost_of(value: Array, shared_value: Array, usable: Booleans) -> Array:
-    """Sum of squares over usable rows; NaN there means that a leg was lost: infinite."""
+    """Sum of squares (B,) over usable rows; infinite where one is NaN, for a leg left the image."""
     used = np.where(usable, value, 0.0).reshape(len(value), -1)
     total = np.sum(used * used, axis=1) + np.sum(shared_value * shared_value, axis=1)
     return np.where(np.isfinite(total), total, np.inf)

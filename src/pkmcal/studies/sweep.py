@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
 from pkmcal.boards.board import load_board
 from pkmcal.cameras import Camera, camera_models, load_camera
+from pkmcal.cameras.contract import FOCAL
 from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
@@ -346,22 +346,14 @@ def _resized(camera: Camera, width: int) -> Camera:
     """Camera with the same lens and sensor size, and another number of pixels."""
     factor = width / camera.image_size[0]
     size = (width, max(1, round(factor * camera.image_size[1])))
-    parameters = _scaled_pixels(camera, factor)
-    # pixel centres are at integers, so the corner of the image is at -0.5
-    parameters[2:4] = factor * (camera.parameters[2:4] + 0.5) - 0.5
-    return replace(camera, image_size=size, parameters=parameters, covariance=None)
+    return camera.resampled(factor, size)
 
 
 def _refocused(camera: Camera, focal: float) -> Camera:
     """Camera with another focal length and the same sensor."""
-    parameters = _scaled_pixels(camera, focal / float(camera.parameters[0]))
-    return replace(camera, parameters=parameters, covariance=None)
-
-
-def _scaled_pixels(camera: Camera, factor: float) -> Array:
     parameters = camera.parameters.copy()
-    parameters[:2] *= factor
-    return parameters
+    parameters[FOCAL] *= focal / float(camera.focal[0])
+    return replace(camera, parameters=parameters, covariance=None)
 
 
 def _with_radii(machine: Machine, factor: float) -> Machine:

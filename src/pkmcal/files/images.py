@@ -1,0 +1,147 @@
+"""Image files opened by Pillow: their size, their EXIF, and what Pillow raises for broken ones.
+
+The classes of Pillow's formats are called directly, not `PIL.Image.open`: that one warns above 89
+megapixels and refuses 179 by a limit of the whole process, and `MOST_PIXELS` is ours.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from io import BytesIO
+from math import inf
+from typing import TYPE_CHECKING, BinaryIO
+
+from pkmcal.errors import InputError
+from pkmcal.files.limits import MOST_PIXELS, check_count
+from pkmcal.wording import install_step
+
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile
+
+IMAGE_FILE_ENDINGS = frozenset(
+    {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".heic", ".heif"}
+)
+"""Endings of image files' names, in lower case."""
+IMAGE_ERRORS = (
+    OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError,
+    EOFError, RuntimeError, struct.error, zlib.error, Warning,
+)  # fmt: skip
+"""Exceptions that Pillow raises for broken files; warnings, where they are errors."""
+MOST_PIXELS_PER_BYTE = 8 * 1032
+"""Pixels that one byte of a file stands for at most: 1 bit each, behind PNG's compression (RFC
+1951: 258 bytes in two bits). Other formats reach less."""
+_HEAD_BYTES = 1000
+"""Bytes in which the size of a PNM file stands, comments before it included."""
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+_ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+_TRANSPOSING_ORIENTATIONS = range(5, 9)
+
+
+@dataclass(frozen=True)
+class Exif:
+    """How an image was taken (CIPA DC-008).
+
+    orientation : 1 to 8, as in the standard; 1 where the file has none. focal_35mm : focal length
+    (mm) of the lens with the same field of view on film of 36 x 24 mm; None where unknown.
+    """
+
+    orientation: int = 1
+    focal_35mm: float | None = None
+
+
+def open_image(stream: BinaryIO, label: str) -> ImageFile:
+    """Open an image file (PNG, JPEG, BMP, TIFF, PNM, HEIF) and read its header, no pixels.
+
+    label : the file's name in messages. Raises InputError for a file of another format, a broken
+    header, more pixels than MOST_PIXELS or than the file's bytes can stand for (memory is taken
+    by the header's size), and for HEIF without the extra.
+    """
+    head = stream.read(_HEAD_BYTES)
+    length = stream.seek(0, 2)
+    stream.seek(0)
+    try:
+        image_class = _image_class(head, label)
+        if head.startswith(b"P"):  # Pillow reads a comment byte by byte, however long it is
+            image_class(BytesIO(head))
+        image = image_class(stream)
+    except IMAGE_ERRORS:
+        raise _unreadable(length, label) from None
+    width, height = image.size
+    if not 0 < width * height <= MOST_PIXELS_PER_BYTE * length:
+        raise _unreadable(length, label)
+    check_count(width * height, MOST_PIXELS, "pixels", label)
+    return image
+
+
+def _image_class(head: bytes, label: str) -> Callable[[BinaryIO], ImageFile]:
+    """Pillow's class for a file that begins with these bytes; imports of a format take 20 ms."""
+    if head.startswith(b"\x89PNG\r\n\x1a\n"):
+        from PIL.PngImagePlugin import PngImageFile as ImageClass
+    elif head.startswith(b"\xff\xd8"):
+        from PIL.JpegImagePlugin import JpegImageFile as ImageClass
+    elif head.startswith(b"BM"):
+        from PIL.BmpImagePlugin import BmpImageFile as ImageClass
+    elif head.startswith((b"II*\0", b"MM\0*")):
+        from PIL.TiffImagePlugin import TiffImageFile as ImageClass
+    elif head.startswith((b"P2", b"P3", b"P5", b"P6")):
+        from PIL.PpmImagePlugin import PpmImageFile as ImageClass
+    elif head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
+        try:
+            ImageClass = import_module("pillow_heif").HeifImageFile  # an extra
+        except ImportError:
+            raise InputError(
+                "HEIF images need the package pillow-heif, which is not installed",
+                where=label,
+                expected="a PNG or JPEG file",
+                next_step=f"{install_step('heic')}; or set the camera to JPEG",
+            ) from None
+    else:
+        raise ValueError("a format that is not read")
+    return ImageClass
+
+
+def _unreadable(length: int, label: str) -> InputError:
+    return InputError(
+        "the file is not an image that can be read" if length else "the image file is empty",
+        where=label,
+        expected="a PNG or JPEG file",
+        next_step="Copy it from the camera again, or remove it",
+    )
+
+
+def sensor_size(image: ImageFile) -> tuple[int, int]:
+    """(width, height) in pixels as the sensor has them, before EXIF's orientation.
+
+    Decoders of HEIF apply the orientation, those of other formats do not.
+    """
+    turned = image.info.get("original_orientation") in _TRANSPOSING_ORIENTATIONS
+    return image.size[::-1] if turned else image.size
+
+
+def read_exif(image: ImageFile) -> Exif:
+    """EXIF of an opened image; entries that are absent or broken have their defaults."""
+    try:
+        exif = image.getexif()
+        orientation = image.info.get("original_orientation") or exif.get(_ORIENTATION, 1)
+        focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM) or 0)
+    except IMAGE_ERRORS:
+        return Exif()
+    # a focal length of 0 is the standard's value for unknown
+    return Exif(
+        orientation if orientation in range(1, 9) else 1, focal if 0 < focal < inf else None
+    )
+
+
+def with_exif(data: bytes, exif: Exif) -> bytes:
+    """A JPEG file's bytes with an EXIF segment before all others, as the standard requires."""
+    from PIL.Image import Exif as Entries
+
+    entries = Entries()
+    entries[_ORIENTATION] = exif.orientation
+    entries.get_ifd(_EXIF_DIRECTORY)[_FOCAL_35MM] = round(exif.focal_35mm or 0)
+    body = entries.tobytes()
+    return data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2) + body + data[2:]
