@@ -1,9 +1,9 @@
-"""The own unknowns of each configuration eliminated.
+"""Elimination of each configuration's own unknowns (nuisance parameters), as a square root.
 
-The Schur complement of rows that depend on everything is formed as a square root: with
-``by_own = Q R`` the reduced rows are ``(I - Q Q^T) by_shared``. Subtracting normal matrices instead
-would cancel half the digits, since readings a thousand times sharper than edges dominate both
-terms.
+The Schur complement is formed as reduced rows: with ``by_own = Q R`` they are ``(I - Q Q^T)
+by_shared``. A difference of normal matrices would cancel half of the digits, since readings a
+thousand times sharper than edges dominate both terms. :mod:`pkmcal.solver.strips` draws the
+Jacobian.
 """
 
 from __future__ import annotations
@@ -15,19 +15,25 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 
 SOLVER_ROWS_AT_ONCE = 2**15
-"""Rows that are worked on at once: as many runs, or configurations of one, as have so many. A call
-of NumPy then costs little beside its arithmetic, and what it works on stays in the processor."""
+"""Rows that are evaluated in one call, as whole runs or as whole configurations of one run: enough
+that the overhead of a NumPy call is small, few enough that its arrays fit into the processor's
+cache.
+"""
 TALL_BLOCK_ROWS = 512
-"""Rows of a block that is condensed by itself, where there are many: of fewer unknowns it takes a
-third of the time."""
+"""Rows of a block of a tall matrix that is condensed by itself: with fewer columns than this, the
+QR decomposition by blocks takes a third of the time.
+"""
 
 
 class Linear(NamedTuple):
-    """Residuals and Jacobian at a point.
+    """Residuals and Jacobian at a state: B runs, K configurations of r rows.
 
-    value : (B, K, r). by_shared : (B, K, r, na). by_own : (B, K, r, d).
+    value : (B, K, r).
+    by_shared : (B, K, r, na) by the shared unknowns.
+    by_own : (B, K, r, d) by the configuration's own unknowns.
     usable : (B, K, r) False where nothing can be predicted; such rows are zero.
-    shared_value : (B, c) rows on shared unknowns only. shared_by : (c, na).
+    shared_value : (B, c) residuals of the rows on shared unknowns only.
+    shared_by : (c, na) their Jacobian.
     """
 
     value: Array
@@ -39,10 +45,11 @@ class Linear(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """The problem after elimination of the own unknowns.
+    """Rows after elimination of the own unknowns.
 
-    rows : (B, K, r, na) reduced Jacobian. value : (B, K, r) what of the residuals the own unknowns
-    cannot take up. q, r : QR factors of the own Jacobian.
+    rows : (B, K, r, na) reduced Jacobian.
+    value : (B, K, r) reduced residuals, orthogonal to the own Jacobian.
+    q, r : QR factors of the own Jacobian, (B, K, r, d) and (B, K, d, d).
     """
 
     rows: Array
@@ -52,7 +59,7 @@ class Reduced(NamedTuple):
 
 
 def eliminate(linear: Linear) -> Reduced:
-    """Own unknowns eliminated."""
+    """Eliminate the own unknowns."""
     q, r = np.linalg.qr(linear.by_own)
     none = ~linear.by_own.any(axis=(-2, -1), keepdims=True)
     if none.any():  # nothing to eliminate; the factors of zeros are any orthonormal columns
@@ -63,13 +70,14 @@ def eliminate(linear: Linear) -> Reduced:
 
 
 def flat(rows: Array) -> Array:
-    """Rows (B, K, r, n) of all configurations, (B, K r, n); n may be none."""
+    """Rows (B, K, r, n) of all configurations as (B, K r, n); n may be zero."""
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
 
 
 def rows_on_shared(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
-    """All rows on the shared unknowns, the own ones eliminated: Jacobian (B, n, na)
-    and residuals (B, n). The configurations' rows come first, those on shared unknowns only last.
+    """Jacobian (B, n, na) and residuals (B, n) by the shared unknowns, the own ones eliminated.
+
+    The configurations' rows come first, the rows on shared unknowns only last.
     """
     n_runs = len(reduced.rows)
     shared = np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape))
@@ -79,8 +87,8 @@ def rows_on_shared(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
 
 
 def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
-    """Rows (B, n, m) and residuals (B, n) as m + 1 with the same normal matrix, gradient and sum of
-    squares: the triangle of their QR decomposition.
+    """Rows (B, n, m) and residuals (B, n) as m + 1 rows with the same normal matrix, gradient and
+    sum of squares: the triangle of their QR decomposition.
     """
     both = np.concatenate([rows, value[..., None]], axis=-1)
     n_runs, n, m = both.shape
@@ -96,7 +104,7 @@ def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
 
 
 def divisions(count: int, rows: int) -> list[slice]:
-    """Configurations, of so many rows each, that are worked on together; see
+    """Slices of ``count`` configurations of ``rows`` rows each that are evaluated together; see
     SOLVER_ROWS_AT_ONCE.
     """
     each = max(1, SOLVER_ROWS_AT_ONCE // max(1, rows))

@@ -1,10 +1,10 @@
-"""The search: damped steps of all runs at once, each of which stops on its own.
+"""Levenberg-Marquardt search of many runs at once, each of which stops by itself.
 
 **States and data of many runs** are arrays, or frozen dataclasses or named tuples of arrays, whose
 leading axis counts the runs; see :func:`take`, :func:`put` and :func:`of_runs`.
 
-**Robust weights**, one for a search that lets go of what does not fit (:func:`soft_weights`), one
-for its end (:func:`final_weights`).
+**Robust weights**: Geman-McClure weights for a search (:func:`soft_weights`), weights with a finite
+cut for the estimate (:func:`final_weights`) with their loss (:func:`final_loss`).
 """
 
 from __future__ import annotations
@@ -28,38 +28,45 @@ from pkmcal.solver.strips import (
 )
 
 LEAST_DAMPING = 1e-14
-"""Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
-step is the best, and any damping costs steps along what is known little of."""
+"""Damping at the start of a search, in effect none: near a solution, where most starts are, the
+full step is best, and any damping costs steps along weakly determined directions.
+"""
 DAMPING_GROWTH = 8.0
-"""Factor on it after a step that was refused, and that factor's after each more in a row: from
-nothing to a hundredth in five."""
+"""Factor on the damping after a refused step, and on that factor after each further refusal in a
+row: from LEAST_DAMPING to 0.01 in five refusals.
+"""
 STRONG_DAMPING = 1e-2
-"""Damping from which on a step is small anywhere, so that its size tells nothing."""
+"""Damping from which on a step is small in any case, so that its size does not show convergence."""
 MOST_DAMPING = 1e9
-"""Damping beyond which a step is below rounding: nothing downhill was found."""
+"""Damping beyond which a step is below rounding: there is no step downhill."""
 STEP_TOLERANCE = 1e-7
-"""A step that changes all fitted values together by less, in standard deviations, ends the
-search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
+"""Change of all fitted values together, in standard deviations, below which a step ends the search:
+a ten-millionth of what the noise changes, and above their rounding of about 1e-9.
+"""
 REFUSED_STEP_TOLERANCE = 1e-3
-"""The same of a step that the residuals refuse, though the linear model promises something: so
-little is their rounding, where a direction is a millionth as well known as the others."""
+"""Predicted change below which a refused step ends the search, in standard deviations: the rounding
+of the residuals where one direction is determined a million times worse than the others.
+"""
 COST_ROUNDING = 1e-13
-"""Of the cost, relative."""
+"""Relative rounding of the cost."""
 CACHED_PROBLEM_PARTS = 16
-"""Parts of a problem of which is kept what their residuals took, so that the next step goes on from
-it: some 5 MB each. Of those of a larger problem it is found again, so that memory does not grow."""
+"""Parts of a problem whose intermediate results are stored with their residuals, so that the next
+step continues from them: some 5 MB each. Further parts are evaluated again, so that memory does not
+grow with the problem.
+"""
 
 FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE = 4.0, 6.5
-"""Final weights are 1 up to FULL_WEIGHT_DISTANCE and 0 from NO_WEIGHT_DISTANCE standard deviations:
-of clean pairs of residuals 3 in 10^4 lose part of their weight and none all of it, so efficiency is
-above 0.999."""
+"""Distances in standard deviations up to which final weights are 1, and from which on they are 0.
+Of pairs of residuals without outliers 3 in 10^4 lose part of their weight and none all of it, so
+the efficiency is above 0.999.
+"""
 
 Runs = TypeVar("Runs")
 """An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""
 
 
 class Stop(Enum):
-    """Why a search ended; the text is what the user reads."""
+    """Reason why a search stopped; the value is the text that the user reads."""
 
     CONVERGED = "converged"
     STALLED = (
@@ -72,9 +79,12 @@ class Stop(Enum):
 
 
 class Values(NamedTuple):
-    """Residuals alone: value (B, K, r) with NaN where nothing can be predicted, shared (B, c).
+    """Residuals at a state.
 
-    rows : gives the Jacobian there, where it costs less to go on from what these took.
+    value : (B, K, r), NaN where nothing can be predicted.
+    shared_value : (B, c) of the rows on shared unknowns only.
+    rows : function that completes the Jacobian from the residuals' intermediate results; None where
+    these are not stored.
     """
 
     value: Array
@@ -83,7 +93,7 @@ class Values(NamedTuple):
 
 
 class LeastSquares(Protocol):
-    """What the solver needs of a problem; ``state`` is the problem's own, opaque here."""
+    """Contract of a least-squares problem; ``state`` is the problem's own type, opaque here."""
 
     def residuals(self, state: Any) -> Values:
         """Residuals at a state."""
@@ -94,51 +104,53 @@ class LeastSquares(Protocol):
         ...
 
     def retract(self, state: Any, shared: Array, own: Array) -> Any:
-        """The state moved by steps (B, na) and (B, K, d)."""
+        """Retract the state along steps (B, na) of the shared and (B, K, d) of the own unknowns."""
         ...
 
     def select(self, runs: Integers) -> LeastSquares:
-        """The problem of some runs only."""
+        """The problem restricted to some runs."""
         ...
 
 
 class Divisible(LeastSquares, Protocol):
-    """A problem of which some configurations can be looked at alone, so that the Jacobian of all
+    """A problem that can be restricted to some configurations, so that the Jacobian of all of them
     never stands in memory at once.
     """
 
     def among(self, configurations: slice) -> Divisible:
-        """The problem of some configurations, with all that they share."""
+        """The problem restricted to some configurations, with all shared unknowns."""
         ...
 
     def state_among(self, state: Any, configurations: slice) -> Any:
-        """What that problem needs of a state."""
+        """The state restricted to some configurations."""
         ...
 
     def compact(self, state: Any) -> Compact:
-        """As :meth:`linearize`."""
+        """Residuals and exact Jacobian, with strips stored compactly."""
         ...
 
     @property
     def extent(self) -> tuple[int, int]:
-        """Configurations K and rows of each, r."""
+        """Number of configurations K, and of the rows of each, r."""
         ...
 
 
 def _is_divisible(problem: LeastSquares) -> TypeGuard[Divisible]:
-    """Whether a problem is one: told by a method, since asking a protocol takes a tenth of the
-    millisecond that a small step does.
+    """Whether a problem is :class:`Divisible`.
+
+    One attribute is tested, since isinstance on the protocol takes a tenth of the millisecond that
+    a small step takes.
     """
     return hasattr(problem, "state_among")
 
 
 def take(state: Runs, runs: Integers) -> Runs:
-    """The state of some runs."""
+    """State of some runs."""
     return _each(lambda array: array[runs], state)
 
 
 def put(state: Runs, runs: Integers, part: Runs) -> Runs:
-    """The state with some runs' values replaced by those of ``part``."""
+    """State with the values of some runs replaced by those of ``part``."""
 
     def replaced(array: Array, new: Array) -> Array:
         out = array.copy()
@@ -149,12 +161,12 @@ def put(state: Runs, runs: Integers, part: Runs) -> Runs:
 
 
 def of_runs(data: Runs, runs: Integers) -> Runs:
-    """The measured numbers of some runs; what all runs share (a leading axis of 1) stays."""
+    """Data of some runs; arrays that all runs share (leading axis of length 1) stay."""
     return _each(lambda array: array if len(array) == 1 else array[runs], data)
 
 
 def _count(state: Any) -> int:
-    """Runs of a state."""
+    """Number of runs in a state."""
     if isinstance(state, np.ndarray):
         return len(state)
     first = state[0] if isinstance(state, tuple) else getattr(state, fields(state)[0].name)
@@ -162,7 +174,7 @@ def _count(state: Any) -> int:
 
 
 def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
-    """A function of the arrays of states, array by array."""
+    """Apply a function to corresponding arrays of one or more states."""
     if isinstance(first, np.ndarray):
         return cast(Runs, function(first, *others))
     states: tuple[Any, ...] = (first, *others)
@@ -174,11 +186,13 @@ def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop.
+    """Result of a search over B runs.
 
-    cost : of a search whose last step needed no trial, as the linear model says.
-    normal : (B, na, na) the reduced normal matrix where the last step was made, which is at the end
-    but for that step.
+    state : final state.
+    cost : (B,) final cost; predicted by the linear model where the last step needed no trial.
+    steps : (B,) number of steps.
+    stop : reason of each run.
+    normal : (B, na, na) reduced normal matrix at the state before the last step.
     """
 
     state: Any
@@ -194,9 +208,9 @@ def minimise(
     max_steps: int = 100,
     tolerance: float = STEP_TOLERANCE,
 ) -> Solution:
-    """Least squares from ``start``, all runs at once; each stops on its own.
+    """Minimise the sum of squares from ``start``, all runs at once.
 
-    tolerance : in the place of STEP_TOLERANCE, where less will do.
+    tolerance : change of the fitted values, in standard deviations, that ends a run.
     """
     values: list[Values] | None = None
     if _is_divisible(problem):
@@ -223,27 +237,32 @@ def minimise(
 
 
 class _Divided(NamedTuple):
-    """A problem with its parts of some configurations, small enough for the processor's cache."""
+    """A problem and its restrictions to groups of configurations that fit into the processor's
+    cache.
+    """
 
     problem: LeastSquares
     parts: list[tuple[slice, LeastSquares]]
 
     @classmethod
     def of(cls, problem: LeastSquares, n_runs: int, count: int, rows: int) -> _Divided:
-        """A problem of so many runs and configurations of so many rows, divided where it can be."""
+        """Divide a problem of ``n_runs`` runs and ``count`` configurations of ``rows`` rows, if it
+        is :class:`Divisible`.
+        """
         cuts = divisions(count, n_runs * rows)
         if not _is_divisible(problem) or len(cuts) < 2:
             return cls(problem, [(slice(0, count), problem)])
         return cls(problem, [(cut, problem.among(cut)) for cut in cuts])
 
     def select(self, runs: Integers) -> _Divided:
-        """The same of some runs."""
+        """The same division for some runs."""
         parts = [(cut, part.select(runs)) for cut, part in self.parts]
         return self._replace(problem=self.problem.select(runs), parts=parts)
 
     def rows(self, state: Any, values: list[Values] | None) -> Iterator[Compact]:
-        """Residuals and Jacobian of one part after the other; values : the residuals there, where
-        they are known.
+        """Residuals and Jacobian of one part after the other.
+
+        values : residuals of each part at the state, where they have been evaluated.
         """
         for k, (cut, part) in enumerate(self.parts):
             reference_values = values[k].rows if values else None
@@ -255,7 +274,7 @@ class _Divided(NamedTuple):
                 yield compact(part.linearize(state))
 
     def residuals(self, state: Any) -> list[Values]:
-        """Residuals of each part; those of shared unknowns only in the first."""
+        """Residuals of each part; those of the shared rows only in the first part."""
         results = [self.parts[0][1].residuals(self._state_among(state, 0))]
         for k in range(1, len(self.parts)):
             values = self.parts[k][1].residuals(self._state_among(state, k))
@@ -264,7 +283,7 @@ class _Divided(NamedTuple):
         return results
 
     def _state_among(self, state: Any, k: int) -> Any:
-        """What a part needs of a state."""
+        """State restricted to the configurations of part k."""
         cut, part = self.parts[k]
         if len(self.parts) > 1 and _is_divisible(part):
             return part.state_among(state, cut)
@@ -278,7 +297,9 @@ def _minimised(
     max_steps: int,
     tolerance: float,
 ) -> Solution:
-    """The same of few runs; values : the residuals at the start, where they are known."""
+    """Minimise a divided problem; values : its residuals at the start, where they were
+    evaluated.
+    """
     n_runs = _count(start)
     cost, steps = np.full(n_runs, np.inf), np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
@@ -296,6 +317,7 @@ def _minimised(
         cost[active], search = gain.cost, gain.search
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason
+        # continue with the runs that have not stopped
         keep = np.array([k for k, reason in enumerate(gain.stop) if reason is Stop.RUNNING])
         if keep.size == 0:
             break
@@ -308,7 +330,7 @@ def _minimised(
 
 
 def _accepted_state(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values] | None]:
-    """The state with the steps that were accepted, and the residuals there where they are known."""
+    """State after the accepted steps, and its residuals where they were evaluated."""
     if gain.accepted.all():
         return new, gain.values
     runs = np.flatnonzero(gain.accepted)
@@ -316,10 +338,11 @@ def _accepted_state(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values]
 
 
 class _Search(NamedTuple):
-    """Where a search stands, (B,) each.
+    """Damping schedule of each run, (B,) each.
 
-    damping : of the next step. growth : by how much more of it, should that be refused. size : of
-    the last step's change of all residuals; infinite where it was damped or refused.
+    damping : of the next step.
+    growth : factor on the damping if the next step is refused.
+    size : change of all residuals by the last step; infinite where that was damped or refused.
     """
 
     damping: Array
@@ -328,11 +351,15 @@ class _Search(NamedTuple):
 
     @classmethod
     def begun(cls, n_runs: int) -> _Search:
-        """Before the first step."""
+        """Schedule before the first step."""
         return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, DAMPING_GROWTH, np.inf)))
 
     def after(self, accepted: Booleans, ratio: Array, size: Array) -> _Search:
-        """After a step of a size that kept a ratio of what it promised."""
+        """Schedule after a step.
+
+        accepted, ratio, size : (B,) whether the step was accepted, actual relative to predicted
+        decrease of the cost, and change of all residuals.
+        """
         less = np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2.0))
         damping = self.damping * np.where(accepted, less, self.growth)
         return _Search(
@@ -343,20 +370,24 @@ class _Search(NamedTuple):
 
     @property
     def undamped(self) -> Booleans:
-        """Whether the next step is a full one."""
+        """Whether the next step is a full Gauss-Newton step, (B,)."""
         return self.damping <= LEAST_DAMPING
 
     def remaining(self, size: Array) -> Array:
-        """How much is left to go after a full step of this size. Steps that shrink by a factor q
-        each leave ``q / (1 - q)`` of the last (Hairer and Wanner, Solving Ordinary Differential
-        Equations II, IV.8).
+        """Estimated remaining distance (B,) after a full step of this size, infinite if unknown.
+
+        Steps that shrink by a factor q each leave ``q / (1 - q)`` of the last one (Hairer and
+        Wanner, Solving Ordinary Differential Equations II, IV.8).
         """
         shrinking = self.undamped & np.isfinite(self.size) & (size < self.size)
         return np.where(shrinking, size**2 / np.where(shrinking, self.size - size, 1.0), np.inf)
 
 
 class _Gain(NamedTuple):
-    """What came of a step. values : each part's residuals after it; None where it was not tried."""
+    """Outcome of one step of B runs.
+
+    values : residuals of each part after the step; None where the step was not tried.
+    """
 
     accepted: Booleans
     values: list[Values] | None
@@ -373,27 +404,30 @@ def _try(
     search: _Search,
     tolerance: float,
 ) -> tuple[Any, _Gain]:
-    """One damped step of every run; returns the states after it and what came of it.
+    """One damped step of every run: the states after it, and its outcome.
 
-    values : the residuals at the state, where they are known.
+    values : residuals of each part at the state, where they were evaluated.
     """
     damping = search.damping
+    # step and its predicted effect
     normal = normal_equations(problem.rows(state, values), damping)
     shared, own = normal.step(damping)
     descent, size2 = normal.promise(shared, own)
     cost, promised = normal.cost, descent - size2
+    # convergence by the linear model
     size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
-    # a step near the end changes the cost by less than its rounding, and then it cannot be judged
+    # near the end a step changes the cost by less than the cost's rounding, which cannot be judged
     small = (size < tolerance * unit) | (np.abs(promised) < COST_ROUNDING * cost)
     last = search.remaining(size) < tolerance * unit
     usable = [part.usable for part in normal.parts]
     any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     trial = problem.problem.retract(state, shared, np.concatenate(own, axis=1))
     if np.all(search.undamped & any_usable & (small | last)):
-        # full steps as short as these keep what they promise: nothing is left to be tried
+        # full steps as short as these decrease the cost as predicted: no trial is needed
         every = np.ones(len(cost), dtype=bool)
         stop = [Stop.CONVERGED] * len(cost)
         return trial, _Gain(every, None, cost - promised, search, normal.matrix, stop)
+    # trial: residuals at the new state
     values = problem.residuals(trial)
     cost_trial = total(
         cost_of(part.value, part.shared_value, use)
@@ -402,7 +436,7 @@ def _try(
     ratio = (cost - cost_trial) / np.maximum(promised, 1e-300)
     accepted = cost_trial <= cost * (1 + COST_ROUNDING)
     small |= accepted & last
-    # a step that is refused for its rounding is better taken: all that is known of it is good
+    # a step that is refused by rounding only is taken: the linear model is the better evidence
     little = (
         ~accepted & (promised < (REFUSED_STEP_TOLERANCE * unit) ** 2) & (damping < STRONG_DAMPING)
     )
@@ -416,6 +450,7 @@ def _try(
 
 
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
+    """Stop reason of one run after a step."""
     if not usable:
         return Stop.NOT_FINITE
     if small and damping < STRONG_DAMPING:
@@ -424,8 +459,10 @@ def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
 
 
 def soft_weights(distance: Array, scale: Array | float) -> Array:
-    """Geman-McClure weights ``(c^2 / (c^2 + d^2))^2`` of distances; 0 where nothing can be
-    predicted. A search begins with a scale so wide that everything counts, and narrows it.
+    """Geman-McClure weights ``(c^2 / (c^2 + d^2))^2`` of distances d at scale c; 0 where nothing
+    can be predicted.
+
+    A search starts with a scale so wide that all measurements have weight, and narrows it.
     """
     square = scale**2
     weight = (square / (square + np.nan_to_num(distance) ** 2)) ** 2
@@ -433,8 +470,8 @@ def soft_weights(distance: Array, scale: Array | float) -> Array:
 
 
 def final_weights(distance: Array) -> Array:
-    """Weights of distances in standard deviations: 1 up to FULL_WEIGHT_DISTANCE, a cosine's way
-    down to 0 at NO_WEIGHT_DISTANCE; 0 where nothing can be predicted.
+    """Weights of distances in standard deviations: 1 up to FULL_WEIGHT_DISTANCE, then a cosine down
+    to 0 at NO_WEIGHT_DISTANCE; 0 where nothing can be predicted.
     """
     x = np.clip(
         (distance - FULL_WEIGHT_DISTANCE) / (NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE), 0, 1
@@ -443,9 +480,10 @@ def final_weights(distance: Array) -> Array:
 
 
 def final_loss(distance: Array) -> Array:
-    """The robust loss of distances whose weights are :func:`final_weights`, in the place of their
-    squares: ``2 int_0^d w(t) t dt``. It ends at a constant, the loss of a measurement that is
-    rejected; so much where nothing can be predicted.
+    """Robust loss of distances whose weights are :func:`final_weights`: ``2 int_0^d w(t) t dt``.
+
+    It takes the place of the squared distance and is constant from NO_WEIGHT_DISTANCE on: the loss
+    of a rejected measurement, and of one that cannot be predicted.
     """
     width = NO_WEIGHT_DISTANCE - FULL_WEIGHT_DISTANCE
     x = np.minimum(np.where(np.isfinite(distance), distance, np.inf), NO_WEIGHT_DISTANCE)

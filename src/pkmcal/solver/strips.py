@@ -1,9 +1,31 @@
-"""Rows that are many and depend on few shared unknowns, and the normal equations of all.
+"""Normal equations of a step: own unknowns eliminated, rows in strips as products only.
 
-Such rows are in *strips* (:class:`Strips`), of which only products are formed
-(:attr:`Eliminated.strips_normal`): a tenth of the arithmetic, and as many digits as of the reduced
-rows themselves, as no sharp row is among them. With the rows besides they make the normal equations
-of a step.
+The Jacobian of one run, with the own unknowns y_k of each configuration k (d numbers) and the
+shared unknowns s of all (na numbers)::
+
+                            y_1  y_2  y_3 |  s     residual
+    1: strips                x            |  w        x     edges: few of the shared unknowns,
+       rows in no strip      x            |  x        x     closures, poses, links
+    2: strips                     x       |  w        x     w <= na columns a strip
+       rows in no strip           x       |  x        x
+    3: strips                          x  |  w        x
+       rows in no strip                x  |  x        x
+    rows on shared unknowns               |  x        x     prior, gauge
+
+The own unknowns of linked configurations, whose poses a distance joins, are among s. No row of one
+configuration touches the own unknowns of another, so each block y_k is eliminated by itself
+(:func:`eliminated`): ``by_own_k = Q_k R_k``, with the damping's rows appended, and
+
+    reduced rows   (I - Q_k Q_k^T) [by_shared_k, residual_k]      (Schur complement, as a root)
+    own step       y_k = -R_k^-1 Q_k^T (residual_k + by_shared_k s)
+
+after which one system (na, na) remains for s (:class:`NormalEquations`).
+
+Rows in no strip are reduced as rows, since readings may be a thousand times sharper than edges and
+a difference of normal matrices would cancel the digits. Rows that are many and depend on few shared
+unknowns stand in *strips* (:class:`Strips`), of which only products are formed
+(:attr:`Eliminated.strips_normal`): a tenth of the arithmetic at the same accuracy, since no sharp
+row is among them.
 """
 
 from __future__ import annotations
@@ -22,15 +44,19 @@ from pkmcal.solver.ranks import unit_diagonal
 
 @dataclass(frozen=True)
 class StripLayout:
-    """Where the rows of N strips belong; the same for all runs.
+    """Index arrays of N strips, the same for all runs.
 
-    A strip is n rows of one configuration that depend on w of the shared unknowns, as all edges of
-    one leg in one photograph do. Strips with the same columns stand side by side.
+    A strip is n rows of one configuration that depend on the same w shared unknowns, as all edges
+    of one leg in one image do. Strips with the same columns stand side by side.
 
-    n_shared, n_own : na, d. configuration : (N,), of ``count``. rows : (N, n) which of the
-    configuration's each is, -1 for padding. groups : strips with the same columns. columns :
-    (groups, w), na where there are fewer. linked : (count, d) shared columns of each configuration
-    whose own unknowns are shared, -1 for all others; None where there is none.
+    n_shared, n_own : na shared unknowns, d own unknowns of each configuration.
+    count : number of configurations, K.
+    configuration : (N,) configuration of each strip.
+    rows : (N, n) index of each row among its configuration's rows, -1 for padding.
+    groups : strips with the same columns, as slices of N.
+    columns : (groups, w) shared unknowns of each group, na for padding.
+    linked : (K, d) shared columns of the configurations whose own unknowns are shared, -1 for all
+    other configurations; None where no configuration is linked.
     """
 
     n_shared: int
@@ -44,14 +70,15 @@ class StripLayout:
 
     @classmethod
     def none(cls, n_shared: int, n_own: int, count: int) -> StripLayout:
-        """No strips."""
+        """Layout without strips."""
         empty = np.zeros((0, 0), dtype=int)
         return cls(n_shared, n_own, count, empty.ravel(), empty, [], empty)
 
     @cached_property
     def own_target(self) -> Integers:
-        """Where the products (N, d + w + 1, d) of all a strip's columns with its own unknowns' are
-        summed, out of (K, d, d + na + 2): own unknowns, shared ones, none, and the residual.
+        """Flat indices (N (d + w + 1) d,) at which the products (N, d + w + 1, d) of a strip's
+        columns with its own columns are summed, in an array (K, d, d + na + 2) whose last axis is:
+        own unknowns, shared unknowns, padding, residual.
         """
         d, na = self.n_own, self.n_shared
         column = np.empty((len(self.configuration), d + self.columns.shape[1] + 1), dtype=int)
@@ -64,14 +91,16 @@ class StripLayout:
 
     @cached_property
     def shared_target(self) -> Integers:
-        """The same of the groups' products by shared unknowns, out of (na + 2, na + 2)."""
+        """Flat indices at which the groups' products (groups, w + 1, w + 1) by shared unknowns and
+        residual are summed, in an array (na + 2, na + 2): shared unknowns, padding, residual.
+        """
         residual = np.full((len(self.columns), 1), self.n_shared + 1)
         column = np.concatenate([self.columns, residual], axis=1)
         return (column[:, :, None] * (self.n_shared + 2) + column[:, None]).ravel()
 
     @cached_property
     def linked_places(self) -> tuple[Integers, Integers]:
-        """Configurations (n,) whose own unknowns are shared, and their columns (n, d)."""
+        """Configurations (n,) whose own unknowns are shared, and their shared columns (n, d)."""
         if self.linked is None:
             return np.zeros(0, dtype=int), np.zeros((0, self.n_own), dtype=int)
         which = np.flatnonzero(self.linked[:, 0] >= 0) if self.n_own else np.zeros(0, dtype=int)
@@ -79,8 +108,10 @@ class StripLayout:
 
 
 class Strips(NamedTuple):
-    """Strips' numbers (B, d + w + 1, N, n): by the own unknowns, by the shared ones of their
-    columns, and the residual.
+    """Values of N strips.
+
+    numbers : (B, d + w + 1, N, n), along the second axis the derivatives by the own unknowns, those
+    by the w shared unknowns of the strip's columns, and the residual.
     """
 
     layout: StripLayout
@@ -88,10 +119,12 @@ class Strips(NamedTuple):
 
 
 class Compact(NamedTuple):
-    """As :class:`Linear`, but for the rows of strips; those that are in none come last among the
-    rows of their configuration.
+    """Residuals and Jacobian as in :class:`Linear`, with the rows of strips stored compactly.
 
-    n_shared : na. by_shared : (B, K, r', na) and by_own : (B, K, r', d) of the rows in no strip.
+    value, usable, shared_value, shared_by : as in :class:`Linear`.
+    strips : derivatives and residuals of the rows in strips.
+    by_shared, by_own : (B, K, r', na) and (B, K, r', d) of the rows in no strip, which are the last
+    r' rows of each configuration.
     """
 
     value: Array
@@ -103,7 +136,7 @@ class Compact(NamedTuple):
     by_own: Array
 
     def linear(self) -> Linear:
-        """The same with the Jacobian in memory as a whole."""
+        """Expand to the full Jacobian."""
         layout, numbers = self.strips
         (*batch, n_rows), d, na = self.value.shape, layout.n_own, layout.n_shared
         by_own, by_shared = (
@@ -126,7 +159,7 @@ class Compact(NamedTuple):
 
 
 def compact(linear: Linear) -> Compact:
-    """The same of a Jacobian that stands in memory."""
+    """Compact form, without strips, of a full Jacobian."""
     (*_, n_own), (n_runs, count, _, n_shared) = linear.by_own.shape, linear.by_shared.shape
     layout = StripLayout.none(n_shared, n_own, count)
     strips = Strips(layout, np.zeros((n_runs, n_own + 1, 0, 0)))
@@ -135,18 +168,28 @@ def compact(linear: Linear) -> Compact:
 
 
 class Eliminated(NamedTuple):
-    """Configurations with their own unknowns eliminated, ``by_own = Q R``.
+    """Rows of K configurations after elimination of their own unknowns, ``by_own = Q R``.
 
-    inverse : (B, K, d, d) of R. along : Q^T J, (B, K, d, na), with J the Jacobian by the shared
-    unknowns. fitted : Q^T value, (B, K, d). damped : (B, K, d) the damping of the own unknowns'
-    squares.
+    J (r, na) is a configuration's Jacobian by the shared unknowns; index s marks the rows in
+    strips.
 
-    Of rows in no strip q (B, K, r', d), the reduced rows (B, K, r', na) and what of their residuals
-    is left, (B, K, r').
+    inverse : (B, K, d, d) R^-1.
+    along : (B, K, d, na) W = Q^T J.
+    fitted : (B, K, d) Q^T value.
+    damped : (B, K, d) damping times the squared column norms of the own unknowns.
 
-    Of the strips' rows J_s what their products need, which is far less than the rows themselves:
-    normal J_s^T J_s (B, na, na), slope J_s^T value (B, na), along_strips Q_s^T J_s (B, K, d, na),
-    own Q_s^T Q_s (B, K, d, d), to which the damping's rows count, which have no J.
+    Rows in no strip:
+
+    q : (B, K, r', d) their part of Q.
+    rows : (B, K, r', na) reduced rows, J - Q W.
+    residual : (B, K, r') reduced residuals, value - Q fitted.
+
+    Rows in strips, as the products that the normal equations need (far fewer than the rows):
+
+    normal : (B, na, na) sum over K of J_s^T J_s.
+    slope : (B, na) sum over K of J_s^T value.
+    along_strips : (B, K, d, na) Q_s^T J_s.
+    own : (B, K, d, d) Q_s^T Q_s, with the rows of the damping, whose J is zero.
     """
 
     inverse: Array
@@ -166,8 +209,8 @@ class Eliminated(NamedTuple):
         """Normal matrices (B, na, na) of the strips' reduced rows ``J_s - Q_s W`` with W = Q^T J:
         ``J_s^T J_s - V^T W - W^T V`` with ``V = Q_s^T J_s - Q_s^T Q_s W / 2``.
 
-        Readings a thousand times sharper than edges have no part in these differences: W is in
-        units of the own unknowns' directions, of which edges see as much as of the shared ones.
+        Readings a thousand times sharper than edges do not enter these differences: W is in units
+        of the own unknowns' directions, which edges measure about as well as the shared unknowns.
         """
         half = self.along_strips - 0.5 * (self.own @ self.along)
         both = flat(half).mT @ flat(self.along)
@@ -175,19 +218,20 @@ class Eliminated(NamedTuple):
 
     @property
     def rows_normal(self) -> Array:
-        """The same of the rows in no strip."""
+        """Normal matrices (B, na, na) of the reduced rows in no strip."""
         rows = flat(self.rows)
         return rows.mT @ rows
 
 
 def eliminated(rows: Compact, damping: Array) -> Eliminated:
-    """Own unknowns eliminated with Marquardt damping (B,), zero for none.
+    """Eliminate the own unknowns of all configurations, with Marquardt damping (B,), zero for none.
 
-    The damping's rows sqrt(damping) diag(column norms) are appended, so a configuration that its
-    data do not fix stays solvable.
+    The damping appends the rows sqrt(damping) diag(column norms), so that a configuration whose own
+    unknowns its data do not determine stays solvable.
     """
     (layout, numbers), by_own = rows.strips, rows.by_own
     n_runs, d, na = len(numbers), layout.n_own, layout.n_shared
+    # products of the strips' columns, summed by configuration and over all configurations
     strips = numbers.swapaxes(1, 2)
     products = strips @ np.ascontiguousarray(strips[:, :, :d].mT)
     sums = _summed(products, layout.own_target, (n_runs, layout.count, d, d + na + 2))
@@ -240,7 +284,7 @@ def _group_sums(layout: StripLayout, numbers: Array) -> tuple[Array, Array]:
 
 
 def _summed(parts: Array, target: Integers, shape: tuple[int, ...]) -> Array:
-    """Numbers (B, ...) of each run summed where ``target`` says."""
+    """Sums (B, *shape) of each run's numbers (B, ...) at the flat indices ``target``."""
     out = np.zeros(shape)
     for total, own in zip(out.reshape(len(out), -1), parts.reshape(len(out), -1), strict=True):
         np.add.at(total, target, own)
@@ -248,7 +292,7 @@ def _summed(parts: Array, target: Integers, shape: tuple[int, ...]) -> Array:
 
 
 def _root(square: Array) -> Array:
-    """Matrices (..., d, d) with ``root^T root = square``, which may be singular."""
+    """Square roots (..., d, d) with ``root^T root = square``; a square may be singular."""
     try:
         return np.linalg.cholesky(square).mT
     except np.linalg.LinAlgError:
@@ -257,11 +301,14 @@ def _root(square: Array) -> Array:
 
 
 class NormalPart(NamedTuple):
-    """The normal equations of some configurations' rows, their own unknowns eliminated, and what a
-    step needs of them once the rows are forgotten.
+    """Reduced normal equations of some configurations, and what the own step needs of them.
 
-    matrix : (B, na, na) and gradient (B, na) of the shared unknowns. cost : (B,). usable :
-    (B, K, r). along, fitted, inverse, damped : see :class:`Eliminated`.
+    The rows themselves are not stored.
+
+    matrix, gradient : (B, na, na) and (B, na) by the shared unknowns.
+    cost : (B,) sum of squares over usable rows.
+    usable : (B, K, r) as in :class:`Linear`.
+    along, fitted, inverse, damped : as in :class:`Eliminated`.
     """
 
     matrix: Array
@@ -274,13 +321,13 @@ class NormalPart(NamedTuple):
     damped: Array
 
     def own(self, shared: Array) -> Array:
-        """The own unknowns' step (B, K, d) after the shared one (B, na)."""
+        """Step of the own unknowns (B, K, d) for a step of the shared unknowns (B, na)."""
         right = self.fitted[..., None] + self.along @ shared[:, None, :, None]
         return -(self.inverse @ right)[..., 0]
 
 
 def _part(rows: Compact, damping: Array) -> NormalPart:
-    """A part's normal equations."""
+    """Reduced normal equations of some configurations, with damping (B,)."""
     eliminated_part = eliminated(rows, damping)
     taken_up = flat(eliminated_part.along_strips).mT @ flat(eliminated_part.fitted[..., None])
     residual = flat(rows.by_shared).mT @ flat(eliminated_part.residual[..., None])
@@ -300,7 +347,7 @@ def _part(rows: Compact, damping: Array) -> NormalPart:
 
 
 class NormalEquations(NamedTuple):
-    """The normal equations of all parts; see :class:`NormalPart`."""
+    """Reduced normal equations summed over all parts; see :class:`NormalPart`."""
 
     matrix: Array
     gradient: Array
@@ -308,7 +355,7 @@ class NormalEquations(NamedTuple):
     parts: list[NormalPart]
 
     def step(self, damping: Array) -> tuple[Array, list[Array]]:
-        """Levenberg-Marquardt step: shared (B, na) and own (B, K, d) of each part."""
+        """Levenberg-Marquardt step: shared (B, na), and own (B, K, d) of each part."""
         scaled, scale = unit_diagonal(self.matrix)
         # at least a few rounding units, so that an unidentified direction gives no step
         np.einsum("...ii->...i", scaled)[...] += np.maximum(damping, 1e-15)[:, None]
@@ -317,11 +364,12 @@ class NormalEquations(NamedTuple):
         return shared, [part.own(shared) for part in self.parts]
 
     def promise(self, shared: Array, own: list[Array]) -> tuple[Array, Array]:
-        """By how much the linear model lessens the cost along a step, to first order, and the
-        square of its change of all residuals, (B,) each.
+        """Predicted change of the cost along a step, (B,) each.
 
-        With ``by_own = Q R`` the residuals' change is ``rows shared - Q fitted``, so that both
-        follow from what is left of the rows; the damping's own share is taken out.
+        Returns -2 g . x, the decrease of the cost to first order, and |J x|^2, the squared change
+        of all residuals, so that the linear model predicts a decrease of their difference. With
+        ``by_own = Q R`` the residuals change by ``rows shared - Q fitted``, so both follow from the
+        reduced normal equations; the rows of the damping are subtracted.
         """
         fitted = total(np.sum(part.fitted**2, axis=(1, 2)) for part in self.parts)
         damped = zip(self.parts, own, strict=True)
@@ -332,12 +380,12 @@ class NormalEquations(NamedTuple):
 
 
 def total(parts: Iterable[Array]) -> Array:
-    """Their sum."""
+    """Sum of arrays of one shape."""
     return reduce(np.add, parts)
 
 
 def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquations:
-    """The normal equations of all parts, each reduced before the next is asked for."""
+    """Normal equations of all parts; each part is reduced before the next is evaluated."""
     done: list[NormalPart] = []
     for rows in parts:
         if done:  # the rows on shared unknowns only stand in the first part
@@ -350,7 +398,10 @@ def normal_equations(parts: Iterable[Compact], damping: Array) -> NormalEquation
 
 
 def cost_of(value: Array, shared_value: Array, usable: Booleans) -> Array:
-    """Sum of squares over usable rows; NaN there means that a leg was lost: infinite."""
+    """Cost (B,): sum of squares over usable rows (B, K, r) and rows on shared unknowns (B, c).
+
+    Infinite where a usable row is NaN: a leg that could be predicted no longer can.
+    """
     used = np.where(usable, value, 0.0).reshape(len(value), -1)
     total = np.sum(used * used, axis=1) + np.sum(shared_value * shared_value, axis=1)
     return np.where(np.isfinite(total), total, np.inf)
