@@ -1,6 +1,6 @@
-"""What takes a while to make and comes out the same each time, kept in the user's cache folder.
+"""Cache in the user's cache folder, for results that take a while and are reproducible.
 
-Nothing depends on it: where the folder cannot be read or written, all is made anew.
+It is optional: where the folder cannot be read or written, results are made anew.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def remembered(name: str) -> bytes | None:
-    """What is kept under a name; None for nothing."""
+    """Content under a name, None if there is none."""
     try:
         return (cache_folder() / name).read_bytes()
     except OSError:
@@ -19,7 +19,9 @@ def remembered(name: str) -> bytes | None:
 
 
 def remember(name: str, content: bytes) -> None:
-    """Keep it, whole or not at all, for this user alone to read: code is kept, and a key."""
+    """Store content, as a whole or not at all, readable for this user only: code and a key are
+    stored.
+    """
     place = cache_folder()
     new = place / f"{name}.{os.getpid()}"
     with suppress(OSError):
@@ -33,7 +35,7 @@ def remember(name: str, content: bytes) -> None:
 
 
 def cache_folder() -> Path:
-    """The user's cache folder; it may not exist yet."""
+    """The user's cache folder, which may not exist yet."""
     from platformdirs import user_cache_path
 
     return user_cache_path("pkmcal", appauthor=False)

@@ -1,5 +1,7 @@
-"""How much an input may hold. Each limit is several times what any machine or session needs, and is
-checked before what it limits takes time or memory; docs/files.md has them for readers.
+"""Limits on the size of inputs.
+
+Each limit is several times what any machine or session needs, and is checked before the input takes
+time or memory; docs/files.md lists them.
 """
 
 from __future__ import annotations
@@ -7,48 +9,52 @@ from __future__ import annotations
 from pkmcal.errors import InputError
 
 LARGEST_TEXT_FILE = 2**26
-"""Bytes of a text: 64 MB of calibration.json hold the residuals of 100,000 images."""
+"""Bytes of a text file: 64 MB of calibration.json hold the residuals of 100,000 images."""
 LARGEST_WRITTEN_FILE = 2**20
 """Bytes of a file that people write: a session of 200 stations with comments has 100 kB."""
 MOST_YAML_NODES = 50_000
 """Keys and values of a YAML file as written. A large machine has a thousand; reading these takes
-two seconds."""
+two seconds.
+"""
 MOST_VALUES = 200_000
-"""Values that a file may expand to. Aliases of aliases reach billions from one short line, and
-would fill the memory."""
+"""Values that a file may expand to. Aliases of aliases expand one short line to billions, which
+would fill the memory.
+"""
 MOST_CHARACTERS = 10_000_000
-"""The same of their texts."""
+"""Characters that the texts of a file may expand to."""
 MOST_NESTED_LEVELS = 50
-"""Levels of lists and mappings in one another. A machine has six; programs that read JSON give up
-at two hundred or so."""
+"""Levels of nested lists and mappings. A machine has six; programs that read JSON fail at about two
+hundred.
+"""
 MOST_MACHINE_LEGS = 32
 """Legs of a machine; redundant ones have eight."""
 MOST_LEG_TUBES = 16
 """Tubes of a leg; a telescopic leg has five. Each is measured in every image."""
 MOST_STATIONS = 200
-"""Entries of ``stations``: places of cameras that stand, and trackers."""
+"""Entries of ``stations``: fixed cameras and trackers."""
 MOST_IMAGES = 20_000
-"""Images of a station: of all configurations, ten times each."""
+"""Images of a station: ten of each configuration on average."""
 MOST_PIXELS = 2**28
 """Pixels of an image: 268 million, some twice as many as the largest cameras have. Decoding takes
 four bytes each."""
 MOST_HANDHELD_IMAGES = 500
-"""Images that were taken by hand, each of which is a station of its own."""
+"""Hand-held images, each of which is a station of its own."""
 MOST_ROWS = 10_000
 """Rows of a table, which are configurations: a bed of 10,000 heights takes a minute."""
 MOST_COLUMNS = 100
 """Columns of a table; three for each leg leave room."""
 MOST_FAULTS_NAMED = 50
-"""Faults of one file that are looked at more closely; the others are found after these are
-mended."""
+"""Faults of one file that are reported in detail; the others are reported once these are
+corrected.
+"""
 
 
 def check_count(
     number: int, most: int, what: str, where: str | None = None, next_step: str | None = None
 ) -> None:
-    """Raise `InputError` where there are more than a limit allows.
+    """Raise `InputError` where a number exceeds a limit.
 
-    what : in the plural, such as "stations".
+    what : what is counted, in the plural, such as "stations".
     """
     if number > most:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Locks between processes; each ends with its process, however that ends."""
+"""Locks between processes; the operating system releases a lock when its process ends."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from pkmcal.errors import InputError
 from pkmcal.files.cache import cache_folder
 
 FOLDER_LOCK_FILE = "lock"
-"""An empty file in a folder in which one process at a time works; it stays there."""
+"""Empty file in a folder in which one process at a time works; it is not removed."""
 LONGEST_WAIT_FOR_OUTPUT = 60.0
-"""Seconds that a process waits for another one to move its files: this takes a second or so."""
+"""Seconds that a process waits for another one to move its files, which takes about a second."""
 LOCK_ATTEMPT_INTERVAL = 0.05
 """Seconds between two attempts."""
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
-"""Flag of os.open by which a link is not followed, where the operating system has it."""
+"""Flag of os.open that refuses links, where the operating system has it."""
 
 _PLACES: ContextVar[frozenset[str]] = ContextVar("_PLACES", default=frozenset())
 """Folders around outputs that this thread has locked."""
@@ -31,8 +31,8 @@ _PLACES: ContextVar[frozenset[str]] = ContextVar("_PLACES", default=frozenset())
 def lock(file: int) -> bool | None:
     """Lock an open file, by its descriptor, for as long as this process keeps it open.
 
-    False where another process has locked it; None where the file system has no locks at all, as
-    some of a network have none.
+    Returns False where another process has locked it, and None where the file system has no locks,
+    as some network file systems.
     """
     try:
         if sys.platform == "win32":
@@ -51,10 +51,10 @@ def lock(file: int) -> bool | None:
 
 @contextmanager
 def output_lock(output: Path) -> Generator[None]:
-    """Look at an output and move files to it while no other process does; wait for one that does.
+    """Context in which no other process reads the state of an output or moves files to it.
 
-    Raises `InputError` where that takes longer than LONGEST_WAIT_FOR_OUTPUT. Without effect inside
-    itself, and where there are no locks.
+    Waits for a process that does; raises `InputError` after LONGEST_WAIT_FOR_OUTPUT. Nested
+    contexts, and file systems without locks, have no effect.
     """
     place = _place(output)
     if place in _PLACES.get():
@@ -86,12 +86,12 @@ def output_busy(output: Path) -> bool:
 
 
 def _place(output: Path) -> str:
-    """The folder around an output, of which there is one lock."""
+    """The folder around an output, which has one lock."""
     return str(Path(os.path.realpath(output)).parent)
 
 
 def _locked_file(place: str, output: Path) -> int | None:
-    """An open file with the lock of a folder, None without one."""
+    """Descriptor with the lock of a folder, None where there are no locks."""
     end = time.monotonic() + LONGEST_WAIT_FOR_OUTPUT
     for file in _lockable_files(place):
         while (success := lock(file)) is False:
@@ -110,8 +110,8 @@ def _locked_file(place: str, output: Path) -> int | None:
 
 
 def _lockable_files(place: str) -> Iterator[int]:
-    """The folder itself, so that no file is left in it; where a folder cannot be opened or locked,
-    as in Windows, a file of the user's cache folder.
+    """Descriptors that may carry a folder's lock: the folder itself, so that no file is left in it;
+    where a folder cannot be opened or locked, as on Windows, a file in the user's cache folder.
     """
     with suppress(OSError):
         yield os.open(place, os.O_RDONLY)

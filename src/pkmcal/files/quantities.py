@@ -1,8 +1,8 @@
-"""Lengths, angles and shares with a unit, as people write them: 269.3 mm, 30 deg, 0.1 %.
+"""Lengths, angles and ratios with a unit, as people write them: 269.3 mm, 30 deg, 0.1 %.
 
 A number without a unit is in metres, radians or parts of one. :data:`Metres`, :data:`Radians`,
-:data:`Share` and :data:`Reading` are the types of such fields in a file's schema; in a table, a
-column's head may name its unit, ``leg1 [mm]``.
+:data:`Share` and :data:`Reading` are types of fields in a file's schema; in a table, a column's
+head may name its unit, ``leg1 [mm]``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from pydantic import BeforeValidator
 from pkmcal.files.documents import quoted
 
 LARGEST_UNITLESS_LENGTH = 50.0
-"""m; a machine or a camera's place without a unit that is larger was written in millimetres."""
+"""Largest plausible length without a unit, m: a larger machine, or position of a camera, was
+written in millimetres.
+"""
 _QUANTITY = re.compile(
     r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})"
 )
@@ -33,7 +35,11 @@ _KINDS = {
 
 
 class Unit(NamedTuple):
-    """What a number in it is multiplied by to be one of ``kind``: "m", "rad" or "" (parts of 1)."""
+    """Unit of a quantity.
+
+    factor : to SI.
+    kind : "m", "rad" or "" (parts of 1).
+    """
 
     factor: float
     kind: str
@@ -41,7 +47,7 @@ class Unit(NamedTuple):
 
 @cache
 def unit(name: str) -> Unit | None:
-    """The unit of a name such as mm, in, deg or %; None for what is none of these quantities'."""
+    """Unit with a name such as mm, in, deg or %; None for names of no such quantity."""
     import pint
 
     try:
@@ -49,7 +55,7 @@ def unit(name: str) -> Unit | None:
     except (pint.PintError, AssertionError):  # the latter for signs that stand alone
         return None
     kind = _ROOTS.get(str(root))
-    # without a dimension there are decibels and pi, too
+    # decibels and pi are dimensionless, too
     if kind is None or (kind == "" and name not in SHARE_UNIT_NAMES):
         return None
     return Unit(float(factor), kind)
@@ -57,46 +63,47 @@ def unit(name: str) -> Unit | None:
 
 @cache
 def _registry() -> Any:
+    """Registry of units."""
     import pint  # a third of a second: only where somebody writes a unit
 
     return pint.UnitRegistry()
 
 
 def written_unit(value: object) -> Unit | None:
-    """The unit with which a file's value is written, or None."""
+    """Unit with which a file's value is written, or None."""
     match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
     return unit(match[2]) if match else None
 
 
 def any_unit(data: object) -> bool:
-    """Whether any value of a file's content is written with its unit."""
+    """Whether any value of a file's content is written with a unit."""
     if isinstance(data, (dict, list)):
         return any(map(any_unit, data.values() if isinstance(data, dict) else data))
     return written_unit(data) is not None
 
 
 def split_head(head: str) -> tuple[str, Unit | None]:
-    """A column's name, and the unit that its head names behind it."""
+    """Name of a column, and the unit behind it in the column's head."""
     match = _HEAD.fullmatch(head)
     reference_values = unit(match[2] or match[3]) if match else None
     return (match[1], reference_values) if match and reference_values else (head, None)
 
 
 def no_such(kind: str, value: object) -> str:
-    """A sentence about a value with a unit of another kind."""
+    """Sentence about a value with a unit of another kind."""
     what, plain, example = _KINDS[kind]
     return f"{quoted(value)} is not {what}; write it in {plain}, or with a unit, such as {example}"
 
 
 def _read(kind: str, value: Any) -> Any:
-    """A number in SI of a text with a unit; anything else is left to the schema to judge."""
+    """Convert text with a unit to a number in SI; any other value is left to the schema."""
     match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
     if not match:
         return value
     reference_values = unit(match[2])
     if reference_values is None or reference_values.kind not in kind.split(" or "):
         raise ValueError(no_such(kind, value))
-    # decimal, so that 269.3 mm is what 0.2693 is
+    # decimal arithmetic, so that 269.3 mm equals 0.2693
     return float(Decimal(match[1]) * Decimal(repr(reference_values.factor)))
 
 

@@ -1,4 +1,4 @@
-"""What a person can do where the operating system refuses to write."""
+"""Advice where the operating system refuses to write."""
 
 from __future__ import annotations
 
@@ -18,5 +18,5 @@ _NEXT_STEPS = {
 
 
 def next_step_after(error: OSError) -> str:
-    """The sentence for a message's ``next_step``, without its full stop."""
+    """Sentence for a message's ``next_step``, without its full stop."""
     return _NEXT_STEPS.get(error.errno or 0, "Name another folder")

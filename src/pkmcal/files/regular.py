@@ -1,4 +1,4 @@
-"""What stands under a file's name: a file, or something that reading would wait for for ever."""
+"""Check that a path is a regular file: reading a pipe or a device would block."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _KINDS = (
 
 
 def resolved(path: Path) -> Path:
-    """The absolute path with its links followed, as far as they lead: of a link that leads to
-    itself, the link. `Path.resolve` raises an error of its own kind there.
+    """Absolute path with its links followed as far as they lead, up to a link that leads to itself,
+    where `Path.resolve` raises another kind of error.
     """
     return Path(os.path.realpath(path))
 
 
 def check_regular(path: Path, label: str) -> None:
-    """Raise `InputError` where `path` is there and is no file, before it is opened.
+    """Raise `InputError`, before it is opened, where `path` exists and is not a regular file.
 
     label : its name in messages. Raises FileNotFoundError where nothing is there.
     """

@@ -1,14 +1,14 @@
-"""New files moved to their places in a folder that holds others already.
+"""Replacement of files in a folder that holds other files.
 
-A replacement is committed by one rename: a complete folder of new files, with a journal of what is
-to be moved and removed, becomes COMMITTED_FOLDER of the output. From then on it has to be
-finished: by the same process, or after a kill by the next one that writes to the same output.
+A replacement is committed by one rename: a complete folder of new files, with a journal of the
+files to be moved and removed, becomes COMMITTED_FOLDER of the output. From then on it has to be
+finished: by the same process, or after a kill by the next process that writes to the same output.
 Reading finishes nothing.
 
-The output may be part of a session that somebody else made, with a COMMITTED_FOLDER in it that
-would overwrite any file. Therefore a journal counts only where it is signed with a key that this
-user's cache folder holds and names the output's place; files are moved only if they have the
-digests in it, and nothing is moved or removed through a link.
+The output may be part of a session that somebody else made, with a COMMITTED_FOLDER that would
+overwrite any file. Therefore a journal is accepted only if it is signed with a key in this user's
+cache folder and names the output's place; files are moved only if they have the digests in the
+journal, and nothing is moved or removed through a link.
 """
 
 from __future__ import annotations
@@ -30,18 +30,22 @@ from pkmcal.files.locks import LOCK_ATTEMPT_INTERVAL, output_busy, output_lock
 from pkmcal.files.refusals import next_step_after
 
 COMMITTED_FOLDER = ".pkmcal-replacing"
-"""Inside an output folder: new files on the way to their places, and the journal."""
+"""Folder inside an output with the new files that are to be moved, and the journal."""
 NEW_FILES_FOLDER = "new"
 JOURNAL_FILE = "journal"
 LARGEST_JOURNAL = 2**24
-"""Bytes; of a hundred thousand files."""
+"""Largest size of a journal in bytes, that of a hundred thousand files."""
 JOURNAL_KEY_NAME, JOURNAL_KEY_BYTES = "journal-key", 32
 LONGEST_WAIT_FOR_MOVES = 10.0
 """Seconds that a reader waits while another process moves its files, which takes milliseconds."""
 
 
 class _Journal(NamedTuple):
-    """What a replacement does. digests : by the names of new files. gone : names to be removed."""
+    """Content of a replacement.
+
+    digests : by the names of new files.
+    gone : names of files to be removed.
+    """
 
     digests: Mapping[str, str]
     gone: Sequence[str]
@@ -65,11 +69,10 @@ def check_replaced(folder: Path) -> None:
 
 
 def commit_replacement(stage: Path, folder: Path, gone: Sequence[str]) -> None:
-    """Replace files in `folder` by all that lie in `stage`/NEW_FILES_FOLDER; both are on one file
-    system.
+    """Replace files in `folder` by all files in `stage`/NEW_FILES_FOLDER, on the same file system.
 
-    gone : names of files in `folder` to be removed. Raises OSError before anything is changed where
-    a file or a link stands in a folder's place, or a folder in a file's.
+    gone : names of files in `folder` to be removed. Raises OSError, before anything changes, where
+    a file or a link is in a folder's place, or a folder in a file's.
     """
     new = stage / NEW_FILES_FOLDER
     names = [path.relative_to(new).as_posix() for path in files_below(new)]
@@ -88,7 +91,8 @@ def commit_replacement(stage: Path, folder: Path, gone: Sequence[str]) -> None:
 def finish_replacement(folder: Path) -> None:
     """Finish a replacement in `folder`, an output, in which a process of this user was killed.
 
-    Raises `InputError` for one that this user did not begin there, and where files cannot be moved.
+    Raises `InputError` for a replacement that this user did not begin there, and where files cannot
+    be moved.
     """
     if not _unfinished(folder):
         return
@@ -109,13 +113,13 @@ def finish_replacement(folder: Path) -> None:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """All files in a folder and its folders."""
+    """All files in a folder and its subfolders."""
     return [path for path in sorted(folder.rglob("*")) if not path.is_dir()]
 
 
 def _unfinished(folder: Path) -> bool:
-    """Whether anything stands under COMMITTED_FOLDER but an empty folder, which is a finished one's
-    last trace.
+    """Whether COMMITTED_FOLDER exists and is not empty; an empty one is the remains of a finished
+    replacement.
     """
     place = folder / COMMITTED_FOLDER
     if not os.path.lexists(place):
@@ -129,9 +133,9 @@ def _unfinished(folder: Path) -> bool:
 
 
 def _signed_journal(folder: Path) -> _Journal | None:
-    """The journal of a replacement that this user began in this place, None of any other.
+    """Journal of a replacement that this user began in this place, None for any other.
 
-    What is there of the new files is as it was then, and no link stands where files go.
+    The new files are unchanged since then, and no link is where files go.
     """
     place = folder / COMMITTED_FOLDER
     try:
@@ -148,7 +152,7 @@ def _signed_journal(folder: Path) -> _Journal | None:
             _check_target(folder, name)
             _check_target(place / NEW_FILES_FOLDER, name)
             source = place / NEW_FILES_FOLDER / name
-            # a file that is not there any more was moved
+            # a file that no longer exists here was moved already
             if os.path.lexists(source):
                 regular = source.is_file() and not source.is_symlink()
                 if not regular or _digest(source) != digest:
@@ -161,7 +165,9 @@ def _signed_journal(folder: Path) -> _Journal | None:
 
 
 def _move(folder: Path, journal: _Journal) -> None:
-    """Move what has not been moved yet; a rename replaces a link, and does not follow it."""
+    """Move the files that have not been moved yet; a rename replaces a link without following
+    it.
+    """
     place = folder / COMMITTED_FOLDER
     try:
         for name in journal.gone:
@@ -178,7 +184,7 @@ def _move(folder: Path, journal: _Journal) -> None:
             found=f"the rest of them in {COMMITTED_FOLDER}",
             next_step=f"{next_step_after(error)}; then run this again, which finishes it",
         ) from None
-    # The journal last: without it, nobody could tell that all has been moved.
+    # The journal last: without it, no process could determine that all files have been moved.
     new = place / NEW_FILES_FOLDER
     for path in (*sorted(new.rglob("*"), reverse=True), new):
         with suppress(OSError):
@@ -189,15 +195,13 @@ def _move(folder: Path, journal: _Journal) -> None:
 
 
 def _folders_above(folder: Path, name: str) -> Iterator[Path]:
-    """The folders between `folder` and a file below it, from the top."""
+    """Folders between `folder` and a file below it, from the top."""
     for part in reversed(Path(name).parents[:-1]):
         yield folder / part
 
 
 def _check_target(folder: Path, name: str) -> None:
-    """Raise OSError where a file cannot be moved to its place below `folder`, or would be moved out
-    of it.
-    """
+    """Raise OSError where a file cannot be moved to its place below `folder`, or would leave it."""
     for part in _folders_above(folder, name):
         if part.is_symlink():
             raise NotADirectoryError(20, "a link stands where a folder should go", str(part))
@@ -209,9 +213,10 @@ def _check_target(folder: Path, name: str) -> None:
 
 
 def _signature(payload: bytes) -> bytes:
-    """Of a journal, with the key of this user, which is made when first needed.
+    """Signature of a journal with this user's key, which is made when first needed.
 
-    Where no key can be kept, each signature has its own, and nothing is ever finished later.
+    Where no key can be stored, each signature has a new one, and no replacement can be finished
+    later.
     """
     key = remembered(JOURNAL_KEY_NAME)
     if key is None or len(key) != JOURNAL_KEY_BYTES:
@@ -221,5 +226,6 @@ def _signature(payload: bytes) -> bytes:
 
 
 def _digest(path: Path) -> str:
+    """SHA-256 digest of a file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
