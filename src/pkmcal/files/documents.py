@@ -322,6 +322,7 @@ class _Loader(yaml.SafeLoader):
     top = ""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node; raises _LimitError for one too deep or too many."""
         if self.depth == 1:
             self.top = getattr(index, "value", "")
         if self.depth > MOST_NESTED_LEVELS:
@@ -349,6 +350,7 @@ class _Dumper(yaml.SafeDumper):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
+        """Write every value in full."""
         return True
 
     def write_double_quoted(self, text: str, split: bool = True) -> None:
@@ -361,6 +363,7 @@ class _Dumper(yaml.SafeDumper):
 
 def _text_node(dumper: _Dumper, text: str) -> yaml.ScalarNode:
     # PyYAML leaves odd line breaks bare between single quotes, and reads them back as blanks.
+    """Scalar of a text; double-quoted where any character is not legible."""
     style = None if legible(text, keep="\n\t") == text else '"'
     return dumper.represent_scalar(_TAG + "str", text, style=style)
 
@@ -472,6 +475,7 @@ class _Builder:
                 )
 
     def _scalar(self, node: yaml.Node) -> str | int | float | bool | None:
+        """Plain value of a scalar. Raises `InputError` for tags that are not allowed."""
         kind = node.tag.removeprefix(_TAG)
         if not isinstance(node, yaml.ScalarNode) or kind not in _CONSTRUCT:
             raise self._error(node, f"the tag {node.tag} is not allowed here")
@@ -481,11 +485,13 @@ class _Builder:
             raise self._error(node, f"{quoted(node.value)} is not a usable {kind}") from None
 
     def _key(self, node: yaml.Node) -> str:
+        """Text of a key. Raises `InputError` for a list or a mapping."""
         if not isinstance(node, yaml.ScalarNode):
             raise self._error(node, "a key is a list or a mapping; it should be a word")
         return node.value
 
     def _error(self, node: yaml.Node, what: str, keys: Keys = ()) -> InputError:
+        """Error at a node's line."""
         place = f", {field_path(keys)}" if keys else ""
         return InputError(what, where=f"{self.label}, line {node.start_mark.line + 1}{place}")
 
@@ -511,7 +517,7 @@ def json_value(value: Any) -> Any:
         )
     if isinstance(value, (list, tuple)):
         if set(map(type, value)) == {float} and all(map(math.isfinite, value)):
-            return list(value)  # a row of a matrix: most numbers stand in one
+            return list(value)  # a row of a matrix, as most numbers are
         return [json_value(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
@@ -522,6 +528,7 @@ def json_text(value: Any) -> str:
 
 
 def _text(value: Any, indent: str) -> str:
+    """JSON text of a value that starts at an indent."""
     if not isinstance(value, (dict, list)) or _is_row(value):
         return _line(value)
     if not any(isinstance(item, (dict, list)) for item in _items(value)):
@@ -550,6 +557,7 @@ def _line(value: Any) -> str:
 
 
 def _escape(sign: str) -> str:
+    """JSON escape of a character; a surrogate is spelt out."""
     return json.dumps(legible(sign) if "\ud800" <= sign <= "\udfff" else sign)[1:-1]
 
 
@@ -557,6 +565,7 @@ _NUMBERS = {int, float, bool, type(None)}
 
 
 def _items(value: dict[str, Any] | list[Any]) -> list[Any]:
+    """Values of an object or a list."""
     return list(value.values()) if isinstance(value, dict) else value
 
 
@@ -596,4 +605,5 @@ _ODD = re.compile(r'"(?:\\.|[^"\\])*"?|(?P<number>NaN|-?Infinity|-?\d{1000,})')
 
 
 def _refuse(constant: str) -> float:
+    """Raise ValueError for NaN and Infinity, which are not JSON."""
     raise ValueError(constant)

@@ -52,7 +52,7 @@ def unit(name: str) -> Unit | None:
 
     try:
         factor, root = _registry().get_root_units(name)
-    except (pint.PintError, AssertionError):  # the latter for signs that stand alone
+    except (pint.PintError, AssertionError):  # the latter for single signs
         return None
     kind = _ROOTS.get(str(root))
     # decibels and pi are dimensionless, too

@@ -145,6 +145,7 @@ def _phrases(
             else listed(reference_values, 12)
         )
         return "this key is not known", str(keys[-1]), expected or None
+    # unions by a tag
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         tags = context.get("expected_tags") or _tags(schemas)
         return (
@@ -158,6 +159,7 @@ def _phrases(
     if kind == "too_long" and isinstance(value, (list, dict)):
         entries = f"{len(value)} entries"
         return _WHAT[kind], entries, _EXPECTED[kind].format_map(context)
+    # types and ranges
     limits = {name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in context.items()}
     expected = (
         _EXPECTED[kind].format_map(limits)

@@ -89,10 +89,12 @@ def read_csv(
         raise InputError(
             "the file is empty", where=label, expected=f"a header: {CONFIGURATION_COLUMN},…"
         )
+    # header: names and units of the columns
     heads = [split_head(head) for head in header[1:]]
     header[1:] = [name for name, _ in heads]
     _check_header(header, columns, f"{label}, line {header_line}", (CONFIGURATION_COLUMN,))
     check_count(len(header), MOST_COLUMNS, "columns", f"{label}, line {header_line}")
+    # rows; plain ones are read quickly
     lines: dict[str, int] = {}
     values = array("d")
     for line, cells in rows:
@@ -118,6 +120,7 @@ def read_csv(
             )
     if not lines:
         raise InputError("there are no rows under the header", where=label)
+    # values in SI
     each = np.array(values).reshape(len(lines), len(header) - 1)
     units = tuple(results for _, results in heads)
     each *= [results.factor if results else 1.0 for results in units]
@@ -151,12 +154,14 @@ def read_pairs(
     header_line, header = next(rows, (0, None))
     if header is None:
         raise InputError("the file is empty", where=label, expected=f"a header: {example}")
+    # header: names and units of the columns
     results = [split_head(head) for head in header[2:]]
     header[2:] = [name for name, _ in results]
     _check_header(
         header, [*columns, *(c for c in optional if c in header)], f"{label}, line {header_line}",
         heads,
     )  # fmt: skip
+    # rows
     pairs, lines, values = list[tuple[str, str]](), list[int](), list[list[float]]()
     for line, cells in rows:
         where = f"{label}, line {line}"
@@ -209,6 +214,7 @@ def _check_header(
     """Raise `InputError` for a faulty header; first : names of the columns that name
     configurations.
     """
+    # other separators than commas
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(header) == 1 and separator in header[0]:
             raise InputError(
@@ -219,6 +225,7 @@ def _check_header(
                 next_step="Save it as CSV (comma delimited); a spreadsheet with English settings"
                 " does so",
             )
+    # names of the first columns
     if tuple(header[: len(first)]) != first:
         several = len(first) > 1
         other = "columns have other names" if several else "column has another name"
@@ -231,6 +238,7 @@ def _check_header(
             + (",".join(columns or ()) if several else "<one column a number>"),
         )
     _check_length(header, where)
+    # names of all columns
     if "" in header:
         number = header.index("") + 1
         raise InputError(f"column {number} of the header has no name", where=where)

@@ -198,6 +198,7 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
             new = stage / _COMPLETE / NEW_FILES_FOLDER
             new.mkdir(parents=True)
             yield new
+            # the caller has written all files: flush them, then move them
             written = files_below(new)
             for path in written:
                 _to_disk(path)

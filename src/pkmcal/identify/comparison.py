@@ -72,9 +72,11 @@ def compare(
             expected=f"{known.name}, {known.n_legs} legs, {len(known.parameters)} parameters",
             next_step="Compare machines of one drawing",
         )
+    # two exact machines: the covariances of centres and tool are not used
     joints = np.asarray(joints, dtype=float)
     nothing = np.zeros((len(known.parameters), len(known.parameters)))
     base, platform = joint_centres(machine, known, nothing)
+    # poses by the frames of the joint centres, or of the poses themselves
     poses = known.forward(joints)
     tool = tool_error(machine, known, nothing, poses, joints, legs_observed=legs_observed)
     return MachineErrors(

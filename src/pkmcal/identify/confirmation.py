@@ -228,15 +228,18 @@ class _Cases(NamedTuple):
         units: tuple[RejectedUnit, ...],
     ) -> _Cases:
         """Terms of an estimate's problem."""
+        # normal equations of the estimate
         base = _prior(problem, state)
         for cut in divisions(*problem.extent):
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
+        # weights in use, and losses of rejected measurements
         pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
         links = problem.link_data.weight
         full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
         losses = Kinds(*(full / np.maximum(as_pairs(kind), 1e-9) ** 2 for kind in problem.kinds))
         edges = measurements.edges
+        # weight, loss and configuration of each unit
         changes, loss, rows = list[_Normal](), list[float](), list[int]()
         for unit in units[:MOST_REJECTED_UNITS]:
             weight = Kinds(edge_weight.copy(), pose_weight.copy(), links.copy())
@@ -259,6 +262,7 @@ class _Cases(NamedTuple):
                 weight.edges[places.row[own], places.place[own]] = 1.0
                 loss.append(full * len(own))
                 rows.append(IMAGE_ROW)
+            # change of the normal equations of its configuration
             cut = slice(row, row + 1)
             there = problem.state_among(state, cut)
             new = Kinds(weight.edges[None], weight.poses[None], weight.links)

@@ -74,7 +74,7 @@ def _beside(info: Information) -> Array:
     half, cells = info.root, info.problem.blocks.cells
     na = half.shape[-1]
     out, tilts = np.zeros((2, na, na))
-    sums = np.zeros((NUMBERS_AN_EDGE, len(cells.count) + 1, na))  # the last of what is in none
+    sums = np.zeros((NUMBERS_AN_EDGE, len(cells.count) + 1, na))  # the last: edges in no cell
     every = -(-int(cells.count.sum()) // MOST_TILTS_COMPARED)
     compared = list[_Tilts]()
     for piece in reduced_edges(info):

@@ -93,7 +93,7 @@ def covariance_of_undetected(info: Information, weight: Array) -> Array:
                 by_any[number] += reference_values @ reference_values.mT
                 in_residuals[number] += np.sum(each * square[:, mine], axis=1)
                 redundancy[number] += np.sum(each, axis=1)
-    # p, and the sum of all
+    # probability p, and J^T D J
     lost = np.sum((1 - weight) * shifted, axis=(1, 2))
     p = (lost + 0.5) / (noticed + lost + 1)
     counted = np.minimum(p * in_residuals / np.maximum(redundancy, LEAST_REDUNDANCY), 1.0)

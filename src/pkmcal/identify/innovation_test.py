@@ -58,6 +58,7 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
         own = own @ used.inverse
         by = np.concatenate([own, (shared - own @ used.along) @ info.root[:, None]], axis=-1)
         value, n = rows.value[..., part.kinds.poses.rows], kind.whiten.shape[-1]
+        # d^2 of each rejected pose
         for run, k, place in np.argwhere(rejected[:, cut]).tolist():
             at = slice(n * place, n * (place + 1))
             r, a = value[run, k, at], by[run, k, at]

@@ -186,7 +186,7 @@ def candidates(s: Situation) -> Iterator[NamedChanges]:
     yield NamedChanges(s.legs, np.eye(len(s.machine.parameters)), rest)
 
 
-# ------------------------------------------------------------------ legs nobody sees, frames
+# ------------------------------------------------------------------ legs in no image, frames
 
 
 def _unseen(s: Situation, leg: int) -> NamedChanges:
@@ -220,7 +220,7 @@ def _conventions(s: Situation) -> Iterator[NamedChanges]:
     layout = s.machine.layout
     bars = any(g.carrier.floats or g.carrier.turns for g in layout.platform)
     if s.photographed or (layout.motion[:3].any() and not bars):
-        shifts = shifts[:, :0]  # photographs, or the platform's turns, tell the ends of legs
+        shifts = shifts[:, :0]  # images, or the platform's rotations, determine both ends
     else:
         one = "of {how}: both can shift alike {ways}"
         yield NamedChanges(s.legs, shifts, one, how=_difference, convention=True)
@@ -251,7 +251,7 @@ def _difference(s: Situation, coefficients: Array) -> str:
     return f"{joined(axes)} of {base} and of {platform}, only the difference is seen{visible}"
 
 
-# ------------------------------------------------------------------ of one leg
+# ------------------------------------------------------------------ one leg
 
 
 def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
@@ -448,6 +448,7 @@ def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
     """
 
     def how(s: Situation, coefficients: Array) -> str:
+        """Words on a single change; none for several."""
         if len(coefficients) > 1:
             return ""
         what, unit = changes(coefficients[0], labels)
@@ -554,7 +555,7 @@ def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[NamedChanges]:
 
 
 def _relation(s: Situation, legs: tuple[int, ...]) -> str:
-    """Words on how the group is seen together with the other legs."""
+    """Words on how stations measure the group together with the other legs."""
     others = [j for j in s.legs if j not in legs]
     with_group = np.any(s.observed[s.observed[:, list(legs)].any(axis=1)], axis=0)
     bridging = [j for j in others if with_group[j]]
@@ -572,6 +573,7 @@ def _rigid(legs: tuple[int, ...], body: int) -> How:
     """Words on the open rigid motions of a group; of both bodies' twelve numbers, on the base's."""
 
     def how(s: Situation, coefficients: Array) -> str:
+        """Words on the twists of one body."""
         own, other = coefficients[:, :6], coefficients[:, 6:]
         twists = own if np.linalg.norm(own) > 0 or not other.size else other
         points = s.machine.values[centre_index(s.machine.layout)[body]]

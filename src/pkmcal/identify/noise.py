@@ -243,6 +243,7 @@ class NoiseShares:
         others, squares = self.others[:, None], np.square(self.z)[:, None]
 
         def value(log: Array) -> Array:
+            """-2 log likelihood (B, G) at log t^2 (B, G)."""
             variance = np.maximum(own + np.exp(log)[..., None] * others, LEAST_VARIANCE)
             return np.sum(np.log(variance) + squares / variance, axis=-1)
 

@@ -144,6 +144,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
+        """Table as HTML, for notebooks."""
         head, *rows = self._cells()
         body = "".join(f"<tr>{_html_cells('td', row)}</tr>" for row in rows)
         return (
@@ -171,6 +172,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
 
 
 def _html_cells(kind: str, row: tuple[str, ...]) -> str:
+    """Cells of one row as HTML."""
     return "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row)
 
 

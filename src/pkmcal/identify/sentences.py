@@ -127,6 +127,7 @@ def sentence(
         "how": open_motion.how(around),
     }
     text = open_motion.motion.words(len(open_motion.legs)).format_map(places)
+    # effect on the platform
     how_far = "This does not move the platform."
     if matters:
         how_far = (

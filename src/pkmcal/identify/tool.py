@@ -220,11 +220,13 @@ def tool_error(
         reached: Booleans = closed.converged & np.isfinite(joints).all(axis=-1)
     else:
         reached = np.ones(n, dtype=bool)
+    # derivatives, and differences to the nominal model, at the poses that can be taken
     rows = np.flatnonzero(reached)
     jacobian = np.full((n, 6, theta.size), np.nan)
     jacobian[rows] = pose_by_parameters(calibrated, joints[rows], poses[rows])
     off = np.full((n, 6, 1), np.nan)
     off[rows, :, 0] = _off(drawing, calibrated, joints[rows], poses[rows])
+    # frames removed from both
     by, off = (
         without_frames(calibrated, poses, change, every=not legs_observed, fitted=fitted)
         for change in (jacobian, off)

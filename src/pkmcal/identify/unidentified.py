@@ -126,6 +126,7 @@ def explain(
     unseen = {id(d) for d in ranks.unidentified}
 
     def text(directions: tuple[ParameterDirection, ...]) -> tuple[Sentence, ...]:
+        """Sentences on some directions."""
         reference = [0.0 if id(d) in unseen else d.information for d in directions]
         return describe(around, direction_vectors(directions, machine), np.array(reference), effect)
 
@@ -212,7 +213,7 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
     alone = np.linalg.norm(residual, axis=0) < CONVENTION_NULL_SHARE
     names = tuple(name for name, is_alone in zip(table.fixed, alone, strict=True) if is_alone)
     others = residual[:, ~alone]
-    kinds = np.unique(np.round(others / CONVENTION_NULL_SHARE), axis=1)  # what is tied counts once
+    kinds = np.unique(np.round(others / CONVENTION_NULL_SHARE), axis=1)  # tied ones count once
     rank = int(np.sum(np.linalg.svd(others, compute_uv=False) > CONVENTION_NULL_SHARE))
     return names, kinds.shape[1] - rank
 

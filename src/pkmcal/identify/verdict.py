@@ -104,11 +104,13 @@ def judge(
     if matter:
         least = WORTH_REPORTING * platform_sigma(estimate)
         matter = [s for s in matter if s.moves_platform > least]
+    # reasons against the result by what is undetermined
     undetermined = [_undetermined(s, Level.WRONG) for s in large]
     if bed:
         undetermined = list(_bed_unknown(bed))
     elif not large:
         undetermined = list(_platform_unknown(estimate, findings.by_drawing))
+    # all findings, in the order of the report
     every = (
         *_estimate_misfit(estimate, method),
         *undetermined,
@@ -201,7 +203,7 @@ def _bed_unknown(bed: Bed) -> Iterator[Finding]:
 
 def _touch_unnoticed(bed: Bed) -> Iterator[Finding]:
     """Doubtful if one undetected wrong height has a large effect: no standard deviation contains
-    it, since the size of a crumb has no distribution.
+    it, since the size of such an error, of a crumb for example, is unknown.
     """
     if bed.unnoticed is None or no_gain(bed.unnoticed, bed.by_drawing):
         yield doubtful(

@@ -9,8 +9,8 @@ With the unit vector e from the first mark to the second, a perturbation (omega,
 pose changes the distance by ``e . (omega x R_2 m + tau)``, the same perturbation of the first pose
 by ``-e . (omega x R_1 m + tau)``, and a shift tau of the tool's point by ``e . (R_2 - R_1) tau``.
 
-Distances determine the size of a machine, for which heights of a bed leave only the nominal model.
-Klipper's ``DELTA_ANALYZE`` uses distances in the same way, from a part of a fixed shape
+Distances determine the size of a machine, which heights of a bed do not determine. Klipper's
+``DELTA_ANALYZE`` uses distances in the same way, from a part of a fixed shape
 (https://www.klipper3d.org/Delta_Calibrate.html).
 """
 
@@ -162,6 +162,7 @@ def _check_row(table: PairTable, k: int, value: float, sigma: float, machine: Ma
             found=f"{first} twice",
             expected="two different configurations",
         )
+    # value
     if value <= 0:
         raise InputError(
             "a distance is a positive number", where=where, found=f"{value:g} m", expected="above 0"
@@ -177,6 +178,7 @@ def _check_row(table: PairTable, k: int, value: float, sigma: float, machine: Ma
             if value <= 1e3 * most
             else None,
         )
+    # standard deviation
     if SIGMA_COLUMN not in table.columns:
         return
     where = table.where(k, table.columns.index(SIGMA_COLUMN))

@@ -153,6 +153,7 @@ def put(state: Runs, runs: Integers, part: Runs) -> Runs:
     """State with the values of some runs replaced by those of ``part``."""
 
     def replaced(array: Array, new: Array) -> Array:
+        """Copy of an array with new values in some runs."""
         out = array.copy()
         out[runs] = new
         return out
@@ -307,9 +308,11 @@ def _minimised(
     state, part, here, at = start, problem, start, values
     normal: Array | None = None
     for _ in range(max_steps):
+        # a step of the active runs
         new, gain = _try(part, here, at, search, tolerance)
         steps[active] += 1
         here, at = _accepted_state(here, new, gain)
+        # accepted states into the result
         if active.size == n_runs:
             state, normal = here, gain.normal
         else:

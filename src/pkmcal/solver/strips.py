@@ -243,6 +243,7 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
         normal[:, columns[:, None], columns] += square[:, k]
         slope[:, columns] += with_value[:, k, :, 0]
         square[:, k], with_shared[:, k], with_value[:, k] = 0.0, 0.0, 0.0
+    # R of the own Jacobian: root of the strips' products, other rows, damping
     norms = np.einsum("...ii->...i", square) + np.einsum("...nm,...nm->...m", by_own, by_own)
     damped = damping[:, None, None] * np.where(norms > 0, norms, 1.0)
     extra = np.sqrt(damped)[..., None] * np.eye(d)
@@ -252,6 +253,7 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     r = np.linalg.qr(np.concatenate([_root(square), by_own, beside], axis=-2), mode="r")
     inverse = np.linalg.inv(r)
 
+    # Q^T J and Q^T value from both sorts of rows
     q = by_own @ inverse
     value = rows.value[..., rows.value.shape[-1] - q.shape[-2] :, None]
     along_strips = inverse.mT @ with_shared
