@@ -29,8 +29,7 @@ from pkmcal.files.replacing import check_replaced
 
 LONGEST_QUOTE = 60
 """Characters of a value that a message quotes: enough to recognise it, short enough for one
-line.
-"""
+line."""
 SHORTEST_PART = 4
 """Letters from which on a part of a name is recognised as the whole."""
 TEXT_BLOCK_BYTES = 2**20
@@ -151,8 +150,7 @@ Keys = tuple[str | int, ...]
 
 LARGEST_WRITTEN_NUMBER = 1e15
 """Largest number in a file, whatever its unit: the fourth power of a larger one, and higher powers,
-would overflow.
-"""
+would overflow."""
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
 """Zero, which no file name may contain, and surrogates, which cannot be encoded."""
 

@@ -14,18 +14,15 @@ LARGEST_WRITTEN_FILE = 2**20
 """Bytes of a file that people write: a session of 200 stations with comments has 100 kB."""
 MOST_YAML_NODES = 50_000
 """Keys and values of a YAML file as written. A large machine has a thousand; reading these takes
-two seconds.
-"""
+two seconds."""
 MOST_VALUES = 200_000
 """Values that a file may expand to. Aliases of aliases expand one short line to billions, which
-would fill the memory.
-"""
+would fill the memory."""
 MOST_CHARACTERS = 10_000_000
 """Characters that the texts of a file may expand to."""
 MOST_NESTED_LEVELS = 50
 """Levels of nested lists and mappings. A machine has six; programs that read JSON fail at about two
-hundred.
-"""
+hundred."""
 MOST_MACHINE_LEGS = 32
 """Legs of a machine; redundant ones have eight."""
 MOST_LEG_TUBES = 16
@@ -33,7 +30,7 @@ MOST_LEG_TUBES = 16
 MOST_STATIONS = 200
 """Entries of ``stations``: fixed cameras and trackers."""
 MOST_IMAGES = 20_000
-"""Images of a station: ten of each configuration on average."""
+"""Images of a station, of all configurations together: ten each of two thousand."""
 MOST_PIXELS = 2**28
 """Pixels of an image: 268 million, some twice as many as the largest cameras have. Decoding takes
 four bytes each."""
@@ -45,8 +42,7 @@ MOST_COLUMNS = 100
 """Columns of a table; three for each leg leave room."""
 MOST_FAULTS_NAMED = 50
 """Faults of one file that are reported in detail; the others are reported once these are
-corrected.
-"""
+corrected."""
 
 
 def check_count(

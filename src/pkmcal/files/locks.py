@@ -53,8 +53,8 @@ def lock(file: int) -> bool | None:
 def output_lock(output: Path) -> Generator[None]:
     """Context in which no other process reads the state of an output or moves files to it.
 
-    Waits for a process that does; raises `InputError` after LONGEST_WAIT_FOR_OUTPUT. Nested
-    contexts, and file systems without locks, have no effect.
+    Waits for a process that does; raises `InputError` after LONGEST_WAIT_FOR_OUTPUT. Without effect
+    inside itself, and on file systems without locks.
     """
     place = _place(output)
     if place in _PLACES.get():

@@ -18,8 +18,7 @@ from pkmcal.files.documents import quoted
 
 LARGEST_UNITLESS_LENGTH = 50.0
 """Largest plausible length without a unit, m: a larger machine, or position of a camera, was
-written in millimetres.
-"""
+written in millimetres."""
 _QUANTITY = re.compile(
     r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})"
 )

@@ -19,8 +19,7 @@ from pkmcal.mechanisms.closure import LimbEnds, limb_ends
 
 COLLINEAR_SPREAD_SHARE = 1e-6
 """Distance of points from one line, relative to their spread, below which they determine no
-rotation about it.
-"""
+rotation about it."""
 
 
 @dataclass(frozen=True)

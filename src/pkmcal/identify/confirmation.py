@@ -46,13 +46,11 @@ NORMAL_RIDGE = 1e-12
 """Ridge on a normal matrix with unit diagonal, for directions that are not determined."""
 MOST_REJECTED_UNITS = 50
 """Largest number of rejected units that are tested; where more are rejected, their share is itself
-the reason not to use the result.
-"""
+the reason not to use the result."""
 
 IMAGE_ROW, LINK_ROW, DROPPED_LINK_ROW = -1, -2, -3
 """Values in place of a configuration, for units that are not poses: images, links, and links that a
-hypothesis rejects.
-"""
+hypothesis rejects."""
 
 
 @dataclass(frozen=True)

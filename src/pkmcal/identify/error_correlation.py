@@ -39,8 +39,7 @@ from pkmcal.solver.search import take
 
 MOST_TILTS_COMPARED = 800
 """Largest number of edges whose tilts are compared, of configurations evenly among all: c then has
-a standard deviation of a few hundredths.
-"""
+a standard deviation of a few hundredths."""
 LEAST_TILT_INFORMATION = 1e-9
 """Information of pairs of tilts, or a probability, below which it is rounding."""
 UNINFORMED_CORRELATED_SHARE = 0.5

@@ -40,8 +40,7 @@ NOTICED_DISTANCE = (FULL_WEIGHT_DISTANCE + NO_WEIGHT_DISTANCE) / 2
 """Residual, in standard deviations, at which an edge has lost half of its weight."""
 WRONG_EDGE_REACH = 3.0
 """Largest error of a wrong edge, pixels: a measurement pass accepts edges within 1.5 pixels of the
-prediction, and the prediction may be off by as much to the other side.
-"""
+prediction, and the prediction may be off by as much to the other side."""
 LEAST_REDUNDANCY = 1e-3
 """Redundancy of a residual below which it is rounding."""
 

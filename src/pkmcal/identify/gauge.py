@@ -48,12 +48,10 @@ class Gauge(Protocol):
 
 FRAME_CHANGE_ROUNDING = 1e-12
 """Value, relative to the machine's size or to 1 for directions, below which it is rounding of a
-change of frames: some thousand times that of a double.
-"""
+change of frames: some thousand times that of a double."""
 COLLINEAR_POINTS_SINE = 1e-3
 """Distance of three points from one line, relative to their distances, below which they determine
-no rotation about it.
-"""
+no rotation about it."""
 
 
 @dataclass(frozen=True)

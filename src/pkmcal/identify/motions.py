@@ -30,26 +30,21 @@ from pkmcal.wording import DISPLAY_UNITS, decimals, joined, named, number, split
 AXIS_LETTERS = "xyz"
 MOST_GROUPS = 120
 """Largest number of groups of legs that are tried; ten stations, each of which sees other legs,
-form about as many.
-"""
+form about as many."""
 MOST_SIZES = 3
 """Largest number of sizes that are tried together, besides all of them; the number of combinations
-grows as powers of two.
-"""
+grows as powers of two."""
 ALIGNED_AXIS_COSINE = 0.985
 """Cosine (10 degrees) of the angle between a direction and an axis up to which the direction has
-that axis's name.
-"""
+that axis's name."""
 THROUGH_AXIS_DISTANCE = 0.05
 """Distance of a joint from an axis, relative to the joints' spread, up to which it lies on the
-axis.
-"""
+axis."""
 NEGLIGIBLE_CHANGE_SHARE = 1e-3
 """Coefficient of a change, relative to its largest one, below which it is negligible."""
 UNTOLD_SIZE_CHANGE = 0.01
 """Change of a size that goes with another one's 1 mm, in mm or degrees, below which it is not
-reported.
-"""
+reported."""
 MOST_VALUES_LISTED = 5
 """Largest number of terms in a sentence, the last of which may stand for all smaller ones."""
 

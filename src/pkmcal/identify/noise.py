@@ -38,8 +38,7 @@ from pkmcal.measurements.rows import Kinds
 
 NOISE_CONTRADICTION_CHANCE = 0.01 / 3
 """Probability of contradicting a noise that is stated correctly: one in a hundred, shared by the
-three kinds of rows.
-"""
+three kinds of rows."""
 LEAST_NOISE_FREEDOM = 5.0
 """Degrees of freedom below which a sum of squares determines no noise."""
 LARGEST_NOISE_STEP = 10.0
@@ -47,8 +46,7 @@ LARGEST_NOISE_STEP = 10.0
 LARGEST_GROUP = 400
 """Rows whose residuals are made independent together. If there are more, they are handled in groups
 of configurations: each has its exact variance, but the correlation between groups, by the few
-shared unknowns, is neglected.
-"""
+shared unknowns, is neglected."""
 LEAST_RESIDUAL_SHARE = 1e-10
 """Eigenvalue of M below which it is rounding: the unknowns absorb the whole direction."""
 LOG_VARIANCES_TRIED = np.linspace(-20.0, 20.0, 41)
@@ -63,8 +61,7 @@ INTERVAL_HALVINGS = 8
 """Number of bisections of an interval of log s^2."""
 HALVINGS_AT_ONCE = 4
 """Bisections of one interval whose points are evaluated together: the likelihood of fifteen points
-takes hardly longer than that of one.
-"""
+takes hardly longer than that of one."""
 
 
 @dataclass(frozen=True)

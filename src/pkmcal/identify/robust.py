@@ -34,12 +34,10 @@ from pkmcal.solver.search import (
 
 CLEAN_TAIL_SHARE = float(np.exp(-(FULL_WEIGHT_DISTANCE**2) / 2))
 """Share of inliers with two residuals whose norm exceeds FULL_WEIGHT_DISTANCE, where weights begin
-to fall.
-"""
+to fall."""
 POSE_STEPS = 10
 """Solver steps of a stage where there are poses: against readings a hundred times sharper they
-allow short steps only at first, and after a single refused step the scales would seem settled.
-"""
+allow short steps only at first, and after a single refused step the scales would seem settled."""
 MOST_ANNEALING_STAGES = 30
 """Largest number of stages of the annealing."""
 GEMAN_MCCLURE_SCALE = 4.0
@@ -49,22 +47,18 @@ GEMAN_MCCLURE_SCALE = 4.0
 LEAST_SCALE = 1.0
 """Lower bound of the noise scale of poses, and of edges without shading. An error that several
 measurements share (a lens) is partly absorbed by the parameters, so residuals are smaller than
-errors: a smaller scale would promise too much.
-"""
+errors: a smaller scale would promise too much."""
 SCALES_TRIED = 2.0 ** np.arange(13)
 """Factors on LEAST_SCALE that are tried as a kind's noise scale."""
 SCALE_STEPS, MOST_REWEIGHTINGS = 5, 8
 """Fixed-point steps to a kind's noise scale after that, and largest number of rounds of weights and
-solution from a start.
-"""
+solution from a start."""
 LOSS_CHANGE = 1e-2
 """Change of the robust cost, in squared standard deviations, below which the weights have
-converged.
-"""
+converged."""
 ROUGHLY_SOLVED_DISTANCE = 1e-2
 """Step tolerance of such a round: remaining change of all fitted values together, in standard
-deviations.
-"""
+deviations."""
 
 
 class RobustStart(NamedTuple):

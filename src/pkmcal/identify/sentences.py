@@ -17,8 +17,7 @@ from pkmcal.wording import capital, in_full, joined, listed, named, split_name, 
 
 LEAST_PLATFORM_MOVE = 0.01
 """Displacement of the platform, relative to a joint centre's prior sigma, below which it counts as
-not moved: a hundredth of the nominal model's uncertainty is negligible beside any calibration's.
-"""
+not moved: a hundredth of the nominal model's uncertainty is negligible beside any calibration's."""
 MOST_SENTENCES = 8
 """Largest number of sentences in a report."""
 MOST_NAMES_IN_SENTENCE = 5

@@ -23,16 +23,13 @@ from pkmcal.mechanisms.kinematics import on_manifold
 
 POSES_AROUND_SESSION = 40
 """Number of poses sampled around the session's, which show errors that the session's few poses
-hide.
-"""
+hide."""
 AROUND_SESSION_TURN, AROUND_SESSION_SHIFT = 0.2, 0.12
 """Ranges of the samples: rotation in rad, and translation relative to the machine's size, the mean
-distance from base to platform plus the platform's radius.
-"""
+distance from base to platform plus the platform's radius."""
 AS_REGULAR = 0.7
 """Smallest distance of a sample from singular poses, relative to the median of the session's own:
-near a singular pose any error is amplified, and no machine works there.
-"""
+near a singular pose any error is amplified, and no machine works there."""
 POSES_AROUND_SEED = 4
 """Seed of the samples."""
 NO_TURN = 1e-9

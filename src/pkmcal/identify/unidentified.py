@@ -34,28 +34,23 @@ INSIDE_OPEN_SHARES = (0.999, 0.95)
 """Shares of a motion (squared) that lie in the open space for it to explain part of that space:
 first those that fit exactly, since many motions are similar once frames are removed, then those
 that fit nearly. The space is that of the estimate, whose noise of poses bends directions that would
-be exact.
-"""
+be exact."""
 WEAK_INFORMATION = 1 / 3
 """Information, in units of the prior's, below which a direction counts as unidentified: the data
 then decide less than a tenth of its variance. Platforms that only translate seem to rotate by their
-poses' noise, so unidentifiable directions have a trace of information.
-"""
+poses' noise, so unidentifiable directions have a trace of information."""
 UNIDENTIFIED_SHARE = 0.5
 """Standard deviation of a mount's position or rotation, relative to its prior, from which on the
-data do not determine it.
-"""
+data do not determine it."""
 NEW_CHANGE_SINE = 0.1
 """Sine of the angle to the motions so far below which a motion describes nothing new."""
 STEPS_TO_FEWEST_NUMBERS, CHEAP_FRAME_WEIGHT = 20, 10.0
 """Reweighting steps to the sparsest coefficients, and how much less those of frames cost, which no
-sentence contains.
-"""
+sentence contains."""
 CONVENTION_NULL_SHARE = 1e-6
 """Residual effect of a fixed parameter, in m per m or rad, that the free parameters cannot
 reproduce, below which it is a convention: both are derivatives of one machine, equal but for
-rounding.
-"""
+rounding."""
 
 
 @dataclass(frozen=True)

@@ -36,32 +36,27 @@ UNIDENTIFIABLE = 0.05
 """Share of the platform's error by the nominal model that may remain undetermined. A calibration
 reduces that error by a factor of twenty to fifty; a twentieth of it would be the result's largest
 error, and more of the same images do not reduce it. A result whose standard deviation is larger
-anyway is no worse for it.
-"""
+anyway is no worse for it."""
 MOSTLY_SINGULAR_SHARE = 0.5
 """Share of configurations near a singular pose from which on no statement about the estimate is
-reliable.
-"""
+reliable."""
 LARGE_CAUSE_SHARE = 0.3
 """Share of what is undetermined from which on a single cause becomes a reason of its own."""
 WORTH_REPORTING = 0.5
 """Displacement relative to the platform's standard deviation from which on a cause is worth a
-warning; one half makes the total larger by an eighth.
-"""
+warning; one half makes the total larger by an eighth."""
 NOMINAL_ERROR_SHARE = 0.5
 """Error relative to that expected by the prior sigmas that a result may leave: below a half the
 result is almost surely better than the nominal model; above, new values are not worth their risk.
 """
 ENOUGH_TOUCHES = 15
 """Heights of a bed, where a wrong one moves the tool by little more than its standard deviation
-before it is detected (benchmarks/heights.py).
-"""
+before it is detected (benchmarks/heights.py)."""
 EXACT_SHARE = 1e-9
 """Share of a variance below which it is rounding."""
 POLISHED_SHADING = 4 * OWN_SHADING
 """Shading of each edge beside its line, px, from which on tubes are like polished metal or in hard
-light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted ones.
-"""
+light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted ones."""
 POOR_MODEL_POSE_SCALE = 1.3
 """Noise scale of poses beyond which the model is insufficient for them, unless by chance."""
 

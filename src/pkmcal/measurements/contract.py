@@ -45,8 +45,7 @@ LEAST_NOISE = 1e-12
 """Smallest standard deviation of a measurement, m or rad: no instrument is better."""
 NOISE_FIELD_RANGE = Field(ge=LEAST_NOISE, lt=10)
 """Range of a stated standard deviation, m or rad: no instrument measures better than the lower end,
-and a measurement worse than the upper end is of no use.
-"""
+and a measurement worse than the upper end is of no use."""
 
 
 class MeasurementKind(ABC):

@@ -16,18 +16,15 @@ SHADING_CORRELATION_ANGLE = np.radians(7.0)
 """Correlation angle of shading, rad: errors of edges of one side of a tube at one station are
 correlated by exp(-angle / SHADING_CORRELATION_ANGLE), angle that between their normals, since a
 mirrored image or a highlight moves with the normal. Edges of path-traced tubes, metal and painted,
-correlate by one half at 5 degrees once the mean of all is removed.
-"""
+correlate by one half at 5 degrees once the mean of all is removed."""
 
 TUBE_CORRELATION = 0.4
 """Factor on that correlation between edges of two tubes of a leg on one side, which are lit by and
-mirror the same surroundings in part: 0.2 to 0.6 on path-traced legs of five finishes.
-"""
+mirror the same surroundings in part: 0.2 to 0.6 on path-traced legs of five finishes."""
 CELLS_AN_ANGLE, CELLS_AN_ANGLE_OF_MANY, MANY_EDGES = 64, 8, 10_000
 """Cells along SHADING_CORRELATION_ANGLE, and the same for many edges, from the third number on,
 where hardly any edge would have a cell of its own. Edges of one cell are correlated to within 0.01,
-and 0.1.
-"""
+and 0.1."""
 
 
 @dataclass(frozen=True)

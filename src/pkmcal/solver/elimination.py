@@ -17,12 +17,10 @@ from pkmcal.arrays import Array, Booleans
 SOLVER_ROWS_AT_ONCE = 2**15
 """Rows that are evaluated in one call, as whole runs or as whole configurations of one run: enough
 that the overhead of a NumPy call is small, few enough that its arrays fit into the processor's
-cache.
-"""
+cache."""
 TALL_BLOCK_ROWS = 512
 """Rows of a block of a tall matrix that is condensed by itself: with fewer columns than this, the
-QR decomposition by blocks takes a third of the time.
-"""
+QR decomposition by blocks takes a third of the time."""
 
 
 class Linear(NamedTuple):

@@ -29,37 +29,31 @@ from pkmcal.solver.strips import (
 
 LEAST_DAMPING = 1e-14
 """Damping at the start of a search, in effect none: near a solution, where most starts are, the
-full step is best, and any damping costs steps along weakly determined directions.
-"""
+full step is best, and any damping costs steps along weakly determined directions."""
 DAMPING_GROWTH = 8.0
 """Factor on the damping after a refused step, and on that factor after each further refusal in a
-row: from LEAST_DAMPING to 0.01 in five refusals.
-"""
+row: from LEAST_DAMPING to 0.01 in five refusals."""
 STRONG_DAMPING = 1e-2
 """Damping from which on a step is small in any case, so that its size does not show convergence."""
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: there is no step downhill."""
 STEP_TOLERANCE = 1e-7
 """Change of all fitted values together, in standard deviations, below which a step ends the search:
-a ten-millionth of what the noise changes, and above their rounding of about 1e-9.
-"""
+a ten-millionth of what the noise changes, and above their rounding of about 1e-9."""
 REFUSED_STEP_TOLERANCE = 1e-3
 """Predicted change below which a refused step ends the search, in standard deviations: the rounding
-of the residuals where one direction is determined a million times worse than the others.
-"""
+of the residuals where one direction is determined a million times worse than the others."""
 COST_ROUNDING = 1e-13
 """Relative rounding of the cost."""
 CACHED_PROBLEM_PARTS = 16
 """Parts of a problem whose intermediate results are stored with their residuals, so that the next
 step continues from them: some 5 MB each. Further parts are evaluated again, so that memory does not
-grow with the problem.
-"""
+grow with the problem."""
 
 FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE = 4.0, 6.5
 """Distances in standard deviations up to which final weights are 1, and from which on they are 0.
 Of pairs of residuals without outliers 3 in 10^4 lose part of their weight and none all of it, so
-the efficiency is above 0.999.
-"""
+the efficiency is above 0.999."""
 
 Runs = TypeVar("Runs")
 """An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""

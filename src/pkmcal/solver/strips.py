@@ -238,6 +238,7 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     square, with_shared, with_value = sums[..., :d], sums[..., d:-2], sums[..., -1:]
     normal, slope = _group_sums(layout, numbers[:, d:])
     for k, columns in zip(*layout.linked_places, strict=True):
+        # own unknowns of linked configurations are shared: their products count there
         normal[:, columns] += with_shared[:, k]
         normal[:, :, columns] += with_shared[:, k].mT
         normal[:, columns[:, None], columns] += square[:, k]
