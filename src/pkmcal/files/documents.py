@@ -28,8 +28,7 @@ from pkmcal.files.regular import check_regular
 from pkmcal.files.replacing import check_replaced
 
 LONGEST_QUOTE = 60
-"""Characters of a value that a message quotes: enough to recognise it, short enough for one
-line."""
+"""Characters of a value that a message quotes: enough to recognise it, on one line."""
 SHORTEST_PART = 4
 """Letters from which on a part of a name is recognised as the whole."""
 TEXT_BLOCK_BYTES = 2**20

@@ -21,8 +21,7 @@ would fill the memory."""
 MOST_CHARACTERS = 10_000_000
 """Characters that the texts of a file may expand to."""
 MOST_NESTED_LEVELS = 50
-"""Levels of nested lists and mappings. A machine has six; programs that read JSON fail at about two
-hundred."""
+"""Levels of nested lists and mappings: a machine has six; JSON readers fail at some two hundred."""
 MOST_MACHINE_LEGS = 32
 """Legs of a machine; redundant ones have eight."""
 MOST_LEG_TUBES = 16
@@ -41,8 +40,7 @@ MOST_ROWS = 10_000
 MOST_COLUMNS = 100
 """Columns of a table; three for each leg leave room."""
 MOST_FAULTS_NAMED = 50
-"""Faults of one file that are reported in detail; the others are reported once these are
-corrected."""
+"""Faults of one file that are reported in detail; the others once these are corrected."""
 
 
 def check_count(

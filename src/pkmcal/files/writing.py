@@ -84,8 +84,7 @@ def default_output(folder: Path) -> Path:
 def check_own_folder(
     folder: Path, names: Collection[str], what: str, earlier: str | None = None
 ) -> list[str]:
-    """Names in a folder. Raises `InputError` where it holds anything but our own files of these
-    names.
+    """Names in a folder. Raises `InputError` where it holds other files than our own ones.
 
     what : such as "a validation".
     earlier : by default, for example, "an earlier validation".
@@ -177,8 +176,7 @@ def staged_file(path: Path | str) -> Generator[Path]:
 
 @contextmanager
 def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[Path]:
-    """Context with an empty folder to write into; on exit without an error, all of it is in
-    `folder`.
+    """Context with an empty folder; on exit without an error, its files are in `folder`.
 
     A new folder appears in one step. Files for an existing folder are committed in one step
     (:mod:`pkmcal.files.replacing`), and moved to their places from there. On an error nothing

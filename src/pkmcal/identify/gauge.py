@@ -4,8 +4,8 @@ Neither edges nor readings determine the base frame or the platform frame: a rig
 six numbers each, changes parameters, stations and poses together and no residual. A gauge is a set
 of twelve linear constraints on the joint centres that selects one choice.
 
-Frame changes, by the perturbation of :mod:`pkmcal.geometry.rigid`: E acts on base coordinates, ``A'
-= E A``, ``T_camera_base' = T_camera_base E^-1``, and F on platform coordinates, ``B' = F B``,
+Frame changes, by the perturbation of :mod:`pkmcal.geometry.rigid`: E acts on base coordinates,
+``A' = E A``, ``T_camera_base' = T_camera_base E^-1``, and F on platform coordinates, ``B' = F B``,
 ``T_base_platform' = E T_base_platform F^-1``. Twelve numbers: E's six, then F's six.
 
 The origins of an articulated platform's numbers are a choice as well, and follow the twelve:

@@ -32,8 +32,7 @@ REJECTED_BELOW_WEIGHT = 0.5
 
 
 def innovations(info: Information, distance: Array, weight: Array, scale: Array) -> Array:
-    """Norms (B, K, G) of the poses; those of rejected poses are relative to their innovations'
-    covariance.
+    """Norms (B, K, G) of the poses; of rejected ones relative to their innovations.
 
     All norms are converted to those of pairs of numbers (:func:`~pkmcal.identify.robust.as_pairs`).
 

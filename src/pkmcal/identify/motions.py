@@ -38,13 +38,11 @@ ALIGNED_AXIS_COSINE = 0.985
 """Cosine (10 degrees) of the angle between a direction and an axis up to which the direction has
 that axis's name."""
 THROUGH_AXIS_DISTANCE = 0.05
-"""Distance of a joint from an axis, relative to the joints' spread, up to which it lies on the
-axis."""
+"""Distance of a joint from an axis, relative to the joints' spread, up to which it lies on it."""
 NEGLIGIBLE_CHANGE_SHARE = 1e-3
 """Coefficient of a change, relative to its largest one, below which it is negligible."""
 UNTOLD_SIZE_CHANGE = 0.01
-"""Change of a size that goes with another one's 1 mm, in mm or degrees, below which it is not
-reported."""
+"""Change of a size beside another one's 1 mm, in mm or degrees, below which it is omitted."""
 MOST_VALUES_LISTED = 5
 """Largest number of terms in a sentence, the last of which may stand for all smaller ones."""
 

@@ -54,8 +54,7 @@ SCALE_STEPS, MOST_REWEIGHTINGS = 5, 8
 """Fixed-point steps to a kind's noise scale after that, and largest number of rounds of weights and
 solution from a start."""
 LOSS_CHANGE = 1e-2
-"""Change of the robust cost, in squared standard deviations, below which the weights have
-converged."""
+"""Change of the robust cost, in squared standard deviations, below which weights have converged."""
 ROUGHLY_SOLVED_DISTANCE = 1e-2
 """Step tolerance of such a round: remaining change of all fitted values together, in standard
 deviations."""

@@ -146,8 +146,7 @@ def sentence(
 
 
 def _mostly(around: Situation, open_motion: OpenMotion, rows: Integers, unit: Array) -> str:
-    """``: +1 mm of a goes with −0.7 mm of b`` for a single change; else the parameters that change
-    most.
+    """``: +1 mm of a goes with −0.7 mm of b`` for a single change; else the parameters.
 
     rows : parameters that change most.
     unit : (P,) prior sigmas.

@@ -1,5 +1,4 @@
-"""Errors of the tool: the platform's pose by errors of the parameters, before and after
-calibration.
+"""Errors of the platform's pose by errors of the parameters, before and after calibration.
 
 The platform's pose is the purpose of a calibration; joint centres and lengths are a means to it.
 """
@@ -22,8 +21,7 @@ from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold
 
 POSES_AROUND_SESSION = 40
-"""Number of poses sampled around the session's, which show errors that the session's few poses
-hide."""
+"""Number of poses sampled around the session's, for errors that few poses hide."""
 AROUND_SESSION_TURN, AROUND_SESSION_SHIFT = 0.2, 0.12
 """Ranges of the samples: rotation in rad, and translation relative to the machine's size, the mean
 distance from base to platform plus the platform's radius."""

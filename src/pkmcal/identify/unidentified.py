@@ -347,8 +347,7 @@ def _within(changes: Array, space: _Open, inside: float) -> Array:
 
 
 def _coefficients(motion: NamedChanges, space: _Open, values: Array) -> Array:
-    """Coefficients (k, m) of a motion for each of the directions ``values`` (k, P), frames
-    excluded.
+    """Coefficients (k, m) of a motion for directions ``values`` (k, P), frames excluded.
 
     Frames leave a choice. Of a single change the coefficients with the smallest sum of magnitudes
     are taken, by iteratively reweighted least squares, so that a sentence has few numbers.

@@ -38,8 +38,7 @@ reduces that error by a factor of twenty to fifty; a twentieth of it would be th
 error, and more of the same images do not reduce it. A result whose standard deviation is larger
 anyway is no worse for it."""
 MOSTLY_SINGULAR_SHARE = 0.5
-"""Share of configurations near a singular pose from which on no statement about the estimate is
-reliable."""
+"""Share of configurations near a singular pose from which on the estimate is not reliable."""
 LARGE_CAUSE_SHARE = 0.3
 """Share of what is undetermined from which on a single cause becomes a reason of its own."""
 WORTH_REPORTING = 0.5
@@ -150,8 +149,7 @@ def _undetermined(sentence: Sentence, level: Level) -> Finding:
 
 
 def _headline(observation: Observation, estimate: Estimate) -> str:
-    """Accuracy that was reached: of the joint centres where legs were measured, else of the
-    platform.
+    """Accuracy of the joint centres where legs were measured, else of the platform.
 
     Boards determine the platform's poses, and leave unidentified what does not move it.
     """
@@ -257,8 +255,7 @@ def _readings_misfit(estimate: Estimate) -> Iterator[Finding]:
 
 
 def _base_alone(estimate: Estimate) -> Finding:
-    """Finding on [B]'s linear method, which determines the base only, with its accuracy by edges
-    and by prior.
+    """Finding on [B]'s linear method, which determines the base only, and on its accuracy.
 
     The variance by the edges alone is found by removing the prior: in units of the prior's
     principal axes, the posterior has the variance v = e / (1 + e) where the edges' is e.

@@ -1,9 +1,9 @@
 """Elimination of each configuration's own unknowns (nuisance parameters), as a square root.
 
-The Schur complement is formed as reduced rows: with ``by_own = Q R`` they are ``(I - Q Q^T)
-by_shared``. A difference of normal matrices would cancel half of the digits, since readings a
-thousand times sharper than edges dominate both terms. :mod:`pkmcal.solver.strips` draws the
-Jacobian.
+The Schur complement is formed as reduced rows: with ``by_own = Q R`` they are
+``(I - Q Q^T) by_shared``. A difference of normal matrices would cancel half of the digits, since
+readings a thousand times sharper than edges dominate both terms. :mod:`pkmcal.solver.strips` draws
+the Jacobian.
 """
 
 from __future__ import annotations
