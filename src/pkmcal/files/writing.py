@@ -84,7 +84,7 @@ def default_output(folder: Path) -> Path:
 def check_own_folder(
     folder: Path, names: Collection[str], what: str, earlier: str | None = None
 ) -> list[str]:
-    """Names in a folder. Raises `InputError` where it holds other files than our own ones.
+    """Names in a folder. Raises `InputError` where it holds anything but files of ``names``.
 
     what : such as "a validation".
     earlier : by default, for example, "an earlier validation".

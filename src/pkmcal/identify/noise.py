@@ -6,8 +6,8 @@ kind have the covariance ``M = R_kk`` if all noise is as stated. As R is idempot
     M = M M + F + O,      M M by the kind's own noise, F by the prior, O by all other rows,
 
 and where the noise of the kind is s times, and that of all others t times the stated one, then
-``s^2 M M + F + t^2 O``. In the directions u with ``u^T M u = 1`` that diagonalize M M, residuals are
-independent normal numbers z of the variances
+``s^2 M M + F + t^2 O``. In the directions u with ``u^T M u = 1`` that diagonalize M M, the
+residuals are independent normal numbers z of the variances
 
     v = s^2 own + t^2 others + fixed,      own + others + fixed = 1 for each,
 

@@ -33,8 +33,7 @@ from pkmcal.solver.search import (
 )
 
 CLEAN_TAIL_SHARE = float(np.exp(-(FULL_WEIGHT_DISTANCE**2) / 2))
-"""Share of inliers with two residuals whose norm exceeds FULL_WEIGHT_DISTANCE, where weights begin
-to fall."""
+"""Share of inliers with two residuals beyond FULL_WEIGHT_DISTANCE, where weights begin to fall."""
 POSE_STEPS = 10
 """Solver steps of a stage where there are poses: against readings a hundred times sharper they
 allow short steps only at first, and after a single refused step the scales would seem settled."""
