@@ -33,7 +33,7 @@ def remember(name: str, content: bytes) -> None:
 
 
 def cache_folder() -> Path:
-    """The user's cache folder; it may not exist yet."""
+    """The user's cache folder, which may not exist yet."""
     from platformdirs import user_cache_path
 
     return user_cache_path("pkmcal", appauthor=False)

@@ -1,4 +1,4 @@
-"""Text, YAML with line numbers, and JSON: files read, and the phrases that messages are made of."""
+"""Text, YAML with line numbers, and JSON: reading and writing, and phrases for messages."""
 
 from __future__ import annotations
 
@@ -28,26 +28,25 @@ from pkmcal.files.regular import check_regular
 from pkmcal.files.replacing import check_replaced
 
 LONGEST_QUOTE = 60
-"""Characters of a found value that a message quotes: enough to recognise it, short enough for
-one line."""
+"""Characters of a value that a message quotes: enough to recognise it, on one line."""
 SHORTEST_PART = 4
-"""Letters from which on a part of a name stands for the whole."""
+"""Letters from which on a part of a name is recognised as the whole."""
 TEXT_BLOCK_BYTES = 2**20
-"""Bytes of a text that are in memory at a time where it is read line by line."""
+"""Bytes of a text in memory at a time, where it is read line by line."""
 
 
 def read_text(path: Path, label: str | None = None, largest: int = LARGEST_TEXT_FILE) -> str:
     """Text of a UTF-8 file, without byte-order mark and with Unix line ends.
 
-    label : the file's name in messages; the path's last part unless told. largest : bytes that it
-    may have.
+    label : the file's name in messages; by default the last part of the path.
+    largest : largest size in bytes.
     """
     return "".join(text_blocks(path, label or path.name, largest))
 
 
 def text_blocks(path: Path, label: str, largest: int = LARGEST_TEXT_FILE) -> Iterator[str]:
-    """The same in blocks of whole lines, some TEXT_BLOCK_BYTES bytes each: of a table of many
-    megabytes no more has to be in memory.
+    """Text of a UTF-8 file in blocks of whole lines of some TEXT_BLOCK_BYTES bytes each, so that a
+    table of many megabytes does not have to fit into memory.
     """
     lines, mark = 0, "\ufeff"
     for raw in _raw_blocks(path, label, largest):
@@ -56,7 +55,7 @@ def text_blocks(path: Path, label: str, largest: int = LARGEST_TEXT_FILE) -> Ite
 
 
 def _raw_blocks(path: Path, label: str, largest: int) -> Iterator[bytes]:
-    """A file's bytes, cut behind line ends of any kind."""
+    """Bytes of a file, cut after line ends of any kind."""
     try:
         check_replaced(path.parent)
         check_regular(path, label)
@@ -88,7 +87,7 @@ def _raw_blocks(path: Path, label: str, largest: int) -> Iterator[bytes]:
 
 
 def _decoded(raw: bytes, label: str, before: int) -> str:
-    """A block's text with Unix line ends; before : lines of the file before it."""
+    """Text of a block with Unix line ends; before : number of lines before the block."""
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -113,18 +112,18 @@ def _decoded(raw: bytes, label: str, before: int) -> str:
 
 
 def wanted_file(path: Path) -> str:
-    """Say, for a message, which file is missing, and the name like it that is there."""
+    """Phrase about the file that is missing, with a file of a similar name that exists."""
     folder = path.parent
     if not folder.is_dir():
         return f"a file {path} (its folder does not exist either)"
-    # by their stems: any two files of one kind are alike by their suffix
+    # compared by stem, since all files of one kind share their suffix
     stems = {entry.stem: entry.name for entry in sorted(folder.iterdir(), reverse=True)}
     neighbour = stems.get(closest(path.stem, stems) or "")
     return f"a file {path}" + (f" (there is {neighbour})" if neighbour else "")
 
 
 def closest(name: str, names: Iterable[str]) -> str | None:
-    """Return the known name that a misspelt one most likely means, or None."""
+    """The name that a misspelt one most likely means, or None."""
     by_lower = {candidate.lower(): candidate for candidate in names}
     if len(name) >= SHORTEST_PART:  # such as gough of gough-stewart
         whole = [candidate for candidate in by_lower if name.lower() in candidate]
@@ -136,7 +135,7 @@ def closest(name: str, names: Iterable[str]) -> str | None:
 
 
 def quoted(value: object) -> str:
-    """Quote a found value briefly."""
+    """Quote a value for a message, shortened to LONGEST_QUOTE characters."""
     if value is None:
         return "nothing"
     if isinstance(value, bool):
@@ -146,13 +145,13 @@ def quoted(value: object) -> str:
 
 
 Keys = tuple[str | int, ...]
-"""Where a value stands in a file: keys and zero-based list indices from the top."""
+"""Path of a value in a file: keys and zero-based list indices from the top."""
 
 LARGEST_WRITTEN_NUMBER = 1e15
-"""Of a number that a person writes, whatever its unit; what is computed with larger ones, to the
-fourth power and further, would overflow."""
+"""Largest number in a file, whatever its unit: the fourth power of a larger one, and higher powers,
+would overflow."""
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
-"""Zero, which no file's name may hold, and halves of characters, which cannot be written."""
+"""Zero, which no file name may contain, and surrogates, which cannot be encoded."""
 
 _TAG = "tag:yaml.org,2002:"
 _SCALARS = (
@@ -179,7 +178,7 @@ _CONSTRUCT: dict[str, Callable[[str], str | int | float | bool | None]] = {
 
 @dataclass(frozen=True)
 class Document:
-    """A file's content and the line of each of its values.
+    """Content of a file with the line of each of its values.
 
     label : the file's name in messages.
     data : plain dicts, lists, str, int, float, bool and None; keys are str.
@@ -192,9 +191,9 @@ class Document:
     lines: Mapping[Keys, int]
 
     def where(self, *keys: str | int) -> str:
-        """Name file, line and field, as in "session.yaml, line 12, stations.front.camera".
+        """File, line and field for a message, as in "session.yaml, line 12, stations.front.camera".
 
-        A field that is missing has its nearest parent's line, and none at the top.
+        A missing field has the line of its nearest parent, and none at the top.
         """
         reference_values = keys
         while reference_values and reference_values not in self.lines:
@@ -204,19 +203,19 @@ class Document:
 
 
 def field_path(keys: Keys) -> str:
-    """Write keys as a path; lists count from 1, as parameter names do: ``legs[1].base.center``."""
+    """Keys as a path; lists count from 1, as parameter names do: ``legs[1].base.center``."""
     text = "".join(f"[{key + 1}]" if isinstance(key, int) else f".{key}" for key in keys)
     return text.removeprefix(".")
 
 
 def read_yaml(path: Path | str, label: str | None = None) -> Document:
-    """Read a YAML file whose top is a mapping; every fault is an `InputError` with its line."""
+    """Read a YAML file whose top is a mapping; every fault raises an `InputError` with its line."""
     path = Path(path)
     return parse_yaml(read_text(path, label, LARGEST_WRITTEN_FILE), path, label)
 
 
 def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
-    """As `read_yaml`, on text that is already in hand; `path` only names it."""
+    """Parse YAML text as `read_yaml` does; `path` only names it."""
     label = label or path.name
     try:
         loader = _Loader(text)
@@ -253,7 +252,7 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
 
 
 def compose_yaml(text: str) -> yaml.Node:
-    """The nodes of a text that `parse_yaml` has read, with the marks of where each stands."""
+    """Node tree of a text that `parse_yaml` has accepted, with the position of each node."""
     node = _Loader(text).get_single_node()
     if node is None:
         raise InputError("the file is empty", expected="keys and values")
@@ -261,7 +260,9 @@ def compose_yaml(text: str) -> yaml.Node:
 
 
 def _checked(document: Document) -> Document:
-    """The same, if all its texts can be written, and nothing in it is nested too deeply."""
+    """The document, if all its texts can be written and it is not nested too deeply; else raise
+    `InputError`.
+    """
     todo: list[tuple[Keys, Any]] = [((), document.data)]
     while todo:
         keys, value = todo.pop()
@@ -286,6 +287,7 @@ def _checked(document: Document) -> Document:
 
 
 def _check_characters(document: Document, keys: Keys, text: str) -> None:
+    """Raise `InputError` for a character that cannot be written."""
     if bad := _NO_TEXT.search(text):
         raise InputError(
             "this text holds a character that cannot be written",
@@ -296,7 +298,7 @@ def _check_characters(document: Document, keys: Keys, text: str) -> None:
 
 
 def yaml_text(data: Mapping[str, Any]) -> str:
-    """Write plain data as YAML that `read_yaml` reads back the same; short lists stay on one line.
+    """Plain data as YAML text that `read_yaml` reads back unchanged; short lists stay on one line.
 
     Keys keep their order; floats are written in full (shortest text with the same value).
     """
@@ -305,11 +307,11 @@ def yaml_text(data: Mapping[str, Any]) -> str:
 
 
 class _LimitError(yaml.MarkedYAMLError):
-    """More of something than a file may hold."""
+    """A file exceeds one of the limits."""
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader with YAML 1.2's scalars, and an end of nesting and of values."""
+    """PyYAML's safe loader with YAML 1.2's scalars and limits on nesting and number of values."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
     depth = 0
@@ -317,6 +319,7 @@ class _Loader(yaml.SafeLoader):
     top = ""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node; raises _LimitError for one too deep or too many."""
         if self.depth == 1:
             self.top = getattr(index, "value", "")
         if self.depth > MOST_NESTED_LEVELS:
@@ -337,15 +340,18 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Its counterpart: quotes what `_Loader` would not read as text; never writes aliases."""
+    """Counterpart of `_Loader`: quotes text that it would not read as text, and writes no
+    aliases.
+    """
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
     def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
+        """Write every value in full."""
         return True
 
     def write_double_quoted(self, text: str, split: bool = True) -> None:
-        """Escape all but ASCII where something in the text is not legible."""
+        """Escape all but ASCII if any character of the text is not legible."""
         allowed = self.allow_unicode
         self.allow_unicode = allowed and legible(text, keep="\n\t") == text
         super().write_double_quoted(text, split)
@@ -354,6 +360,7 @@ class _Dumper(yaml.SafeDumper):
 
 def _text_node(dumper: _Dumper, text: str) -> yaml.ScalarNode:
     # PyYAML leaves odd line breaks bare between single quotes, and reads them back as blanks.
+    """Scalar of a text; double-quoted where any character is not legible."""
     style = None if legible(text, keep="\n\t") == text else '"'
     return dumper.represent_scalar(_TAG + "str", text, style=style)
 
@@ -367,11 +374,11 @@ for _name, _pattern, _first in _SCALARS:
 
 
 _Pairs = dict[str, tuple[yaml.Node, yaml.Node]]
-"""A mapping's keys with their own nodes and those of their values."""
+"""Keys of a mapping, with the nodes of key and value."""
 
 
 class _Builder:
-    """Turns a YAML node tree into plain data, noting lines and refusing what would be misread."""
+    """Converts a YAML node tree to plain data; records lines, and refuses what would be misread."""
 
     def __init__(self, loader: _Loader, label: str) -> None:
         self.loader = loader
@@ -385,7 +392,7 @@ class _Builder:
         self._aliases = False
 
     def value(self, node: yaml.Node, keys: Keys) -> Any:
-        """Plain data of a node that stands at `keys`."""
+        """Plain data of a node at `keys`."""
         self.lines.setdefault(keys, node.start_mark.line + 1)
         self._count_up(node)
         if len(keys) > MOST_NESTED_LEVELS:
@@ -403,6 +410,7 @@ class _Builder:
             self._open.discard(id(node))
 
     def _mapping(self, node: yaml.MappingNode, keys: Keys) -> dict[str, Any]:
+        """Plain data of a mapping; a repeated key is an error."""
         names_so_far: dict[str, int] = {}
         for key_node, _ in node.value:
             key, line = self._key(key_node), key_node.start_mark.line + 1
@@ -419,7 +427,9 @@ class _Builder:
         return {key: self.value(child, (*keys, key)) for key, (_, child) in pairs.items()}
 
     def _pairs(self, node: yaml.MappingNode) -> _Pairs:
-        """A mapping's pairs, those that it merges (<<) first; its own win, and then the first."""
+        """Pairs of a mapping, merged ones (<<) first; its own override these, and earlier merges
+        later ones.
+        """
         if id(node) in self._merged:
             return self._merged[id(node)]
         pairs: _Pairs = {}
@@ -442,7 +452,9 @@ class _Builder:
         return self._merged.setdefault(id(node), pairs)
 
     def _count_up(self, node: yaml.Node) -> None:
-        """Count a value, and refuse too many; an alias makes thousands of one."""
+        """Count a value and raise an error beyond the limit; an alias makes thousands of one
+        value.
+        """
         self._count += 1
         self._characters += len(node.value) if isinstance(node, yaml.ScalarNode) else 0
         self._aliases = self._aliases or id(node) in self._counted
@@ -460,6 +472,7 @@ class _Builder:
                 )
 
     def _scalar(self, node: yaml.Node) -> str | int | float | bool | None:
+        """Plain value of a scalar. Raises `InputError` for tags that are not allowed."""
         kind = node.tag.removeprefix(_TAG)
         if not isinstance(node, yaml.ScalarNode) or kind not in _CONSTRUCT:
             raise self._error(node, f"the tag {node.tag} is not allowed here")
@@ -469,11 +482,13 @@ class _Builder:
             raise self._error(node, f"{quoted(node.value)} is not a usable {kind}") from None
 
     def _key(self, node: yaml.Node) -> str:
+        """Text of a key. Raises `InputError` for a list or a mapping."""
         if not isinstance(node, yaml.ScalarNode):
             raise self._error(node, "a key is a list or a mapping; it should be a word")
         return node.value
 
     def _error(self, node: yaml.Node, what: str, keys: Keys = ()) -> InputError:
+        """Error at a node's line."""
         place = f", {field_path(keys)}" if keys else ""
         return InputError(what, where=f"{self.label}, line {node.start_mark.line + 1}{place}")
 
@@ -483,7 +498,9 @@ _WIDEST = 160
 
 
 def json_value(value: Any) -> Any:
-    """Arrays, tuples and NumPy numbers as JSON has them; what is not finite becomes null."""
+    """Convert arrays, tuples and NumPy numbers to JSON's types; numbers that are not finite become
+    null.
+    """
     if value is None or isinstance(value, str | int):  # most values; of Python's own types
         return value
     if isinstance(value, float):
@@ -497,7 +514,7 @@ def json_value(value: Any) -> Any:
         )
     if isinstance(value, (list, tuple)):
         if set(map(type, value)) == {float} and all(map(math.isfinite, value)):
-            return list(value)  # a row of a matrix: most numbers stand in one
+            return list(value)  # a row of a matrix, as most numbers are
         return [json_value(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
@@ -508,6 +525,7 @@ def json_text(value: Any) -> str:
 
 
 def _text(value: Any, indent: str) -> str:
+    """JSON text of a value that starts at an indent."""
     if not isinstance(value, (dict, list)) or _is_row(value):
         return _line(value)
     if not any(isinstance(item, (dict, list)) for item in _items(value)):
@@ -526,7 +544,7 @@ _encoded = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
 
 
 def _line(value: Any) -> str:
-    """JSON on one line. What is not legible is escaped; halves of characters, which no program
+    """JSON on one line. Characters that are not legible are escaped; surrogates, which no program
     reads back, are spelt out.
     """
     text = _encoded(value)
@@ -536,6 +554,7 @@ def _line(value: Any) -> str:
 
 
 def _escape(sign: str) -> str:
+    """JSON escape of a character; a surrogate is spelt out."""
     return json.dumps(legible(sign) if "\ud800" <= sign <= "\udfff" else sign)[1:-1]
 
 
@@ -543,11 +562,12 @@ _NUMBERS = {int, float, bool, type(None)}
 
 
 def _items(value: dict[str, Any] | list[Any]) -> list[Any]:
+    """Values of an object or a list."""
     return list(value.values()) if isinstance(value, dict) else value
 
 
 def _is_row(value: Any) -> bool:
-    """A row of a matrix or a table, which is easier to read on one line however long it is."""
+    """Whether a value is a row of numbers, which is easier to read on one line however long."""
     return isinstance(value, list) and _NUMBERS.issuperset(map(type, value))
 
 
@@ -578,8 +598,9 @@ def read_json(path: Path | str, label: str | None = None) -> Document:
 
 
 _ODD = re.compile(r'"(?:\\.|[^"\\])*"?|(?P<number>NaN|-?Infinity|-?\d{1000,})')
-"""Numbers that Python's reader refuses without saying where, outside strings."""
+"""Numbers outside strings that Python's reader refuses without their position."""
 
 
 def _refuse(constant: str) -> float:
+    """Raise ValueError for NaN and Infinity, which are not JSON."""
     raise ValueError(constant)

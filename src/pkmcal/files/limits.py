@@ -21,8 +21,7 @@ values, which would fill the memory."""
 MOST_CHARACTERS = 10_000_000
 """Characters of all texts after the expansion of aliases."""
 MOST_NESTED_LEVELS = 50
-"""Levels of lists and mappings in one another. A machine has six; programs that read JSON give up
-at two hundred or so."""
+"""Levels of nested lists and mappings: a machine has six; JSON readers fail at some two hundred."""
 MOST_MACHINE_LEGS = 32
 """Legs of a machine; redundant ones have eight."""
 MOST_LEG_TUBES = 16
@@ -30,7 +29,7 @@ MOST_LEG_TUBES = 16
 MOST_STATIONS = 200
 """Entries of ``stations``: fixed cameras and trackers."""
 MOST_IMAGES = 20_000
-"""Images of a station: of all configurations, ten times each."""
+"""Images of a station, of all configurations together: ten each of two thousand."""
 MOST_PIXELS = 2**28
 """Pixels of an image: 268 million, some twice as many as the largest cameras have. Decoding takes
 four bytes each."""

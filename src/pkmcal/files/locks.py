@@ -1,4 +1,4 @@
-"""Locks between processes; each ends with its process, however that ends."""
+"""Locks between processes; the operating system releases a lock when its process ends."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from pkmcal.errors import InputError
 from pkmcal.files.cache import cache_folder
 
 FOLDER_LOCK_FILE = "lock"
-"""An empty file in a folder in which one process at a time works; it stays there."""
+"""Empty file in a folder in which one process at a time works; it is not removed."""
 LONGEST_WAIT_FOR_OUTPUT = 60.0
 """Seconds that a process waits while another one moves its files, which takes a second or so."""
 LOCK_ATTEMPT_INTERVAL = 0.05
 """Seconds between two attempts."""
 NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
-"""Flag of os.open by which a link is not followed, where the operating system has it."""
+"""Flag of os.open that refuses links, where the operating system has it."""
 
 _PLACES: ContextVar[frozenset[str]] = ContextVar("_PLACES", default=frozenset())
 """Parent folders of outputs that this context has locked."""

@@ -46,10 +46,10 @@ def unit(name: str) -> Unit | None:
 
     try:
         factor, root = _registry().get_root_units(name)
-    except (pint.PintError, AssertionError):  # the latter for signs that stand alone
+    except (pint.PintError, AssertionError):  # the latter for single signs
         return None
     kind = _ROOTS.get(str(root))
-    # without a dimension there are decibels and pi, too
+    # decibels and pi are dimensionless, too
     if kind is None or (kind == "" and name not in SHARE_UNIT_NAMES):
         return None
     return Unit(float(factor), kind)
@@ -57,6 +57,7 @@ def unit(name: str) -> Unit | None:
 
 @cache
 def _registry() -> Any:
+    """Registry of units."""
     import pint  # a third of a second: only where somebody writes a unit
 
     return pint.UnitRegistry()
@@ -96,7 +97,7 @@ def _read(kind: str, value: Any) -> Any:
     reference_values = unit(match[2])
     if reference_values is None or reference_values.kind not in kind.split(" or "):
         raise ValueError(no_such(kind, value))
-    # decimal, so that 269.3 mm is what 0.2693 is
+    # decimal arithmetic, so that 269.3 mm equals 0.2693
     return float(Decimal(match[1]) * Decimal(repr(reference_values.factor)))
 
 

@@ -1,14 +1,14 @@
 """Transactional replacement of files in a folder that already holds others.
 
-A replacement is committed by one rename: a complete folder of new files, with a journal of what is
-to be moved and removed, becomes COMMITTED_FOLDER of the output. From then on it has to be
-finished: by the same process, or after a kill by the next one that writes to the same output.
+A replacement is committed by one rename: a complete folder of new files, with a journal of the
+files to be moved and removed, becomes COMMITTED_FOLDER of the output. From then on it has to be
+finished: by the same process, or after a kill by the next process that writes to the same output.
 Reading finishes nothing.
 
-The output may be part of a session that somebody else made, with a COMMITTED_FOLDER in it that
-would overwrite any file. Therefore a journal counts only where it is signed with a key that this
-user's cache folder holds and names the output's place; files are moved only if they have the
-digests in it, and nothing is moved or removed through a link.
+The output may be part of a session that somebody else made, with a COMMITTED_FOLDER that would
+overwrite any file. Therefore a journal is accepted only if it is signed with a key in this user's
+cache folder and names the output's place; files are moved only if they have the digests in the
+journal, and nothing is moved or removed through a link.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from pkmcal.files.locks import LOCK_ATTEMPT_INTERVAL, output_busy, output_lock
 from pkmcal.files.refusals import next_step_after
 
 COMMITTED_FOLDER = ".pkmcal-replacing"
-"""Inside an output folder: new files on the way to their places, and the journal."""
+"""Folder inside an output with the new files that are to be moved, and the journal."""
 NEW_FILES_FOLDER = "new"
 JOURNAL_FILE = "journal"
 LARGEST_JOURNAL = 2**24
-"""Bytes; of a hundred thousand files."""
+"""Largest size of a journal in bytes, that of a hundred thousand files."""
 JOURNAL_KEY_NAME, JOURNAL_KEY_BYTES = "journal-key", 32
 LONGEST_WAIT_FOR_MOVES = 10.0
 """Seconds that a reader waits while another process moves files, which takes milliseconds."""
@@ -65,11 +65,10 @@ def check_replaced(folder: Path) -> None:
 
 
 def commit_replacement(stage: Path, folder: Path, gone: Sequence[str]) -> None:
-    """Replace files in `folder` by all that lie in `stage`/NEW_FILES_FOLDER; both are on one file
-    system.
+    """Replace files in `folder` by all files in `stage`/NEW_FILES_FOLDER, on the same file system.
 
-    gone : names of files in `folder` to be removed. Raises OSError before anything is changed where
-    a file or a link stands in a folder's place, or a folder in a file's.
+    gone : names of files in `folder` to be removed. Raises OSError, before anything changes, where
+    a file or a link is in a folder's place, or a folder in a file's.
     """
     new = stage / NEW_FILES_FOLDER
     names = [path.relative_to(new).as_posix() for path in files_below(new)]
@@ -88,7 +87,8 @@ def commit_replacement(stage: Path, folder: Path, gone: Sequence[str]) -> None:
 def finish_replacement(folder: Path) -> None:
     """Finish a replacement in `folder`, an output, in which a process of this user was killed.
 
-    Raises `InputError` for one that this user did not begin there, and where files cannot be moved.
+    Raises `InputError` for a replacement that this user did not begin there, and where files cannot
+    be moved.
     """
     if not _unfinished(folder):
         return
@@ -148,7 +148,7 @@ def _signed_journal(folder: Path) -> _Journal | None:
             _check_target(folder, name)
             _check_target(place / NEW_FILES_FOLDER, name)
             source = place / NEW_FILES_FOLDER / name
-            # a file that is not there any more was moved
+            # a file that no longer exists here was moved already
             if os.path.lexists(source):
                 regular = source.is_file() and not source.is_symlink()
                 if not regular or _digest(source) != digest:
@@ -178,7 +178,7 @@ def _move(folder: Path, journal: _Journal) -> None:
             found=f"the rest of them in {COMMITTED_FOLDER}",
             next_step=f"{next_step_after(error)}; then run this again, which finishes it",
         ) from None
-    # The journal last: without it, nobody could tell that all has been moved.
+    # The journal last: without it, no process could determine that all files have been moved.
     new = place / NEW_FILES_FOLDER
     for path in (*sorted(new.rglob("*"), reverse=True), new):
         with suppress(OSError):
@@ -189,15 +189,13 @@ def _move(folder: Path, journal: _Journal) -> None:
 
 
 def _folders_above(folder: Path, name: str) -> Iterator[Path]:
-    """The folders between `folder` and a file below it, from the top."""
+    """Folders between `folder` and a file below it, from the top."""
     for part in reversed(Path(name).parents[:-1]):
         yield folder / part
 
 
 def _check_target(folder: Path, name: str) -> None:
-    """Raise OSError where a file cannot be moved to its place below `folder`, or would be moved out
-    of it.
-    """
+    """Raise OSError where a file cannot be moved to its place below `folder`, or would leave it."""
     for part in _folders_above(folder, name):
         if part.is_symlink():
             raise NotADirectoryError(20, "a link stands where a folder should go", str(part))
@@ -222,5 +220,6 @@ def _signature(payload: bytes) -> bytes:
 
 
 def _digest(path: Path) -> str:
+    """SHA-256 digest of a file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

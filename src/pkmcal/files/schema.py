@@ -1,4 +1,4 @@
-"""A document checked against a pydantic schema; what is wrong comes back as one sentence."""
+"""Validation of a document against a pydantic schema; all faults become one message."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ SchemaModel = TypeVar("SchemaModel", bound=BaseModel)
 class Schema(BaseModel):
     """Base of every file's schema: unknown keys refused, types exact, numbers finite.
 
-    A field's ``description`` completes "expected …" in the message about its absence, so write it
-    as a noun phrase: "the camera's file, for example cameras/front.yaml".
+    The ``description`` of a field completes "expected …" in the message about its absence: a noun
+    phrase, such as "the camera's file, for example cameras/front.yaml".
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
@@ -35,10 +35,10 @@ class Schema(BaseModel):
 
 
 def validated_document(document: Document, model: type[SchemaModel]) -> SchemaModel:
-    """Return the document as a `model`, or raise one `InputError` about everything wrong in it.
+    """The document as a `model`; raises one `InputError` about all of its faults.
 
-    The first fault in the file's order makes the sentence; the others are named after it, so that
-    they can be mended in one go.
+    The first fault in the file's order makes the sentence; the places of the others follow, so that
+    all can be corrected at once.
     """
     try:
         # By way of JSON, because there a list may become a tuple while types stay exact.
@@ -70,7 +70,7 @@ def validated_document(document: Document, model: type[SchemaModel]) -> SchemaMo
 
 
 def _check_numbers(document: Document, fields: dict[str, Any]) -> None:
-    """Raise `InputError` for a number that is too large, in any of the fields that are used."""
+    """Raise `InputError` for a number that is too large, in any field that is used."""
     todo: list[tuple[Keys, Any]] = [((), fields)]
     while todo:
         keys, value = todo.pop()
@@ -89,7 +89,9 @@ def _check_numbers(document: Document, fields: dict[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class _Fault:
-    """One of pydantic's errors: where in the file, which known key was meant, our error."""
+    """One of pydantic's errors: its place in the file, the key that was probably meant, and our
+    error.
+    """
 
     line: int
     keys: Keys
@@ -99,15 +101,16 @@ class _Fault:
 
 
 def _line(document: Document, details: ErrorDetails) -> int:
-    """The line of a fault's key, or of what it is missing from."""
+    """Line of a fault's key, or of the mapping that lacks it."""
     keys = _keys_in(document.data, details["loc"], missing=details["type"] == "missing")
     return document.lines.get(keys, document.lines.get(keys[:-1], 0))
 
 
 def _fault(document: Document, root: JsonSchema, details: ErrorDetails) -> _Fault:
+    """Convert one of pydantic's errors."""
     missing = details["type"] == "missing"
     keys = _keys_in(document.data, details["loc"], missing=missing)
-    # An entry that a list lacks is told as a list that is too short.
+    # a missing entry of a list is reported as a list that is too short
     short = missing and isinstance(keys[-1], int)
     keys = keys[:-1] if short else keys
     location = details["loc"][:-1] if short else details["loc"]
@@ -142,6 +145,7 @@ def _phrases(
             else listed(reference_values, 12)
         )
         return "this key is not known", str(keys[-1]), expected or None
+    # unions by a tag
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         tags = context.get("expected_tags") or _tags(schemas)
         return (
@@ -155,6 +159,7 @@ def _phrases(
     if kind == "too_long" and isinstance(value, (list, dict)):
         entries = f"{len(value)} entries"
         return _WHAT[kind], entries, _EXPECTED[kind].format_map(context)
+    # types and ranges
     limits = {name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in context.items()}
     expected = (
         _EXPECTED[kind].format_map(limits)
@@ -191,11 +196,13 @@ _EXPECTED = {
     "string_too_long": "text of {max_length} characters at most",
     "string_too_short": "text of {min_length} characters at least",
 }
-"""What each of pydantic's error types wants, in a reader's words; the rest keep pydantic's."""
+"""Phrase for each of pydantic's error types; other types keep pydantic's message."""
 
 
 def _keys_in(data: Any, location: tuple[int | str, ...], *, missing: bool) -> Keys:
-    """Drop from a pydantic location what the file does not hold (names of union members)."""
+    """Keys of a pydantic location without those that the file does not contain (names of union
+    members).
+    """
     keys: list[int | str] = []
     for position, key in enumerate(location):
         try:
@@ -208,7 +215,7 @@ def _keys_in(data: Any, location: tuple[int | str, ...], *, missing: bool) -> Ke
 
 
 def _schemas_at(root: JsonSchema, location: tuple[int | str, ...]) -> list[JsonSchema]:
-    """JSON schemas (every member of a union) of a location; its parent's where it has none."""
+    """JSON schemas of a location, one for each member of a union; its parent's if it has none."""
     value = _members(root, root)
     for key in location:
         children = [child for schema in value for child in _children(schema, key)]
@@ -218,11 +225,11 @@ def _schemas_at(root: JsonSchema, location: tuple[int | str, ...]) -> list[JsonS
 
 
 def _members(root: JsonSchema, schema: JsonSchema) -> list[JsonSchema]:
-    """A schema with its references followed and its unions spread out."""
+    """A schema with its references followed and its unions expanded."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         target = _members(root, root["$defs"][name])
-        # What stands beside a reference (a field's description) belongs to the field: put first.
+        # keys beside a reference (a field's description) belong to the field: they come first
         beside = {key: value for key, value in schema.items() if key != "$ref"}
         return [beside, *target] if beside else target
     nested = [member for word in ("anyOf", "oneOf", "allOf") for member in schema.get(word, ())]
@@ -230,7 +237,7 @@ def _members(root: JsonSchema, schema: JsonSchema) -> list[JsonSchema]:
 
 
 def _children(schema: JsonSchema, key: int | str) -> list[JsonSchema]:
-    """The schemas that one step down from `schema` may mean: a property, a tag, an entry."""
+    """Schemas that one step down from `schema` may have: a property, a tag, an entry."""
     if isinstance(key, int):
         entries = schema.get("prefixItems", ())
         candidate = entries[key] if key < len(entries) else schema.get("items")
@@ -248,11 +255,13 @@ def _children(schema: JsonSchema, key: int | str) -> list[JsonSchema]:
 
 
 def _schema_keys(schemas: list[JsonSchema]) -> list[str]:
+    """Names of all properties."""
     return sorted({name for schema in schemas for name in schema.get("properties", {})})
 
 
 def _description(schemas: list[JsonSchema]) -> str | None:
     # A schema with properties is a model, whose description is its docstring, not the field's.
+    """Description of a field, without its full stop."""
     texts = [
         schema["description"]
         for schema in schemas
@@ -262,5 +271,6 @@ def _description(schemas: list[JsonSchema]) -> str | None:
 
 
 def _tags(schemas: list[JsonSchema]) -> str:
+    """Names of all members of a tagged union."""
     mappings = [schema.get("discriminator", {}).get("mapping", {}) for schema in schemas]
     return ", ".join(tag for mapping in mappings for tag in mapping)

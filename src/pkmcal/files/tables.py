@@ -1,4 +1,4 @@
-"""CSV tables with one row a configuration: a name, then numbers; faults come with their line."""
+"""CSV tables with one row a configuration: a name, then numbers; errors have the file's line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pkmcal.files.quantities import Unit, split_head
 from pkmcal.wording import listed
 
 CONFIGURATION_COLUMN = "configuration"
-"""The first column's name."""
+"""Name of the first column."""
 _NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)
@@ -33,13 +33,13 @@ _KINDS = {"m": "a length, such as mm", "rad": "an angle, such as deg", "": "plai
 
 @dataclass(frozen=True)
 class CsvTable:
-    """A CSV file of named rows.
+    """CSV file of named rows.
 
     label : the file's name in messages.
     columns : names of the m number columns, in the file's order.
-    names : the first column, one name a row, all different.
-    values : (K, m) numbers, in the file's unit, or in SI where its head names one.
-    lines : the file's line (from 1) of each row.
+    names : first column, one name a row, all different.
+    values : (K, m) numbers, in SI where the column's head names a unit, else in the file's unit.
+    lines : line of each row in the file, from 1.
     """
 
     label: str
@@ -48,11 +48,11 @@ class CsvTable:
     values: Array
     lines: tuple[int, ...]
     units: tuple[Unit | None, ...] = ()
-    """What each column's head names behind its name, ``leg1 [mm]``."""
+    """Unit in each column's head, such as ``leg1 [mm]``, or None."""
 
     def check_kinds(self, kinds: Sequence[str]) -> None:
-        """Raise `InputError` where a column's head names a unit that is not of its kind, "m", "rad"
-        or "" for numbers without one.
+        """Raise `InputError` where a column's head names a unit of another kind than "m", "rad" or
+        "" for numbers without a unit.
         """
         for name, names, kind in zip(self.columns, self.units, kinds, strict=False):
             if names is not None and names.kind != kind:
@@ -64,7 +64,7 @@ class CsvTable:
                 )
 
     def where(self, row: int, column: int | None = None) -> str:
-        """Name file, line and column, as in "joints.csv, line 4, column leg2"."""
+        """File, line and column for a message, as in "joints.csv, line 4, column leg2"."""
         place = f"{self.label}, line {self.lines[row]}"
         return place if column is None else f"{place}, column {self.columns[column]}"
 
@@ -74,11 +74,11 @@ def read_csv(
     columns: Sequence[str] | None = None,
     label: str | None = None,
 ) -> CsvTable:
-    """Read a table whose header is CONFIGURATION_COLUMN and then one name a number column.
+    """Read a table whose header is CONFIGURATION_COLUMN and then one name for each number column.
 
-    columns : the only names allowed, all of them needed, in any order; None takes what is there.
-    Values come back in the file's own order of columns. A byte-order mark, any line ends, empty
-    lines and blanks around a cell are taken as they come.
+    columns : the columns of the table, all of them needed, in any order; None allows any. Values
+    are returned in the file's order of columns. A byte-order mark, any line ends, empty lines and
+    blanks around a cell are accepted.
     """
     path = Path(path)
     label = label or path.name
@@ -89,10 +89,12 @@ def read_csv(
         raise InputError(
             "the file is empty", where=label, expected=f"a header: {CONFIGURATION_COLUMN},…"
         )
+    # header: names and units of the columns
     heads = [split_head(head) for head in header[1:]]
     header[1:] = [name for name, _ in heads]
     _check_header(header, columns, f"{label}, line {header_line}", (CONFIGURATION_COLUMN,))
     check_count(len(header), MOST_COLUMNS, "columns", f"{label}, line {header_line}")
+    # rows; plain ones are read quickly
     lines: dict[str, int] = {}
     values = array("d")
     for line, cells in rows:
@@ -118,6 +120,7 @@ def read_csv(
             )
     if not lines:
         raise InputError("there are no rows under the header", where=label)
+    # values in SI
     each = np.array(values).reshape(len(lines), len(header) - 1)
     units = tuple(results for _, results in heads)
     each *= [results.factor if results else 1.0 for results in units]
@@ -126,8 +129,8 @@ def read_csv(
 
 @dataclass(frozen=True)
 class PairTable(CsvTable):
-    """Rows that name two configurations each, in ``pairs``; ``names`` has both as one text, not
-    all different.
+    """Rows that name two configurations each, ``pairs``; ``names`` joins both names, and may
+    repeat.
     """
 
     pairs: tuple[tuple[str, str], ...] = ()
@@ -140,9 +143,9 @@ def read_pairs(
     optional: Sequence[str] = (),
     label: str | None = None,
 ) -> PairTable:
-    """Read a table whose rows name two configurations, under ``heads``, and then have numbers.
+    """Read a table whose rows name two configurations, under ``heads``, followed by numbers.
 
-    columns : all of them needed; optional : that may be there; in any order.
+    columns : needed; optional : allowed besides; in any order.
     """
     path = Path(path)
     label = label or path.name
@@ -151,12 +154,14 @@ def read_pairs(
     header_line, header = next(rows, (0, None))
     if header is None:
         raise InputError("the file is empty", where=label, expected=f"a header: {example}")
+    # header: names and units of the columns
     results = [split_head(head) for head in header[2:]]
     header[2:] = [name for name, _ in results]
     _check_header(
         header, [*columns, *(c for c in optional if c in header)], f"{label}, line {header_line}",
         heads,
     )  # fmt: skip
+    # rows
     pairs, lines, values = list[tuple[str, str]](), list[int](), list[list[float]]()
     for line, cells in rows:
         where = f"{label}, line {line}"
@@ -176,7 +181,7 @@ def read_pairs(
 
 
 def csv_text(columns: Sequence[str], names: Sequence[str], values: Array) -> str:
-    """Write a table (names K, values (K, m)) as text that `read_csv` reads back exactly."""
+    """Table (names K, values (K, m)) as text that `read_csv` reads back exactly."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([CONFIGURATION_COLUMN, *columns])
@@ -206,7 +211,10 @@ def _rows(lines: Iterable[str], label: str) -> Iterator[tuple[int, list[str]]]:
 def _check_header(
     header: list[str], columns: Sequence[str] | None, where: str, first: tuple[str, ...]
 ) -> None:
-    """First : names of the columns that name configurations."""
+    """Raise `InputError` for a faulty header; first : names of the columns that name
+    configurations.
+    """
+    # other separators than commas
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(header) == 1 and separator in header[0]:
             raise InputError(
@@ -217,6 +225,7 @@ def _check_header(
                 next_step="Save it as CSV (comma delimited); a spreadsheet with English settings"
                 " does so",
             )
+    # names of the first columns
     if tuple(header[: len(first)]) != first:
         several = len(first) > 1
         other = "columns have other names" if several else "column has another name"
@@ -229,6 +238,7 @@ def _check_header(
             + (",".join(columns or ()) if several else "<one column a number>"),
         )
     _check_length(header, where)
+    # names of all columns
     if "" in header:
         number = header.index("") + 1
         raise InputError(f"column {number} of the header has no name", where=where)
@@ -242,6 +252,7 @@ def _check_header(
 
 
 def _check_columns(actual_names: Sequence[str], names: Sequence[str], where: str) -> None:
+    """Raise `InputError` for unknown or missing columns."""
     missing = [name for name in names if name not in actual_names]
     for name in actual_names:
         if name not in names:
@@ -257,8 +268,8 @@ def _check_columns(actual_names: Sequence[str], names: Sequence[str], where: str
 
 
 def _quickly(cells: list[str]) -> list[float] | None:
-    """The row's numbers, (m,), where all is plain; None where each cell has to be looked at. Of
-    these characters Python takes nothing for a number that :func:`_number` does not.
+    """Numbers (m,) of a row of plain numbers; None where each cell has to be read by itself. Of
+    these characters Python accepts as a number nothing that :func:`_number` refuses.
     """
     if not (cells[0] and _PLAIN.fullmatch("".join(cells[1:]))):
         return None
@@ -270,7 +281,7 @@ def _quickly(cells: list[str]) -> list[float] | None:
 
 
 def _numbers(cells: list[str], header: list[str], where: str, first: int = 1) -> list[float]:
-    """The row's numbers, (m,), behind the ``first`` cells, which are names."""
+    """Numbers (m,) of a row after the ``first`` cells, which are names."""
     if len(cells) != len(header):
         raise InputError(
             "the row has another number of cells than the header",
@@ -289,6 +300,7 @@ def _numbers(cells: list[str], header: list[str], where: str, first: int = 1) ->
 
 
 def _number(cell: str, where: str) -> float:
+    """Number in a cell. Raises `InputError` for any other text."""
     if not cell:
         raise InputError(
             "the cell is empty",
@@ -314,6 +326,7 @@ def _number(cell: str, where: str) -> float:
 
 
 def _check_length(names: Sequence[str], where: str) -> None:
+    """Raise `InputError` for a name that is longer than file systems allow."""
     for name in names:
         if len(name) > LONGEST_NAME:
             raise InputError(

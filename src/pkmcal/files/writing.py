@@ -1,7 +1,6 @@
-"""Outputs appear whole or not at all: written beside their place, then moved there.
+"""Atomic output: files are written in a stage beside their place, then moved there.
 
-What is written lies in a stage, a hidden folder of one process, until it is complete. Nothing is
-written through a link that stands inside an output.
+A stage is a hidden folder of one process. Nothing is written through a link inside an output.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ from pkmcal.wording import listed
 
 WRITING_STAGE_NAME, WRITING_PROBE_NAME = "stage", "probe"
 _COMPLETE = "complete"
-"""In a stage: what becomes COMMITTED_FOLDER."""
+"""Folder in a stage that becomes COMMITTED_FOLDER."""
 _TEMPORARY_NAME = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
-"""Names of `_beside`."""
+"""Pattern of the names that `_beside` makes."""
 
 
 def check_writable(folder: Path | str) -> None:
-    """Raise `InputError` where `folder` could not be made or written to; leaves no trace.
+    """Raise `InputError` where `folder` cannot be made or written to; leaves no trace.
 
-    Call it before the work whose result goes there. A real attempt is the only sound test:
-    permission bits do not tell about read-only and full file systems.
+    Call it before the work whose result goes there. Only a real attempt is a sound test: permission
+    bits do not reveal read-only and full file systems.
     """
     folder = Path(folder)
     standing = folder
@@ -67,7 +66,7 @@ def check_writable(folder: Path | str) -> None:
 
 
 def default_output(folder: Path) -> Path:
-    """`folder`, in which results go that the user gave no place for.
+    """`folder`, the default place of results.
 
     Raises `InputError` where it is a link: it may be part of somebody else's session, and then
     leads to any place of this computer.
@@ -85,10 +84,10 @@ def default_output(folder: Path) -> Path:
 def check_own_folder(
     folder: Path, names: Collection[str], what: str, earlier: str | None = None
 ) -> list[str]:
-    """Raise `InputError` where a folder holds anything but our own files of these names.
+    """Names in a folder. Raises `InputError` where it holds anything but files of ``names``.
 
-    what : such as "a validation"; earlier : "an earlier validation" unless given.
-    Returns what it holds.
+    what : such as "a validation".
+    earlier : by default, for example, "an earlier validation".
     """
     check_writable(folder)
     standing = entries(folder)
@@ -106,7 +105,7 @@ def check_own_folder(
 
 
 def entries(folder: Path) -> list[str]:
-    """Sorted names in an output folder that is going to be written to, none where there is none.
+    """Sorted names in an output folder before it is written to, none where there is no folder.
 
     Finishes a replacement in which a process of this user was killed. Stages are not among the
     names.
@@ -124,9 +123,9 @@ def entries(folder: Path) -> list[str]:
 def write_folder(
     folder: Path, texts: Mapping[str, str | bytes], over: Collection[str] = ()
 ) -> None:
-    """Write texts, or bytes, by their files' names, all of them or none.
+    """Write texts, or bytes, by the names of their files, all of them or none.
 
-    over : files of an earlier result, of which none is to stay.
+    over : files of an earlier result, all of which are replaced or removed.
     """
     with staged_folder(folder, over) as stage:
         for name, text in texts.items():
@@ -137,9 +136,9 @@ def write_folder(
 
 
 def place_below(folder: Path, name: str) -> Path:
-    """The place of a file in a folder, by a name that may be made of a session's own words.
+    """Path of a file in a folder, by a name that may contain words of a session.
 
-    Raises `InputError` where it would lie outside the folder.
+    Raises `InputError` where it would be outside the folder.
     """
     if PurePath(name).is_absolute() or ".." in PurePath(name).parts or not PurePath(name).name:
         raise InputError("no file can have this name", where=str(folder), found=name)
@@ -147,20 +146,21 @@ def place_below(folder: Path, name: str) -> Path:
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write a UTF-8 file with Unix line ends, whole or not at all."""
+    """Write a UTF-8 file with Unix line ends, as a whole or not at all."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_bytes(path: Path | str, content: bytes) -> None:
-    """Write a file, whole or not at all; its folder is made where missing."""
+    """Write a file, as a whole or not at all; its folder is made where missing."""
     with staged_file(path) as part:
         part.write_bytes(content)
 
 
 @contextmanager
 def staged_file(path: Path | str) -> Generator[Path]:
-    """Give a name to write to; on leaving without an error, that file is at `path`. The folder is
-    made where missing, and a link at `path` replaced.
+    """Context with a path to write to; on exit without an error, that file is moved to `path`.
+
+    The folder is made where missing, and a link at `path` is replaced.
     """
     path = Path(path)
     try:
@@ -176,12 +176,13 @@ def staged_file(path: Path | str) -> Generator[Path]:
 
 @contextmanager
 def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[Path]:
-    """Give an empty folder to write into; on leaving without an error, all of it is in `folder`.
+    """Context with an empty folder; on exit without an error, its files are in `folder`.
 
-    over : names of files in `folder` that go, unless they were written again. Others stay.
-    A new folder appears in one step. What is to go into one that is there already is committed in
-    one step (:mod:`pkmcal.files.replacing`), and moved to its place from there. On an error nothing
+    A new folder appears in one step. Files for an existing folder are committed in one step
+    (:mod:`pkmcal.files.replacing`), and moved to their places from there. On an error nothing
     changes.
+
+    over : names of files in `folder` that are removed unless they were written again; others stay.
     """
     folder = Path(folder)
     check_writable(folder)
@@ -195,6 +196,7 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
             new = stage / _COMPLETE / NEW_FILES_FOLDER
             new.mkdir(parents=True)
             yield new
+            # the caller has written all files: flush them, then move them
             written = files_below(new)
             for path in written:
                 _to_disk(path)
@@ -211,9 +213,9 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
 
 @contextmanager
 def alone_in(folder: Path, what: str) -> Generator[None]:
-    """Work in a folder, made where missing, while no other process that asks for it may.
+    """Context in which this process alone works in a folder, which is made where missing.
 
-    what : what works there, such as "study". Raises InputError where another one does.
+    what : the work, such as "study". Raises InputError where another process holds the folder.
     """
     check_writable(default_output(folder))
     folder.mkdir(parents=True, exist_ok=True)
@@ -236,7 +238,7 @@ def alone_in(folder: Path, what: str) -> Generator[None]:
 
 def remove_folder(folder: Path) -> None:
     """Remove a folder in one step, so that no part of it is ever taken for the whole; of a link,
-    nothing but the link.
+    remove only the link.
     """
     if folder.is_symlink():
         folder.unlink()
@@ -246,7 +248,9 @@ def remove_folder(folder: Path) -> None:
 
 
 def _to_disk(path: Path) -> None:
-    """Without it, a power cut after a move can leave the new name on an empty file."""
+    """Flush a file to disk: without it, a power cut after a move can leave the new name on an empty
+    file.
+    """
     if path.is_symlink():
         return
     with path.open("r+b") as stream:
@@ -255,9 +259,9 @@ def _to_disk(path: Path) -> None:
 
 @contextmanager
 def _stage(path: Path) -> Generator[Path]:
-    """Give a new folder beside `path`, and remove it, with all in it, on leaving.
+    """Context with a new folder beside `path`, which is removed with its content on exit.
 
-    A file in it is locked as long as this process lives, so that others can tell.
+    A file in it is locked as long as this process lives, so that other processes recognise it.
     """
     _clear_abandoned(path.parent)
     stage, held = _locked_stage(path)
@@ -269,7 +273,7 @@ def _stage(path: Path) -> Generator[Path]:
 
 
 def _locked_stage(path: Path) -> tuple[Path, int]:
-    """A new folder beside `path`, and the open file in it that is locked."""
+    """New folder beside `path`, and the descriptor of the locked file in it."""
     while True:
         stage = _beside(path)
         stage.mkdir()
@@ -287,7 +291,9 @@ def _locked_stage(path: Path) -> tuple[Path, int]:
 
 
 def _remove_stage(stage: Path) -> None:
-    """Remove a stage, its locked file last: what a kill leaves of it is still known for a stage."""
+    """Remove a stage, its locked file last, so that the remains after a kill are still
+    recognised.
+    """
     with suppress(OSError):
         for path in stage.iterdir():
             if path.is_dir() and not path.is_symlink():
@@ -299,8 +305,8 @@ def _remove_stage(stage: Path) -> None:
 
 
 def _clear_abandoned(place: Path) -> None:
-    """Remove stages in a folder whose process has ended before it was done, whatever they were
-    for: an hour's photographs may lie in one. Those of which that is not certain stay.
+    """Remove all stages in a folder whose processes were killed, since an hour's images may lie in
+    one. A stage stays where that is not certain.
     """
     try:
         match = [entry for entry in os.scandir(place) if _TEMPORARY_NAME.fullmatch(entry.name)]
@@ -320,18 +326,19 @@ def _clear_abandoned(place: Path) -> None:
 
 
 def _lock_file() -> str:
-    """The name of a stage's locked file. It tells this computer from others: not all file systems
-    of a network tell one computer what another has locked.
+    """Name of a stage's locked file. It contains this computer's identity, because not all network
+    file systems show the locks of another computer.
     """
     return f"locked-by-{blake2b(platform.node().encode(), digest_size=6).hexdigest()}"
 
 
 def _beside(path: Path) -> Path:
-    """A hidden, unused name in the same folder, so that moving to `path` is one step."""
+    """Hidden, unused name in the same folder, so that moving to `path` is one step."""
     return path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
 
 
 def _unwritable(path: Path, error: OSError) -> InputError:
+    """Error about a path that the operating system refuses to write."""
     return InputError(
         f"cannot be written ({error.strerror or error})",
         where=str(path),

@@ -1,8 +1,8 @@
-"""Joint centres of drawing and calibration in one frame, with covariances that no gauge favours.
+"""Joint centres of nominal model and calibration in one frame, with gauge-free covariances.
 
-The frame of a machine is a convention: nailing it to three joints makes those look exact and
-puts their errors on the others. So drawing and calibration are laid over each other by least
-squares ([B] eq. 15), and the covariances are those about such a fit.
+The frame of a machine is a convention: fixing it by three joints makes these look exact and puts
+their errors on the others. So nominal model and calibration are registered by least squares ([B]
+eq. 15), and the covariances are those about that fit.
 """
 
 from __future__ import annotations
@@ -18,15 +18,19 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbEnds, limb_ends
 
 COLLINEAR_SPREAD_SHARE = 1e-6
-"""Points nearer to one line than this part of their spread fix no rotation about it."""
+"""Distance of points from one line, relative to their spread, below which they determine no
+rotation about it."""
 
 
 @dataclass(frozen=True)
 class Centres:
-    """The joint centres of one body, m, in its frame as calibrated.
+    """Joint centres of one body, m, in its calibrated frame.
 
-    side : ``base`` or ``platform``. calibrated : (L, 3). drawing : (L, 3) laid over them by
-    ``T_calibrated_drawing`` (4, 4). covariance : (3L, 3L) about the fit, m^2.
+    side : ``base`` or ``platform``.
+    calibrated : (L, 3).
+    drawing : (L, 3) nominal centres, registered to them by ``T_calibrated_drawing``.
+    T_calibrated_drawing : (4, 4).
+    covariance : (3L, 3L) about the fit, m^2.
     """
 
     side: str
@@ -39,23 +43,23 @@ class Centres:
 
     @property
     def change(self) -> Array:
-        """Calibrated minus drawing, (L, 3) m."""
+        """Calibrated minus nominal, (L, 3) m."""
         return self.calibrated - self.drawing
 
     @property
     def blocks(self) -> Array:
-        """Each centre's own covariance, (L, 3, 3) m^2."""
+        """Covariance of each centre, (L, 3, 3) m^2."""
         n = len(self.calibrated)
         return np.einsum("iaib->iab", self.covariance.reshape(n, 3, n, 3))
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation of a coordinate, averaged over the three axes, (L,) m."""
+        """Standard deviation of a coordinate, root mean square over the three axes, (L,) m."""
         return np.sqrt(np.maximum(np.einsum("iaa->i", self.blocks), 0) / 3)
 
 
 def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> tuple[Centres, ...]:
-    """Base and platform centres; covariance (P, P) as :func:`free_of_gauge` leaves it."""
+    """Base and platform centres; covariance (P, P) as returned by :func:`free_of_gauge`."""
     before, after = _ends(drawing), _ends(calibrated)
     sides = (
         ("base", before.a, after.a, after.a_by, drawing.layout.a_index),
@@ -72,8 +76,8 @@ def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> t
 
 
 def free_of_gauge(machine: Machine, covariance: Array) -> Array:
-    """The covariance (P, P) of a machine's parameters, told in any frames, about the best fit of
-    all centres to the drawing.
+    """Covariance (P, P) of the parameters about the best fit of all centres to the nominal model,
+    from a covariance in any gauge.
     """
     by_frames = generators(machine.layout, machine.values)
     keep = np.eye(len(covariance)) - by_frames @ projector(machine, machine.values, BestFit())
@@ -81,7 +85,9 @@ def free_of_gauge(machine: Machine, covariance: Array) -> Array:
 
 
 def laid_over(source: Array, target: Array) -> Array:
-    """T_target_source (4, 4) of the best fit; a shift alone where the points are on one line."""
+    """T_target_source (4, 4) of the least-squares registration; a shift alone where the points are
+    collinear.
+    """
     spread = np.linalg.svd(source - source.mean(axis=0), compute_uv=False)
     if len(source) < 3 or spread[1] < COLLINEAR_SPREAD_SHARE * spread[0]:
         shift = np.eye(4)
@@ -91,11 +97,12 @@ def laid_over(source: Array, target: Array) -> Array:
 
 
 def _ends(machine: Machine) -> LimbEnds:
+    """Ends of all limbs at the middle readings, with both frames at the same place."""
     return limb_ends(machine.layout, machine.values, machine.middle_readings(), np.eye(4))
 
 
 def _spread(by: Array, index: Integers, covariance: Array) -> Array:
-    """Covariance (3L, 3L) of points whose derivatives (L, 3, n) are by parameters at (L, n)."""
+    """Covariance (3L, 3L) of points with derivatives (L, 3, n) by the parameters at (L, n)."""
     n = len(covariance)
     flat = (by @ np.eye(n + 1)[index, :n]).reshape(-1, n)
     return flat @ covariance @ flat.T

@@ -1,8 +1,8 @@
-"""How far a machine is from one that is known, such as a simulation's truth.
+"""Errors of a machine against a reference machine, such as a simulation's truth.
 
-Frames are conventions: the same machine told in frames of which the one stands elsewhere has other
-numbers, and its poses differ by the frames alone. So its base and platform are laid over the known
-machine's by all joint centres ([B] eq. 15), and what is left is an error.
+Frames are conventions: the same machine in other frames has other parameters, and its poses differ
+by the frames alone. So the frames of base and platform are first aligned to the reference by all
+joint centres ([B] eq. 15), and the remaining difference is the error.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from pkmcal.mechanisms import Machine
 
 @dataclass(frozen=True)
 class MachineErrors:
-    """A machine less the known one, its frames laid over the known one's; m and rad.
+    """Errors of a machine against a reference machine, frames aligned; m and rad.
 
-    T_base, T_platform : (4, 4) from its base and platform frame to the known machine's. base,
-    platform : (L, 3) of the joint centres. offset : (k,) of the readings' zeros, in the order of
-    the parameters. position, orientation : (n,) how far the platform's origin is off, and how far
-    it is turned, at the same readings; NaN where one of the two has no pose.
+    T_base, T_platform : (4, 4) from its base and platform frame to those of the reference.
+    base, platform : (L, 3) errors of the joint centres.
+    offset : (k,) errors of the readings' offsets, in the order of the parameters.
+    position, orientation : (n,) distance of the platform's origins and angle between the platforms
+    at the same readings; NaN where one of the two machines has no pose.
     """
 
     T_base: Array
@@ -40,30 +41,29 @@ class MachineErrors:
 
     @property
     def centre(self) -> Array:
-        """(2L,) distances of the joint centres, base first, m."""
+        """Distances (2L,) of the joint centres, base first, m."""
         return np.linalg.norm(np.concatenate([self.base, self.platform]), axis=-1)
 
 
 def compare(
     machine: Machine, known: Machine, joints: Array, *, legs_observed: bool = True
 ) -> MachineErrors:
-    """Errors of a machine against a known one of the same drawing.
+    """Errors of a machine against a reference machine of the same nominal model.
 
     Parameters
     ----------
     machine, known :
-        The machine, and the one that is known.
+        The machine, and the reference machine.
     joints :
         Readings (n, m), m or rad, at which platform poses are compared.
     legs_observed :
-        False where a board or a tracker observed the platform and no legs were seen: the joints'
-        places are then unidentifiable, and frames are aligned by the poses besides.
+        False where a board or a tracker observed the platform and no legs were measured: the joint
+        centres are then unidentifiable, and frames are aligned by the poses besides.
 
     Raises
     ------
     pkmcal.errors.InputError
-        The two are not of one drawing.
-
+        The two machines have different parameters.
     """
     if machine.parameters.names != known.parameters.names:
         raise InputError(
@@ -72,9 +72,11 @@ def compare(
             expected=f"{known.name}, {known.n_legs} legs, {len(known.parameters)} parameters",
             next_step="Compare machines of one drawing",
         )
+    # two exact machines: the covariances of centres and tool are not used
     joints = np.asarray(joints, dtype=float)
     nothing = np.zeros((len(known.parameters), len(known.parameters)))
     base, platform = joint_centres(machine, known, nothing)
+    # poses by the frames of the joint centres, or of the poses themselves
     poses = known.forward(joints)
     tool = tool_error(machine, known, nothing, poses, joints, legs_observed=legs_observed)
     return MachineErrors(

@@ -1,22 +1,22 @@
-"""Whether the other measurements confirm what an estimate has rejected.
+"""Confirmation of rejections by the other measurements.
 
-An estimate with rejected measurements is one hypothesis, "these are wrong". Others are that a
-rejected one is right, and the parameters differ; that all are; or that it is right and one that
-was kept is wrong. With the cost of a hypothesis a
+An estimate with rejected measurements is one hypothesis, "these are wrong". Other hypotheses are
+that one rejected measurement is right, and the parameters differ; that all are right; or that one
+is right and another one, so far an inlier, is wrong. With the cost of a hypothesis a
 
-    Q_a = (sum of squares of what counts, at its own best values) + (loss of each that does not)
+    Q_a = (sum of squares of the inliers, at their best fit) + (loss of each rejected one)
 
-as in the estimate's robust loss, its probability is p_a ~ exp(-Q_a / 2). What the hypotheses
-differ by moves the tool, by s_a from where the estimate has it; so to the tool's stated variance
-belongs ``sum p_a s_a^2``. Where that is more than the stated variance itself, the data do not tell
-which measurement is wrong: the one that was rejected among seven with seven unknowns is as likely
-right as any other; one of thirty that lies twenty standard deviations off is surely wrong.
+as in the estimate's robust loss, its probability is p_a ~ exp(-Q_a / 2). Under hypothesis a the
+tool is displaced by s_a from the estimate, so the tool's variance has to contain ``sum p_a s_a^2``.
+Where that exceeds the stated variance, the data do not determine which measurement is wrong: one
+that was rejected among seven with seven unknowns is as likely right as any other; one of thirty
+that lies twenty standard deviations off is surely wrong.
 
-A rejection has to be confirmed by measurements, not by the nominal model, which is what a
-calibration doubts. So here its tolerances are ``FAR_FROM_NOMINAL`` times as wide.
+A rejection has to be confirmed by measurements, not by the nominal model, which the calibration is
+to correct. So prior sigmas are ``FAR_FROM_NOMINAL`` times as wide here.
 
-Hypotheses are solved to first order about the estimate, each configuration's own unknowns
-eliminated: its change of the normal matrix is that of one configuration or two.
+Hypotheses are solved to first order about the estimate, with each configuration's own unknowns
+eliminated; a hypothesis changes the normal equations of one configuration or two.
 """
 
 from __future__ import annotations
@@ -41,26 +41,27 @@ from pkmcal.solver.elimination import divisions
 from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE, final_loss
 
 FAR_FROM_NOMINAL = 5.0
-"""Tolerances by which a value may leave the nominal model before a person should look."""
+"""Change from the nominal model, in prior sigmas, beyond which a person should check a value."""
 NORMAL_RIDGE = 1e-12
-"""Of a normal matrix with a unit diagonal: what fixes a direction that nothing else does."""
+"""Ridge on a normal matrix with unit diagonal, for directions that are not determined."""
 MOST_REJECTED_UNITS = 50
-"""Units, from the first on, that are looked at: where more are rejected, the share is the reason
-not to use the result."""
+"""Largest number of rejected units that are tested; where more are rejected, their share is itself
+the reason not to use the result."""
 
 IMAGE_ROW, LINK_ROW, DROPPED_LINK_ROW = -1, -2, -3
-"""In the place of a configuration, of units that are no poses."""
+"""Values in place of a configuration, for units that are not poses: images, links, and links that a
+hypothesis rejects."""
 
 
 @dataclass(frozen=True)
 class RejectedUnit:
-    """What a user measured at once, and the estimate rejected: a height, a board, an image, a
-    distance.
+    """A rejected unit of measurement, as a user took it: a height, a board, an image, a distance.
 
-    pose : its number among the measured poses, -1 for all else. link : its number among the links,
-    -1 for all else. station, configuration : where; of a link -1 and its second one. right :
-    probability that it is right after all. shift : m, root mean square, by which the hypotheses in
-    which it is let the tool be elsewhere.
+    pose : number among the measured poses, -1 for other units.
+    station, configuration : of the unit; for a link -1 and its second configuration.
+    right : probability that it is right after all.
+    shift : root mean square displacement of the tool by the hypotheses in which it is right, m.
+    link : number among the links, -1 for other units.
     """
 
     pose: int
@@ -72,14 +73,16 @@ class RejectedUnit:
 
     @property
     def is_image(self) -> bool:
-        """Whether it is the edges of an image."""
+        """Whether the unit is the edges of an image."""
         return self.pose < 0 and self.link < 0
 
 
 @dataclass(frozen=True)
 class Rejections:
-    """What an estimate has rejected, and by how much (m, root mean square) the tool may be
-    elsewhere because of it, beside its stated deviation.
+    """Rejected units of an estimate.
+
+    shift : root mean square displacement of the tool because they may be right, beside its stated
+    standard deviation, m.
     """
 
     units: tuple[RejectedUnit, ...] = ()
@@ -87,8 +90,9 @@ class Rejections:
 
 
 class _Normal(NamedTuple):
-    """Reduced normal equations of n configurations or hypotheses: matrix (n, na, na), gradient
-    (n, na) and sum of squares (n,).
+    """Reduced normal equations of n configurations or hypotheses.
+
+    matrix, gradient, squares : (n, na, na), (n, na), and sums of squares (n,).
     """
 
     matrix: Array
@@ -96,15 +100,15 @@ class _Normal(NamedTuple):
     squares: Array
 
     def plus(self, other: _Normal, times: float = 1.0) -> _Normal:
-        """The sum with a multiple of others."""
+        """Sum with a multiple of other normal equations."""
         return _Normal(*(a + times * b for a, b in zip(self, other, strict=True)))
 
     def at(self, which: Integers | slice) -> _Normal:
-        """Those of some."""
+        """Some of the normal equations."""
         return _Normal(*(part[which] for part in self))
 
     def solution(self) -> tuple[Array, Array]:
-        """The least sums of squares (n,), and the steps (n, na) to where they are."""
+        """Smallest sums of squares (n,), and the steps (n, na) to the solutions."""
         scale = np.sqrt(np.einsum("...ii->...i", self.matrix))
         scale = np.where(scale > 0, scale, 1.0)
         unit = self.matrix / scale[..., None] / scale[..., None, :]
@@ -114,7 +118,9 @@ class _Normal(NamedTuple):
 
 
 def rejected_units(measurements: Measurements, estimate: Estimate) -> tuple[RejectedUnit, ...]:
-    """Measured poses and links without half of their weight, and images of which most edges are."""
+    """Measured poses and links of less than half of their weight, and images of which most edges
+    are rejected.
+    """
     poses, edges = measurements.poses, measurements.edges
     lost = np.flatnonzero(estimate.pose_weights < 0.5).tolist()
     out = [RejectedUnit(k, int(poses.station[k]), int(poses.configuration[k])) for k in lost]
@@ -130,14 +136,15 @@ def rejected_units(measurements: Measurements, estimate: Estimate) -> tuple[Reje
 
 
 def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -> Rejections:
-    """The rejected units of an estimate, each with how sure the others are of its rejection.
+    """Rejected units of an estimate, each with the probability that it is right.
 
-    tool : (n, P) rows with ``norm(tool @ v)`` how far a change v of the parameters moves the tool
-    (m, root mean square).
+    tool : (n, P) such that ``norm(tool @ v)`` is the tool's root mean square displacement by a
+    change v of the parameters, m.
     """
     units = rejected_units(measurements, estimate)
     if not units:
         return Rejections()
+    # problem at the solution, with wider priors
     assembled, info = linearize_at_solution(measurements, estimate)
     drawn = np.array(assembled.priors) == "drawing"
     wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
@@ -151,25 +158,31 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
     cost, shift, member = list[Array](), list[Array](), list[Integers]()
 
     def add(case: _Normal, loss: Array, of: Integers) -> None:
-        """Hypotheses with the change of what is lost (n,), and of which unit each is."""
+        """Add hypotheses, with their losses (n,) relative to the estimate, and the unit of each, -1
+        for all.
+        """
         solution, to = case.solution()
         away = (to - step)[:, problem.unknowns.machine] @ rows.T
         cost.append(solution - least + loss)
         shift.append(np.sqrt(np.sum(away**2, axis=1)))
         member.append(of)
 
+    # one rejected unit is right
     each = np.arange(len(cases.readmission.squares))
     single = cases.base.plus(cases.readmission)
     add(single, -cases.loss, each)
+    # all of them are right
     if len(each) > 1:
         whole = cases.readmission.at(slice(None))
         total = _Normal(*(part.sum(axis=0, keepdims=True) for part in whole))
         add(cases.base.plus(total), -cases.loss.sum(keepdims=True), np.array([-1]))
+    # one of them is right and an inlier is wrong
     for dropped, loss, row in cases.drops(state):
         for k in each:
             other = row != cases.row[k]
             case = single.at(slice(k, k + 1)).plus(dropped.at(other))
             add(case, loss[other] - cases.loss[k], np.full(int(other.sum()), k))
+    # probabilities, that of the estimate itself included
     costs, shifts, of = (np.concatenate(part) for part in (cost, shift, member))
     best = min(float(costs.min(initial=0.0)), 0.0)
     weight = np.exp(-(costs - best) / 2)
@@ -184,14 +197,14 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
 
 
 class _Cases(NamedTuple):
-    """What hypotheses are made of.
+    """Terms of the normal equations from which hypotheses are composed.
 
-    base : of the estimate (1). readmission : by how much each rejected unit changes it (n); loss :
-    (n,) what these cost as they are. row : (n,) the configuration of each in the problem, for
-    poses; -1 for images, LINK_ROW for links.
-
-    in_use, losses : (K, G) each of poses and of links: whether it is in use, and what it costs
-    rejected.
+    base : normal equations of the estimate (1).
+    readmission : change of these by each rejected unit (n).
+    loss : (n,) loss of each unit as rejected.
+    row : (n,) configuration of each unit in the problem, for poses; IMAGE_ROW for images, LINK_ROW
+    for links.
+    in_use, losses : (K, G) of poses and of links: whether each is in use, and its loss if rejected.
     """
 
     problem: Problem
@@ -212,16 +225,19 @@ class _Cases(NamedTuple):
         estimate: Estimate,
         units: tuple[RejectedUnit, ...],
     ) -> _Cases:
-        """Those of an estimate's problem."""
+        """Terms of an estimate's problem."""
+        # normal equations of the estimate
         base = _prior(problem, state)
         for cut in divisions(*problem.extent):
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
+        # weights in use, and losses of rejected measurements
         pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
         links = problem.link_data.weight
         full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
         losses = Kinds(*(full / np.maximum(as_pairs(kind), 1e-9) ** 2 for kind in problem.kinds))
         edges = measurements.edges
+        # weight, loss and configuration of each unit
         changes, loss, rows = list[_Normal](), list[float](), list[int]()
         for unit in units[:MOST_REJECTED_UNITS]:
             weight = Kinds(edge_weight.copy(), pose_weight.copy(), links.copy())
@@ -244,6 +260,7 @@ class _Cases(NamedTuple):
                 weight.edges[places.row[own], places.place[own]] = 1.0
                 loss.append(full * len(own))
                 rows.append(IMAGE_ROW)
+            # change of the normal equations of its configuration
             cut = slice(row, row + 1)
             there = problem.state_among(state, cut)
             new = Kinds(weight.edges[None], weight.poses[None], weight.links)
@@ -258,8 +275,8 @@ class _Cases(NamedTuple):
         return cls(problem, base, readmission, np.array(loss), np.array(rows), in_use, losses)
 
     def drops(self, state: BatchState) -> Iterator[tuple[_Normal, Array, Integers]]:
-        """Without one more pose, or link, each: the change of the normal equations, what it then
-        costs, and its configuration in the problem, some at a time.
+        """Changes of the normal equations by rejecting one more pose or link each, its loss, and
+        its configuration in the problem (DROPPED_LINK_ROW for links), some at a time.
         """
         if not (self.row != IMAGE_ROW).any():
             return
@@ -278,20 +295,20 @@ class _Cases(NamedTuple):
                     without = part.weighted(weights._replace(**{name: weight}))
                     change = _normal_equations(without, there).plus(before, -1.0)
                     row = np.arange(len(used))[cut][in_use]
-                    # no own unknowns stand between a link and others of its configuration
+                    # a link's row touches no own unknowns: its change adds to that of any unit
                     of = row if name == "poses" else np.full(len(row), DROPPED_LINK_ROW)
                     yield change.at(in_use), losses[row, place], of
 
 
 def _normal_equations(problem: Problem, state: BatchState) -> _Normal:
-    """Of each configuration, its own unknowns eliminated."""
+    """Normal equations of each configuration, its own unknowns eliminated."""
     reduced = Information(problem, state).reduced
     rows, value = reduced.rows[0], reduced.value[0]
     return _Normal(rows.mT @ rows, (rows.mT @ value[..., None])[..., 0], np.sum(value**2, axis=-1))
 
 
 def _prior(problem: Problem, state: BatchState) -> _Normal:
-    """Of what is known beforehand."""
+    """Normal equations of the prior."""
     value = problem.prior_values(state)[0] - problem.prior_target
     rows = problem.prior
     return _Normal((rows.T @ rows)[None], (rows.T @ value)[None], np.sum(value**2)[None])

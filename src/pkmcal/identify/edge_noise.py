@@ -1,19 +1,20 @@
-"""The edges' noise as the data show it: a scale, a shading and how heavy its tails are.
+"""Noise of the edges: scale, shading and tails, by restricted maximum likelihood.
 
-What the profiles of an edge scatter by is stated with it, C. On real surfaces that is not what it
-is wrong by: within an edge the points agree better than their profiles promise, while a highlight
-or something mirrored moves an edge as a whole, some far more than others. So the errors of the
+The stated covariance C of an edge is that of the scatter of its profiles. On real surfaces the
+error differs: within an edge the points agree better than their profiles promise, while a highlight
+or a mirrored object shifts an edge as a whole, some far more than others. So the errors of the
 edges of one tube (first, second, ... of all legs) have Student's distribution with the covariance
 
-    scale^2 C + shading^2 s s^T,      s the change of the normal by a pixel outward,
+    scale^2 C + shading^2 s s^T,      s the change of the normal by a shift of one pixel outward,
 
-and as many degrees of freedom as they show. All three are found by restricted maximum likelihood:
-what the unknowns have taken up of an edge's residual is added to its square, by the hat matrix. An
-edge then counts by its weight (Lange, Little, Taylor 1989), and the information of Student's
-distribution is what the covariance of the result is made of.
+and estimated degrees of freedom. Scale, shading and degrees of freedom are found by restricted
+maximum likelihood: the part of an edge's error that the unknowns have absorbed is added to its
+squared residual, by the hat matrix. Each edge has an IRLS weight (Lange, Little, Taylor 1989), and
+the covariance of the result follows from the information of Student's distribution.
 
-What one edge alone is shaded by is not its own: edges of a line whose normals are near are moved
-alike (:mod:`pkmcal.identify.error_correlation`), so its variance counts times their number.
+The shading of one edge is not independent of its neighbours': edges of a line with similar normals
+are correlated (:mod:`pkmcal.identify.error_correlation`), so the shading's variance is multiplied
+by their number.
 """
 
 from __future__ import annotations
@@ -33,24 +34,26 @@ from pkmcal.identify.scatter import (
 )
 
 TAILS_TRIED = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
-"""Degrees of freedom that are tried: the last is as good as the normal distribution."""
+"""Degrees of freedom that are tried; the last is close to the normal distribution."""
 STATED_NOISE_WORTH = 5.0
-"""Edges that the stated noise is worth when their own is found."""
+"""Weight of the stated noise as prior of the scale, in edges."""
 MOST_EDGE_NOISE_ROUNDS = 60
+"""Largest number of scoring steps."""
 VARIANCE_CHANGE = 1e-4
-"""Relative change of a variance below which it counts as found."""
+"""Relative change of a variance below which the iteration has converged."""
 LARGEST_VARIANCE_FACTOR = 4.0
-"""Largest factor on a variance in one round."""
+"""Largest factor on a variance in one step."""
 
 
 def edge_noise(
     info: Information, weight: Array, before: EdgeScatter, *, same_tails: bool = False
 ) -> EdgeScatter:
-    """The edges' noise that a solution shows.
+    """Noise of the edges, tube by tube, at a solution.
 
-    weight : (B, K, G) of edges, 0..1, their trust left out; those of 0 do not belong to the machine
-    and tell nothing. before : where the search begins, whose tails are kept where that is asked; a
-    tube of which no edge was seen keeps all.
+    weight : (B, K, G) of edges, 0..1, without their IRLS weight; edges of weight 0 are outliers and
+    are not used.
+    before : start of the iteration; a tube without edges keeps its values.
+    same_tails : keep the degrees of freedom of ``before``.
     """
     along, rest, size = _squares(info)
     tube, results = info.problem.blocks.tube, list[tuple[Array, ...]]()
@@ -70,8 +73,10 @@ def edge_noise(
 
 
 def _squares(info: Information) -> tuple[Array, Array, Array]:
-    """Squares expected of the edges' errors, in their stated noise, (B, K, G) each: along what a
-    shift outward does, and across; and the square of that shift by a pixel.
+    """Expected squared errors of the edges in their stated noise, (B, K, G) each.
+
+    Returns the squares along the change by a shift outward and across it, and the square of that
+    change by a shift of one pixel.
     """
     half, squares = info.root, list[Array]()
     for piece in reduced_edges(info):
@@ -98,11 +103,13 @@ def _student(
     shading: Array,
     tried: Array,
 ) -> tuple[Array, Array, Array]:
-    """Scale, shading and tails (B,) of n edges, all (B, n), by their likelihood.
+    """Scale, shading and degrees of freedom (B,) of n edges with the highest likelihood.
 
-    scale, shading : (B,) where the search begins. tried : (V, B or 1) tails; for each of them
-    weights and the two variances in turns: with fixed weights these are components of the variances
-    of two normal variables, a step of Fisher's scoring each.
+    along, rest, size, weight : (B, n), see :func:`_squares`.
+    scale, shading : (B,) start of the iteration.
+    tried : (V, B or 1) degrees of freedom. For each of them weights and the two variances are
+    updated in turns: with fixed weights these are variance components of two normal variables, and
+    a step is one of Fisher's scoring.
     """
     from scipy.special import gammaln
 
@@ -115,27 +122,30 @@ def _student(
         return np.einsum("vbn,bn->vb", each, times)
 
     def scored(a: Array, b: Array) -> tuple[Array, Array]:
-        """One step of the two variances."""
+        """One step of Fisher's scoring of both variances."""
         s, t = a[..., None] + b[..., None] * size, a[..., None]
+        # weights of Student's distribution
         irls_weight = (tails + NUMBERS_AN_EDGE) / (tails + along / s + rest / t)
         of_s = weight / s**2
         remainder = (irls_weight * along - s) * of_s
-        # the stated noise counts as some edges more
+        # gradient by the variances a (scale) and b (shading); the stated noise is a prior
         by_a = np.sum(remainder, axis=-1) + (total(irls_weight, of_rest) - count * a) / a**2
         by_a += STATED_NOISE_WORTH * (1 - a) / a**2
         by_b = total(remainder, size)
+        # Fisher information
         aa, ab = np.sum(of_s, axis=-1) + (count + STATED_NOISE_WORTH) / a**2, total(of_s, size)
         bb = total(of_s, square) + EDGE_SCATTER_FLOOR
         det = aa * bb - ab**2
         det = np.where(det > EDGE_SCATTER_FLOOR * aa * bb, det, np.inf)
         new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
-        # a shading at its least is known: the scale goes on alone
+        # where the shading is at its lower bound, only the scale is updated
         new_a = np.where(new_b > least, new_a, a + (by_a + (b - least) * ab) / aa)
         new_a = np.clip(new_a, a / LARGEST_VARIANCE_FACTOR, a * LARGEST_VARIANCE_FACTOR)
         return new_a, np.maximum(
             np.clip(new_b, b / LARGEST_VARIANCE_FACTOR, b * LARGEST_VARIANCE_FACTOR), least
         )
 
+    # variances for each number of degrees of freedom
     a = scale**2 / norm
     b = np.broadcast_to(shading**2 / norm, a.shape)
     for _ in range(MOST_EDGE_NOISE_ROUNDS):
@@ -144,6 +154,7 @@ def _student(
         if change < VARIANCE_CHANGE:
             break
     s, t = a[..., None] + b[..., None] * size, a[..., None]
+    # likelihood of each number of degrees of freedom, and the best
     distance = along / s + rest / t
     cost = np.sum(
         weight * (np.log(s * t) + (tails + NUMBERS_AN_EDGE) * np.log1p(distance / tails)) / 2,

@@ -1,25 +1,27 @@
-"""What edges that err alike do to the covariance of an estimate.
+"""Covariance of an estimate whose edges have correlated errors.
 
-What moves one edge of a line, a highlight or something mirrored, moves its neighbours too: errors
-of two edges whose normals are an angle apart are alike by ``exp(-angle /
-SHADING_CORRELATION_ANGLE)`` (:class:`~pkmcal.measurements.line_cells.LineCells`), the shift's by
-the part of it that is shading, the tilt's by a part ``c`` that the data tell. The estimate counts
-every edge by itself, and the shading of its shift as often as edges share it. Were its normal
-matrix inverted, that would be the covariance where it makes the same of all of them; but where a
-platform's pose takes up what they have in common it is far too careful, and of tilts too sure.
+A highlight or a mirrored object that shifts one edge of a line shifts its neighbours too: the
+errors of two edges whose normals enclose an angle are correlated by ``exp(-angle /
+SHADING_CORRELATION_ANGLE)`` (:class:`~pkmcal.measurements.line_cells.LineCells`); of the shift, the
+part of its variance that is shading; of the tilt, a share ``c`` that is estimated from the data.
+The estimate treats the edges as independent, with the variance of shading multiplied by the number
+of edges that share it. The inverse of its normal matrix would be the right covariance if all these
+edges affected the result in the same way; where a platform's pose absorbs their common error it is
+far too large, and for tilts too small.
 
-With J the rows of the edges in the noise that they count with, the own unknowns eliminated, and S
-the covariance of their errors there, the estimate has the covariance
+With J the rows of the edges, in the noise of the estimate and with the own unknowns eliminated, and
+S the covariance of their errors in that noise, the estimate has the covariance
 
     C + C J^T (S - 1) J C,      C the inverse of the normal matrix
 
-(Huber 1967; Liang and Zeger 1986). The rows are gone through once, and their sums by cells are all
-that is kept.
+(Huber 1967; Liang and Zeger 1986). The rows are evaluated once, and only their sums by cells are
+stored.
 
-c is found from the tilts' residuals x: of their products in pairs by how alike they may be, P,
-``x^T P x`` is expected to be ``s^2 (tr P Q + c tr P Q P Q)``, with Q = 1 - H the hat matrix's
-complement and s^2 their mean square (MINQUE; Rao 1971). Where that tells little, c is the mean of
-what it allows between none and all.
+c is estimated from the tilts' residuals x. With P the correlations of all pairs of edges at c = 1,
+the expectation of ``x^T P x`` is ``s^2 (tr P Q + c tr P Q P Q)``, with Q = 1 - H the complement of
+the hat matrix and s^2 the tilts' mean square (MINQUE; Rao 1971). c is the mean of its normal
+distribution truncated to [0, 1], so that it tends to one half where the data contain little
+information about it.
 """
 
 from __future__ import annotations
@@ -36,17 +38,18 @@ from pkmcal.measurements.line_cells import LineCells
 from pkmcal.solver.search import take
 
 MOST_TILTS_COMPARED = 800
-"""Edges, of configurations evenly among all, whose tilts tell how alike they are, if there are
-more: c is then known to a few hundredths."""
+"""Largest number of edges whose tilts are compared, of configurations evenly among all: c then has
+a standard deviation of a few hundredths."""
 LEAST_TILT_INFORMATION = 1e-9
-"""Below it the pairs of tilts, or a probability, are rounding."""
+"""Information of pairs of tilts, or a probability, below which it is rounding."""
 UNINFORMED_CORRELATED_SHARE = 0.5
-"""The mean of a part of which nothing is told."""
+"""Mean of c without data."""
 
 
 def covariance_of_correlated(info: Information) -> Array:
-    """Covariance (B, na, na) of the shared unknowns at a solution, with what edges have in common;
-    a direction that nothing fixes has a huge variance.
+    """Covariance (B, na, na) of the shared unknowns at a solution, with correlated errors of edges.
+
+    A direction that is not determined has a huge variance.
     """
     if not info.problem.blocks.cells.count.size:
         return info.covariance
@@ -59,18 +62,18 @@ def covariance_of_correlated(info: Information) -> Array:
 
 
 def _of_run(info: Information, run: int) -> Information:
-    """What one run's problem says alone."""
+    """Information of a single run."""
     at = np.array([run])
     normal = None if info.normal is None else info.normal[at]
     return Information(info.problem.select(at), take(info.state, at), normal)
 
 
 def _beside(info: Information) -> Array:
-    """``F^T J^T (S - 1) J F`` (na, na) of one run."""
+    """``F^T J^T (S - 1) J F`` (na, na) of one run, F the root of the covariance."""
     half, cells = info.root, info.problem.blocks.cells
     na = half.shape[-1]
     out, tilts = np.zeros((2, na, na))
-    sums = np.zeros((NUMBERS_AN_EDGE, len(cells.count) + 1, na))  # the last of what is in none
+    sums = np.zeros((NUMBERS_AN_EDGE, len(cells.count) + 1, na))  # the last: edges in no cell
     every = -(-int(cells.count.sum()) // MOST_TILTS_COMPARED)
     compared = list[_Tilts]()
     for piece in reduced_edges(info):
@@ -79,7 +82,7 @@ def _beside(info: Information) -> Array:
         own, scale = data.own[0] ** 2 * size, data.scale[0] ** 2
         used = (place >= 0) & (data.weight[0][row, place] > 0)
         cell = np.where(used, blocks.cell[row, place], -1)
-        # the part of what it counts with that is shading, and that of its own shading alone
+        # share of an edge's variance that is shading, and root of the share by one edge's shading
         part = np.where(cell >= 0, (own / (own + scale))[row, place], 0.0)
         once = np.sqrt(part / np.maximum(blocks.n_effective, 1.0)[row, place])
         for cut, shared in piece.shared(half):
@@ -88,17 +91,20 @@ def _beside(info: Information) -> Array:
                 for number in range(NUMBERS_AN_EDGE)
             )
             mine = cell[cut].ravel()
+            # sums by cell, and -J^T J of the correlated part
             out -= (part[cut].reshape(-1, 1) * shift).T @ shift
             np.add.at(sums[0], mine, once[cut].reshape(-1, 1) * shift)
             np.add.at(sums[1], mine, tilt)
             above_limit = mine >= 0
             tilts += tilt[above_limit].T @ tilt[above_limit]
+            # tilts of some configurations, to estimate c
             number = np.broadcast_to(row[cut] + piece.first, cell[cut].shape).ravel()
             some = above_limit & (number % every == 0)
             value = piece.value[0, cut, 1::NUMBERS_AN_EDGE].ravel()
             taken = piece.own[0, cut, :, 1::NUMBERS_AN_EDGE].swapaxes(1, 2)
             taken = taken.reshape(len(mine), -1)
             compared.append(_Tilts(*(x[some] for x in (value, tilt, taken, number, mine))))
+    # J^T S J from the sums by cell
     by_tilts = -tilts
     for own, shift_correlation, tilt_correlation in cells.correlated_groups():
         shift, tilt = sums[:, own]
@@ -109,8 +115,12 @@ def _beside(info: Information) -> Array:
 
 
 class _Tilts(NamedTuple):
-    """Tilts of n edges: residuals value (n,), shared (n, na) and own (n, d) what unknowns take up
-    of them, their configurations and cells (n,).
+    """Tilts of n edges of one run.
+
+    value : (n,) residuals.
+    shared, own : (n, na) and (n, d) the rows' parts by shared and own unknowns in orthonormal
+    bases, so that the hat matrix has their products.
+    configuration, cell : (n,).
     """
 
     value: Array
@@ -120,7 +130,7 @@ class _Tilts(NamedTuple):
     cell: Integers
 
     def correlated_share(self, cells: LineCells) -> float:
-        """c; see the module."""
+        """Estimate of c, see the module's docstring."""
         from scipy.special import ndtr
 
         together = self.configuration[:, None] == self.configuration

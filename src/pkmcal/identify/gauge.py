@@ -1,22 +1,22 @@
-"""Which frames the results are told in: an explicit choice that can be changed afterwards.
+"""Gauge: the choice of base and platform frames, and the transformations between choices.
 
-Neither edges nor readings know where the base frame or the platform frame is: a rigid motion
-of either, six numbers each, changes parameters, stations and poses together and no residual.
-A gauge is a set of twelve linear constraints on the joint centres that picks one choice.
+Neither edges nor readings determine the base frame or the platform frame: a rigid motion of either,
+six numbers each, changes parameters, stations and poses together and no residual. A gauge is a set
+of twelve linear constraints on the joint centres that selects one choice.
 
-Frame changes, by the perturbation of :mod:`pkmcal.geometry.rigid`: E moves base coordinates,
-``A' = E A``, ``T_camera_base' = T_camera_base E^-1``, and F platform coordinates,
-``B' = F B``, ``T_base_platform' = E T_base_platform F^-1``. Twelve numbers: E's six, F's six.
+Frame changes, by the perturbation of :mod:`pkmcal.geometry.rigid`: E acts on base coordinates,
+``A' = E A``, ``T_camera_base' = T_camera_base E^-1``, and F on platform coordinates, ``B' = F B``,
+``T_base_platform' = E T_base_platform F^-1``. Twelve numbers: E's six, then F's six.
 
-Where an articulated platform's numbers begin is a choice as well, and continues the twelve:
+The origins of an articulated platform's numbers are a choice as well, and follow the twelve:
 
-- A hinge's point may slide along its axis, with the bar's joints sliding back, and the bar's
-  joints may be told turned about the hinge, with its internal coordinate turned back. Two numbers
-  a bar: shift (m) and turn (rad).
+- The point of a hinge may slide along its axis, with the bar's joints sliding back; and the bar's
+  joints may be described turned about the hinge, with its internal coordinate turned back. Two
+  numbers a bar: shift (m) and angle (rad).
 - The joint of a bar that keeps its direction may move together with its leg's base, by three
-  numbers a leg (m, base frame): [C]'s d with y_BC.
+  numbers a leg (m, base frame): d in [C] with y_BC.
 
-Not all are allowed: fixed and tied parameters leave some combinations, with the frames.
+Fixed and tied parameters allow only some combinations of these and of the frame changes.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from pkmcal.mechanisms.layout import LimbLayout
 
 
 class Gauge(Protocol):
-    """A choice of frames: linear constraints C theta = C drawing."""
+    """Choice of frames: linear constraints C theta = C theta_nominal."""
 
     @property
     def name(self) -> str:
-        """The choice in words."""
+        """Name of the choice, for people."""
         ...
 
     def constraints(self, machine: Machine) -> Array:
@@ -47,27 +47,29 @@ class Gauge(Protocol):
 
 
 FRAME_CHANGE_ROUNDING = 1e-12
-"""Share of the machine's size, and of a direction's one, below which a value is the rounding of a
-change of frames: some thousand times a double's."""
+"""Value, relative to the machine's size or to 1 for directions, below which it is rounding of a
+change of frames: some thousand times that of a double."""
 COLLINEAR_POINTS_SINE = 1e-3
-"""Three points nearer to one line than this part of their distances fix no turn about it."""
+"""Distance of three points from one line, relative to their distances, below which they determine
+no rotation about it."""
 
 
 @dataclass(frozen=True)
 class ThreeCentres:
-    """Frames by three joint centres, 3-2-1, base and platform alike.
+    """Frames by three joint centres, 3-2-1, for base and platform.
 
-    The first leg's centre keeps its drawing value, the second lies in the drawing's direction
-    from it, the third in the drawing's plane. Legs from 0; a machine of fewer than five legs
-    uses its first three. Where all legs meet in one point of a platform, that keeps its drawing
-    value, and no turn of it is told from the base's.
+    The first leg's centre keeps its nominal value, the second lies in the nominal direction from
+    it, the third in the nominal plane. Where all legs meet in one point of the platform, that point
+    keeps its nominal value, and the platform has no rotation constraints.
+
+    legs : from 0; a machine of fewer than five legs uses its first three.
     """
 
     legs: tuple[int, int, int] = (0, 2, 4)
 
     @property
     def name(self) -> str:
-        """The choice in words."""
+        """Name of the choice, for people."""
         return "three centres: legs " + ", ".join(str(j + 1) for j in self.legs)
 
     def constraints(self, machine: Machine) -> Array:
@@ -82,15 +84,17 @@ class ThreeCentres:
 
 @dataclass(frozen=True)
 class BestFit:
-    """Frames that lay the joint centres on the drawing's by least squares ([B] eq. 15)."""
+    """Frames that align the joint centres with the nominal ones by least squares ([B] eq. 15)."""
 
     @property
     def name(self) -> str:
-        """The choice in words."""
+        """Name of the choice, for people."""
         return "best fit of all centres to the drawing"
 
     def constraints(self, machine: Machine) -> Array:
-        """C (12, P): at the least-squares fit sum(A - D) = 0 and sum(D x A) = 0, D centred."""
+        """C (12, P): sum(A - D) = 0 and sum(D x A) = 0 at the least-squares fit, D nominal and
+        centred.
+        """
         drawing = machine.parameters.drawing
         rows = []
         for index in centre_index(machine.layout):
@@ -115,7 +119,7 @@ def centre_index(layout: LimbLayout) -> tuple[Integers, Integers]:
 
 
 def _three_rows(drawing: Array, index: Integers) -> Array:
-    """The 3-2-1 constraints of one body, (6, P); the first three alone where it is a point."""
+    """3-2-1 constraints of one body, (6, P); only the first three where all joints coincide."""
     p1, p2, p3 = drawing[index]
     if (p1 == p2).all() and (p1 == p3).all():
         rows = np.zeros((6, drawing.size))
@@ -133,13 +137,13 @@ def _three_rows(drawing: Array, index: Integers) -> Array:
 
 
 def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -> Array:
-    """How parameters move with the twelve numbers of a frame change, (..., P, 12).
+    """Derivatives (..., P, 12) of the parameters by a frame change.
 
-    drawing : (P,) where directions stay on the tangent planes of the drawing's.
+    drawing : (P,) nominal values, where directions stay on the tangent planes of the nominal ones.
     """
     out = np.zeros((*theta.shape[:-1], theta.shape[-1] + 1, 12))
     for group in (*layout.base, *layout.platform):
-        # what the file is silent about lands in the last row
+        # parameters that are not in the file have the last index, a row that is discarded
         out[..., group.index, :] = group.carrier.by_frames(group.of(theta))
     out = out[..., :-1, :]
     for body, axes in enumerate(layout.turning):
@@ -154,7 +158,9 @@ def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -
 
 
 def mount_generators(T_mount: Array, on_platform: Booleans) -> Array:
-    """How boards (..., M, 4, 4) fixed to a body move with a frame change, (..., M, 6, 12)."""
+    """Derivatives (..., M, 6, 12) of the poses (..., M, 4, 4) of boards on a body by a frame
+    change.
+    """
     if not on_platform.size:
         return np.zeros((*T_mount.shape[:-2], 6, 12))
     own = np.zeros((*T_mount.shape[:-2], 6, 6))
@@ -165,7 +171,7 @@ def mount_generators(T_mount: Array, on_platform: Booleans) -> Array:
 
 
 def station_generators(T_camera_base: Array) -> Array:
-    """How stations (..., S, 4, 4) move with a frame change, (..., S, 6, 12)."""
+    """Derivatives (..., S, 6, 12) of the stations' poses (..., S, 4, 4) by a frame change."""
     out = np.zeros((*T_camera_base.shape[:-2], 6, 12))
     out[..., :3, :3] = -T_camera_base[..., :3, :3]
     out[..., 3:, 3:6] = -T_camera_base[..., :3, :3]
@@ -173,7 +179,7 @@ def station_generators(T_camera_base: Array) -> Array:
 
 
 def pose_generators(T_base_platform: Array) -> Array:
-    """How platform poses (..., K, 4, 4) move with a frame change, (..., K, 6, 12)."""
+    """Derivatives (..., K, 6, 12) of the platform's poses (..., K, 4, 4) by a frame change."""
     rot, t = T_base_platform[..., :3, :3], T_base_platform[..., :3, 3]
     out = np.zeros((*T_base_platform.shape[:-2], 6, 12))
     out[..., :3, :3], out[..., 3:, 3:6] = np.eye(3), np.eye(3)
@@ -183,18 +189,20 @@ def pose_generators(T_base_platform: Array) -> Array:
 
 
 def other_moves(layout: LimbLayout) -> int:
-    """Numbers besides the frames'."""
+    """Number of gauge freedoms besides the frame changes."""
     return 2 * layout.n_internal + 3 * _floating(layout).size
 
 
 def _floating(layout: LimbLayout) -> Integers:
-    """Legs that end on bars which keep their direction."""
+    """Legs on bars that keep their direction."""
     legs = [g.legs for g in layout.platform if g.carrier.floats]
     return np.concatenate(legs) if legs else np.zeros(0, dtype=int)
 
 
 def move_generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -> Array:
-    """How parameters move with all these changes, (..., P, 12 + n)."""
+    """Derivatives (..., P, 12 + n) of the parameters by frame changes and the n other gauge
+    freedoms.
+    """
     frames = generators(layout, theta, drawing)
     if not other_moves(layout):
         return frames
@@ -208,7 +216,7 @@ def move_generators(layout: LimbLayout, theta: Array, drawing: Array | None = No
 
 
 def _shifts(layout: LimbLayout, theta: Array) -> Array:
-    """Both ends of each floating leg by its three numbers, (..., P, 3 legs)."""
+    """Derivatives (..., P, 3 legs) of both ends of each floating leg by its three numbers."""
     legs = _floating(layout)
     out = np.zeros((theta.shape[-1], 3 * legs.size))
     columns = np.arange(3 * legs.size).reshape(-1, 3)
@@ -218,7 +226,7 @@ def _shifts(layout: LimbLayout, theta: Array) -> Array:
 
 
 def slid(layout: LimbLayout, theta: Array, y: Array) -> Array:
-    """Parameters (..., P) after the changes y (..., n) that are not the frames'."""
+    """Parameters (..., P) after the gauge changes y (..., n) besides those of the frames."""
     if not other_moves(layout):
         return theta
     out = theta + (_shifts(layout, theta) @ y[..., 2 * layout.n_internal :, None])[..., 0]
@@ -231,36 +239,40 @@ def slid(layout: LimbLayout, theta: Array, y: Array) -> Array:
 
 
 def turned_back(layout: LimbLayout, y: Array) -> Array:
-    """By how much the internal coordinates become less, (..., n_internal)."""
+    """Decrease of the internal coordinates by the gauge changes y, (..., n_internal)."""
     return y[..., 1 : 2 * layout.n_internal : 2]
 
 
 def freedoms(machine: Machine) -> Array:
-    """Frame changes that the machine's model allows, a basis (12, g), at the drawing's values.
+    """Basis (12, g) of the frame changes that the machine's model allows, at the nominal values.
 
-    All twelve for a spatial machine without fixed parameters. Fixed or tied parameters take
-    some away; a machine that moves in fewer directions keeps those that respect its motion.
+    All twelve for a spatial machine without fixed parameters. Fixed or tied parameters remove some;
+    a machine that moves in fewer directions keeps those that preserve its motion.
     """
     shifted = generators(machine.layout, machine.parameters.drawing)
     return _allowed(machine, shifted, respecting_motion(machine.layout.motion))
 
 
 def conventions(machine: Machine) -> Array:
-    """Frame and hinge changes that the machine's model allows, a basis (12 + n, g), at the
-    drawing's values: what is a choice, not a question to the data.
+    """Basis (12 + n, g) of the frame and hinge changes that the machine's model allows, at the
+    nominal values: parameters of choice, which no data can determine.
     """
     frames = freedoms(machine)
     return _with_hinges(machine, frames, 2 * machine.layout.n_internal)
 
 
 def exact_moves(machine: Machine) -> Array:
-    """All changes that leave every prediction as it is, a basis (12 + n, g), at the drawing's."""
+    """Basis (12 + n, g) of all changes that leave every prediction unchanged, at the nominal
+    values.
+    """
     frames = respecting_motion(machine.layout.motion)
     return _with_hinges(machine, frames, other_moves(machine.layout))
 
 
 def _with_hinges(machine: Machine, frames: Array, n: int) -> Array:
-    """What the model allows of frame changes (12, g) and of the first n other changes."""
+    """Combinations of frame changes (12, g) and of the first n other changes that the model
+    allows.
+    """
     shifted = move_generators(machine.layout, machine.parameters.drawing)
     candidates = np.zeros((shifted.shape[1], frames.shape[1] + n))
     candidates[:12, : frames.shape[1]] = frames
@@ -269,7 +281,10 @@ def _with_hinges(machine: Machine, frames: Array, n: int) -> Array:
 
 
 def _allowed(machine: Machine, shifted: Array, candidates: Array) -> Array:
-    """Combinations of candidates (c, k) that move free parameters only; shifted : (P, c)."""
+    """Combinations of candidates (c, k) that change free parameters only.
+
+    shifted : (P, c) derivatives of the parameters.
+    """
     free, shifted = machine.parameters.free_matrix(), shifted @ candidates
     outside = shifted - free @ np.linalg.lstsq(free, shifted, rcond=None)[0]
     _, s, vt = np.linalg.svd(outside)
@@ -279,7 +294,7 @@ def _allowed(machine: Machine, shifted: Array, candidates: Array) -> Array:
 
 
 def respecting_motion(motion: Array) -> Array:
-    """Frame changes after which the platform still moves along ``motion``, (12, g)."""
+    """Frame changes (12, g) after which the platform still moves along ``motion`` (6, m)."""
     if motion.shape[1] == 6:
         return np.eye(12)
     both = np.concatenate([np.eye(6), np.eye(6)])
@@ -294,8 +309,8 @@ def respecting_motion(motion: Array) -> Array:
 
 
 def default_gauge(machine: Machine) -> Gauge:
-    """Three centres where three legs' joints make a triangle on both bodies, or meet in one point
-    of a platform that does not turn; else the best fit.
+    """Three centres where the joints of three legs form a triangle on both bodies, or coincide in
+    one point of a platform that does not rotate; else the best fit.
     """
     legs = (0, 2, 4) if machine.n_legs > 4 else (0, 1, 2)
     if machine.n_legs < 3:
@@ -312,10 +327,10 @@ def default_gauge(machine: Machine) -> Gauge:
 
 
 def frame_rows(machine: Machine, gauge: Gauge) -> Array:
-    """The gauge's constraints as rows (g, P) that frame changes alone can meet.
+    """Constraints of the gauge as rows (g, P) that frame changes can satisfy.
 
-    A machine with fewer frames than the gauge has constraints (planar, translational) cannot meet
-    them all; these are the combinations that it can.
+    A machine with fewer frame changes than the gauge has constraints (planar, translational) cannot
+    satisfy all of them; these rows are the combinations that it can.
     """
     c, drawing = gauge.constraints(machine), machine.parameters.drawing
     slope = c @ generators(machine.layout, drawing) @ freedoms(machine)
@@ -323,10 +338,11 @@ def frame_rows(machine: Machine, gauge: Gauge) -> Array:
 
 
 def projector(machine: Machine, theta: Array, gauge: Gauge) -> Array:
-    """What turns any result into the gauge, to first order: N C with y = -N C (theta - drawing).
+    """Frame change that brings parameters into the gauge, to first order: N C in y = -N C (theta -
+    theta_nominal).
 
-    theta : (..., P). Returns (..., 12, P); with it the S-transformation of the parameters is
-    ``I - G N C``, G of :func:`generators`.
+    theta : (..., P). Returns (..., 12, P); the S-transformation of the parameters is ``I - G N C``
+    with G of :func:`generators`.
     """
     c = gauge.constraints(machine)
     basis = freedoms(machine)
@@ -337,7 +353,7 @@ def projector(machine: Machine, theta: Array, gauge: Gauge) -> Array:
 
 
 def alignment(machine: Machine, state: State, gauge: Gauge) -> tuple[Array, Array]:
-    """The frame changes E and F, (4, 4) each, that bring a state into the gauge.
+    """Frame changes E and F, (4, 4) each, that bring a state into the gauge.
 
     Newton steps, each followed by an exact rigid motion of the centres.
     """
@@ -353,9 +369,9 @@ def alignment(machine: Machine, state: State, gauge: Gauge) -> tuple[Array, Arra
 
 
 def in_gauge(machine: Machine, state: State, gauge: Gauge) -> State:
-    """The same machine, stations and poses told in the gauge's frames; no residual changes.
+    """The same machine, stations and poses in the frames of the gauge; no residual changes.
 
-    What the frames make zero is zero, not the rounding of their change.
+    Values that the gauge makes zero are set to zero, without rounding.
     """
     shifted = changed_frames(machine.layout, state, *alignment(machine, state, gauge))
     lengths = np.array([unit == "m" for unit in machine.parameters.units])
@@ -365,7 +381,7 @@ def in_gauge(machine: Machine, state: State, gauge: Gauge) -> State:
 
 
 def changed_frames(layout: LimbLayout, state: State, e: Array, f: Array) -> State:
-    """The state after frame changes E and F, (4, 4) each."""
+    """State after the frame changes E and F, (4, 4) each."""
     return replace(
         state,
         theta=moved_centres(layout, state.theta, e, f),
@@ -376,7 +392,7 @@ def changed_frames(layout: LimbLayout, state: State, e: Array, f: Array) -> Stat
 
 
 def moved_mounts(T_mount: Array, on_platform: Booleans, e: Array, f: Array) -> Array:
-    """Boards' poses (..., M, 4, 4) in their bodies' new frames."""
+    """Poses (..., M, 4, 4) of boards in the new frames of their bodies."""
     if not on_platform.size:
         return T_mount
     frames = np.stack([e, f], axis=-3)
@@ -384,9 +400,9 @@ def moved_mounts(T_mount: Array, on_platform: Booleans, e: Array, f: Array) -> A
 
 
 def moved_centres(layout: LimbLayout, theta: Array, e: Array, f: Array) -> Array:
-    """Parameters (..., P) in frames moved by E (..., 4, 4) on the base, F on the platform.
+    """Parameters (..., P) in frames changed by E (..., 4, 4) on the base and F on the platform.
 
-    Centres move and directions turn with their body; what a carrier has besides follows.
+    Centres move and directions rotate with their body; other parameters of a carrier follow.
     """
     e, f = e[..., None, :, :], f[..., None, :, :]
     out = np.concatenate([theta, np.zeros((*theta.shape[:-1], 1))], axis=-1)
@@ -399,26 +415,28 @@ def moved_centres(layout: LimbLayout, theta: Array, e: Array, f: Array) -> Array
 
 
 def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Array:
-    """Errors of (theta, stations, mounts) before the frame changes to those after, (n, n),
-    n = P + 6 S + 6 M.
+    """Jacobian (n, n) of (theta, stations, mounts) after frame changes by those before, n = P + 6 S
+    + 6 M.
 
-    Centres turn with their frame. A station's left perturbation (omega, tau) becomes
-    (omega, tau + [R R_E^T t_E]x omega), as ``(T E^-1)`` keeps the camera's own axes. A mount's
-    are turned with its body.
+    Centres rotate with their frame. A station's left perturbation (omega, tau) becomes (omega, tau
+    + [R R_E^T t_E]x omega), as ``T E^-1`` keeps the camera's axes. A mount's perturbation rotates
+    with its body.
     """
     estimated = estimated_unknowns(before)
     out = np.eye(estimated.count)
     for transform, axes in zip((e, f), layout.turning, strict=True):
         out[axes[:, :, None], axes[:, None, :]] = transform[:3, :3]
-    # the carriers' own; the last takes what the file is silent about
+    # the carriers' parameters; those that are not in the file have the last index
     own = np.pad(out[estimated.machine, estimated.machine], ((0, 1), (0, 1)))
     for group in (*layout.base, *layout.platform):
         by = group.carrier.carried(group.of(before.theta), e[None], f[None])
         own[group.index[:, :, None], group.index[:, None, :]] = by
     out[estimated.machine, estimated.machine] = own[:-1, :-1]
+    # stations
     for s, station in enumerate(before.T_camera_base):
         at = estimated.stations.start + 6 * s
         out[at + 3 : at + 6, at : at + 3] = skew(station[:3, :3] @ e[:3, :3].T @ e[:3, 3])
+    # boards
     for m, moving in enumerate(before.on_platform):
         at, frame = estimated.mounts.start + 6 * m, f if moving else e
         out[at : at + 3, at : at + 3] = out[at + 3 : at + 6, at + 3 : at + 6] = frame[:3, :3]
@@ -426,11 +444,11 @@ def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Arr
 
 
 def transformation(machine: Machine, state: State, gauge: Gauge) -> Array:
-    """S-transformation (n, n) of the errors of (theta, stations, mounts) into the gauge,
-    n = P + 6 S + 6 M.
+    """S-transformation (n, n) of the errors of (theta, stations, mounts) into the gauge, n = P + 6
+    S + 6 M.
 
-    Errors in the gauge are ``J e``: the frame change that restores the constraints is taken
-    out of all alike. Constrained coordinates get zero variance exactly.
+    Errors in the gauge are ``S e``: the frame change that restores the constraints is applied to
+    all unknowns together. Constrained coordinates get exactly zero variance.
     """
     change = projector(machine, state.theta, gauge)
     shifted = np.concatenate(

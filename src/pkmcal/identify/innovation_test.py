@@ -1,16 +1,17 @@
-"""Rejected poses that the rest of the measurements explain after all.
+"""Innovation test: whether a rejected pose agrees with the estimate from the other measurements.
 
-Where a measured pose has lost its weight, its configuration follows the readings, and the pose is
-as far from there as these are wrong. In units of the pose's own noise that is much where readings
-are coarse, though nothing is wrong with the pose: rejected while the readings' noise was stated too
-small, or on the way to the solution, it would stay so for ever. So a rejected pose is judged by its
-innovation. With A the rows that it would have, unweighted, r their residuals, and C the covariance
-of all unknowns by the rest of the measurements and by what is known beforehand,
+The configuration of a pose without weight follows the readings, and the pose differs from the
+prediction by the errors of the readings. Where readings are coarse that is many standard deviations
+of the pose's own noise, though the pose is right; once rejected, because the readings' noise was
+stated too small or on the way to the solution, such a pose would stay rejected. So a rejected pose
+is tested by its innovation. With A the rows that the pose would have, unweighted, r their
+residuals, and C the covariance of all unknowns from the other measurements and the prior,
 
     d^2 = r^T (s^2 I + A C A^T)^-1 r,      s the noise scale of the poses.
 
-C has a configuration's own unknowns and the shared ones: with Q R the Jacobian by its own unknowns,
-W = Q^T J what they take up of that by the shared ones, and F F^T the shared unknowns' covariance,
+C covers a configuration's own unknowns and the shared ones. With Q R the Jacobian by the own
+unknowns, W = Q^T J the part of the shared ones' Jacobian J in its range, and F F^T the covariance
+of the shared unknowns,
 
     A C A^T = A_own R^-1 R^-T A_own^T + G F F^T G^T,      G = A_shared - A_own R^-1 W.
 """
@@ -27,14 +28,18 @@ from pkmcal.solver.elimination import divisions
 from pkmcal.solver.strips import eliminated
 
 REJECTED_BELOW_WEIGHT = 0.5
+"""Weight below which a pose counts as rejected."""
 
 
 def innovations(info: Information, distance: Array, weight: Array, scale: Array) -> Array:
-    """Norms (B, K, G) of the poses as those of pairs, of the rejected ones in units of what is
-    expected of their innovations.
+    """Norms (B, K, G) of the poses; of rejected ones relative to their innovations.
 
-    info : a solution with weights (B, K, G) in use; distance : the norms in the poses' own noise;
-    scale : (B,) of that noise.
+    All norms are converted to those of pairs of numbers (:func:`~pkmcal.identify.robust.as_pairs`).
+
+    info : a solution, with the weights in use.
+    distance : (B, K, G) norms in the poses' own noise.
+    weight : (B, K, G).
+    scale : (B,) noise scale of the poses.
     """
     kind = info.problem.kinds.poses
     rejected = kind.present & (weight < REJECTED_BELOW_WEIGHT)
@@ -43,13 +48,16 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
     out, factor, count = distance.copy(), as_pairs(kind), info.problem.layout.n_equations
     for cut in divisions(*info.problem.extent):
         part, state = info.problem.among(cut), info.problem.state_among(info.state, cut)
+        # R and W by the weighted rows
         used = eliminated(part.compact(state), np.zeros(len(state.z)))
+        # A: the same rows without weights
         whole = Kinds(*(one.present[None].astype(float) for one in part.kinds))
         rows = part.weighted(whole).compact(state)
         own, shared = rows.by_own[:, :, count:], rows.by_shared[:, :, count:]
         own = own @ used.inverse
         by = np.concatenate([own, (shared - own @ used.along) @ info.root[:, None]], axis=-1)
         value, n = rows.value[..., part.kinds.poses.rows], kind.whiten.shape[-1]
+        # d^2 of each rejected pose
         for run, k, place in np.argwhere(rejected[:, cut]).tolist():
             at = slice(n * place, n * (place + 1))
             r, a = value[run, k, at], by[run, k, at]

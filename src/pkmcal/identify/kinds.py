@@ -1,7 +1,6 @@
-"""What the rows of each kind say once the configurations' own unknowns are eliminated.
+"""Reduced rows of each kind, and their sums over all configurations.
 
-Sums over all configurations, found in one pass in which the rows themselves are written, reduced
-and forgotten.
+The sums are formed in one pass, in which the rows are evaluated, reduced and discarded.
 """
 
 from __future__ import annotations
@@ -19,16 +18,22 @@ from pkmcal.solver.strips import Compact, Eliminated, eliminated
 
 EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND = range(4)
 ROWS_KINDS = 4
-"""Kinds of rows in the axes of :class:`KindSums`."""
+"""Number of kinds of rows, the length of the axes of :class:`KindSums`."""
 
 
 class KindSums(NamedTuple):
-    """Sums over the configurations c of B runs; kinds k of rows as :data:`EDGE_ROWS_KIND`.
+    """Sums over the configurations c of B runs, by kind k of rows, numbered as
+    :data:`EDGE_ROWS_KIND`.
 
-    With Q of the own Jacobian in a configuration and its reduced rows A, Q_k and A_k those of a
-    kind: trace sum_c tr Q_k^T Q_k (B, 4), normal sum_c A_k^T A_k (B, 4, na, na). every : sum_c A^T
-    A (B, na, na) of all rows, those that are of no kind, as of rods of constant length, among them.
-    chi2 : (B, 4). value : (B, K, r) residuals, zero where nothing can be predicted or is there.
+    Q_k and A_k are the rows of kind k in Q of a configuration's own Jacobian, and in its reduced
+    rows A.
+
+    trace : (B, 4) sum_c tr Q_k^T Q_k.
+    normal : (B, 4, na, na) sum_c A_k^T A_k.
+    every : (B, na, na) sum_c A^T A of all rows, including those of no kind, such as the closures of
+    rods of constant length.
+    chi2 : (B, 4) sums of squared residuals.
+    value : (B, K, r) residuals, zero for padding and where nothing can be predicted.
     """
 
     trace: Array
@@ -39,9 +44,12 @@ class KindSums(NamedTuple):
 
 
 class KindRows(NamedTuple):
-    """Rows of one kind in K configurations of B runs, n of each: own (B, K, n, d) of the
-    orthonormal basis of the configuration's own Jacobian, shared (B, K, n, na) reduced, and their
-    residuals (B, K, n); zero where nothing can be predicted or is there.
+    """Rows of one kind, n in each of K configurations of B runs; zero for padding and where nothing
+    can be predicted.
+
+    own : (B, K, n, d) in the orthonormal basis Q of the configuration's own Jacobian.
+    shared : (B, K, n, na) reduced rows.
+    value : (B, K, n) residuals.
     """
 
     own: Array
@@ -50,7 +58,7 @@ class KindRows(NamedTuple):
 
 
 def kind_sums(problem: Problem, state: BatchState) -> KindSums:
-    """Those of a problem's rows at a state."""
+    """Sums of a problem's rows at a state."""
     n_runs, na = len(state.z), problem.unknowns.count
     trace, normal = np.zeros((n_runs, ROWS_KINDS)), np.zeros((n_runs, ROWS_KINDS, na, na))
     every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, ROWS_KINDS))
@@ -74,7 +82,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
 
 
 def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
-    """The rows of poses, readings or links at a state."""
+    """Rows of poses, readings or links at a state."""
     parts: list[KindRows] = []
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
@@ -87,7 +95,10 @@ def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
 def _rows_of_kind(
     problem: Problem, rows: Compact, eliminated_part: Eliminated, by_reading: Array, kind: int
 ) -> KindRows:
-    """The rows of poses, readings or links in some configurations; by_reading (B, K, E)."""
+    """Rows of poses, readings or links in some configurations.
+
+    by_reading : (B, K, E) derivatives of the closures by the readings.
+    """
     equations, start = problem.layout.n_equations, problem.closure_rows.start
     parts = eliminated_part.q, eliminated_part.rows, rows.value[:, :, start:, None]
     if kind in (POSE_ROWS_KIND, LINK_ROWS_KIND):
@@ -102,12 +113,12 @@ def _rows_of_kind(
 
 
 def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:
-    """Of the closures' rows (B, K, E, n) those of the readings, (B, K, m, n)."""
+    """Rows (B, K, m, n) of the readings among the closures' rows (B, K, E, n)."""
     return joint_rows(problem.layout, by_reading[:, :, None], closures.mT).mT
 
 
 def _chi2(problem: Problem, value: Array, by_reading: Array) -> Array:
-    """Sums of squares of each kind, (B, 4), of residuals (B, K, r)."""
+    """Sums of squares (B, 4) of residuals (B, K, r), by kind."""
     closures = problem.closure_rows
     readings = _readings(problem, value[..., closures, None], by_reading)[..., 0]
     poses, links = (value[..., kind.rows] for kind in problem.kinds[1:])

@@ -1,7 +1,7 @@
 """Rows of measurements that link two configurations (:mod:`pkmcal.measurements.links`).
 
-A link's row stands among those of its second configuration. It depends on nothing but unknowns that
-all configurations share: the own unknowns of both configurations, and the mount.
+A link's row stands among those of its second configuration. It depends on shared unknowns only: the
+own unknowns of both configurations, which are shared, and the mount.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from pkmcal.measurements import LinkRows, LinkSet
 
 @dataclass(frozen=True)
 class LinkBlocks:
-    """Where the links are: K configurations of G rows, padded; the same for all runs.
+    """Places of the links: K configurations of G rows, padded; the same for all runs.
 
-    sets : the links by kind, N of them together, in which ``configuration`` counts the linked
-    configurations, from 0. linked : (J,) which of all configurations these are. number : (K,) which
-    of the linked ones each is, -1 for none. at : where the links stand.
+    sets : links by kind, N together, whose ``configuration`` counts linked configurations, from 0.
+    linked : (J,) the linked ones among all configurations.
+    number : (K,) number of each configuration among the linked ones, -1 for none.
+    at : places of the links.
     """
 
     sets: tuple[LinkSet, ...]
@@ -37,7 +38,7 @@ class LinkBlocks:
 
     @cached_property
     def ends(self) -> Integers:
-        """(N, 2) numbers of the linked configurations that each link has."""
+        """(N, 2) linked configurations of each link, numbered as in ``linked``."""
         none = np.zeros((0, 2), dtype=int)
         return np.concatenate([none, *(one.configuration for one in self.sets)])
 
@@ -48,7 +49,7 @@ class LinkBlocks:
         return np.concatenate([none, *(one.mount for one in self.sets)])
 
     def among(self, configurations: slice) -> LinkBlocks:
-        """Those of some configurations; all linked ones stay among the unknowns."""
+        """Links of some configurations; all linked configurations stay among the unknowns."""
         first, stop, _ = configurations.indices(len(self.number))
         keep = (self.at.row >= first) & (self.at.row < stop)
         ends = np.cumsum([len(one) for one in self.sets])
@@ -64,23 +65,26 @@ class LinkBlocks:
 
 @dataclass(frozen=True)
 class LinkData:
-    """Weights (B or 1, K, G) of the links, 0..1 over the square of the noise scale, and whitening
-    (1, K, G, 1, 1) of their stated noise.
+    """Weights and whitening of the links.
+
+    weight : (B or 1, K, G) robust weight, 0..1, divided by the squared noise scale.
+    whiten : (1, K, G, 1, 1) inverse of the stated standard deviation.
     """
 
     weight: Array
     whiten: Array
 
     def among(self, configurations: slice) -> LinkData:
-        """Those of some configurations."""
+        """Data of some configurations."""
         return LinkData(self.weight[:, configurations], self.whiten[:, configurations])
 
 
 def link_rows(blocks: LinkBlocks, data: LinkData, linked: Array, T_mount: Array) -> LinkRows:
-    """Weighted residuals (B, K, G) of links, and their derivatives (B, N, 6), in standard
+    """Weighted residuals (B, K, G) of links and their derivatives (B, N, 6), in standard
     deviations.
 
-    linked : (B, J, 4, 4) T_base_platform of the linked configurations. T_mount : (B, M, 4, 4).
+    linked : (B, J, 4, 4) T_base_platform of the linked configurations.
+    T_mount : (B, M, 4, 4).
     """
     count, each = blocks.at.shape
     value, n_runs = np.zeros((len(linked), count, each)), len(linked)

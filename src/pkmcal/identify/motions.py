@@ -1,12 +1,12 @@
-"""Changes of a machine that people can picture: candidates for what data leave open.
+"""Named motions of a machine: candidates for the directions that data leave unidentified.
 
 A motion is a set of changes with one name and one sentence: its columns are changes of all P
-parameters in their own units (m, rad, or parts of a unit axis). They come from the parameter table
-(a number of one leg, the same number of all legs, what all legs have in common), from the frames
-(single legs, groups of legs and whole bodies moved as frames are), from what a leg looks like along
-itself, and from the carriers' own files: no joint kind is known here by its name.
+parameters in their own units (m, rad, or parts of a unit axis). Motions come from the parameter
+table (a parameter of one leg, the same parameter of all legs, parameters that all legs have in
+common), from frames (single legs, groups of legs and whole bodies moved as rigid bodies), from a
+leg's appearance along itself, and from the carriers' own files: no joint kind is named here.
 
-:mod:`pkmcal.identify.unidentified` finds which of them the data do not see.
+:mod:`pkmcal.identify.unidentified` finds the motions that the data do not determine.
 """
 
 from __future__ import annotations
@@ -29,34 +29,39 @@ from pkmcal.wording import DISPLAY_UNITS, decimals, joined, named, number, split
 
 AXIS_LETTERS = "xyz"
 MOST_GROUPS = 120
-"""Groups of legs that are tried; ten stations that each see other legs make about as many."""
+"""Largest number of groups of legs that are tried; ten stations, each of which sees other legs,
+form about as many."""
 MOST_SIZES = 3
-"""Sizes of which fewer than all are tried together; their combinations grow as powers of two."""
+"""Largest number of sizes that are tried together, besides all of them; the number of combinations
+grows as powers of two."""
 ALIGNED_AXIS_COSINE = 0.985
-"""Cosine (10 degrees) of a direction with an axis that still is called by that axis's name."""
+"""Cosine (10 degrees) of the angle between a direction and an axis up to which the direction has
+that axis's name."""
 THROUGH_AXIS_DISTANCE = 0.05
-"""Distance of a joint from an axis, in parts of the joints' spread, that still lies on it."""
+"""Distance of a joint from an axis, relative to the joints' spread, up to which it lies on it."""
 NEGLIGIBLE_CHANGE_SHARE = 1e-3
-"""Part of its greatest number below which a number of a change is nothing."""
+"""Coefficient of a change, relative to its largest one, below which it is negligible."""
 UNTOLD_SIZE_CHANGE = 0.01
-"""mm (or degrees) by which a size changes with another's 1 mm and is not worth a word."""
+"""Change of a size beside another one's 1 mm, in mm or degrees, below which it is omitted."""
 MOST_VALUES_LISTED = 5
-"""Numbers of a change that are told, the last of them for all smaller ones."""
+"""Largest number of terms in a sentence, the last of which may stand for all smaller ones."""
 
 Advice = Literal[
     "more", "photograph", "tie", "caliper", "more or caliper", "turn", "drawing", "size"
 ]  # fmt: skip
-"""What helps: see :mod:`pkmcal.identify.sentences`."""
+"""Kind of advice: see :mod:`pkmcal.identify.sentences`."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What the candidates are made from.
+    """Session from which the candidates are made.
 
-    machine : with the present values. observed : (S, L) legs that each station sees.
-    T_base_platform : (K, 4, 4) poses of the session. photographed : whether legs are in
-    photographs; otherwise only boards or poses were seen. heights : whether it was nothing but
-    heights.
+    machine : with its present values.
+    observed : (S, L) legs that each station measures.
+    T_base_platform : (K, 4, 4) poses of the session.
+    photographed : whether legs are in images; otherwise only boards, poses or heights were
+    measured.
+    heights : whether nothing but heights was measured.
     """
 
     machine: Machine
@@ -72,7 +77,7 @@ class Situation:
 
     @cached_property
     def fields(self) -> tuple[dict[str, Integers], ...]:
-        """Positions of each leg's parameters by field: ``base.center``, ``length.offset``,
+        """Positions of each leg's parameters by field: ``base.center``, ``length.offset``, and
         ``tubes`` for all radii.
         """
         out: tuple[dict[str, list[int]], ...] = tuple({} for _ in self.legs)
@@ -84,12 +89,12 @@ class Situation:
         return tuple({field: np.array(rows) for field, rows in leg.items()} for leg in out)
 
     def rows(self, leg: int, *starts: str) -> Integers:
-        """Positions of a leg's parameters in fields that start so."""
+        """Positions of a leg's parameters in fields whose names start with one of ``starts``."""
         results = [rows for field, rows in self.fields[leg].items() if field.startswith(starts)]
         return np.concatenate([np.zeros(0, dtype=int), *results])
 
     def label(self, rows: Integers) -> str:
-        """What a field is called."""
+        """Name of the field with these parameters, for people."""
         label = self.machine.parameters.labels[int(rows[0])]
         return label[:-2] if len(rows) == 3 else label
 
@@ -109,32 +114,34 @@ class Situation:
         return self.machine.inverse(self.T_base_platform)
 
     def one_hot(self, rows: Integers) -> Array:
-        """Each of these parameters by itself, (P, rows)."""
+        """Unit changes of single parameters, (P, rows)."""
         return np.eye(len(self.machine.parameters))[:, rows]
 
 
 How = Callable[[Situation, Array], str]
-"""Words from a motion's own numbers (k, m), one row for each direction that data leave open."""
+"""Words made from a motion's coefficients (k, m), one row for each open direction."""
 
 
 @dataclass(frozen=True)
 class NamedChanges:
-    """Changes with one name.
+    """Changes of the parameters with one name.
 
-    legs : that it is about, from 0. columns : (P, m). one, several : its sentence for one leg, and
-    for several that say the same, without a full stop, with places for
+    legs : that the changes concern, from 0.
+    columns : (P, m).
+    one, several : sentence for one leg, and for several legs, without a full stop, with the fields
 
     - ``{legs}``: leg 3; legs 1 to 4. ``{each}``: "each of ", before several legs.
-    - ``{is}``, ``{are}``, ``{open}``: is free, are free, free; or that only the drawing knows it.
-      ``{better}``, ``{limited}``: the same as an end of the sentence, empty where it is free.
-    - ``{n}``: how many independent changes of a leg. ``{combinations}``: that so many are open.
+    - ``{is}``, ``{are}``, ``{open}``: is free, are free, free; or known from the nominal model
+      only. ``{better}``, ``{limited}``: the same as an end of the sentence, empty where it is free.
+    - ``{n}``: number of independent changes of a leg. ``{combinations}``: that so many are open.
       ``{ways}``: in how many ways.
-    - ``{mostly}``: the numbers of a single change, or the parameters that change most.
-    - ``{how}``: what ``how`` says of the motion's own numbers.
+    - ``{mostly}``: terms of a single change, or the parameters that change most.
+    - ``{how}``: result of ``how`` for the motion's coefficients.
 
-    labels : names and units of the columns, where ``{mostly}`` tells these and not the parameters.
-    advice : what helps. convention : a change of the description, not of a leg: what was found does
-    not count again.
+    how : makes words from the coefficients.
+    labels : names and units of the columns, where ``{mostly}`` lists these instead of parameters.
+    advice : kind of advice.
+    convention : a change of the description, not of a leg; other motions are searched without it.
     """
 
     legs: tuple[int, ...]
@@ -147,18 +154,18 @@ class NamedChanges:
     convention: bool = False
 
     def words(self, n_legs: int) -> str:
-        """The sentence for so many legs."""
+        """Sentence for a number of legs."""
         return self.several if n_legs > 1 and self.several else self.one
 
 
 def candidates(s: Situation) -> Iterator[NamedChanges]:
-    """Every motion, the most particular first; the last is anything at all."""
+    """All motions, the most specific first; the last one is any change at all."""
     yield from (_unseen(s, j) for j in s.legs if not s.observed[:, j].any())
     yield from _conventions(s)
     carried = [m for j in s.legs for m in _carriers(s, j)]
     own = [motion for j in s.legs for motion in _of_one_leg(s, j)]
     shared = [*(motion for motion, _ in carried), *_sizes(s)]
-    # photographs tell legs one by one; poses leave open what is the same of all
+    # images measure legs one by one; poses leave open changes that all legs have in common
     yield from (*own, *shared) if s.photographed else (*shared, *own)
     for group in movable_leg_groups(s.observed):
         yield from _group(s, group)
@@ -172,10 +179,11 @@ def candidates(s: Situation) -> Iterator[NamedChanges]:
     yield NamedChanges(s.legs, np.eye(len(s.machine.parameters)), rest)
 
 
-# ------------------------------------------------------------------ legs nobody sees, frames
+# ------------------------------------------------------------------ legs in no image, frames
 
 
 def _unseen(s: Situation, leg: int) -> NamedChanges:
+    """All parameters of a leg that is in no image."""
     read = "; its readings alone leave {n} of its values {open}"
     all_read = "; their readings alone leave {n} of each one's values {open}"
     if not s.rows(leg, "length").size:
@@ -191,9 +199,10 @@ def _unseen(s: Situation, leg: int) -> NamedChanges:
 
 
 def _conventions(s: Situation) -> Iterator[NamedChanges]:
-    """Both ends of a leg shifted alike, as a frame of its own; the base frame turned.
+    """Both ends of the legs shifted in the same way, as a frame of its own; the base frame rotated.
 
-    Where the file holds some of what a frame would have to take along, the rest still may move.
+    Where the file fixes parameters that a frame change would have to change, the others may still
+    change.
     """
     ends = centre_index(s.machine.layout)
     shifts = np.zeros((len(s.machine.parameters), 3, s.machine.n_legs))
@@ -204,13 +213,13 @@ def _conventions(s: Situation) -> Iterator[NamedChanges]:
     layout = s.machine.layout
     bars = any(g.carrier.floats or g.carrier.turns for g in layout.platform)
     if s.photographed or (layout.motion[:3].any() and not bars):
-        shifts = shifts[:, :0]  # photographs, or the platform's turns, tell the ends of legs
+        shifts = shifts[:, :0]  # images, or the platform's rotations, determine both ends
     else:
         one = "of {how}: both can shift alike {ways}"
         yield NamedChanges(s.legs, shifts, one, how=_difference, convention=True)
     frames = generators(s.machine.layout, s.machine.values)
     for axis in (2, 0, 1):
-        # with shifts of both ends: what is held of the one end, the other makes good
+        # with shifts of both ends, which compensate for coordinates that are fixed at one end
         turn = np.concatenate([frames[:, [axis, 6 + axis]], shifts], axis=1)
         text = (
             f"the turn of the base frame about {AXIS_LETTERS[axis]} {{is}}: the axes and places"
@@ -221,7 +230,7 @@ def _conventions(s: Situation) -> Iterator[NamedChanges]:
 
 
 def _difference(s: Situation, coefficients: Array) -> str:
-    """Along which axes both ends shift, and what is seen instead."""
+    """Axes along which both ends shift, and the difference that is identifiable instead."""
     numbers = np.abs(coefficients).max(axis=0).reshape(3, -1).max(axis=1)
     axes = [c for c, x in zip(AXIS_LETTERS, numbers, strict=True) if x > 0.05 * numbers.max()]
     layout = s.machine.layout
@@ -235,11 +244,13 @@ def _difference(s: Situation, coefficients: Array) -> str:
     return f"{joined(axes)} of {base} and of {platform}, only the difference is seen{visible}"
 
 
-# ------------------------------------------------------------------ of one leg
+# ------------------------------------------------------------------ one leg
 
 
 def _of_one_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
-    """Its axes, its radii, the leg along itself, then every number and every point by itself."""
+    """Motions of one leg: axes, radii, the leg along itself, then each parameter and each point
+    alone.
+    """
     base, platform = s.fields[leg].get("base.axis"), s.fields[leg].get("platform.axis")
     if base is not None and platform is not None:
         values, rot = s.machine.values, s.T_base_platform[0, :3, :3]
@@ -282,7 +293,7 @@ def _along(s: Situation, leg: int) -> NamedChanges:
 
 
 def _slide(s: Situation, leg: int) -> Array:
-    """Base joint back along the leg, platform joint on along it, the rod growing; (P, 2)."""
+    """Base joint back along the leg, platform joint forward along it, the rod growing; (P, 2)."""
     out = np.zeros((len(s.machine.parameters), 2))
     for end, (centres, along) in enumerate(
         zip(centre_index(s.machine.layout), s.along, strict=True)
@@ -293,7 +304,7 @@ def _slide(s: Situation, leg: int) -> Array:
 
 
 def _sliding(_s: Situation, coefficients: Array) -> str:
-    """Which end slides: base, platform, both on their own, or the leg as a whole."""
+    """Which end slides: base, platform, both independently, or the leg as a whole."""
     if len(coefficients) > 1:
         return "can grow and shift along itself, its two joints and its length together"
     base, platform = np.abs(coefficients[0])
@@ -320,13 +331,13 @@ def directions_in_words(vectors: Array) -> str:
 
 
 def _axis_name(vector: Array) -> str:
-    """The axis that a vector (3,) is along, empty where it is along none."""
+    """Name of the axis that a vector (3,) is parallel to, empty for none."""
     size = np.abs(vector) / max(float(np.linalg.norm(vector)), 1e-300)
     return AXIS_LETTERS[int(np.argmax(size))] if size.max() > ALIGNED_AXIS_COSINE else ""
 
 
 def _carriers(s: Situation, leg: int) -> Iterator[tuple[NamedChanges, str]]:
-    """What a leg's carriers name in their own files, each with its sentence for all legs."""
+    """Motions that a leg's carriers define, each with its sentence for all legs."""
     layout, poses = s.machine.layout, s.T_base_platform
     readings = np.full(len(poses), np.nan)
     if layout.actuated[leg] >= 0:
@@ -335,7 +346,7 @@ def _carriers(s: Situation, leg: int) -> Iterator[tuple[NamedChanges, str]]:
         for i in np.flatnonzero(group.legs == leg):
             own = group.of(s.machine.values)[i]
             for motion in group.carrier.motions(own, readings):
-                # what the file is silent about lands in the last row
+                # parameters that are not in the file have the last index, a row that is discarded
                 columns = np.zeros((len(s.machine.parameters) + 1, motion.columns.shape[1]))
                 columns[group.index[i]] = motion.columns
                 names = NamedChanges((leg,), columns[:-1], motion.one, motion.several)
@@ -343,6 +354,7 @@ def _carriers(s: Situation, leg: int) -> Iterator[tuple[NamedChanges, str]]:
 
 
 def _whole_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
+    """Any combination of a leg's parameters; tube radii with the distance to the camera."""
     own = s.rows(leg, "base", "platform", "length", "scale")
     one = "of the values of {legs}, {combinations}{mostly}"
     yield NamedChanges((leg,), s.one_hot(own), one)
@@ -356,7 +368,11 @@ def _whole_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
 
 
 class Size(NamedTuple):
-    """A number that several legs have: what it is called, its unit, and (P, L) a column a leg."""
+    """A parameter that several legs have.
+
+    label, unit : its name and unit.
+    columns : (P, L), one column a leg.
+    """
 
     label: str
     unit: str
@@ -364,8 +380,8 @@ class Size(NamedTuple):
 
 
 def sizes(s: Situation) -> tuple[Size, ...]:
-    """Radius of the base (a joint moves outwards from the middle of all) and height (along z), and
-    every other number that several legs have, free ones only.
+    """Base radius (joints move outwards from their centre), base height (along z), and every other
+    parameter that several legs have, if any of these is free.
     """
     table, n = s.machine.parameters, s.machine.n_legs
     places, _ = centre_index(s.machine.layout)
@@ -390,7 +406,7 @@ def sizes(s: Situation) -> tuple[Size, ...]:
 
 
 def _sizes(s: Situation) -> Iterator[NamedChanges]:
-    """Few of them first: of all legs alike, then of single legs."""
+    """Combinations of few sizes first: of all legs together, then of single legs."""
     reference_values = sizes(s)
     numbers = [*range(1, min(MOST_SIZES, len(reference_values)) + 1)]
     numbers += [len(reference_values)] if len(reference_values) > MOST_SIZES else []
@@ -420,9 +436,12 @@ def _sizes(s: Situation) -> Iterator[NamedChanges]:
 
 
 def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
-    """What changes together while heights stay, and what it does to x and y."""
+    """Words on sizes that change together without effect on heights, and on their effect on x and
+    y.
+    """
 
     def how(s: Situation, coefficients: Array) -> str:
+        """Words on a single change; none for several."""
         if len(coefficients) > 1:
             return ""
         what, unit = changes(coefficients[0], labels)
@@ -441,11 +460,13 @@ def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
 
 
 def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[str], float]:
-    """``+1 mm of the rod length``, ``+0.2 mm of the radius``: a change (m,) told by its numbers.
+    """Terms of a change (m,): ``+1 mm of the rod length``, ``+0.2 mm of the radius``.
 
-    labels : name and unit of each. The largest length becomes a millimetre, or, where there is
-    none, the largest angle a tenth of a degree, or scale a tenth of a per cent; also returns the
-    factor by which.
+    The change is scaled so that its largest length is a millimetre, or, without lengths, its
+    largest angle a tenth of a degree, or its largest scale a tenth of a per cent; the factor is
+    also returned.
+
+    labels : name and unit of each number.
     """
     units = [
         {**DISPLAY_UNITS, "": (100.0, "%")}.get(unit, DISPLAY_UNITS["rad"]) for _, unit in labels
@@ -477,10 +498,10 @@ def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[st
 
 
 def movable_leg_groups(visible: Booleans) -> tuple[tuple[int, ...], ...]:
-    """Groups of legs that might move against the others, by which stations (S, L) see them.
+    """Groups of legs that may move relative to the others, by the legs that stations see (S, L).
 
-    What one station sees, what it sees and another does not, and what hangs together through
-    shared legs; of a group and its complement the smaller.
+    Legs of one station, differences between two stations, and legs connected through stations that
+    share legs; of a group and its complement the smaller.
     """
     results: dict[tuple[int, ...], None] = {}
     rows = np.unique(visible, axis=0)
@@ -496,14 +517,14 @@ def movable_leg_groups(visible: Booleans) -> tuple[tuple[int, ...], ...]:
 
 
 def hanging_together(visible: Booleans) -> tuple[Booleans, ...]:
-    """Sets of legs (L,) that stations (S, L) connect, one station sharing a leg with the next."""
+    """Sets of legs (L,) that stations (S, L) connect: each station shares a leg with the next."""
     joint = visible.T.astype(int) @ visible.astype(int) > 0
     reach = np.linalg.matrix_power(np.eye(len(joint)) + joint.astype(float), len(joint))
     return tuple(np.unique(reach > 0, axis=0))
 
 
 def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[NamedChanges]:
-    """Some legs' ends moved as their body's frame would move them, the others left."""
+    """Ends of some legs moved as a rigid body, the others unchanged."""
     frames = generators(s.machine.layout, s.machine.values)
     ends: list[Array] = []
     for body, side in enumerate(("base", "platform")):
@@ -527,7 +548,7 @@ def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[NamedChanges]:
 
 
 def _relation(s: Situation, legs: tuple[int, ...]) -> str:
-    """How the group is seen with the other legs."""
+    """Words on how stations measure the group together with the other legs."""
     others = [j for j in s.legs if j not in legs]
     with_group = np.any(s.observed[s.observed[:, list(legs)].any(axis=1)], axis=0)
     bridging = [j for j in others if with_group[j]]
@@ -542,9 +563,10 @@ def _relation(s: Situation, legs: tuple[int, ...]) -> str:
 
 
 def _rigid(legs: tuple[int, ...], body: int) -> How:
-    """A group's open rigid motions; of both bodies' twelve numbers the base's tell."""
+    """Words on the open rigid motions of a group; of both bodies' twelve numbers, on the base's."""
 
     def how(s: Situation, coefficients: Array) -> str:
+        """Words on the twists of one body."""
         own, other = coefficients[:, :6], coefficients[:, 6:]
         twists = own if np.linalg.norm(own) > 0 or not other.size else other
         points = s.machine.values[centre_index(s.machine.layout)[body]]
@@ -555,8 +577,10 @@ def _rigid(legs: tuple[int, ...], body: int) -> How:
 
 
 def rigid_words(twists: Array, points: Array, legs: tuple[int, ...]) -> str:
-    """``shift along x and turn about the axis through joints 1 and 4``: twists (k, 6) about the
-    middle of some legs' joints among the points (L, 3), (omega, tau) each.
+    """Twists in words: ``shift along x and turn about the axis through joints 1 and 4``.
+
+    twists : (k, 6) each (omega, tau), about the centre of some legs' joints.
+    points : (L, 3) all joints.
     """
     middle = points[list(legs)].mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=-1))))
@@ -577,7 +601,7 @@ def rigid_words(twists: Array, points: Array, legs: tuple[int, ...]) -> str:
 def _line(
     omega: Array, tau: Array, middle: Array, points: Array, legs: tuple[int, ...], spread: float
 ) -> str:
-    """What a twist (omega, tau) about ``middle`` turns about, by the other joints on its line."""
+    """Axis of a twist (omega, tau) about ``middle`` in words, by the other joints on it."""
     square = float(omega @ omega)
     point, direction = middle + cross(omega, tau) / square, omega / np.sqrt(square)
     axis = _axis_name(direction)
@@ -596,9 +620,9 @@ def _line(
 
 
 def _spread(s: Situation, legs: tuple[int, ...]) -> NamedChanges:
-    """Legs move apart as they are while their tubes grow thicker by the same share, (P, 1).
+    """Legs move apart in their present shape while their tubes grow by the same ratio, (P, 1).
 
-    A camera sees the same where the platform does not turn: it is the depth of all of them.
+    The images are the same if the platform does not rotate: the change is one of all depths.
     """
     values, (base, platform) = s.machine.values, centre_index(s.machine.layout)
     centres = values[base[list(legs)]]
@@ -615,8 +639,8 @@ def _spread(s: Situation, legs: tuple[int, ...]) -> NamedChanges:
 
 
 def _everything(s: Situation) -> NamedChanges:
-    """All lengths grow by the same share, (P, 1): what readings in m stand for as well, where all
-    their scales are free; else readings cannot, so offsets stay.
+    """All lengths grow by the same ratio, (P, 1): readings in m as well if all their scales are
+    free; else readings cannot follow, and offsets stay.
     """
     table, layout = s.machine.parameters, s.machine.layout
     free = np.append(np.any(table.free_matrix(), axis=1), False)
@@ -638,7 +662,7 @@ def _everything(s: Situation) -> NamedChanges:
 
 
 def _all_together(s: Situation, carried: list[tuple[NamedChanges, str]]) -> Iterator[NamedChanges]:
-    """Motions of single legs, of which only combinations are open."""
+    """Motions of single legs of which only combinations are open."""
     slides = np.concatenate([_slide(s, j) for j in s.legs], axis=1)
     text = "legs that grow while their joints move along them {are} {ways}{mostly}"
     yield NamedChanges(s.legs, slides, text)
@@ -664,7 +688,7 @@ def _all_together(s: Situation, carried: list[tuple[NamedChanges, str]]) -> Iter
 
 
 def all_radii(s: Situation) -> NamedChanges:
-    """The radii of all tubes, (P, tubes)."""
+    """Radii of all tubes, (P, tubes)."""
     legs = tuple(j for j in s.legs if "tubes" in s.fields[j])
     rows = np.concatenate([s.rows(j, "tubes") for j in s.legs])
     return NamedChanges(legs, s.one_hot(rows), "the tubes' radii of {legs} {are}", advice="caliper")

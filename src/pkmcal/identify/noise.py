@@ -1,24 +1,26 @@
-"""How large the noise of each kind of rows is, as the data show it: variance components.
+"""Noise scale of each kind of rows from the residuals: variance components.
 
-With H the hat matrix of all rows in standard deviations and R = 1 - H, a kind's residuals ``r_k``
-have the covariance ``M = R_kk`` where every noise is as it counts. As R is idempotent, that is
+With H the hat matrix of all rows in standard deviations and R = 1 - H, the residuals ``r_k`` of a
+kind have the covariance ``M = R_kk`` if all noise is as stated. As R is idempotent, that is
 
-    M = M M + F + O,      M M by the kind's own noise, F by what is known beforehand, O by all else,
+    M = M M + F + O,      M M by the kind's own noise, F by the prior, O by all other rows,
 
-and where the kind's noise is s times, and all else's t times what it counts for,
-``s^2 M M + F + t^2 O``. In the directions u with ``u^T M u = 1`` that make M M diagonal, the
+and where the noise of the kind is s times, and that of all others t times the stated one, then
+``s^2 M M + F + t^2 O``. In the directions u with ``u^T M u = 1`` that diagonalize M M, the
 residuals are independent normal numbers z of the variances
 
     v = s^2 own + t^2 others + fixed,      own + others + fixed = 1 for each,
 
-and these hold all that is known of s: restricted maximum likelihood (Patterson and Thompson 1971).
-F is taken as diagonal there; it is small beside the others wherever the data say anything of s.
+and contain all information about s: restricted maximum likelihood (Patterson and Thompson 1971). F
+is approximated by its diagonal there; it is small beside the others wherever the data contain
+information about s.
 
-t is unknown. Edges of a line err alike, and how much of that a pose takes up no other residual
-shows; so where readings are far sharper than poses are seen, a change of t by a hundredth would do
-to the sum of all z^2 what all of the readings' noise does. Directions in which poses are seen well
-and badly tell s and t apart. The interval of s is that of the profile likelihood, t at its best for
-every s; where the directions tell little it is wide.
+t is unknown, a nuisance parameter. Errors of the edges of a line are correlated, and no other
+residual shows how much of their common error a pose absorbs; so where readings are far sharper than
+poses are measured, a change of t by one hundredth would change the sum of all z^2 by as much as all
+of the readings' noise does. Directions in which poses are determined well and badly separate s from
+t. The interval of s is that of the profile likelihood, with the best t for every s; it is wide
+where the directions contain little information.
 """
 
 from __future__ import annotations
@@ -35,37 +37,39 @@ from pkmcal.identify.problem import Problem
 from pkmcal.measurements.rows import Kinds
 
 NOISE_CONTRADICTION_CHANCE = 0.01 / 3
-"""Probability of contradicting a noise that is stated right: one in a hundred, shared by the three
-kinds of rows."""
+"""Probability of contradicting a noise that is stated correctly: one in a hundred, shared by the
+three kinds of rows."""
 LEAST_NOISE_FREEDOM = 5.0
-"""Degrees of freedom below which a sum of squares tells no noise."""
+"""Degrees of freedom below which a sum of squares determines no noise."""
 LARGEST_NOISE_STEP = 10.0
-"""Largest factor on a noise in one step: what follows from it is linear no further."""
+"""Largest factor on a noise in one step, beyond which the linear model no longer holds."""
 LARGEST_GROUP = 400
-"""Rows whose residuals are made independent together. Of more, those of some configurations are at
-a time, each with its exact variance; what they have in common with the others, by the few unknowns
-that all share, is left."""
+"""Rows whose residuals are made independent together. If there are more, they are handled in groups
+of configurations: each has its exact variance, but the correlation between groups, by the few
+shared unknowns, is neglected."""
 LEAST_RESIDUAL_SHARE = 1e-10
-"""Part of a direction that the unknowns leave in the residuals, below which it is rounding."""
+"""Eigenvalue of M below which it is rounding: the unknowns absorb the whole direction."""
 LOG_VARIANCES_TRIED = np.linspace(-20.0, 20.0, 41)
-"""Logarithms of s^2 that are tried; the least stands for none."""
+"""Logarithms of s^2 that are tried; the smallest stands for zero."""
 LEAST_VARIANCE = float(np.exp(LOG_VARIANCES_TRIED[0]))
+"""Lower bound of a variance."""
 LOG_OTHERS_TRIED = np.linspace(-14.0, 14.0, 15)
-"""Logarithms of t^2 that are tried first for each of them."""
+"""Logarithms of t^2 that are tried first for each s^2."""
 LOG_OTHERS_STEPS = 1.0, 0.25, 0.0625
-"""And then about the best of them: steps by which it is looked for more closely."""
+"""Step sizes of the refinement of the best of them."""
 INTERVAL_HALVINGS = 8
+"""Number of bisections of an interval of log s^2."""
 HALVINGS_AT_ONCE = 4
-"""Halvings of one interval whose points are evaluated together: the likelihood of fifteen points
+"""Bisections of one interval whose points are evaluated together: the likelihood of fifteen points
 takes hardly longer than that of one."""
 
 
 @dataclass(frozen=True)
 class Components:
-    """What B solutions leave of each kind of rows, see the module.
+    """Residuals of each kind of rows in B solutions.
 
-    chi2 : (B, 4) sums of squares of the residuals. freedom : (B, 4) tr R_kk, what they are expected
-    to be.
+    chi2 : (B, 4) sums of squared residuals.
+    freedom : (B, 4) tr R_kk, their expectation at the stated noise.
     """
 
     chi2: Array
@@ -73,10 +77,10 @@ class Components:
 
 
 def components(info: Information, weight: Kinds[Array]) -> Components:
-    """Those of a solution with weights (B, K, G) in use.
+    """Sums of squares and degrees of freedom of a solution; weight : (B, K, G) in use.
 
-    H is Q Q^T of the own unknowns and S S^T of the shared ones, orthogonal to each other; what
-    nothing fixes has no part in it.
+    H is Q Q^T of the own unknowns plus S S^T of the shared ones, orthogonal to each other;
+    undetermined directions are not part of it.
     """
     problem, sums, half = info.problem, info.by_kind, info.root
     n_readings = float(info.state.T_base_platform.shape[1] * problem.layout.n_readings)
@@ -90,17 +94,18 @@ def components(info: Information, weight: Kinds[Array]) -> Components:
 
 
 def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
-    """Residuals of each kind in use, each counted by its robust weight, (B,)."""
+    """Number of residuals of each kind, weighted by their robust weights, (B,)."""
     parts = zip(problem.kinds, weight, strict=True)
     return Kinds(*(np.sum(part * kind.count, axis=(1, 2)) for kind, part in parts))
 
 
 @dataclass(frozen=True)
 class NoiseShares:
-    """The independent numbers of a kind's residuals, of B runs; see the module.
+    """Independent residuals of a kind in B runs, with the shares of their variances; see the
+    module's docstring.
 
-    z : (B, n). own, others, fixed : (B, n) parts of their variances. Padding has the fixed variance
-    1 and is zero.
+    z : (B, n).
+    own, others, fixed : (B, n). Padding has z = 0 and the fixed share 1.
     """
 
     z: Array
@@ -110,46 +115,48 @@ class NoiseShares:
 
     @property
     def best(self) -> Array:
-        """Factor s (B,) of the highest likelihood, 0 where none is better than any."""
+        """Factor s (B,) of the highest likelihood, 0 where that is at the smallest value tried."""
         return np.sqrt(self._best[0])
 
     def factor(self) -> Array:
-        """By what to multiply the kind's noise next, (B,). Where the data allow the present noise
-        and any smaller one it stays: they know no better, and a noise of nothing promises too much.
+        """Factor (B,) on the kind's noise for the next step.
+
+        Where the data allow the present noise and any smaller one, it stays: they contain no better
+        value, and a noise of zero would promise too much.
         """
         low, high = self.interval()
         step = np.clip(self.best, 1 / LARGEST_NOISE_STEP, LARGEST_NOISE_STEP)
         return np.where((low == 0) & (high >= 1), 1.0, step)
 
     def freedom(self, s: Array) -> Array:
-        """Numbers (B,) that determine s (B,): by the square of the part that it has in the variance
-        of each.
+        """Effective number of residuals (B,) that determine s (B,): the sum of the squared shares
+        of s in their variances.
         """
         return self._freedom((s**2)[:, None])[:, 0]
 
     def interval(self, chance: float = NOISE_CONTRADICTION_CHANCE) -> tuple[Array, Array]:
-        """Factors on the kind's noise, smallest and largest (B,) each, that the data allow at the
-        level 1 - ``chance``; 0 and infinity where they do not tell an end.
+        """Smallest and largest factor (B,) on the kind's noise that the data allow at the level 1 -
+        ``chance``; 0 and infinity where there is no bound.
 
-        By the likelihood ratio. The least is none where few numbers determine the best, and the
-        largest is not less than what enough of them determine.
+        By the likelihood ratio. The lower end is 0 where too few residuals determine the best
+        factor, and the upper end is at least the factor that enough residuals would determine.
         """
         if chance not in self._intervals:
             self._intervals[chance] = self._interval(chance)
         return self._intervals[chance]
 
     def contradicts(self) -> Booleans:
-        """Whether the data do not allow the kind's noise as it is, (B,)."""
+        """Whether the data exclude the present noise of the kind, (B,)."""
         low, high = self.interval()
         return (low > 1) | (high < 1)
 
     @cached_property
     def _intervals(self) -> dict[float, tuple[Array, Array]]:
-        """Those computed so far, by their chance."""
+        """Intervals computed so far, by ``chance``."""
         return {}
 
     def _interval(self, chance: float) -> tuple[Array, Array]:
-        """:meth:`interval`, computed."""
+        """Compute :meth:`interval`."""
         from scipy.special import chdtri
 
         n_runs, n = self.z.shape
@@ -160,7 +167,7 @@ class NoiseShares:
         inside = self._grid <= level[:, None]
         with np.errstate(divide="ignore"):
             middle = np.clip(np.log(best), tried[0], tried[-1])
-        # from the outermost that was tried, or the best itself, to the next one beyond
+        # from the outermost value tried that is allowed, or the best one, to the next value beyond
         a = np.minimum(np.where(inside, tried, np.inf).min(axis=1), middle)
         b = np.maximum(np.where(inside, tried, -np.inf).max(axis=1), middle)
         before = tried[np.maximum(np.searchsorted(tried, a) - 1, 0)]
@@ -172,8 +179,9 @@ class NoiseShares:
         return np.where(has_low, np.sqrt(low), 0.0), np.sqrt(high)
 
     def _crossing(self, inside: Array, outside: Array, level: Array) -> Array:
-        """s^2 (B, G) where -2 log likelihood crosses a level (B,) between two logarithms of it
-        (B, G).
+        """s^2 (B, G) where -2 log likelihood crosses a level (B,).
+
+        inside, outside : (B, G) logarithms of s^2 below and above the level.
         """
         for _ in range(INTERVAL_HALVINGS):
             middle = (inside + outside) / 2
@@ -183,7 +191,7 @@ class NoiseShares:
 
     @cached_property
     def _least_determined(self) -> Array:
-        """s^2 (B,) from which on enough numbers determine s, infinite for none."""
+        """Smallest s^2 (B,) that enough residuals would determine, infinite for none."""
         low, high = (np.full(len(self.z), end) for end in LOG_VARIANCES_TRIED[[0, -1]])
         enough_at_all = self._freedom(np.exp(high)[:, None])[:, 0] > LEAST_NOISE_FREEDOM
         # bisection, all points of several halvings in one evaluation
@@ -206,7 +214,7 @@ class NoiseShares:
 
     @cached_property
     def _grid(self) -> Array:
-        """-2 log likelihood (B, G) of the variances tried, the first of them none."""
+        """-2 log likelihood (B, G) of the values of s^2 tried, the first of which is zero."""
         return self._profile(_variances_tried(len(self.z)))[0]
 
     @cached_property
@@ -227,11 +235,12 @@ class NoiseShares:
         return np.where(at > 0, np.exp(log), 0.0), value
 
     def _profile(self, square: Array) -> tuple[Array, Array]:
-        """-2 log likelihood (B, G) of s^2 (B, G) with t at its best, and log t^2 there."""
+        """-2 log profile likelihood (B, G) of s^2 (B, G), and the best log t^2."""
         own = square[..., None] * self.own[:, None] + self.fixed[:, None]
         others, squares = self.others[:, None], np.square(self.z)[:, None]
 
         def value(log: Array) -> Array:
+            """-2 log likelihood (B, G) at log t^2 (B, G)."""
             variance = np.maximum(own + np.exp(log)[..., None] * others, LEAST_VARIANCE)
             return np.sum(np.log(variance) + squares / variance, axis=-1)
 
@@ -241,7 +250,7 @@ class NoiseShares:
         for step in LOG_OTHERS_STEPS:
             middle, centre = best, log
             a, b = value(centre - step), value(centre + step)
-            # the vertex of the parabola through the three, no further than a step
+            # vertex of the parabola through the three points, at most a step away
             bend = a + b - 2 * middle
             direction = np.where(
                 bend > 0, (a - b) / np.where(bend > 0, bend, 1.0) / 2, np.sign(a - b)
@@ -254,7 +263,7 @@ class NoiseShares:
 
 
 def noise_shares(info: Information, kind: int) -> NoiseShares:
-    """Those of the readings, or of the poses, at a solution."""
+    """Independent residuals of the readings, poses or links at a solution."""
     rows, half = kind_rows(info.problem, info.state, kind), info.root
     in_prior = info.problem.prior @ half
     fixed = in_prior.mT @ in_prior
@@ -293,13 +302,16 @@ def _of_run(rows: KindRows, half: Array, fixed: Array) -> tuple[Array, Array, Ar
 def _independent(
     own: Array, shared: Array, value: Array, used: Booleans, across: Array, fixed: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """The same of the rows of some configurations.
+    """z, own, others and fixed (n,) of the rows of some configurations.
 
-    own (K, n, d) and shared (K, n, na) in orthonormal bases, value and used (K, n); across (na, na)
-    the product of all configurations' shared rows.
+    own, shared : (K, n, d) and (K, n, na) rows in orthonormal bases.
+    value, used : (K, n) residuals, and whether they are in use.
+    across : (na, na) product of all configurations' shared rows.
+    fixed : (na, na) product of the prior's rows in the same basis.
     """
     n_configurations, n, _ = own.shape
     flat_used = used.ravel()
+    # M = 1 - H of these rows, and M M, which also contains the kind's rows outside this group
     blocks = np.zeros((n_configurations, n, n_configurations, n))
     each = np.arange(n_configurations)
     blocks[each, :, each] = np.eye(n) - own @ own.mT
@@ -308,9 +320,11 @@ def _independent(
     residual = d - s @ s.T
     ds = d @ s
     by_own = d @ d - ds @ s.T - s @ ds.T + s @ across @ s.T
+    # directions u with u^T M u = 1
     size, turn = np.linalg.eigh(residual)
     some = size > LEAST_RESIDUAL_SHARE
     unit = turn[:, some] / np.sqrt(size[some])
+    # that diagonalize M M
     of_own, turn = np.linalg.eigh(unit.T @ by_own @ unit)
     unit = unit @ turn
     of_own = np.clip(of_own, 0.0, 1.0)

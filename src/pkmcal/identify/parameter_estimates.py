@@ -1,4 +1,4 @@
-"""The parameters of a calibrated machine as a table: one row each, for people and for pandas."""
+"""Table of a calibrated machine's parameters: one row each, as text, HTML or a DataFrame."""
 
 from __future__ import annotations
 
@@ -26,15 +26,18 @@ REPR_ROWS = 12
 Decider = Literal["data", "drawing", "frame", "fixed"]
 
 DATA_DECIDES_SHARE = 0.5
-"""Share of what is known that has to come from the data for the value to be theirs."""
+"""Share of a parameter's information from which on its value counts as decided by the data."""
 ROUNDING_SIGMA = 1e-9
-"""Standard deviations (m or rad) below this are zero but for rounding: a nanometre."""
+"""Standard deviations (m or rad) below which they are rounding: a nanometre."""
 
 
 def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> tuple[Decider, ...]:
-    """What decides each of the parameters: covariance (P, P), and the data's share (P,).
+    """What decides each parameter: data, drawing (the nominal model), frame or fixed.
 
-    frame : the value only defines the result's frames. fixed : the mechanism file holds it.
+    frame : the value only defines the result's frames. fixed : the mechanism file fixes it.
+
+    covariance : (P, P).
+    data_share : (P,) share of the information that comes from the data.
     """
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return tuple(
@@ -48,11 +51,12 @@ def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> t
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """One parameter, m, rad, or 1 of a direction's components and of ratios.
+    """One parameter: m, rad, or 1 for components of a direction and for ratios.
 
-    drawing, value, sigma : before, as calibrated, and its standard deviation in the result's
-    frames. data_share : of what is known, from the data; NaN where that means nothing.
-    decided_by : data, drawing, frame (of the result) or fixed.
+    drawing, value, sigma : nominal and calibrated value, and its standard deviation in the gauge of
+    the result.
+    data_share : share of the information that comes from the data; NaN where that is undefined.
+    decided_by : see :func:`decided_by`.
     """
 
     name: str
@@ -65,13 +69,13 @@ class ParameterEstimate:
 
     @property
     def change(self) -> float:
-        """Calibrated less drawing."""
+        """Calibrated minus nominal value."""
         return self.value - self.drawing
 
 
 @dataclass(frozen=True, repr=False)
 class ParameterEstimates(Sequence[ParameterEstimate]):
-    """All parameters in the order of the mechanism file; by number, or by name."""
+    """All parameters in the order of the mechanism file, by number or by name."""
 
     rows: tuple[ParameterEstimate, ...]
     table: ParameterTable
@@ -87,8 +91,10 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
     @overload
     def __getitem__(self, index: slice) -> ParameterEstimates: ...
     def __getitem__(self, index: int | str | slice) -> ParameterEstimate | ParameterEstimates:
-        """A row by its place or its name, such as ``legs[1].base.center.z``; InputError names the
-        closest name otherwise. Of a slice, those rows.
+        """Row at a position or with a name, such as ``legs[1].base.center.z``; a table of the rows
+        of a slice.
+
+        Raises InputError, with the closest name, for an unknown name.
         """
         if isinstance(index, str):
             return self.rows[self.table.index(index)]
@@ -97,7 +103,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
         return self.rows[index]
 
     def to_pandas(self) -> DataFrame:
-        """A DataFrame, one row a parameter by its name, in m and rad. Needs pandas."""
+        """DataFrame with one row a parameter, indexed by name, in m and rad. Needs pandas."""
         try:
             import pandas as pd
         except ImportError:
@@ -110,7 +116,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
         )
 
     def records(self) -> list[dict[str, str | float]]:
-        """One mapping a row, by PARAMETER_ESTIMATE_COLUMNS."""
+        """One mapping a row, with the keys PARAMETER_ESTIMATE_COLUMNS."""
         return [
             {name: getattr(row, name) for name in PARAMETER_ESTIMATE_COLUMNS} for row in self.rows
         ]
@@ -138,6 +144,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
+        """Table as HTML, for notebooks."""
         head, *rows = self._cells()
         body = "".join(f"<tr>{_html_cells('td', row)}</tr>" for row in rows)
         return (
@@ -145,7 +152,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
         )
 
     def _cells(self) -> list[tuple[str, ...]]:
-        """The heading and all rows as text, with digits that mean something."""
+        """Heading and all rows as text, with as many digits as the standard deviations warrant."""
         out: list[tuple[str, ...]] = [
             ("parameter", "drawing", "calibrated", "sigma", "unit", "decided by")
         ]
@@ -165,13 +172,19 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
 
 
 def _html_cells(kind: str, row: tuple[str, ...]) -> str:
+    """Cells of one row as HTML."""
     return "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row)
 
 
 def parameter_estimates(
     drawing: Array, machine: Machine, covariance: Array, data_share: Array
 ) -> ParameterEstimates:
-    """The table. drawing : (P,) values before. covariance : (P, P). data_share : (P,)."""
+    """Table of a machine's parameters.
+
+    drawing : (P,) nominal values.
+    covariance : (P, P).
+    data_share : (P,).
+    """
     table = machine.parameters
     source = decided_by(table, covariance, data_share)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -1,9 +1,9 @@
-"""The edges' rows with what the unknowns take up of them: shift and tilt apart.
+"""Reduced rows of the edges, shift and tilt separated, with their hat matrix.
 
-In the noise that a solution counts with, the two residuals of an edge are turned into the one along
-what a shift outward does and the one across, its tilt. Of both the hat matrix has the part of the
-configuration's own unknowns, ``q q^T``, and that of the shared ones, ``t t^T`` with ``t = F^T J``
-where J is what elimination has left of the row and ``F F^T`` the shared unknowns' covariance.
+The two residuals of an edge, in the noise of the solution, are rotated into the one along the
+change by a shift outward and the one across it, the tilt. The hat matrix of both is the part of the
+configuration's own unknowns, ``q q^T``, plus that of the shared ones, ``t t^T`` with ``t = F^T J``,
+where J are the reduced rows and ``F F^T`` is the covariance of the shared unknowns.
 """
 
 from __future__ import annotations
@@ -23,12 +23,17 @@ from pkmcal.solver.strips import Eliminated, StripLayout, eliminated
 
 @dataclass(frozen=True)
 class ReducedEdges:
-    """The edges of some configurations of B runs, in strips: N views of r numbers each, shift and
+    """Reduced edges of some configurations of B runs, in strips: N strips of r numbers, shift and
     tilt of one edge after the other.
 
-    problem : of these configurations, from ``first`` on. value : (B, N, r) residuals. own : (B, N,
-    d, r) what the own unknowns take up, q. numbers : (B, w, N, r) rows by the strips' unknowns.
+    problem : restricted to these configurations.
+    first : number of the first of them.
+    layout : of the strips.
+    value : (B, N, r) residuals.
+    own : (B, N, d, r) parts q of the own unknowns in the hat matrix.
+    numbers : (B, w, N, r) rows by the shared unknowns of the strips' columns.
     by_linked : (B, N, d, r) rows by the own unknowns of linked configurations, which are shared.
+    eliminated : the configurations' elimination.
     """
 
     problem: Problem
@@ -42,21 +47,23 @@ class ReducedEdges:
 
     @property
     def at(self) -> tuple[Integers, Integers]:
-        """Configuration and place, (N, 1) and (N, r / 2), of each edge; place -1 for padding."""
+        """Configuration (N, 1) and place (N, r / 2) of each edge; place -1 for padding."""
         return _edges_at(self.layout)
 
     def placed(self, numbers: Array) -> Array:
         """Numbers (B, N, r) at the edges' places, (B, K', G, 2)."""
         count, places = self.problem.blocks.present.shape
-        # a place more than there are takes in the padding, -1
+        # an extra place at the end receives the padding, whose place is -1
         out = np.zeros((len(numbers), count, places + 1, NUMBERS_AN_EDGE))
         edges = numbers.shape[-1] // NUMBERS_AN_EDGE  # not -1, for there may be no configuration
         out[:, *self.at] = numbers.reshape(*numbers.shape[:2], edges, NUMBERS_AN_EDGE)
         return out[:, :, :-1]
 
     def shared(self, half: Array) -> Iterator[tuple[slice, Array]]:
-        """What the shared unknowns take up, t, of views with the same unknowns after the other, (B,
-        N', na, r); half : (B, na, na) F.
+        """Parts t of the shared unknowns in the hat matrix, (B, N', na, r), for each group of
+        strips with the same columns.
+
+        half : (B, na, na) root F of the covariance.
         """
         at = self.layout.configuration
         of_own = (self.eliminated.along @ half[:, None]).mT
@@ -70,16 +77,18 @@ class ReducedEdges:
 
 
 def reduced_edges(info: Information) -> Iterator[ReducedEdges]:
-    """The edges of a solution, some configurations after the other."""
+    """Reduced edges of a solution, some configurations at a time."""
     problem, n_runs = info.problem, len(info.state.z)
     for cut in divisions(info.state.T_base_platform.shape[1], problem.n_rows * n_runs):
         part, state = problem.among(cut), problem.state_among(info.state, cut)
         rows = part.compact(state)
         eliminated_part, layout = eliminated(rows, np.zeros(n_runs)), rows.strips.layout
+        # direction of a shift outward in each edge's residuals
         v = part.data.by_shift
         norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))
         unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
         numbers = _turned(rows.strips.numbers, unit[:, *_edges_at(layout)])
+        # own unknowns eliminated; those of linked configurations are shared instead
         d = layout.n_own
         by_own = numbers[:, :d].swapaxes(1, 2)
         own = eliminated_part.inverse.mT[:, layout.configuration] @ by_own
@@ -105,8 +114,10 @@ def _edges_at(layout: StripLayout) -> tuple[Integers, Integers]:
 
 
 def _turned(numbers: Array, unit: Array) -> Array:
-    """Numbers (B, ..., N, n) of strips of edges with the two rows of each turned into those along
-    ``unit`` (B, N, n / 2, 2) and across.
+    """Rotate the two rows of each edge.
+
+    numbers : (B, ..., N, n) of strips of edges.
+    unit : (B, N, n / 2, 2) direction of the first of the new rows; the second is perpendicular.
     """
     first, second = numbers[..., ::NUMBERS_AN_EDGE], numbers[..., 1::NUMBERS_AN_EDGE]
     x, y = np.moveaxis(unit, -1, 0)[:, :, None]

@@ -1,15 +1,15 @@
-"""Edges and poses that belong to something else: weights that let them go.
+"""Robust start of an estimate: IRLS weights that reject wrong edges, poses and links.
 
-A wrong edge (another leg's, a shadow's) is wrong as a whole, so the weight belongs to the whole
-edge and judges the Mahalanobis norm d of its two residuals; so does that of a board's pose, of its
-six, and that of any other kind of measurement, of as many as it has. The search begins with a scale
-so wide that everything counts and narrows it while the estimate settles (graduated non-convexity,
-Geman-McClure weights); it ends with weights that are 1 for all that is clean.
+A wrong edge (another leg's, a shadow's) is wrong as a whole, so an edge has one weight by the
+Mahalanobis norm d of its two residuals; so have a board's pose by its six, and any other
+measurement by as many as it has. The search begins with a scale so wide that all measurements have
+weight and narrows it from stage to stage (graduated non-convexity, Geman-McClure weights); it ends
+with weights that are 1 for all inliers.
 
-Where that search begins, most measurements may fit by chance, and what one parameter explains then
-looks like outliers. So where it rejects something, least squares of all measurements are a second
-start, and the solution with the larger posterior density is kept (:func:`robust_cost`): a change of
-a parameter that its prior allows is likelier than many wrong measurements.
+At the first scales most measurements may fit by chance, and the effect of one wrong parameter may
+look like outliers. So where the annealing rejects measurements, least squares of all of them is a
+second start, and the solution with the larger posterior density is used (:func:`robust_cost`): a
+change of a parameter within its prior is likelier than many wrong measurements.
 """
 
 from __future__ import annotations
@@ -31,31 +31,39 @@ from pkmcal.solver.kernels import (
 from pkmcal.solver.search import minimise, put, take
 
 CLEAN_TAIL_SHARE = float(np.exp(-(FULL_WEIGHT_DISTANCE**2) / 2))
-"""Share of two clean residuals' norms beyond FULL_WEIGHT_DISTANCE, where weights begin to fall."""
+"""Share of inliers with two residuals beyond FULL_WEIGHT_DISTANCE, where weights begin to fall."""
 POSE_STEPS = 10
-"""Steps of a stage where there are poses: against readings a hundred times sharper they allow
-short steps only at first, and one that is refused would look as if all had settled."""
+"""Solver steps of a stage where there are poses: against readings a hundred times sharper they
+allow short steps only at first, and after a single refused step the scales would seem settled."""
 MOST_ANNEALING_STAGES = 30
+"""Largest number of stages of the annealing."""
 GEMAN_MCCLURE_SCALE = 4.0
 """Geman-McClure scale in units of the residuals' robust scale."""
 
 
 LEAST_SCALE = 1.0
-"""The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
-What moves several alike (a lens) is partly taken up by the parameters, so residuals come out
-smaller than errors are: scaling down by them would promise too much."""
+"""Lower bound of the noise scale of poses, and of edges without shading. An error that several
+measurements share (a lens) is partly absorbed by the parameters, so residuals are smaller than
+errors: a smaller scale would promise too much."""
 SCALES_TRIED = 2.0 ** np.arange(13)
-"""Factors on a kind's stated noise, from the least on, from which its likeliest one is sought."""
+"""Factors on LEAST_SCALE that are tried as a kind's noise scale."""
 SCALE_STEPS, MOST_REWEIGHTINGS = 5, 8
-"""Steps to that factor, and most rounds of weights and solution from a start."""
+"""Fixed-point steps to a kind's noise scale after that, and largest number of rounds of weights and
+solution from a start."""
 LOSS_CHANGE = 1e-2
-"""Change of the robust cost, in squared standard deviations, below which weights are settled."""
+"""Change of the robust cost, in squared standard deviations, below which weights have converged."""
 ROUGHLY_SOLVED_DISTANCE = 1e-2
-"""Standard deviations, of all fitted values together, that such a round may have left to go."""
+"""Step tolerance of such a round: remaining change of all fitted values together, in standard
+deviations."""
 
 
 class RobustStart(NamedTuple):
-    """Where a robust search begins: state, weights (B, K, G), robust scale (B,), solver steps."""
+    """Start of a robust search.
+
+    weight : (B, K, G) each.
+    scale : (B,) noise scales.
+    steps : solver steps so far.
+    """
 
     state: BatchState
     weight: Kinds[Array]
@@ -64,7 +72,7 @@ class RobustStart(NamedTuple):
 
 
 def clean_norm(share: float, count: Integers) -> Array:
-    """The norm beyond which a share of those of ``count`` clean residuals lies."""
+    """Norm that a share of inliers with ``count`` residuals exceeds."""
     pair = np.sqrt(-2 * np.log(share))  # the closed form of two residuals: most are edges
     out = np.full(count.shape, pair)
     others = [int(number) for number in np.unique(count) if number != 2]
@@ -77,15 +85,17 @@ def clean_norm(share: float, count: Integers) -> Array:
 
 
 def as_pairs(kind: RowsOfKind) -> Array:
-    """Factors (K, G) on a kind's norms, so that as many clean ones lie beyond FULL_WEIGHT_DISTANCE
-    as of pairs.
+    """Factors (K, G) that convert a kind's norms to those of pairs of residuals: the same share of
+    inliers lies beyond FULL_WEIGHT_DISTANCE.
     """
     return FULL_WEIGHT_DISTANCE / clean_norm(CLEAN_TAIL_SHARE, kind.count)
 
 
 def norms(problem: Problem, rows: Kinds[Array]) -> Kinds[Array]:
-    """Mahalanobis norms (B, K, G) of each kind's residuals (:meth:`Problem.unweighted`), as those
-    of pairs (:func:`as_pairs`); NaN for padding.
+    """Mahalanobis norms (B, K, G) of each kind, converted to those of pairs (:func:`as_pairs`); NaN
+    for padding.
+
+    rows : unweighted residuals (:meth:`Problem.unweighted`).
     """
     parts = zip(problem.kinds, rows, strict=True)
     return Kinds(
@@ -97,9 +107,10 @@ def norms(problem: Problem, rows: Kinds[Array]) -> Kinds[Array]:
 
 
 def robust_scale(d: Array, usual: Array) -> Array:
-    """Factor by which the noise seems to differ from the stated one, from the median, (B,).
+    """Noise relative to the stated one (B,), by the median of the norms.
 
-    d : (B, K, G) norms. usual : (K, G) the medians of clean ones.
+    d : (B, K, G) norms.
+    usual : (K, G) median norms of inliers.
     """
     flat = np.sort((d / usual).reshape(d.shape[0], -1), axis=1)  # NaN last
     count = np.sum(np.isfinite(flat), axis=1)
@@ -109,14 +120,14 @@ def robust_scale(d: Array, usual: Array) -> Array:
 
 
 def noise_scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array]:
-    """Each kind's factor, (B,), not below the least."""
+    """Noise scale of each kind (B,), at least ``least``."""
     parts = zip(problem.kinds, d, strict=True)
     values = (robust_scale(part, clean_norm(0.5, k.count) * as_pairs(k)) for k, part in parts)
     return Kinds(*(np.maximum(scale, least) for scale in values))
 
 
 def settled_weights(distance: Kinds[Array], scale: Kinds[Array]) -> Kinds[Array]:
-    """Each kind's weights by its :func:`norms`."""
+    """Final weights of each kind by its :func:`norms`."""
     parts = zip(distance, scale, strict=True)
     return Kinds(*(final_weights(part / each[:, None, None]) for part, each in parts))
 
@@ -124,12 +135,12 @@ def settled_weights(distance: Kinds[Array], scale: Kinds[Array]) -> Kinds[Array]
 def robust_cost(
     problem: Problem, state: BatchState, *, scaled: bool = True
 ) -> tuple[Array, Kinds[Array], Kinds[Array]]:
-    """-2 log of the posterior density (B,) at a state, constants left out, with each kind's weights
-    (B, K, G) and likeliest noise scale (B,); that is 1 unless ``scaled``.
+    """-2 log of the posterior density (B,) at a state, up to a constant; with each kind's weights
+    (B, K, G) and most likely noise scale (B,), which is 1 unless ``scaled``.
 
-    A measurement of k numbers at a distance d costs ``loss(d / s) + 2 w k log(s)`` in the noise
-    scale s, with its weight w. What is rejected costs the same at any scale, and all scales are
-    compared with their log, so no solution wins by enlarging or shrinking its noise.
+    A measurement of k numbers at a distance d costs ``loss(d / s) + 2 w k log(s)`` at the noise
+    scale s, with its weight w. A rejected measurement costs the same at any scale, and the
+    logarithm is part of the cost, so no solution gains by a larger or smaller noise.
     """
     values = problem.residuals(state)
     closures = np.nan_to_num(values.value[..., problem.closure_rows])
@@ -151,13 +162,17 @@ def robust_cost(
 
 
 def _kind_cost(d: Array, count: Integers, unit: Array, *, scaled: bool) -> tuple[Array, Array]:
-    """The least cost (B,) of one kind's norms d (B, n), as those of pairs, and the scale (B,) that
-    has it. count, unit : (n,) numbers of each measurement, and its factor of :func:`as_pairs`.
+    """Smallest cost (B,) of one kind's norms over the noise scale, and that scale (B,).
+
+    d : (B, n) norms, as those of pairs.
+    count, unit : (n,) residuals of each measurement, and its factor :func:`as_pairs`.
     """
     squares = np.nan_to_num(d / unit) ** 2
 
     def cost_at(scale: Array) -> tuple[Array, Array]:
-        """The cost at a scale (B,), and the scale at which the weighted squares are as expected."""
+        """Cost at a scale (B,), and the scale at which the weighted squares equal their
+        expectation.
+        """
         weight = final_weights(d / scale[:, None])
         numbers = weight @ count
         expected = np.sum(weight * squares, axis=1) / np.maximum(numbers, 1.0)
@@ -177,9 +192,10 @@ def _kind_cost(d: Array, count: Integers, unit: Array, *, scaled: bool) -> tuple
 
 
 def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) -> RobustStart:
-    """A start near the solution although measurements are wrong, or parameters far from nominal:
-    the end of the annealing; or, where that rejects measurements and least squares of all of them
-    lead to a smaller robust cost, the end of these.
+    """Start near the solution even where measurements are wrong, or parameters far from nominal.
+
+    The end of the annealing; or, where that rejects measurements and least squares of all of them
+    leads to a smaller robust cost, the end of the latter.
 
     scaled : whether noise may be larger than stated.
     """
@@ -193,6 +209,7 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
         return annealed  # both starts lead to the same solution
     part, state = problem.select(runs), take(annealed.state, runs)
     usual, _, _ = robust_cost(part, state, scaled=scaled)
+    # second start: all measurements at full weight
     every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.kinds)
     one = np.ones(len(runs))
     every = Kinds(*(p.astype(float) for p in every))
@@ -205,11 +222,12 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
         solution = minimise(searched, other.state, tolerance=ROUGHLY_SOLVED_DISTANCE)
         cost, weight, scale = robust_cost(part, solution.state, scaled=scaled)
         other = RobustStart(solution.state, weight, scale, other.steps + int(solution.steps.max()))
-        # a few wrong ones among thousands of edges always draw least squares aside: where these do
-        # not cost less at once, they are not followed
+        # a few wrong edges among thousands always draw least squares away: these iterations go on
+        # only where they cost less at once
         if np.all(cost > before - LOSS_CHANGE) or not (poses or np.any(cost < usual)):
             break
         before = cost
+    # the cheaper solution of each run
     better = np.flatnonzero(cost < usual - LOSS_CHANGE)
     runs = runs[better]
     return RobustStart(
@@ -221,7 +239,7 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
 
 
 def anneal(problem: Problem, start: BatchState) -> RobustStart:
-    """Where graduated non-convexity leads from a start."""
+    """Graduated non-convexity from a start: weights at a scale that shrinks from stage to stage."""
     state, steps = start, 0
     most = POSE_STEPS if problem.kinds.poses.present.size else 1
     d = norms(problem, problem.unweighted(state))

@@ -1,4 +1,6 @@
-"""Findings in English: what is open, how far that moves the platform, and what to do about it."""
+"""Sentences about unidentifiable directions: what is open, its effect on the platform, and
+advice.
+"""
 
 from __future__ import annotations
 
@@ -14,28 +16,31 @@ from pkmcal.mechanisms.parameters import EVERY_LEG
 from pkmcal.wording import capital, in_full, joined, listed, named, split_name, ways
 
 LEAST_PLATFORM_MOVE = 0.01
-"""Share of a joint centre's tolerance below which a platform counts as not moved: a hundredth
-of what the drawing leaves open disappears beside any calibration's own deviations."""
+"""Displacement of the platform, relative to a joint centre's prior sigma, below which it counts as
+not moved: a hundredth of the nominal model's uncertainty is negligible beside any calibration's."""
 MOST_SENTENCES = 8
-"""Sentences that people read."""
+"""Largest number of sentences in a report."""
 MOST_NAMES_IN_SENTENCE = 5
+"""Largest number of parameters named in a sentence."""
 NAMED_CHANGE_SHARE = 0.15
-"""Part of the greatest change, in tolerances, from which on a parameter is named."""
+"""Change relative to the greatest one, both in prior sigmas, from which on a parameter is named."""
 SHIFT_ONLY_TURN = 0.02
-"""Turn (rad) of the platform between configurations below which they only shift it."""
+"""Rotation (rad) of the platform between configurations below which they only translate it."""
 ZERO_AXIS_COMPONENT = 1e-9
-"""Component of an axis below which the file can hold it alone."""
+"""Component of a nominal axis below which the file can fix it by itself."""
 
 
 @dataclass(frozen=True)
 class Sentence:
-    """One thing that the data do not tell.
+    """One unidentified or weakly identified motion of the machine.
 
-    text, advice : what, and what to do. parameters : the names that it is about, most first.
-    dimensions : independent changes that it stands for. moves_platform : how far (m, root mean
-    square over its joints and poses) the platform moves when these changes are as large as the
-    drawing's tolerance lets expect. matters : whether that is more than nothing. weak : the data
-    know it, yet less than the drawing does.
+    text, advice : the user's sentences: what is open, and what to do about it.
+    parameters : names of the parameters, the most affected first.
+    dimensions : number of independent changes.
+    moves_platform : root mean square displacement of the platform, over its joints and poses, by
+    these changes as the prior allows them, m.
+    matters : whether that displacement is more than negligible.
+    weak : the data contain information about it, but less than the nominal model does.
     """
 
     text: str
@@ -51,9 +56,11 @@ class Sentence:
 class OpenMotion:
     """A motion that the data leave open, of one or more legs.
 
-    space : (k, P) changes that it explains, in units of the drawing's deviations. numbers : (n, m)
-    the motion's own numbers for them, of one leg. own : (k, P) what these change, in the same units
-    as ``space``, from which it differs by frames. new : how many of the k nobody said before.
+    space : (k, P) changes that it explains, in prior sigmas.
+    numbers : (n, m) the motion's own coefficients for these, of one leg.
+    own : (k, P) the changes that these coefficients make, in prior sigmas; they differ from
+    ``space`` by frame changes.
+    new : how many of the k no earlier motion explains.
     """
 
     motion: NamedChanges
@@ -64,11 +71,11 @@ class OpenMotion:
     new: int
 
     def how(self, around: Situation) -> str:
-        """What the motion says of its own numbers."""
+        """Words made from the motion's own coefficients."""
         return self.motion.how(around, self.numbers) if self.motion.how else ""
 
     def and_of(self, other: OpenMotion) -> OpenMotion:
-        """The same said of other legs, or of these again."""
+        """Merge with the same motion of other legs, or with another part of it for these legs."""
         again = self.legs == other.legs
         return replace(
             self,
@@ -83,11 +90,15 @@ class OpenMotion:
 def sentence(
     around: Situation, open_motion: OpenMotion, unit: Array, shifted: float, weak: bool
 ) -> Sentence:
-    """The sentence of a motion; unit (P,) of the drawing's deviations, moved (m) the platform's
-    joints, weak : whether the data know it, yet less than the drawing does.
+    """Sentence of a motion.
+
+    unit : (P,) prior sigmas of the parameters.
+    shifted : displacement of the platform's joints, m.
+    weak : the data contain information about it, but less than the nominal model does.
     """
     table = around.machine.parameters
     matters = shifted > LEAST_PLATFORM_MOVE * float(table.tolerance[table.of_kind("center")].mean())
+    # parameters that change most
     size = np.linalg.norm(open_motion.own, axis=0)
     order = np.argsort(-np.round(size, 6), kind="stable")
     rows = order[: int(np.sum(size > NAMED_CHANGE_SHARE * size.max()))]
@@ -98,6 +109,7 @@ def sentence(
         len(open_motion.numbers),
     )
     open_ = f"{'is' if n == 1 else 'are'} {reference_values}"
+    # fields of the motion's template
     places = {
         "legs": named(open_motion.legs),
         "each": "each of " if several else "",
@@ -114,6 +126,7 @@ def sentence(
         "how": open_motion.how(around),
     }
     text = open_motion.motion.words(len(open_motion.legs)).format_map(places)
+    # effect on the platform
     how_far = "This does not move the platform."
     if matters:
         how_far = (
@@ -133,7 +146,11 @@ def sentence(
 
 
 def _mostly(around: Situation, open_motion: OpenMotion, rows: Integers, unit: Array) -> str:
-    """``: +1 mm of a goes with −0.7 mm of b`` of a single change; else what changes most."""
+    """``: +1 mm of a goes with −0.7 mm of b`` for a single change; else the parameters.
+
+    rows : parameters that change most.
+    unit : (P,) prior sigmas.
+    """
     table, single = around.machine.parameters, len(open_motion.space) == 1
     if open_motion.motion.labels:
         if not single:
@@ -152,7 +169,7 @@ def _mostly(around: Situation, open_motion: OpenMotion, rows: Integers, unit: Ar
 
 
 def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
-    """At most ``MOST_SENTENCES`` sentences, the rest counted in the last."""
+    """At most ``MOST_SENTENCES`` sentences; the least important ones are counted in the last."""
     if len(sentences) <= MOST_SENTENCES:
         return tuple(sentences)
     ranked = sorted(sentences, key=lambda s: -s.moves_platform)
@@ -174,7 +191,7 @@ def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
 def advice_on(
     around: Situation, open_motion: OpenMotion, names: tuple[str, ...], matters: bool, weak: bool
 ) -> str:
-    """What to do about a motion that changes these parameters."""
+    """Advice on a motion that changes these parameters."""
     held = _fixing(around, _enough(around, open_motion.motion, names))
     if not matters:
         return f"Nothing needs to be done; {held} silences this."
@@ -199,7 +216,7 @@ def advice_on(
 
 
 def _tying(around: Situation, legs: tuple[int, ...]) -> str:
-    """How to tie a group of legs to the others."""
+    """Advice on measurements that join a group of legs to the others."""
     others = [j for j in around.legs if j not in legs]
     with_group = np.any(around.observed[around.observed[:, list(legs)].any(axis=1)], axis=0)
     apart = [j for j in others if not with_group[j]]
@@ -211,7 +228,7 @@ def _tying(around: Situation, legs: tuple[int, ...]) -> str:
 
 
 def _more(around: Situation, legs: tuple[int, ...]) -> str:
-    """Which configurations are missing."""
+    """Advice on missing configurations."""
     if around.heights:  # more heights of the same bed would not help
         return "Measure x and y too, by a board on the platform (observe: board) or a tracker"
     take, poses = "Photograph" if around.photographed else "Measure", around.T_base_platform
@@ -227,8 +244,8 @@ def _more(around: Situation, legs: tuple[int, ...]) -> str:
 
 
 def _enough(around: Situation, motion: NamedChanges, names: tuple[str, ...]) -> tuple[str, ...]:
-    """What is enough to hold: of a convention one axis, or one end of legs of which only the
-    difference counts.
+    """Parameters that are sufficient to fix: for a convention one axis, or one end of legs of which
+    only the difference is identifiable.
     """
     if not motion.convention:
         return names
@@ -239,10 +256,10 @@ def _enough(around: Situation, motion: NamedChanges, names: tuple[str, ...]) -> 
 
 
 def _fixing(around: Situation, names: tuple[str, ...]) -> str:
-    """The line of the mechanism file that takes parameters out, or what it takes besides.
+    """The line of the mechanism file that fixes parameters, beside those that it fixes already.
 
-    An axis is held as a whole; a centre is said as a whole where all of it is meant, and all legs
-    in one where all that have the number are meant.
+    An axis is fixed as a whole; a centre as a whole where all of its coordinates are meant, and all
+    legs at once where all legs with that parameter are meant.
     """
     table = around.machine.parameters
     entries: dict[str, None] = {}

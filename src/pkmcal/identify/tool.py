@@ -1,5 +1,6 @@
-"""Where the platform is: what errors of the parameters do to it, how sure that is, and how wrong
-the drawing was. A calibration is for this; joints and lengths are the way to it.
+"""Errors of the platform's pose by errors of the parameters, before and after calibration.
+
+The platform's pose is the purpose of a calibration; joint centres and lengths are a means to it.
 """
 
 from __future__ import annotations
@@ -21,23 +22,27 @@ from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.solver.ranks import nonzero
 
 POSES_AROUND_SESSION = 40
-"""Poses around the session's: what a session's few poses hide, others show."""
+"""Number of poses sampled around the session's, for errors that few poses hide."""
 AROUND_SESSION_TURN, AROUND_SESSION_SHIFT = 0.2, 0.12
-"""How far they reach: rad, and share of the legs' mean length."""
+"""Ranges of the samples: rotation in rad, and translation relative to the machine's size, the mean
+distance from base to platform plus the platform's radius."""
 AS_REGULAR = 0.7
-"""Part of the session's own distance from a singular pose that the others keep: near one, any
-error counts manifold, and nobody works there."""
+"""Smallest distance of a sample from singular poses, relative to the median of the session's own:
+near a singular pose any error is amplified, and no machine works there."""
 POSES_AROUND_SEED = 4
+"""Seed of the samples."""
 NO_TURN = 1e-9
-"""rad; what rounding leaves of a turn."""
+"""Rotation below which it is rounding, rad."""
 
 
 def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
     """Derivatives (n, 6, P) of the pose (omega, tau) by the parameters at given readings.
 
-    joints (n, m), poses T_base_platform (n, 4, 4). From the implicit function closure(theta, X) = 0
-    at given readings: dX = -(dc/dX)^+ dc/dtheta, with X the pose and, where the platform has
-    hinges, their turns.
+    By the implicit function closure(theta, X) = 0 at given readings: dX = -(dc/dX)^+ dc/dtheta,
+    where X is the pose and, for platforms with hinges, their angles.
+
+    joints : (n, m) readings.
+    poses : (n, 4, 4) T_base_platform.
     """
     layout = machine.layout
     internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
@@ -47,18 +52,18 @@ def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
 
 
 def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
-    """Displacements of the platform's joints by the parameters, (r, P); frames taken out.
+    """Displacements (r, P) of the platform's joints by the parameters at given readings, frames
+    removed.
 
-    Joints on side bars count as if they were fixed to the centre bar, which carries the tool.
-
-    Rows are the joints' coordinates at the session's poses (K, 4, 4) and at others around them,
-    divided by the root of the number of joints and poses: for a change v of the parameters
-    ``norm(out @ v)`` is the joints' displacement (m, root mean square).
+    Rows are coordinates of the joints at the session's poses (K, 4, 4) and at samples around them,
+    divided by the root of the number of joints and poses: for a change v of the parameters,
+    ``norm(out @ v)`` is the joints' root mean square displacement, m. Joints on side bars are
+    treated as fixed to the centre bar, which carries the tool.
     """
     joints, poses = _around(machine, T_base_platform)
     points = limb_ends(machine.layout, machine.values, joints, poses).b_by_pose
     shifted = points @ pose_by_parameters(machine, joints, poses)[:, None]
-    # whether its parameters can follow or not: frames are conventions
+    # all frame changes, whether the parameters can follow or not, since frames are conventions
     frames = points @ (pose_generators(poses) @ respecting_motion(machine.layout.motion))[:, None]
     shifted = shifted.reshape(-1, shifted.shape[-1])
     frames = frames.reshape(len(shifted), -1)
@@ -69,14 +74,14 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
 
 
 def platform_sigma(estimate: Estimate) -> float:
-    """Standard deviation (m, root mean square) of the platform's joints at given readings."""
+    """Standard deviation of the platform's joints at given readings, root mean square, m."""
     used = estimate.state.T_base_platform[estimate.configurations]
     by = platform_by_parameters(estimate.machine, used)
     return float(np.sqrt(np.sum((by @ estimate.covariance) * by)))
 
 
 def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
-    """Readings and poses of the session and of samples about it that the machine can take."""
+    """Readings and poses of the session, and of samples around it that the machine can take."""
     rng = np.random.default_rng(POSES_AROUND_SEED)
     layout = machine.layout
     base, platform = machine.base_centers(), machine.platform_centers()
@@ -86,7 +91,7 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     reach = np.array([AROUND_SESSION_TURN] * 3 + [AROUND_SESSION_SHIFT * size] * 3)
     step = rng.uniform(-1, 1, (POSES_AROUND_SESSION, 6)) * reach
     start = perturb(start, step @ layout.motion @ layout.motion.T)
-    # constant legs and joints with axes leave the samples fewer ways: brought back onto them
+    # constant legs and joints with axes restrict the poses: samples are projected onto these
     value = on_manifold(layout, machine.values, start)
     own = on_manifold(layout, machine.values, T_base_platform).singularity
     retained_rows = value.converged & (value.singularity >= AS_REGULAR * float(np.median(own)))
@@ -96,13 +101,15 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class ToolError:
-    """How sure n poses of the platform are, and how wrong the drawing's were; NaN where the machine
-    cannot take a pose, or the drawing has none.
+    """Errors of n poses of the platform: covariance after calibration, and differences to the
+    nominal model's poses; NaN where the machine cannot take a pose, or the nominal model has none.
 
-    T_base_platform : (n, 4, 4) as calibrated. by_parameters : (n, 6, P) derivatives of the poses
-    (omega, tau), left perturbation, frames taken out. parameters : (P, P) covariance of these, told
-    in the same way. off : (n, 6) what leads from the calibrated pose to the drawing's at the same
-    readings, frames laid over each other.
+    T_base_platform : (n, 4, 4) as calibrated.
+    by_parameters : (n, 6, P) derivatives of the poses (omega, tau), left perturbation, frames
+    removed.
+    parameters : (P, P) covariance of the parameters in the same gauge.
+    off : (n, 6) difference from the calibrated pose to the nominal one at the same readings, frames
+    aligned.
     """
 
     T_base_platform: Array
@@ -113,7 +120,7 @@ class ToolError:
     __repr__ = short_repr
 
     def first(self, n: int) -> ToolError:
-        """Of the first n poses alone."""
+        """Errors of the first n poses."""
         return replace(
             self,
             T_base_platform=self.T_base_platform[:n],
@@ -123,32 +130,38 @@ class ToolError:
 
     @cached_property
     def covariance(self) -> Array:
-        """(n, 6, 6) of (omega, tau), rad and m: the geometry's part, not the noise of a reading."""
+        """Covariance (n, 6, 6) of (omega, tau), rad and m, by the parameters; without the noise of
+        readings.
+        """
         return self.by_parameters @ self.parameters @ self.by_parameters.mT
 
     @property
     def position(self) -> Array:
-        """(n,) standard deviations of the platform's origin, m, root of the summed variances."""
+        """Standard deviations (n,) of the platform's origin, root of the summed variances, m."""
         return np.sqrt(np.maximum(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2), 0.0))
 
     @property
     def orientation(self) -> Array:
-        """(n,) the same of its rotation, rad."""
+        """Standard deviations (n,) of the platform's rotation, root of the summed variances,
+        rad.
+        """
         return np.sqrt(np.maximum(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2), 0.0))
 
     @property
     def off_position(self) -> Array:
-        """(n,) how far the drawing's origin is off, m."""
+        """Distances (n,) of the nominal from the calibrated origin, m."""
         return np.linalg.norm(self.off[:, 3:], axis=-1)
 
     @property
     def off_orientation(self) -> Array:
-        """(n,) how far it is turned, rad."""
+        """Angles (n,) between the nominal and the calibrated platform, rad."""
         return np.linalg.norm(self.off[:, :3], axis=-1)
 
 
 def checked_poses(poses: Array) -> Array:
-    """The poses (n, 4, 4). Raises InputError for another shape, or numbers that are none."""
+    """Poses as an array (n, 4, 4). Raises InputError for another shape or numbers that are not
+    finite.
+    """
     array = np.asarray(poses, dtype=float)
     if array.ndim != 3 or array.shape[1:] != (4, 4) or not np.isfinite(array).all():
         raise InputError(
@@ -163,8 +176,8 @@ def checked_poses(poses: Array) -> Array:
 def centres_and_tool(
     drawing: Machine, estimate: Estimate, joints: Array
 ) -> tuple[tuple[Centres, ...], ToolError]:
-    """Joint centres of an estimate and the platform's poses of the configurations in use, no frame
-    favoured; joints (K, m).
+    """Joint centres of an estimate, and errors of the poses of the configurations in use,
+    gauge-free; joints (K, m).
     """
     machine, used = estimate.machine, estimate.configurations
     covariance = free_of_gauge(machine, estimate.covariance)
@@ -184,16 +197,16 @@ def tool_error(
     legs_observed: bool = True,
     fitted: Integers | None = None,
 ) -> ToolError:
-    """How well poses T_base_platform (n, 4, 4) of the calibrated machine are known, and how wrong
-    the drawing's were.
+    """Errors of poses T_base_platform (n, 4, 4) of the calibrated machine and of the nominal model.
 
     covariance : (P, P) of the parameters about the best fit of the frames
-    (:func:`~pkmcal.identify.centres.free_of_gauge`), so that no three joints carry the uncertainty
-    of all. joints : (n, m) readings that were taken there; without them the poses are first put
-    where rods and axes allow them, and readings are the calibrated machine's.
-    legs_observed : whether legs tell where the joints are, and these the frames. A board leaves
-    open what shifts joints and moves nothing, so without legs frames are by the poses themselves,
-    all or the ``fitted`` (k,) among them.
+    (:func:`~pkmcal.identify.centres.free_of_gauge`), so that no three joints define the frames.
+    joints : (n, m) readings at the poses; by default the poses are first projected onto those that
+    rods and axes allow, and readings are the calibrated machine's.
+    legs_observed : whether legs were measured, which determine the joint centres and by them the
+    frames. A board leaves unidentified all shifts of joints that do not move the platform, so
+    without legs the frames are aligned by the poses themselves, all or the ``fitted`` (k,) among
+    them.
     """
     layout, n, theta = calibrated.layout, len(poses), calibrated.values
     if joints is None:
@@ -202,11 +215,13 @@ def tool_error(
         reached: Booleans = closed.converged & np.isfinite(joints).all(axis=-1)
     else:
         reached = np.ones(n, dtype=bool)
+    # derivatives, and differences to the nominal model, at the poses that can be taken
     rows = np.flatnonzero(reached)
     jacobian = np.full((n, 6, theta.size), np.nan)
     jacobian[rows] = pose_by_parameters(calibrated, joints[rows], poses[rows])
     off = np.full((n, 6, 1), np.nan)
     off[rows, :, 0] = _off(drawing, calibrated, joints[rows], poses[rows])
+    # frames removed from both
     by, off = (
         without_frames(calibrated, poses, change, every=not legs_observed, fitted=fitted)
         for change in (jacobian, off)
@@ -222,12 +237,13 @@ def without_frames(
     every: bool = False,
     fitted: Integers | None = None,
 ) -> Array:
-    """Changes (n, 6, m) of poses less what only turns or shifts base and platform as wholes.
+    """Changes (n, 6, m) of poses without their best-fitting frame changes of base and platform.
 
-    By least squares over all poses, or the ``fitted`` (k,) among them, as far as their changes are
-    known; turns count as ways of the platform's joints. Only frame changes that keep the motion,
-    and, but for ``every`` one, that no parameters follow (some are fixed, or tied): what parameters
-    follow is taken out of their covariance already.
+    The fit is by least squares over all poses, or the ``fitted`` (k,) among them, as far as their
+    changes are finite; rotations are weighted by the radius of the platform's joints. Only frame
+    changes that keep the motion are removed, and of these, unless ``every`` is set, only those that
+    no parameters follow (some are fixed, or tied): the others are already removed from the
+    parameters' covariance.
     """
     rest = respecting_motion(machine.layout.motion)
     if not every:
@@ -247,11 +263,12 @@ def without_frames(
 
 
 def _off(drawing: Machine, calibrated: Machine, joints: Array, poses: Array) -> Array:
-    """Differences (n, 6) of the drawing's poses from the calibrated ones, left perturbation; NaN
-    where either machine has none.
+    """Differences (n, 6) of the nominal from the calibrated poses, left perturbation; NaN where
+    either machine has none.
 
-    Along the motion's own directions: joints of a planar machine at several heights, or a delta's
-    that are laid over each other, tilt frames against each other, and no platform.
+    Only the components along the motion count: the registration of joint centres may tilt the
+    frames of a planar machine with joints at several heights, or of a delta, against each other,
+    which tilts no platform.
     """
     along = calibrated.layout.motion @ calibrated.layout.motion.T
     nothing = np.zeros((calibrated.values.size, calibrated.values.size))

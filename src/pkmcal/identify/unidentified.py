@@ -1,12 +1,12 @@
-"""What the data leave open, said so that people know what to do.
+"""Unidentifiable directions, described by motions with a name.
 
-    data -> directions that they do not see -> nearest motions with a name -> sentences
+    data -> null space of their information -> nearest named motions -> sentences
 
-The null space of the data's information has no axes of its own: any rotation of it is as good.
-So changes that people can picture (:mod:`pkmcal.identify.motions`) are held against the whole
-space, one after the other: what lies in it is taken out and said
-(:mod:`pkmcal.identify.sentences`), the rest stays for the next. All comparisons are made in units
-of the drawing's tolerances, with the frames' freedoms taken out.
+The null space has no axes of its own: any rotation of a basis is as good. So named motions
+(:mod:`pkmcal.identify.motions`) are compared with the whole space, one after the other: a motion
+that lies in the space is removed from it and described (:mod:`pkmcal.identify.sentences`), and the
+rest of the space is left for the next motion. All comparisons are in units of the prior sigmas,
+with the freedoms of the frames removed.
 """
 
 from __future__ import annotations
@@ -32,30 +32,36 @@ if TYPE_CHECKING:
     from pkmcal.measurements import EdgeSet, Measurements
 
 INSIDE_OPEN_SHARES = (0.999, 0.95)
-"""Shares of a change (squared) that lie in the open space for it to explain part of that space:
-first what fits exactly, since much looks alike once frames are taken out, then what fits in all
-but name. The space is that of the estimate, whose poses' noise bends what would be exact."""
+"""Shares of a motion (squared) that lie in the open space for it to explain part of that space:
+first those that fit exactly, since many motions are similar once frames are removed, then those
+that fit nearly. The space is that of the estimate, whose noise of poses bends directions that would
+be exact."""
 WEAK_INFORMATION = 1 / 3
-"""Information below which a direction counts as not told: the data then decide less than a tenth
-of its variance. Poses that only shift seem to turn by their noise, so directions that nothing fixes
-come out with a trace of information."""
+"""Information, in units of the prior's, below which a direction counts as unidentified: the data
+then decide less than a tenth of its variance. Platforms that only translate seem to rotate by their
+poses' noise, so unidentifiable directions have a trace of information."""
 UNIDENTIFIED_SHARE = 0.5
-"""Part of what is known beforehand of a place or turn from which the data do not determine it."""
+"""Standard deviation of a mount's position or rotation, relative to its prior, from which on the
+data do not determine it."""
 NEW_CHANGE_SINE = 0.1
-"""Sine of the angle to what is said already below which a change says nothing new."""
+"""Sine of the angle to the motions so far below which a motion describes nothing new."""
 STEPS_TO_FEWEST_NUMBERS, CHEAP_FRAME_WEIGHT = 20, 10.0
-"""Steps to the fewest numbers, and how much less a frame's costs: they are not said."""
+"""Reweighting steps to the sparsest coefficients, and how much less those of frames cost, which no
+sentence contains."""
 CONVENTION_NULL_SHARE = 1e-6
-"""Metres a metre (or a radian) of a held value that free values leave undone, at most, for it to be
-a convention: both are derivatives at one machine, alike but for rounding."""
+"""Residual effect of a fixed parameter, in m per m or rad, that the free parameters cannot
+reproduce, below which it is a convention: both are derivatives of one machine, equal but for
+rounding."""
 
 
 @dataclass(frozen=True)
 class Condition:
     """One of [A]'s conditions, counted by :mod:`pkmcal.papers.conditions`.
 
-    equation : its number in the paper. needed, available : counts. met : needed <= available.
-    text : what is counted, a sentence for people.
+    equation : its number in the paper.
+    needed, available : counts.
+    met : needed <= available.
+    text : sentence on what is counted.
     """
 
     equation: str
@@ -67,14 +73,19 @@ class Condition:
 
 @dataclass(frozen=True)
 class Findings:
-    """What the data tell and do not tell: the test, its words, and the paper's conditions.
+    """What the data determine of the machine, and what they leave unidentified.
 
-    identifiability : rank and spectrum. unidentified : what such data do not tell, of
-    ``told.unidentified`` and of what they know ``WEAK_INFORMATION``. weak : what the drawing knows
-    better. by_drawing : how far (m, as ``Sentence.moves_platform``) the platform moves when all
-    parameters are as wrong as the drawing's tolerances let expect. conventional : held parameters
-    for which any value would do; also_conventional : combinations of the other held ones. bed : how
-    flat it will be, where nothing but heights was measured.
+    identifiability : rank and spectrum of the information.
+    unidentified : sentences on directions without information, or with less than
+    ``WEAK_INFORMATION``.
+    weak : sentences on directions of which the nominal model contains more information.
+    by_drawing : displacement of the platform by the prior sigmas of all parameters, m, as
+    ``Sentence.moves_platform``.
+    conditions : [A]'s conditions.
+    conventional : fixed parameters for which any value would do.
+    also_conventional : number of combinations of other fixed parameters for which any value would
+    do.
+    bed : predicted flatness, where nothing but heights was measured.
     """
 
     identifiability: Identifiability
@@ -96,12 +107,14 @@ def explain(
     conditions: tuple[Condition, ...] = (),
     bed: Bed | None = None,
 ) -> Findings:
-    """The findings of an estimate; visible : (S, L) legs that each station sees. bed : where
-    nothing but heights was measured.
+    """Findings of an estimate.
 
-    Stations that a board on the base joins are one here, see :func:`observed_by_boards`.
+    visible : (S, L) legs that each station measures; stations that a board on the base joins count
+    as one, see :func:`observed_by_boards`.
+    bed : where nothing but heights was measured.
     """
     machine, table = estimate.machine, estimate.machine.parameters
+    # situation of the session, and effect of the parameters on the platform
     poses = estimate.state.T_base_platform[estimate.configurations]
     photographed = estimate.edge_weights.size > 0
     around = Situation(machine, visible, poses, photographed, only_heights(estimate))
@@ -109,12 +122,15 @@ def explain(
     unseen = {id(d) for d in ranks.unidentified}
 
     def text(directions: tuple[ParameterDirection, ...]) -> tuple[Sentence, ...]:
+        """Sentences on some directions."""
         reference = [0.0 if id(d) in unseen else d.information for d in directions]
         return describe(around, direction_vectors(directions, machine), np.array(reference), effect)
 
+    # directions by information
     lost = (*ranks.unidentified, *(d for d in ranks.weak if d.information < WEAK_INFORMATION))
     weak = tuple(d for d in ranks.weak if d.information >= WEAK_INFORMATION)
-    # Poses and heights blend what they hardly see with what they do not: together it has names.
+    # poses and heights mix weakly identified directions with unidentified ones: only both together
+    # have names
     sentences = (*text(lost), *text(weak)) if photographed else text((*lost, *weak))
     conventional, others = conventions_held(machine, effect)
     return Findings(
@@ -130,18 +146,22 @@ def explain(
 
 
 def only_heights(estimate: Estimate) -> bool:
-    """Whether nothing but heights was measured: what is not measured leaves no residual."""
+    """Whether nothing but heights was measured; components that are not measured have no
+    residual.
+    """
     poses = estimate.pose_residuals
     others = estimate.edge_weights.size + estimate.link_weights.size
     return not others and len(poses) > 0 and not poses[:, :5].any()
 
 
 def identified(machine: Machine, covariance: Array) -> Booleans:
-    """Which of the six numbers of poses the data determine, (..., 6); covariance (..., 6, 6), rad
-    and m. The others are conventions, or where the search began, and stand nowhere as numbers.
+    """Which of the six numbers of poses the data determine, (..., 6). The others are conventions,
+    or the start of the search, and are not reported as numbers.
 
-    Of a target's place no more than the machine's size is known beforehand, and of a turn nothing:
-    a number that is known no better than half of that is not known by the data.
+    The prior of a target's position is the machine's size, and that of its rotation one radian; a
+    number whose standard deviation is not below half of its prior's is not determined by the data.
+
+    covariance : (..., 6, 6), rad and m.
     """
     sigma = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 0.0))
     return sigma < UNIDENTIFIED_SHARE * np.repeat([1.0, machine_size(machine)], 3)
@@ -153,7 +173,7 @@ def direction_vectors(directions: tuple[ParameterDirection, ...], machine: Machi
 
 
 def observed_legs(edges: EdgeSet, weights: Array, n_stations: int, n_legs: int) -> Booleans:
-    """Legs that each station sees, (S, L); edges given up, of weight (N,) below a half, aside."""
+    """Legs that each station measures, (S, L), without rejected edges; weights (N,)."""
     inliers = np.asarray(weights) >= 0.5
     out = np.zeros((n_stations, n_legs), dtype=bool)
     out[edges.station[inliers], edges.leg[inliers]] = True
@@ -161,7 +181,7 @@ def observed_legs(edges: EdgeSet, weights: Array, n_stations: int, n_legs: int) 
 
 
 def observed_by_boards(visible: Booleans, measurements: Measurements) -> Booleans:
-    """The same (S, L), where stations that see one board on the base count as one station."""
+    """Legs by station (S, L), where stations that measure one board on the base count as one."""
     out, poses = visible.copy(), measurements.poses
     for k, mount in enumerate(measurements.mounts):
         stations = np.unique(poses.station[poses.mount == k])
@@ -171,10 +191,10 @@ def observed_by_boards(visible: Booleans, measurements: Measurements) -> Boolean
 
 
 def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], int]:
-    """Held parameters that say nothing of the machine, by name, and how many combinations of the
-    other held ones do so: the free ones, or the frames, do all that they could do.
+    """Names of fixed parameters that are conventions, and number of combinations of the other fixed
+    ones that are: free parameters or frames reproduce their whole effect.
 
-    effect : (r, P) the platform's displacements by the parameters, frames taken out.
+    effect : (r, P) displacements of the platform by the parameters, frames removed.
     """
     table = machine.parameters
     if not table.fixed:
@@ -185,11 +205,11 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
     q, s, _ = np.linalg.svd(free, full_matrices=False)
     q = q[:, nonzero(s)]
     residual = held - q @ (q.T @ held)
-    # a metre moves joints by about a metre: without effect is without effect in metres
+    # a parameter's metre moves joints by about a metre, so the threshold is absolute
     alone = np.linalg.norm(residual, axis=0) < CONVENTION_NULL_SHARE
     names = tuple(name for name, is_alone in zip(table.fixed, alone, strict=True) if is_alone)
     others = residual[:, ~alone]
-    kinds = np.unique(np.round(others / CONVENTION_NULL_SHARE), axis=1)  # what is tied counts once
+    kinds = np.unique(np.round(others / CONVENTION_NULL_SHARE), axis=1)  # tied ones count once
     rank = int(np.sum(np.linalg.svd(others, compute_uv=False) > CONVENTION_NULL_SHARE))
     return names, kinds.shape[1] - rank
 
@@ -198,8 +218,12 @@ def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], 
 
 
 class _Open(NamedTuple):
-    """What is left open, in units of the drawing's deviations: rows (n, P) orthonormal, their
-    covariance (n, n) as the estimate leaves it, frames (P, g) orthonormal, unit (P,).
+    """Open space, in prior sigmas.
+
+    rows : (n, P) orthonormal basis.
+    covariance : (n, n) posterior in that basis.
+    frames : (P, g) orthonormal frame changes.
+    unit : (P,) prior sigmas.
     """
 
     rows: Array
@@ -211,12 +235,13 @@ class _Open(NamedTuple):
 def describe(
     around: Situation, null: Array, information: Array | None = None, effect: Array | None = None
 ) -> tuple[Sentence, ...]:
-    """Sentences for a space of changes that the data do not see.
+    """Sentences on a space of changes that the data do not determine.
 
     null : (n, P) changes of all parameters in their units, any basis.
-    information : (n,) singular values of what the data know of each after all, in units of the
-    tolerance, 0 where absent: from ``WEAK_INFORMATION`` on it is said that the drawing knows
-    it better, not that it is free. effect : (r, P) as :func:`platform_by_parameters` gives it.
+    information : (n,) singular values of the data's information on each direction, in units of the
+    prior, 0 by default: from ``WEAK_INFORMATION`` on the sentence is that the nominal model knows
+    it better, not that it is free.
+    effect : (r, P) as returned by :func:`platform_by_parameters`.
     """
     machine = around.machine
     space = _open(machine, null, information)
@@ -224,7 +249,7 @@ def describe(
         return ()
     if effect is None:
         effect = platform_by_parameters(machine, around.T_base_platform)
-    if not around.photographed:  # nobody asks a board how thick legs are
+    if not around.photographed:  # boards and trackers do not measure tubes
         space = _without(space, _within(all_radii(around).columns, space, INSIDE_OPEN_SHARES[0]))
     results = _merged(around, _explained(around, space))
     text = [sentence(around, part, space.unit, *_moves(part, space, effect)) for part in results]
@@ -232,7 +257,7 @@ def describe(
 
 
 def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
-    """The open space without frames, in units of the drawing's deviations."""
+    """Open space in prior sigmas, frames removed."""
     squares = machine.parameters.free_matrix() ** 2
     # tied parameters share one deviation
     shared = np.where(squares.sum(axis=1) > 0, squares @ squares.sum(axis=0), 1.0)
@@ -247,12 +272,13 @@ def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
     basis = _orthonormal(rows)
     if information is None or not len(rows):
         return _Open(basis, np.eye(len(basis)), frames, unit)
+    # posterior covariance in the basis
     mixed = np.linalg.lstsq(rows.T, basis.T, rcond=None)[0].T
     return _Open(basis, mixed / (1 + s**2) @ mixed.T, frames, unit)
 
 
 def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
-    """An orthonormal basis (k, P) of the rows' space."""
+    """Orthonormal basis (k, P) of the rows' space."""
     if rows.size == 0:
         return np.zeros((0, rows.shape[-1]))
     _, s, vt = np.linalg.svd(rows, full_matrices=False)
@@ -260,7 +286,7 @@ def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
 
 
 def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
-    """Motions that lie in the open space, each with what it says anew."""
+    """Motions that lie in the open space, each with the part that it is the first to explain."""
     parts: list[OpenMotion] = []
     done = np.zeros((0, space.rows.shape[1]))
     reference_values, whole = list(candidates(around)), space
@@ -271,6 +297,7 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
         if len(done) == len(whole.rows):
             break
         names = _within(motion.columns, space, inside)
+        # the part that no earlier motion explains
         new = _directions(names - (names @ done.T) @ done)
         if len(new) == 0:
             continue
@@ -286,7 +313,7 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
 
 
 def _without(space: _Open, directions: Array) -> _Open:
-    """The open space where changes (k, P) in it count for nothing, as frames do."""
+    """Open space without changes (k, P) in it, which are treated as frame changes."""
     retained_rows = np.linalg.svd(space.rows @ directions.T)[0][:, len(directions) :].T
     frames = np.concatenate([space.frames, directions.T], axis=1)
     return _Open(
@@ -298,7 +325,7 @@ def _without(space: _Open, directions: Array) -> _Open:
 
 
 def _directions(rows: Array) -> Array:
-    """Orthonormal directions (k, P) that the rows still have, those that rounding left aside."""
+    """Orthonormal directions (k, P) of rows, those of negligible size removed."""
     if rows.size == 0:
         return rows[:0]
     _, s, vt = np.linalg.svd(rows, full_matrices=False)
@@ -306,11 +333,14 @@ def _directions(rows: Array) -> Array:
 
 
 def _within(changes: Array, space: _Open, inside: float) -> Array:
-    """Directions (k, P) of the open space that changes (P, m) can make, orthonormal."""
+    """Orthonormal directions (k, P) of the open space that changes (P, m) can make.
+
+    inside : least squared cosine between such a direction and the changes.
+    """
     columns = (changes / space.unit[:, None]).T
     size = np.linalg.norm(columns, axis=1)
     columns = columns[size > 0] / size[size > 0, None]
-    # what only moves the frames changes nothing, whatever rounding leaves of it
+    # pure frame changes are removed, with their rounding
     basis = _orthonormal(columns - (columns @ space.frames) @ space.frames.T, 1e-4)
     u, s, _ = np.linalg.svd(space.rows @ basis.T)
     s = np.pad(s, (0, len(space.rows) - len(s)))[: len(space.rows)]
@@ -318,10 +348,10 @@ def _within(changes: Array, space: _Open, inside: float) -> Array:
 
 
 def _coefficients(motion: NamedChanges, space: _Open, values: Array) -> Array:
-    """The motion's own numbers (k, m) for each direction, frames aside.
+    """Coefficients (k, m) of a motion for directions ``values`` (k, P), frames excluded.
 
-    Frames leave a choice: of a single change the numbers whose magnitudes have the smallest sum,
-    by reweighted least squares, since people want to read as few as possible.
+    Frames leave a choice. Of a single change the coefficients with the smallest sum of magnitudes
+    are taken, by iteratively reweighted least squares, so that a sentence has few numbers.
     """
     columns = motion.columns / space.unit[:, None]
     scale = np.linalg.norm(columns, axis=0)
@@ -338,7 +368,7 @@ def _coefficients(motion: NamedChanges, space: _Open, values: Array) -> Array:
 
 
 def _merged(around: Situation, parts: list[OpenMotion]) -> list[OpenMotion]:
-    """Parts with one sentence as one: the same of several legs, or the same legs' again."""
+    """Merge parts with the same sentence: of several legs, or of the same legs."""
     out: dict[tuple[object, ...], OpenMotion] = {}
     for part in parts:
         single = len(part.legs) == 1
@@ -348,7 +378,9 @@ def _merged(around: Situation, parts: list[OpenMotion]) -> list[OpenMotion]:
 
 
 def _with_last_leg(part: OpenMotion, parts: list[OpenMotion]) -> OpenMotion:
-    """Sizes of all legs but one, of which the common part is said too, are those of all legs."""
+    """Add the last leg to sizes of all legs but one, where their common part is described as
+    well.
+    """
     same = [p.legs for p in parts if p.motion.labels == part.motion.labels and len(p.legs) > 1]
     single = bool(part.motion.labels) and len(part.motion.legs) == 1
     if single and same and len(part.legs) == len(same[0]) - 1:
@@ -357,12 +389,14 @@ def _with_last_leg(part: OpenMotion, parts: list[OpenMotion]) -> OpenMotion:
 
 
 def _moves(part: OpenMotion, space: _Open, effect: Array) -> tuple[float, bool]:
-    """How far (m) it moves the platform, and whether the data know something of it after all."""
+    """Displacement of the platform by a motion, m, and whether the data contain information about
+    it.
+    """
     value = _directions(part.space)
     mixed = value @ space.rows.T
     shifted = effect @ (space.unit[:, None] * value.T)
     covariance = mixed @ space.covariance @ mixed.T
-    # the estimate's information is the drawing's, one, and the data's
+    # the posterior's information is the prior's, which is 1 in these units, plus the data's
     data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
     above_limit = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
     return float(np.sqrt(np.sum((shifted @ covariance) * shifted))), above_limit >= WEAK_INFORMATION

@@ -1,4 +1,4 @@
-"""The verdict on an estimate: may it be used, with reasons, warnings and advice as findings."""
+"""Verdict on an estimate: whether it may be used, with reasons, warnings and advice as findings."""
 
 from __future__ import annotations
 
@@ -29,41 +29,43 @@ if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
 TOO_NOISY = 4.0
-"""Factor on the edges' stated noise beyond which the model does not explain the photographs."""
+"""Noise scale beyond which the model does not explain the images, or the poses."""
 TOO_MANY_LOST = 0.4
-"""Share of edges given up as outliers beyond which the rest may be the outliers."""
+"""Share of rejected edges beyond which the remaining ones may be the outliers."""
 UNIDENTIFIABLE = 0.05
-"""Share of the platform's error by the drawing that may be left undecided. A calibration makes the
-drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
-largest error, and one that more of the same photographs do not shrink. A result whose deviation is
-larger anyway is no worse for it."""
+"""Share of the platform's error by the nominal model that may remain undetermined. A calibration
+reduces that error by a factor of twenty to fifty; a twentieth of it would be the result's largest
+error, and more of the same images do not reduce it. A result whose standard deviation is larger
+anyway is no worse for it."""
 MOSTLY_SINGULAR_SHARE = 0.5
-"""Share of configurations near a singular pose from which on nothing said here can be trusted."""
+"""Share of configurations near a singular pose from which on the estimate is not reliable."""
 LARGE_CAUSE_SHARE = 0.3
-"""Share of what is undecided from which on a single cause of it is worth a reason."""
+"""Share of what is undetermined from which on a single cause becomes a reason of its own."""
 WORTH_REPORTING = 0.5
-"""Part of the platform's deviation from which on what makes it is worth a warning; half of it makes
-the whole larger by an eighth."""
+"""Displacement relative to the platform's standard deviation from which on a cause is worth a
+warning; one half makes the total larger by an eighth."""
 NOMINAL_ERROR_SHARE = 0.5
-"""Part of the error that the nominal model's tolerances let expect which a result may leave: below
-a half the result is better than the nominal model almost for sure; above, new values are not worth
-their risk."""
+"""Error relative to that expected by the prior sigmas that a result may leave: below a half the
+result is almost surely better than the nominal model; above, new values are not worth their risk.
+"""
 ENOUGH_TOUCHES = 15
-"""Of a bed, where a wrong one moves it by little more than its deviation before it is noticed
-(benchmarks/heights.py)."""
+"""Heights of a bed, where a wrong one moves the tool by little more than its standard deviation
+before it is detected (benchmarks/heights.py)."""
 EXACT_SHARE = 1e-9
-"""Part of a variance below which it is rounding."""
+"""Share of a variance below which it is rounding."""
 POLISHED_SHADING = 4 * OWN_SHADING
-"""px, of what shades each edge beside its line, from which tubes are as polished metal or in hard
-light: of path-traced machines those of metal show 0.07 to 0.26, painted ones 0.005 to 0.05."""
+"""Shading of each edge beside its line, px, from which on tubes are like polished metal or in hard
+light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted ones."""
 POOR_MODEL_POSE_SCALE = 1.3
-"""Factor on the poses' noise beyond which the model is too poor for them, if that is no chance."""
+"""Noise scale of poses beyond which the model is insufficient for them, unless by chance."""
 
 
 @dataclass(frozen=True)
 class RicherModel:
-    """Another model of the mechanism file, and by how many times their noise poses fit it; infinite
-    where there is no estimate, and failure says why.
+    """Another model of the mechanism file, tried on the same poses.
+
+    scale : noise scale of the poses with it, infinite where there is no estimate.
+    failure : reason why there is none.
     """
 
     name: str
@@ -81,26 +83,28 @@ def judge(
     explained: bool = False,
     others: Sequence[Finding] = (),
 ) -> Verdict:
-    """The verdict on an estimate of a session by a method.
+    """Verdict on an estimate of a session.
 
-    findings : what the data determine of the machine, and what they leave open.
-    richer : models of the machine that were tried because this one is too poor for the poses.
-    explained : whether the model discrepancy surely explains why heights scatter; the standard
+    findings : what the data determine of the machine, and what they leave unidentified.
+    richer : models of the machine that were tried because this one is insufficient for the poses.
+    explained : whether the model discrepancy surely explains the scatter of heights; the standard
     deviations then contain it.
     others : findings of any level about the session.
     """
     bed = findings.bed
     large, small = ((), ()) if bed else _unidentifiable_text(estimate, findings)
-    # what is a small part of the deviation that was reached is in that, and in the report
+    # small parts of the standard deviation are in it already, and in the report
     matter = [s for s in small if s.matters]
     if matter:
         least = WORTH_REPORTING * platform_sigma(estimate)
         matter = [s for s in matter if s.moves_platform > least]
+    # reasons against the result by what is undetermined
     undetermined = [_undetermined(s, Level.WRONG) for s in large]
     if bed:
         undetermined = list(_bed_unknown(bed))
     elif not large:
         undetermined = list(_platform_unknown(estimate, findings.by_drawing))
+    # all findings, in the order of the report
     every = (
         *_estimate_misfit(estimate, method),
         *undetermined,
@@ -130,7 +134,7 @@ def judge(
 
 
 def _undetermined(sentence: Sentence, level: Level) -> Finding:
-    """A motion of the machine that the data leave open."""
+    """Finding about a motion of the machine that the data leave unidentified."""
     return finding(
         "machine.undetermined",
         level,
@@ -145,9 +149,9 @@ def _undetermined(sentence: Sentence, level: Level) -> Finding:
 
 
 def _headline(observation: Observation, estimate: Estimate) -> str:
-    """What was reached: of joints where legs were seen, of the platform where only it was.
+    """Accuracy of the joint centres where legs were measured, else of the platform.
 
-    Boards tell where the platform goes, and leave open what does not move it.
+    Boards determine the platform's poses, and leave unidentified what does not move it.
     """
     if not len(observation.edges):
         return (
@@ -170,29 +174,29 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
 def no_gain(sigma: float, by_nominal: float) -> bool:
     """Whether a result is no better than the nominal model, for data of any kind.
 
-    sigma : standard deviation of what the result is for (the platform at given readings, or the
-    tool's height above the bed), by_nominal : the same by the nominal model's tolerances alone, in
-    the same unit.
+    sigma : standard deviation of the purpose of the result (the platform at given readings, or the
+    tool's height above the bed).
+    by_nominal : the same by the prior sigmas alone, in the same unit.
     """
     return not sigma <= NOMINAL_ERROR_SHARE * by_nominal
 
 
 def _platform_unknown(estimate: Estimate, by_nominal: float) -> Iterator[Finding]:
-    """Why measurements of the platform are of no use, if they are not."""
+    """Wrong if measurements of the platform do not improve on the nominal model."""
     sigma = platform_sigma(estimate)
     if no_gain(sigma, by_nominal):
         yield wrong("platform.no_gain", sigma=sigma, nominal_sigma=by_nominal)
 
 
 def _bed_unknown(bed: Bed) -> Iterator[Finding]:
-    """Why heights are of no use, if they are not."""
+    """Wrong if heights do not improve on the nominal model."""
     if no_gain(bed.sigma, bed.by_drawing):
         yield wrong("bed.no_gain", sigma=bed.sigma, nominal_sigma=bed.by_drawing)
 
 
 def _touch_unnoticed(bed: Bed) -> Iterator[Finding]:
-    """The effect of one wrong height that nothing shows, where it is large: no deviation contains
-    it, for nobody knows how wrong a crumb is.
+    """Doubtful if one undetected wrong height has a large effect: no standard deviation contains
+    it, since the size of such an error, of a crumb for example, is unknown.
     """
     if bed.unnoticed is None or no_gain(bed.unnoticed, bed.by_drawing):
         yield doubtful(
@@ -205,7 +209,7 @@ def _touch_unnoticed(bed: Bed) -> Iterator[Finding]:
 
 
 def _not_by_heights(bed: Bed, findings: Findings) -> Iterator[Finding]:
-    """What heights leave to the nominal model, in figures, and its largest cause."""
+    """Notes on what heights leave to the nominal model, and on its largest cause."""
     yield note("bed.sideways", sigma=bed.sideways, size_sigma=bed.size)
     matter = [s for s in (*findings.unidentified, *findings.weak) if s.matters]
     if matter:
@@ -221,7 +225,9 @@ def _not_by_heights(bed: Bed, findings: Findings) -> Iterator[Finding]:
 
 
 def _estimate_misfit(estimate: Estimate, method: str) -> Iterator[Finding]:
-    """Edges that the model does not explain, and an estimate that is none."""
+    """Findings on edges that the model does not explain, and on an estimate without convergence or
+    redundancy.
+    """
     s = estimate.statistics
     rejected = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
     if s.noise_scale > TOO_NOISY and method != "bundle":
@@ -249,23 +255,26 @@ def _readings_misfit(estimate: Estimate) -> Iterator[Finding]:
 
 
 def _base_alone(estimate: Estimate) -> Finding:
-    """How far [B]'s linear method goes: the base, by the edges and by the drawing, and no further.
+    """Finding on [B]'s linear method, which determines the base only, and on its accuracy.
 
-    By the edges alone is what the drawing was to them taken out: in units of the drawing's
-    deviations, what is known together has the variance v = e / (1 + e) where the edges' is e.
+    The variance by the edges alone is found by removing the prior: in units of the prior's
+    principal axes, the posterior has the variance v = e / (1 + e) where the edges' is e.
     """
     machine, table = estimate.machine, estimate.machine.parameters
     drawing = machine.with_values(table.drawing)
     root = table.free_matrix() * table.tolerances_free()
+    # covariances of the base centres after and before
     together, before = (
         joint_centres(drawing, machine, free_of_gauge(machine, covariance))[0].covariance
         for covariance in (estimate.covariance, root @ root.T)
     )
+    # principal axes of the prior
     values, vectors = np.linalg.eigh(before)
     above_limit = values > EXACT_SHARE * values[-1]
     unit = vectors[:, above_limit] * np.sqrt(values[above_limit])
     inverse = vectors[:, above_limit] / np.sqrt(values[above_limit])
     v, axes = np.linalg.eigh(inverse.T @ together @ inverse)
+    # e, and back to metres
     by_edges = v / np.maximum(1 - v, EXACT_SHARE)
     alone = np.sum((unit @ axes) ** 2 * by_edges)
     edges, nominal, both = (
@@ -275,8 +284,8 @@ def _base_alone(estimate: Estimate) -> Finding:
 
 
 def _poses_misfit(estimate: Estimate, richer: tuple[RicherModel, ...]) -> Iterator[Finding]:
-    """Poses that the model does not explain, that do not agree among themselves, or that scatter
-    more than they should; with the least rich of the richer models that fit alike.
+    """Findings on poses that the model does not explain, of which many are rejected, or that
+    scatter more than stated; with the simplest of the richer models that fit equally well.
     """
     s = estimate.statistics
     best = min((model.scale for model in richer), default=np.inf)
@@ -294,7 +303,9 @@ def _poses_misfit(estimate: Estimate, richer: tuple[RicherModel, ...]) -> Iterat
 
 
 def _singular(estimate: Estimate) -> Iterator[Finding]:
-    """Where most poses are singular, small errors move the platform far and nothing is linear."""
+    """Wrong if most poses are singular: small errors then move the platform far, and no
+    linearization holds.
+    """
     machine = estimate.machine
     poses = estimate.state.T_base_platform[estimate.configurations]
     weak = on_manifold(machine.layout, machine.values, poses).singularity < NEAR_SINGULAR
@@ -305,10 +316,10 @@ def _singular(estimate: Estimate) -> Iterator[Finding]:
 def _unidentifiable_text(
     estimate: Estimate, findings: Findings
 ) -> tuple[tuple[Sentence, ...], tuple[Sentence, ...]]:
-    """What is undecided: reasons against the result, and what to know of it.
+    """Sentences on what is undetermined: reasons against the result, and those to know of.
 
-    Only what moves the platform counts. What the data know a little counts where they do not
-    decide one of its values; otherwise its deviations say enough.
+    Only motions that move the platform count. Weakly identified motions count where the nominal
+    model decides one of their parameters; otherwise the standard deviations show them.
     """
     undecided = set(_undecided(estimate))
     weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
@@ -316,7 +327,7 @@ def _unidentifiable_text(
     total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
     if total <= UNIDENTIFIABLE * findings.by_drawing:
         return (), open_
-    # where all else makes more of the deviation that was reached, that says enough
+    # where other causes make more of the standard deviation, that deviation suffices
     if total <= np.sqrt(max(platform_sigma(estimate) ** 2 - total**2, 0.0)):
         return (), open_
     least = min(LARGE_CAUSE_SHARE * total, max(s.moves_platform for s in open_))
@@ -325,7 +336,9 @@ def _unidentifiable_text(
 
 
 def _harmless(sentences: tuple[Sentence, ...]) -> Iterator[Finding]:
-    """One line about what is open and does no harm; the report has the sentences."""
+    """One note on unidentified motions that do not move the platform; the report has the
+    sentences.
+    """
     harmless = [s for s in sentences if not s.matters]
     if harmless:
         what = re.split(r"\.(?=\s|$)", harmless[0].text)[0]  # not at the point of a number
@@ -338,7 +351,7 @@ def _harmless(sentences: tuple[Sentence, ...]) -> Iterator[Finding]:
 
 
 def _undecided(estimate: Estimate) -> list[str]:
-    """Parameters that the drawing decides; a tube's radius moves nothing."""
+    """Parameters that the nominal model decides, except tube radii, which move nothing."""
     table = estimate.machine.parameters
     decided = decided_by(table, estimate.covariance, estimate.data_share)
     named = zip(table.names, table.kinds, decided, strict=True)
@@ -346,7 +359,7 @@ def _undecided(estimate: Estimate) -> list[str]:
 
 
 def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]:
-    """Values far from the nominal model, and what enlarges their deviations."""
+    """Findings on values far from the nominal model, and on what increases standard deviations."""
     table = estimate.machine.parameters
     change = np.abs(_from_drawing(estimate.machine))
     far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_NOMINAL]
@@ -369,9 +382,9 @@ def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]
 
 
 def _from_drawing(machine: Machine) -> Array:
-    """Changes (P,) of the parameters in tolerances, in the frames that make them least.
+    """Changes (P,) of the parameters in prior sigmas, in the frames that make them least.
 
-    Frames by three joints would put those joints' own errors on all others, axes above all.
+    Frames by three joints would add these joints' errors to all other parameters, axes above all.
     """
     table = machine.parameters
     change = (machine.values - table.drawing) / table.tolerance
@@ -381,6 +394,7 @@ def _from_drawing(machine: Machine) -> Array:
 
 
 def _few_configurations(estimate: Estimate) -> Iterator[Finding]:
+    """Note if fewer than ten configurations are in use."""
     used = int(np.sum(estimate.configurations))
     if used < 10 and not only_heights(estimate):
         yield note("configurations.few", number=used)

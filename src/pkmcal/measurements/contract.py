@@ -1,16 +1,16 @@
-"""What a kind of measurement has to say of itself: one file a kind, found by enumeration.
+"""Contract of a kind of measurement; one file a kind, found by enumeration.
 
-A kind is a final subclass of one of four:
+A kind is a final subclass of one of four base classes:
 
 - :class:`ImageKind`: measured in images, where a station observes it;
-- :class:`TargetKind`: a table of what a tracker, a measuring machine or a probe measured of a
-  target on the platform;
+- :class:`TargetKind`: a table of a tracker, a measuring machine or a probe, which measures a target
+  on the platform;
 - :class:`LinkKind`: a table of numbers that link two configurations each, under a key of its own in
   session.yaml;
-- :class:`MotorKind`: what the motors read.
+- :class:`MotorKind`: readings of the motors.
 
-Rows, Jacobian and noise stand beside the kind, in standard deviations: edges in
-:mod:`~pkmcal.measurements.edges`, targets of boards and trackers alike in
+Rows, Jacobian and noise, in standard deviations, stand beside the kind: edges in
+:mod:`~pkmcal.measurements.edges`, targets of boards and trackers in
 :mod:`~pkmcal.measurements.poses`, readings in :mod:`~pkmcal.measurements.readings`, links in the
 kind's own file.
 """
@@ -40,18 +40,23 @@ POINT_COLUMNS, QUATERNION_COLUMNS, TURN_VECTOR_COLUMNS = (
     ("rx", "ry", "rz"),
 )
 DISPLAY_UNITS = {"m": ("mm", 1e3), "px": ("px", 1.0)}
-"""Unit in reports and the factor to it, by a kind's own unit."""
+"""Unit in reports, and the factor to it, by a kind's unit."""
 LEAST_NOISE = 1e-12
+"""Smallest standard deviation of a measurement, m or rad: no instrument is better."""
 NOISE_FIELD_RANGE = Field(ge=LEAST_NOISE, lt=10)
-"""m or rad; nothing measures better, nor is of any use that measures worse."""
+"""Range of a stated standard deviation, m or rad: no instrument measures better than the lower end,
+and a measurement worse than the upper end is of no use."""
 
 
 class MeasurementKind(ABC):
-    """A kind of measurement.
+    """Kind of measurement.
 
-    code : for programs. one : what one of them is called, label : its plural, in reports and
-    messages. unit : of its numbers. numbers
-    : how many each measurement has at most. joins : configurations that each depends on.
+    code : identifier in files and programs.
+    one : name of one measurement in reports and messages.
+    label : its plural.
+    unit : unit of the numbers.
+    numbers : largest number of residuals of one measurement.
+    joins : number of configurations on which one measurement depends.
     """
 
     code: ClassVar[str]
@@ -63,24 +68,30 @@ class MeasurementKind(ABC):
 
 
 class ImageKind(MeasurementKind):
-    """Measured in images. observe : the word under ``stations.*.observe``."""
+    """Kind that is measured in images.
+
+    observe : its word under ``stations.*.observe``.
+    """
 
     observe: ClassVar[str]
 
 
 class MotorKind(MeasurementKind):
-    """What the motors read. key : in session.yaml."""
+    """Readings of the motors.
+
+    key : key in session.yaml.
+    """
 
     key: ClassVar[str]
 
 
 class TargetKind(MeasurementKind, ABC):
-    """A tracker's table, under ``stations.*.tracker``.
+    """Table of a tracker, under ``stations.*.tracker``.
 
-    headers : columns beside the configuration's, in any order, of each form of the table. known :
-    which of (omega, tau) of T_tracker_target are measured. fewest_rows : that fix the tracker's
-    place and leave something that is known. levels : whether the tracker's z axis may be stated to
-    be the base's.
+    headers : for each form of the table, the columns beside the configuration's, in any order.
+    known : which of the six numbers (omega, tau) of T_tracker_target are measured.
+    fewest_rows : smallest number of rows that determine the tracker's pose with redundancy.
+    levels : whether ``level: true`` is allowed, which makes the tracker's z axis the base's.
     """
 
     headers: ClassVar[tuple[tuple[str, ...], ...]]
@@ -90,13 +101,15 @@ class TargetKind(MeasurementKind, ABC):
 
     @classmethod
     def turns(cls) -> bool:
-        """Whether turns are measured, which need a stated noise."""
+        """Whether rotations are measured, which need a stated noise."""
         return any(k < 3 for k in cls.known)
 
     @classmethod
     def whiten(cls, position: float, rotation: float | None) -> Array:
-        """Whitening (6, 6) of one measurement, by standard deviations in m and rad; rows of zeros
-        for what is not measured.
+        """Whitening matrix (6, 6) of one measurement.
+
+        position, rotation : standard deviations in m and rad. Rows of numbers that are not measured
+        are zero.
         """
         sigma = np.repeat([rotation or 1.0, position], 3)
         return np.diag(np.where(np.isin(np.arange(6), cls.known), 1 / sigma, 0.0))
@@ -104,22 +117,26 @@ class TargetKind(MeasurementKind, ABC):
     @classmethod
     @abstractmethod
     def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
-        """A first T_tracker_base (4, 4) from measurements (N, 4, 4) and the platform's places
-        (N, 3) by the nominal model; None where whole poses tell it themselves.
+        """Initial T_tracker_base (4, 4), or None for whole poses, which determine it directly.
+
+        T_tracker_target : (N, 4, 4) measurements.
+        platform : (N, 3) positions of the platform by the nominal model, m.
         """
 
     @classmethod
     def lengths(cls, T_tracker_target: Array) -> Array:
-        """The measured lengths (N, n), m."""
+        """Measured coordinates (N, n), m."""
         return T_tracker_target[:, [k - 3 for k in cls.known if k >= 3], 3]
 
 
 class LinkKind(MeasurementKind, ABC):
     """Numbers that link two configurations, under a key of their own in session.yaml.
 
-    key, schema : of session.yaml. Each measurement is one number with a standard deviation of its
-    own, and hangs on a point of the platform that is estimated with the machine. Where residuals
-    ask for larger deviations, all kinds of links share one factor.
+    Each measurement is one number with its own standard deviation, of a point on the platform that
+    is estimated with the machine. Where the residuals show larger deviations than stated, all kinds
+    of links share one noise scale.
+
+    key, schema : of session.yaml.
     """
 
     key: ClassVar[str]
@@ -130,25 +147,27 @@ class LinkKind(MeasurementKind, ABC):
     @classmethod
     @abstractmethod
     def table(cls, node: Any) -> str:
-        """The table's file as session.yaml names it. node : of the schema."""
+        """Name of the table's file in session.yaml; node : an instance of the schema."""
 
     @classmethod
     @abstractmethod
     def noise(cls, node: Any) -> float | None:
-        """The standard deviation of a measurement as session.yaml states it."""
+        """Standard deviation of a measurement as stated in session.yaml, None if not stated."""
 
     @classmethod
     @abstractmethod
     def read(cls, node: Any, path: Path, names: tuple[str, ...], machine: Machine) -> LinkSet:
-        """Read the table; every fault is an InputError with line and column.
+        """Read the table; every fault raises `InputError` with line and column.
 
-        node : of the schema. path : of the file. names : the session's configurations.
+        node : an instance of the schema.
+        path : of the file.
+        names : configurations of the session.
         """
 
     @classmethod
     @abstractmethod
     def check_start(cls, links: LinkSet, T_base_platform: Array) -> None:
-        """Raise `InputError` for what the nominal model's poses (K, 4, 4) show to be wrong, such as
+        """Raise `InputError` for faults that the nominal model's poses (K, 4, 4) reveal, such as
         another unit.
         """
 
@@ -158,7 +177,7 @@ Kind = TypeVar("Kind", bound=MeasurementKind)
 
 @cache
 def measurement_kinds() -> dict[str, type[MeasurementKind]]:
-    """Every kind of this folder, by its code."""
+    """All kinds of this folder, by code."""
     package = __name__.rpartition(".")[0]
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
@@ -166,12 +185,12 @@ def measurement_kinds() -> dict[str, type[MeasurementKind]]:
 
 
 def kinds_of(base: type[Kind]) -> dict[str, type[Kind]]:
-    """Those of one sort, by their codes."""
+    """Kinds that are subclasses of ``base``, by code."""
     return {code: kind for code, kind in measurement_kinds().items() if issubclass(kind, base)}
 
 
 def _concrete(base: type[MeasurementKind]) -> list[type[MeasurementKind]]:
-    """Subclasses that have a code, in the order of their files."""
+    """Subclasses that define a code, sorted by module name."""
     out: list[type[MeasurementKind]] = []
     for kind in base.__subclasses__():
         out += [kind] if "code" in vars(kind) else _concrete(kind)
@@ -179,8 +198,10 @@ def _concrete(base: type[MeasurementKind]) -> list[type[MeasurementKind]]:
 
 
 def configuration_rows(table: CsvTable, names: tuple[str, ...]) -> Integers:
-    """Rows (N,) of the readings of the configurations that a table names, (N, 2) of pairs. Raises
-    `InputError` for one that has no readings.
+    """Rows of the readings that belong to a table's configurations, (N,), or (N, 2) for a table of
+    pairs.
+
+    Raises `InputError` for a configuration without joint readings.
     """
     number = {name: k for k, name in enumerate(names)}
     written = table.pairs if isinstance(table, PairTable) else tuple((n,) for n in table.names)

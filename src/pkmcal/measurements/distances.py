@@ -5,12 +5,12 @@ tool's point m, fixed to the platform, the marks are ``p_k = R_k m + t_k`` and t
 
     (|p_2 - p_1| - d) / sigma.
 
-With the unit vector e from the first mark to the second, a perturbation (omega, tau) of the pose of
-the second configuration changes the distance by ``e . (omega x R_2 m + tau)``, the first by as much
-the other way, and a shift tau of the tool's point by ``e . (R_2 - R_1) tau``.
+With the unit vector e from the first mark to the second, a perturbation (omega, tau) of the second
+pose changes the distance by ``e . (omega x R_2 m + tau)``, the same perturbation of the first pose
+by ``-e . (omega x R_1 m + tau)``, and a shift tau of the tool's point by ``e . (R_2 - R_1) tau``.
 
-Distances tell the size of a machine, which heights of a bed leave to the nominal model. Klipper's
-``DELTA_ANALYZE`` uses them in the same way, from a part of a fixed shape
+Distances determine the size of a machine, which heights of a bed do not determine. Klipper's
+``DELTA_ANALYZE`` uses distances in the same way, from a part of a fixed shape
 (https://www.klipper3d.org/Delta_Calibrate.html).
 """
 
@@ -37,11 +37,11 @@ from pkmcal.mechanisms import Machine, check_plausible
 
 END_COLUMNS, VALUE_COLUMN, SIGMA_COLUMN = ("from", "to"), "distance", "sigma"
 LONGEST_IN_SIZES = 4.0
-"""Longest distance in times of the machine's size: a tool reaches no further than the machine is
-large to either side, and a nominal model may be wrong by a factor of two."""
+"""Largest plausible distance, relative to the machine's size: a tool reaches no further than the
+machine's size to either side, and a nominal model may be wrong by a factor of two."""
 OTHER_UNIT_RATIO = 10.0
-"""Ratio of measured to nominal distances, all of them, from which they are in another unit: inches
-for millimetres make 25.4, and no nominal model is wrong by ten."""
+"""Ratio of measured to nominal distances, or its inverse, beyond which all of them are in another
+unit: inches for millimetres make 25.4, and no nominal model is wrong by a factor of ten."""
 
 
 class DistancesDocument(Schema):
@@ -56,7 +56,7 @@ class DistancesDocument(Schema):
 
 @dataclass(frozen=True)
 class DistanceSet(LinkSet):
-    """N distances in m; the mount's place is the tool's point."""
+    """N distances, m; the mount's origin is the tool's point."""
 
     @property
     def kind(self) -> str:
@@ -64,7 +64,7 @@ class DistanceSet(LinkSet):
         return Distances.code
 
     def rows(self, first: Array, second: Array, mount: Array) -> LinkRows:
-        """Residuals and derivatives; see the module."""
+        """Residuals and derivatives; equations in the module's docstring."""
         point = mount[..., :3, 3:]
         arms = [(T[..., :3, :3] @ point)[..., 0] for T in (first, second)]
         apart = arms[1] + second[..., :3, 3] - arms[0] - first[..., :3, 3]
@@ -90,19 +90,19 @@ class Distances(LinkKind):
 
     @classmethod
     def table(cls, node: DistancesDocument) -> str:
-        """The table's file."""
+        """Name of the table's file."""
         return node.file
 
     @classmethod
     def noise(cls, node: DistancesDocument) -> float | None:
-        """Standard deviation of a distance, m."""
+        """Standard deviation of a distance, m, None if not stated."""
         return node.noise
 
     @classmethod
     def read(
         cls, node: DistancesDocument, path: Path, names: tuple[str, ...], machine: Machine
     ) -> DistanceSet:
-        """Read the table; every fault is an InputError with line and column."""
+        """Read the table; every fault raises `InputError` with line and column."""
         table = read_pairs(path, END_COLUMNS, (VALUE_COLUMN,), (SIGMA_COLUMN,), label=node.file)
         table.check_kinds(["m"] * len(table.columns))
         rows = configuration_rows(table, names)
@@ -129,7 +129,7 @@ class Distances(LinkKind):
     def check_start(cls, links: LinkSet, T_base_platform: Array) -> None:
         """Raise `InputError` where all distances are in another unit than the machine.
 
-        T_base_platform : (K, 4, 4) by the nominal model, NaN where it has none.
+        T_base_platform : (K, 4, 4) by the nominal model, NaN where it has no pose.
         """
         place = T_base_platform[:, :3, 3]
         apart = place[links.configuration[:, 1]] - place[links.configuration[:, 0]]
@@ -148,7 +148,9 @@ class Distances(LinkKind):
 
 
 def _check_row(table: PairTable, k: int, value: float, sigma: float, machine: Machine) -> None:
-    """Raise `InputError` for a distance that cannot be."""
+    """Raise `InputError` for an impossible distance: not positive, too long, between a
+    configuration and itself, or with an impossible standard deviation.
+    """
     first, second = table.pairs[k]
     where = table.where(k, table.columns.index(VALUE_COLUMN))
     if first == second:
@@ -158,6 +160,7 @@ def _check_row(table: PairTable, k: int, value: float, sigma: float, machine: Ma
             found=f"{first} twice",
             expected="two different configurations",
         )
+    # value
     if value <= 0:
         raise InputError(
             "a distance is a positive number", where=where, found=f"{value:g} m", expected="above 0"
@@ -173,6 +176,7 @@ def _check_row(table: PairTable, k: int, value: float, sigma: float, machine: Ma
             if value <= 1e3 * most
             else None,
         )
+    # standard deviation
     if SIGMA_COLUMN not in table.columns:
         return
     where = table.where(k, table.columns.index(SIGMA_COLUMN))

@@ -17,7 +17,7 @@ from pkmcal.measurements.contract import TargetKind
 
 @final
 class Heights(TargetKind):
-    """Height of a target."""
+    """Height of a target above a flat bed."""
 
     code: ClassVar = "heights"
     one: ClassVar = "height"
@@ -31,6 +31,6 @@ class Heights(TargetKind):
 
     @classmethod
     def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
-        """The bed below the platform by the mean height."""
+        """Bed that is parallel to the base's x-y plane, at the mean height."""
         shift = np.nanmean(T_tracker_target[:, 2, 3] - platform[:, 2])
         return pose(np.eye(3), np.array([0.0, 0.0, shift]))

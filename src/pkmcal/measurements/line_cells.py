@@ -1,4 +1,7 @@
-"""Edges of a leg's side at a station gathered by their normals: near ones are shaded alike."""
+"""Edges of one side of a leg at one station, grouped into cells of similar normals.
+
+Edges with similar normals are shaded in the same way, so their errors are correlated.
+"""
 
 from __future__ import annotations
 
@@ -10,25 +13,29 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, short_repr
 
 SHADING_CORRELATION_ANGLE = np.radians(7.0)
-"""Angle between the normals of two edges of one side of a tube at one station over which their
-shading ceases to be the same, by exp(-angle / SHADING_CORRELATION_ANGLE): what a surface mirrors,
-and where its highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree
-by half at 5 degrees once what all have in common is taken off."""
+"""Correlation angle of shading, rad: errors of edges of one side of a tube at one station are
+correlated by exp(-angle / SHADING_CORRELATION_ANGLE), angle that between their normals, since a
+mirrored image or a highlight moves with the normal. Edges of path-traced tubes, metal and painted,
+correlate by one half at 5 degrees once the mean of all is removed."""
 
 TUBE_CORRELATION = 0.4
-"""The same between edges of two tubes of a leg on one side: they see the same light, and mirror the
-same, in part. Of path-traced legs of five finishes 0.2 to 0.6."""
+"""Factor on that correlation between edges of two tubes of a leg on one side, which are lit by and
+mirror the same surroundings in part: 0.2 to 0.6 on path-traced legs of five finishes."""
 CELLS_AN_ANGLE, CELLS_AN_ANGLE_OF_MANY, MANY_EDGES = 64, 8, 10_000
-"""Cells along SHADING_CORRELATION_ANGLE, and where there are so many edges that hardly one would
-have a cell of its own: those of a cell are alike to a hundredth, and to a tenth."""
+"""Cells along SHADING_CORRELATION_ANGLE, and the same for many edges, from the third number on,
+where hardly any edge would have a cell of its own. Edges of one cell are correlated to within 0.01,
+and 0.1."""
 
 
 @dataclass(frozen=True)
 class LineCells:
-    """N edges of L lines in C cells; those of one side of a leg at a station stand side by side.
+    """N edges of L lines in C cells; the cells of one side of a leg at a station are contiguous.
 
-    cell : (N,) of each edge, -1 where it is a line of its own. first : (sides + 1,) where the
-    sides' cells begin. line : (C,). middle : (C, 3) unit normals. count : (C,) edges in each.
+    cell : (N,) cell of each edge, -1 for an edge that is a line of its own.
+    first : (sides + 1,) first cell of each side, and C.
+    line : (C,) line of each cell.
+    middle : (C, 3) mean normal of each cell, a unit vector.
+    count : (C,) number of edges in each cell.
     """
 
     cell: Integers
@@ -41,8 +48,11 @@ class LineCells:
 
     @classmethod
     def of(cls, normal: Array, line: Integers, side: Integers) -> LineCells:
-        """The cells of edges with normals (N, 3) and lines (N,), -1 for none, which are on sides
-        (L,).
+        """Group edges into cells.
+
+        normal : (N, 3) unit normals.
+        line : (N,) line of each edge, -1 for none.
+        side : (L,) side of each line.
         """
         mine = line >= 0
         fine = CELLS_AN_ANGLE if len(line) < MANY_EDGES else CELLS_AN_ANGLE_OF_MANY
@@ -59,9 +69,10 @@ class LineCells:
         return cls(cell, first, keys[:, 1], middle, count)
 
     def correlated_groups(self) -> Iterator[tuple[slice, Array, Array]]:
-        """Of side after side its cells, and how alike two of them err, (c, c): in their shift by
-        exp(-angle / SHADING_CORRELATION_ANGLE), if on two tubes by TUBE_CORRELATION of that; in
-        their tilt on one tube alone.
+        """Cells of each side, with the correlations (c, c) of the shifts and of the tilts.
+
+        Shifts of two edges are correlated by exp(-angle / SHADING_CORRELATION_ANGLE), times
+        TUBE_CORRELATION if on two tubes; tilts only on the same tube.
         """
         for start, end in zip(self.first[:-1], self.first[1:], strict=True):
             own = slice(int(start), int(end))
@@ -73,9 +84,11 @@ class LineCells:
 
     @property
     def n_effective(self) -> Array:
-        """How many edges of its line share an edge's own shading, itself among them, (N,): the sum
-        over them of how alike they err. Of n edges with the same normal each counts as one n-th,
-        whatever their number; an edge that is a line of its own is alone.
+        """Number of edges (N,) that share an edge's own shading: the sum of its correlations with
+        all edges of its line, itself included.
+
+        Of n edges with the same normal each counts 1/n, so that together they count as one whatever
+        their number; an edge that is a line of its own has 1.
         """
         many = np.ones(len(self.count) + 1)
         for own, _, similar in self.correlated_groups():

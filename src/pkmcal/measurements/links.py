@@ -1,8 +1,8 @@
 """Measurements that link two configurations: one number each, such as a distance.
 
-A row of such a measurement depends on the poses of both configurations. So the pose of a
-configuration that takes part in a link is an unknown that all rows share; the poses of all others
-are eliminated configuration by configuration (:mod:`pkmcal.identify.problem`).
+A row of such a measurement depends on the poses of both configurations. The pose of a linked
+configuration is therefore a shared unknown; the poses of all other configurations are eliminated
+one by one (:mod:`pkmcal.identify.problem`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from pkmcal.arrays import Array, Booleans, Integers, short_repr
 
 
 class LinkRows(NamedTuple):
-    """Residuals of N links in B runs, and their derivatives, in standard deviations.
+    """Residuals of N links in B runs and their derivatives, in standard deviations.
 
-    value : (B, N), predicted less measured. by_first, by_second : (B, N, 6) by the left
-    perturbation (omega, tau) of T_base_platform in either configuration. by_mount : (B, N, 6) by
-    that of T_platform_mount.
+    value : (B, N) predicted minus measured.
+    by_first, by_second : (B, N, 6) by the left perturbation (omega, tau) of T_base_platform in
+    either configuration.
+    by_mount : (B, N, 6) by the left perturbation of T_platform_mount.
     """
 
     value: Array
@@ -34,9 +35,11 @@ class LinkRows(NamedTuple):
 class LinkSet(ABC):
     """N measurements of one kind that link two configurations each.
 
-    label : the table's name in messages. configuration : (N, 2) rows of the readings. mount : (N,)
-    what is fixed to the platform. value : (N,) as measured, sigma : (N,) its standard deviation, in
-    SI. lines : (N,) of the table, from 1.
+    label : the table's name in messages.
+    configuration : (N, 2) rows of the readings.
+    mount : (N,) number of the mount on the platform.
+    value, sigma : (N,) measured value and its standard deviation, SI.
+    lines : (N,) lines of the table, from 1.
     """
 
     label: str
@@ -58,12 +61,14 @@ class LinkSet(ABC):
 
     @abstractmethod
     def rows(self, first: Array, second: Array, mount: Array) -> LinkRows:
-        """Residuals at poses T_base_platform (B, N, 4, 4) of both configurations, with T_mount
-        (B, N, 4, 4) on the platform.
+        """Residuals and derivatives of all links.
+
+        first, second : (B, N, 4, 4) T_base_platform of both configurations.
+        mount : (B, N, 4, 4) T_platform_mount.
         """
 
     def select(self, keep: Booleans | Integers) -> Self:
-        """The links at a mask or at positions."""
+        """Links at a mask or at positions."""
         arrays = {
             f.name: getattr(self, f.name)[keep]
             for f in fields(self)
@@ -72,5 +77,5 @@ class LinkSet(ABC):
         return replace(self, **arrays)
 
     def at_mount(self, number: int) -> Self:
-        """The same links with one mount."""
+        """The same links, all at one mount."""
         return replace(self, mount=np.full(len(self), number))

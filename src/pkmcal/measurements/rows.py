@@ -1,7 +1,4 @@
-"""What all sorts of rows have in common: places of measurements in configurations, padded.
-
-Measurements stand in K configurations of G places each, padded to a common count.
-"""
+"""Layout of the rows of all kinds: K configurations of G places for measurements each, padded."""
 
 from __future__ import annotations
 
@@ -17,11 +14,10 @@ Numbers = TypeVar("Numbers")
 
 
 class Kinds(NamedTuple, Generic[Item]):
-    """Something of each sort of rows: of the edges, of the poses of boards and targets, and of what
-    links configurations.
+    """One value for each sort of rows: edges, poses (of boards and targets), and links.
 
-    An estimate weighs, counts and scales all kinds alike. Readings are none: no robust weight lets
-    them go.
+    An estimate weighs, counts and scales all of these in the same way. Readings are not among them,
+    since they have no robust weight.
     """
 
     edges: Item
@@ -31,10 +27,12 @@ class Kinds(NamedTuple, Generic[Item]):
 
 @dataclass(frozen=True)
 class RowsOfKind:
-    """The rows of one sort in a problem.
+    """Rows of one sort in a problem.
 
-    rows : those of a configuration that are its. present : (K, G) False for padding. weight :
-    (B or 1, K, G). whiten : (B or 1, K, G, n, n).
+    rows : their slice among a configuration's rows.
+    present : (K, G) False for padding.
+    weight : (B or 1, K, G).
+    whiten : (B or 1, K, G, n, n).
     """
 
     rows: slice
@@ -44,15 +42,16 @@ class RowsOfKind:
 
     @property
     def count(self) -> Integers:
-        """Residuals of each measurement, (K, G): a board's pose has six, a point's three of them,
-        padding none.
+        """Number of residuals of each measurement, (K, G): six for a board's pose, three for a
+        point, none for padding.
         """
         return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
 
 
 def among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
-    """All arrays of a dataclass cut along the configurations' axis; what is the same for all of
-    them, a single one or none, stays.
+    """Restrict all arrays of a dataclass to some configurations; ``axis`` is their axis.
+
+    Arrays of length 1 or 0 along that axis, which hold for all configurations, stay.
     """
     whole: Any = numbers
     cut = (slice(None),) * axis + (configurations,)

@@ -328,7 +328,7 @@ class Surroundings:
         """Pose hypotheses of an image, with the log-likelihood ratio of the background added.
 
         The background determines from which side the image was taken; the legs determine the exact
-        pose. Hypotheses within SAME_PLACE_TURN of each other share the largest gain of the group.
+        pose. Hypotheses within SAME_POSE_TURN of each other share the largest gain of the group.
 
         hypotheses : log-likelihood ratios in unit 1.
         camera : of this image.

@@ -22,11 +22,14 @@ rows this takes a third of the time."""
 
 
 class Linear(NamedTuple):
-    """Residuals and Jacobian at a point.
+    """Residuals and Jacobian at a state: B runs, K configurations of r rows.
 
-    value : (B, K, r). by_shared : (B, K, r, na). by_own : (B, K, r, d).
+    value : (B, K, r).
+    by_shared : (B, K, r, na) by the shared unknowns.
+    by_own : (B, K, r, d) by the configuration's own unknowns.
     usable : (B, K, r) False where nothing can be predicted; such rows are zero.
-    shared_value : (B, c) rows on shared unknowns only. shared_by : (c, na).
+    shared_value : (B, c) residuals of the rows on shared unknowns only.
+    shared_by : (c, na) their Jacobian.
     """
 
     value: Array
@@ -38,7 +41,7 @@ class Linear(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """The problem after elimination of the own unknowns.
+    """Rows after elimination of the own unknowns.
 
     rows : (B, K, r, na) reduced Jacobian. value : (B, K, r) residuals projected off the own
     Jacobian. q, r : QR factors of the own Jacobian.
@@ -62,7 +65,7 @@ def eliminate(linear: Linear) -> Reduced:
 
 
 def flat(rows: Array) -> Array:
-    """Rows (B, K, r, n) of all configurations, (B, K r, n); n may be none."""
+    """Rows (B, K, r, n) of all configurations as (B, K r, n); n may be zero."""
     return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
 
 

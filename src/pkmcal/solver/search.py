@@ -64,7 +64,7 @@ class Stop(Enum):
 
 
 class Values(NamedTuple):
-    """Residuals alone: value (B, K, r) with NaN where nothing can be predicted, shared (B, c).
+    """Residuals at a state.
 
     rows : the Jacobian there, where intermediate results of the residuals make it cheaper.
     """
@@ -125,14 +125,15 @@ def _is_divisible(problem: LeastSquares) -> TypeGuard[Divisible]:
 
 
 def take(state: Runs, runs: Integers) -> Runs:
-    """The state of some runs."""
+    """State of some runs."""
     return _each(lambda array: array[runs], state)
 
 
 def put(state: Runs, runs: Integers, part: Runs) -> Runs:
-    """The state with some runs' values replaced by those of ``part``."""
+    """State with the values of some runs replaced by those of ``part``."""
 
     def replaced(array: Array, new: Array) -> Array:
+        """Copy of an array with new values in some runs."""
         out = array.copy()
         out[runs] = new
         return out
@@ -166,7 +167,7 @@ def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop.
+    """Result of a search over B runs.
 
     cost : where the last step was taken without a trial, the linear model's. normal : (B, na, na)
     reduced normal matrix at the state before the last step.
@@ -275,9 +276,11 @@ def _minimised(
     state, part, here, at = start, problem, start, values
     normal: Array | None = None
     for _ in range(max_steps):
+        # a step of the active runs
         new, gain = _try(part, here, at, search, tolerance)
         steps[active] += 1
         here, at = _accepted_state(here, new, gain)
+        # accepted states into the result
         if active.size == n_runs:
             state, normal = here, gain.normal
         else:
@@ -285,6 +288,7 @@ def _minimised(
         cost[active], search = gain.cost, gain.search
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason
+        # continue with the runs that have not stopped
         keep = np.array([k for k, reason in enumerate(gain.stop) if reason is Stop.RUNNING])
         if keep.size == 0:
             break
@@ -368,22 +372,25 @@ def _try(
     values : residuals at the state, if known.
     """
     damping = search.damping
+    # step and its predicted effect
     normal = normal_equations(problem.rows(state, values), damping)
     shared, own = normal.step(damping)
     descent, size2 = normal.promise(shared, own)
     cost, promised = normal.cost, descent - size2
+    # convergence by the linear model
     size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
-    # a step near the end changes the cost by less than its rounding, and then it cannot be judged
+    # near the end a step changes the cost by less than the cost's rounding, which cannot be judged
     small = (size < tolerance * unit) | (np.abs(promised) < COST_ROUNDING * cost)
     last = search.remaining(size) < tolerance * unit
     usable = [part.usable for part in normal.parts]
     any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     trial = problem.problem.retract(state, shared, np.concatenate(own, axis=1))
     if np.all(search.undamped & any_usable & (small | last)):
-        # full steps as short as these keep what they promise: nothing is left to be tried
+        # full steps as short as these decrease the cost as predicted: no trial is needed
         every = np.ones(len(cost), dtype=bool)
         stop = [Stop.CONVERGED] * len(cost)
         return trial, _Gain(every, None, cost - promised, search, normal.matrix, stop)
+    # trial: residuals at the new state
     values = problem.residuals(trial)
     cost_trial = total(
         cost_of(part.value, part.shared_value, use)
@@ -392,7 +399,7 @@ def _try(
     ratio = (cost - cost_trial) / np.maximum(promised, 1e-300)
     accepted = cost_trial <= cost * (1 + COST_ROUNDING)
     small |= accepted & last
-    # a step that is refused for its rounding is better taken: all that is known of it is good
+    # a step that is refused by rounding only is taken: the linear model is the better evidence
     little = (
         ~accepted & (promised < (REFUSED_STEP_TOLERANCE * unit) ** 2) & (damping < STRONG_DAMPING)
     )
@@ -406,6 +413,7 @@ def _try(
 
 
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
+    """Stop reason of one run after a step."""
     if not usable:
         return Stop.NOT_FINITE
     if small and damping < STRONG_DAMPING:

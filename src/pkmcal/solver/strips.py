@@ -44,7 +44,7 @@ class StripLayout:
 
     @classmethod
     def none(cls, n_shared: int, n_own: int, count: int) -> StripLayout:
-        """No strips."""
+        """Layout without strips."""
         empty = np.zeros((0, 0), dtype=int)
         return cls(n_shared, n_own, count, empty.ravel(), empty, [], empty)
 
@@ -71,7 +71,7 @@ class StripLayout:
 
     @cached_property
     def linked_places(self) -> tuple[Integers, Integers]:
-        """Configurations (n,) whose own unknowns are shared, and their columns (n, d)."""
+        """Configurations (n,) whose own unknowns are shared, and their shared columns (n, d)."""
         if self.linked is None:
             return np.zeros(0, dtype=int), np.zeros((0, self.n_own), dtype=int)
         which = np.flatnonzero(self.linked[:, 0] >= 0) if self.n_own else np.zeros(0, dtype=int)
@@ -91,7 +91,10 @@ class Compact(NamedTuple):
     """Residuals and Jacobian as :class:`Linear`, with strips; rows in no strip come last among the
     rows of their configuration.
 
-    n_shared : na. by_shared : (B, K, r', na) and by_own : (B, K, r', d) of the rows in no strip.
+    value, usable, shared_value, shared_by : as in :class:`Linear`.
+    strips : derivatives and residuals of the rows in strips.
+    by_shared, by_own : (B, K, r', na) and (B, K, r', d) of the rows in no strip, which are the last
+    r' rows of each configuration.
     """
 
     value: Array
@@ -137,9 +140,8 @@ def compact(linear: Linear) -> Compact:
 class Eliminated(NamedTuple):
     """Configurations after the elimination of their own unknowns, ``by_own = Q R``.
 
-    inverse : (B, K, d, d) of R. along : Q^T J, (B, K, d, na), with J the Jacobian by the shared
-    unknowns. fitted : Q^T value, (B, K, d). damped : (B, K, d) the damping of the own unknowns'
-    squares.
+    J (r, na) is a configuration's Jacobian by the shared unknowns; index s marks the rows in
+    strips.
 
     For rows in no strip: q (B, K, r', d), the reduced rows (B, K, r', na) and their reduced
     residuals (B, K, r').
@@ -188,17 +190,20 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     """
     (layout, numbers), by_own = rows.strips, rows.by_own
     n_runs, d, na = len(numbers), layout.n_own, layout.n_shared
+    # products of the strips' columns, summed by configuration and over all configurations
     strips = numbers.swapaxes(1, 2)
     products = strips @ np.ascontiguousarray(strips[:, :, :d].mT)
     sums = _summed(products, layout.own_target, (n_runs, layout.count, d, d + na + 2))
     square, with_shared, with_value = sums[..., :d], sums[..., d:-2], sums[..., -1:]
     normal, slope = _group_sums(layout, numbers[:, d:])
     for k, columns in zip(*layout.linked_places, strict=True):
+        # own unknowns of linked configurations are shared: their products count there
         normal[:, columns] += with_shared[:, k]
         normal[:, :, columns] += with_shared[:, k].mT
         normal[:, columns[:, None], columns] += square[:, k]
         slope[:, columns] += with_value[:, k, :, 0]
         square[:, k], with_shared[:, k], with_value[:, k] = 0.0, 0.0, 0.0
+    # R of the own Jacobian: root of the strips' products, other rows, damping
     norms = np.einsum("...ii->...i", square) + np.einsum("...nm,...nm->...m", by_own, by_own)
     damped = damping[:, None, None] * np.where(norms > 0, norms, 1.0)
     extra = np.sqrt(damped)[..., None] * np.eye(d)
@@ -208,6 +213,7 @@ def eliminated(rows: Compact, damping: Array) -> Eliminated:
     r = np.linalg.qr(np.concatenate([_root(square), by_own, beside], axis=-2), mode="r")
     inverse = np.linalg.inv(r)
 
+    # Q^T J and Q^T value from both sorts of rows
     q = by_own @ inverse
     value = rows.value[..., rows.value.shape[-1] - q.shape[-2] :, None]
     along_strips = inverse.mT @ with_shared
@@ -248,7 +254,7 @@ def _summed(parts: Array, target: Integers, shape: tuple[int, ...]) -> Array:
 
 
 def _root(square: Array) -> Array:
-    """Matrices (..., d, d) with ``root^T root = square``, which may be singular."""
+    """Square roots (..., d, d) with ``root^T root = square``; a square may be singular."""
     try:
         return np.linalg.cholesky(square).mT
     except np.linalg.LinAlgError:
@@ -260,8 +266,12 @@ class NormalPart(NamedTuple):
     """Reduced normal equations of some configurations' rows, and the factors from which their own
     unknowns' step follows, so that the rows need not be kept.
 
-    matrix : (B, na, na) and gradient (B, na) of the shared unknowns. cost : (B,). usable :
-    (B, K, r). along, fitted, inverse, damped : see :class:`Eliminated`.
+    The rows themselves are not stored.
+
+    matrix, gradient : (B, na, na) and (B, na) by the shared unknowns.
+    cost : (B,) sum of squares over usable rows.
+    usable : (B, K, r) as in :class:`Linear`.
+    along, fitted, inverse, damped : as in :class:`Eliminated`.
     """
 
     matrix: Array
@@ -274,7 +284,7 @@ class NormalPart(NamedTuple):
     damped: Array
 
     def own(self, shared: Array) -> Array:
-        """The own unknowns' step (B, K, d) after the shared one (B, na)."""
+        """Step of the own unknowns (B, K, d) for a step of the shared unknowns (B, na)."""
         right = self.fitted[..., None] + self.along @ shared[:, None, :, None]
         return -(self.inverse @ right)[..., 0]
 
@@ -308,7 +318,7 @@ class NormalEquations(NamedTuple):
     parts: list[NormalPart]
 
     def step(self, damping: Array) -> tuple[Array, list[Array]]:
-        """Levenberg-Marquardt step: shared (B, na) and own (B, K, d) of each part."""
+        """Levenberg-Marquardt step: shared (B, na), and own (B, K, d) of each part."""
         scaled, scale = unit_diagonal(self.matrix)
         # at least a few rounding units, so that an unidentified direction gives no step
         np.einsum("...ii->...i", scaled)[...] += np.maximum(damping, 1e-15)[:, None]
