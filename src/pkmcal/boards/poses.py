@@ -39,7 +39,7 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
-from pkmcal.measurements import Effect, ModelViolation, PoseSet, Rejection
+from pkmcal.measurements import Column, PoseSet, Rejection
 from pkmcal.observe.repeats import groups_of
 from pkmcal.wording import count, listed
 
@@ -472,17 +472,17 @@ def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[R
     return replace(poses, by_intrinsics=by), odd
 
 
-def board_size_violation(poses: PoseSet, mount: int, file: str) -> ModelViolation:
+def board_size_column(poses: PoseSet, mount: int, file: str) -> Column:
     """A board whose squares are not as large as its file says, by more than its tolerance.
 
     mount : the board's number. Where the size is an unknown with a tolerance, freeing it takes the
     unknown back to what the file says: the value that fits is the whole difference.
     """
-    by = np.zeros((len(poses), 6, 1))
-    mine = poses.mount == mount
-    by[mine, 3:, 0] = poses.T_station_target[mine, :3, 3]
+    mine = np.flatnonzero(poses.mount == mount)
+    by = np.zeros((len(mine), 6, 1))
+    by[:, 3:, 0] = poses.T_station_target[mine, :3, 3]
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {"value": value[0], "sigma": sigma[0], "file": file, "factor": 1 + value[0]}
 
-    return ModelViolation("board.size", file, facts, Effect(poses=by))
+    return Column("board.size", file, "board size", poses=by, pose_rows=mine, facts=facts)

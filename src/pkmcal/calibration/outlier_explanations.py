@@ -15,14 +15,13 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.score import FALSE_ALARM
 from pkmcal.measurements import Measurements
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
 from pkmcal.wording import listed
 
-FALSE_OUTVOTED_CHANCE = 0.005
-"""Chance at which any configuration of a right session disagrees."""
 UNLIKELY_EXPLANATION_CHANCE = 1e-4
 """Chance below which one reading, or another configuration's, is no explanation; so small because
 the machine's own uncertainty, about as large as that of a pose, is not counted."""
@@ -53,7 +52,7 @@ def outlier_explanations(
     if usual > MOST_USUAL_MISFIT**2:
         return
     noise = usual * noise
-    odd = _chance(m, chi2 / usual) < FALSE_OUTVOTED_CHANCE / len(which)
+    odd = _chance(m, chi2 / usual) < FALSE_ALARM / len(which)
     odd = np.flatnonzero(odd & (estimate.pose_weights[which] < 0.5))
     # rows of the table that say what the machine did in each odd one, (n, K)
     every = np.broadcast_to(poses[odd, None], (len(odd), len(joints), 4, 4)).reshape(-1, 4, 4)
@@ -88,7 +87,7 @@ def outlier_explanations(
                 else None
             )
             facts = one.facts(value[[motor]], sigma[[motor]])
-            yield doubtful("readings.outvoted", one.of, **facts, like=row)
+            yield doubtful("readings.outvoted", one.subject, **facts, like=row)
         elif same_station[n].any():
             yield _misnamed(
                 session, name, session.configurations[int(np.argmax(same_station[n]))], False

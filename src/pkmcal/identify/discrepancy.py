@@ -53,13 +53,12 @@ from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.score import (
-    NO_RANDOM_EFFECTS,
-    RandomEffects,
+    FALSE_ALARM,
     columns_of,
     eliminated_beside,
     shared_basis,
 )
-from pkmcal.measurements import Effect
+from pkmcal.measurements import Column
 from pkmcal.solver.elimination import divisions
 
 NAMED = "named."
@@ -74,7 +73,7 @@ class DiscrepancyOptions:
     """Constants of the search."""
 
     # chance at which any component is found in a session that has none
-    false_alarm: float = 0.005
+    false_alarm: float = FALSE_ALARM
     # factor on a stated noise from which the discrepancy may be what enlarged it
     enlarged: float = 1.2
     # factors tried then, from what was stated to what is in use
@@ -103,17 +102,21 @@ class DiscrepancyOptions:
 class Component:
     """A family of functions with one scale.
 
-    code : for programs. effect : what the k functions do to the measurements. roots : the L (k, l)
+    column : what the k functions do to the measurements. roots : the L (k, l)
     to choose from, of functions with a mean square of one over the session's configurations.
     inflates : kinds of rows whose noise such an error enlarges, as READING_ROWS_KIND. lengths : of
     the same number as roots, m, the correlation length of each; empty where there is none.
     """
 
-    code: str
-    effect: Effect
+    column: Column
     roots: tuple[Array, ...]
     inflates: tuple[int, ...] = ()
     lengths: tuple[float, ...] = ()
+
+    @property
+    def code(self) -> str:
+        """For programs."""
+        return self.column.code
 
 
 @dataclass(frozen=True)
@@ -135,14 +138,14 @@ class Discrepancy:
     """What the data show of the components.
 
     scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
-    shared unknowns. random : their effects, with the root (c, l) of their prior covariance. mean,
-    covariance : (l,) and (l, l) of the coefficients of that root's columns given the data. sure :
+    shared unknowns. random : their columns, with the priors that the data show. mean,
+    covariance : (l,) and (l, l) of the coefficients of these priors' roots, given the data. sure :
     whether they explain the data better than larger noise alone does.
     """
 
     scales: tuple[ComponentScale, ...]
     shared: Array
-    random: RandomEffects
+    random: tuple[Column, ...]
     mean: Array
     covariance: Array
     sure: bool = False
@@ -165,38 +168,39 @@ class _Products:
 def no_discrepancy(info: Information) -> Discrepancy:
     """None at all."""
     na = info.problem.unknowns.count
-    return Discrepancy((), np.zeros((na, na)), NO_RANDOM_EFFECTS, np.zeros(0), np.zeros((0, 0)))
+    return Discrepancy((), np.zeros((na, na)), (), np.zeros(0), np.zeros((0, 0)))
 
 
 def discrepancy_of(
     assembled: Assembled,
     info: Information,
     components: Sequence[Component],
-    named: Sequence[Effect] = (),
+    named: Sequence[Column] = (),
     enlarged: tuple[float, float] = (1.0, 1.0),
     heights: bool = False,
     options: DiscrepancyOptions = DiscrepancyOptions(),
 ) -> Discrepancy:
     """The discrepancy at a solution; the problem's first run.
 
-    named : effects of the model violations that were found otherwise, which take part with a scale
+    named : columns of the model violations that were found otherwise, which take part with a scale
     each: what they explain better is theirs, and not in the result. enlarged : factors in use on
     the stated noise of the readings and of the poses. heights : whether nothing else was measured.
     """
     rivals = [
-        Component(f"{NAMED}{k}", effect, (np.eye(effect.count),)) for k, effect in enumerate(named)
+        Component(replace(column, code=f"{NAMED}{k}"), (np.eye(column.count),))
+        for k, column in enumerate(named)
     ]
     every = [*components, *rivals]
-    effects = [one.effect for one in every]
-    ends = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
+    columns = [one.column for one in every]
+    ends = np.cumsum([0, *(column.count for column in columns)]).tolist()
     parts = [slice(*ends[k : k + 2]) for k in range(len(every))]
-    at_solution = _products(assembled, info, effects)
+    at_solution = _products(assembled, info, columns)
     kind = (READING_ROWS_KIND, POSE_ROWS_KIND)[int(np.argmax(enlarged))]
     inflated = kind if max(enlarged) > options.enlarged else None
     noises = [at_solution]
     for shares in _noise_shares(enlarged, heights, options):
         other = _with_noise(assembled, shares)
-        noises.append(_products(other, Information(other.problem, info.state), effects))
+        noises.append(_products(other, Information(other.problem, info.state), columns))
     smooth_end = len(components)
     best, smooth, named_only, noise_alone = (
         max(
@@ -228,7 +232,8 @@ def discrepancy_of(
     mean, covariance = best.coefficients
     mean, covariance = mean[unnamed], covariance[np.ix_(unnamed, unnamed)]
     spread = gain @ (np.outer(mean, mean) + covariance) @ gain.T
-    random = RandomEffects(tuple(effects[:smooth_end]), root)
+    by_code = {one.code: one.column for one in components}
+    random = tuple(replace(by_code[one.code], prior=one.scale * one.root) for one in scales)
     return Discrepancy(scales, spread, random, mean, covariance, sure)
 
 
@@ -352,11 +357,11 @@ def _with_noise(assembled: Assembled, factors: tuple[float, float]) -> Assembled
     return replace(assembled, problem=problem)
 
 
-def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]) -> _Products:
+def _products(assembled: Assembled, info: Information, listed: Sequence[Column]) -> _Products:
     """Products of the effects' columns, and the restricted likelihood without them."""
     problem, basis = assembled.problem, shared_basis(info)
-    columns = columns_of(assembled, info.state, [_as_motion(assembled, x) for x in effects])
-    n, count = sum(effect.count for effect in effects), problem.unknowns.count
+    columns = columns_of(assembled, info.state, [_as_motion(assembled, one) for one in listed])
+    n, count = sum(one.count for one in listed), problem.unknowns.count
     squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
     in_basis, remainder, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
     configurations, n_rows = problem.extent
@@ -408,11 +413,11 @@ def _log_noise(assembled: Assembled) -> float:
     return out - float(np.sum(0.5 * kind.count[used] * np.log(kind.weight[0][used])))
 
 
-def _as_motion(assembled: Assembled, effect: Effect) -> Effect:
+def _as_motion(assembled: Assembled, column: Column) -> Column:
     """A station that stands elsewhere from some configuration on, as a motion by configuration."""
-    if effect.station is None:
-        return effect
+    if column.station is None:
+        return column
     unknowns = assembled.problem.unknowns
     motion = np.zeros((unknowns.n_stations, len(assembled.observed), 6, 6))
-    motion[effect.station, effect.since :] = np.eye(6)
-    return Effect(motion=motion)
+    motion[column.station, column.since :] = np.eye(6)
+    return Column(column.code, motion=motion)

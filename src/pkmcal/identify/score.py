@@ -40,7 +40,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.measurements import Effect
+from pkmcal.measurements import Column
 from pkmcal.measurements.readings import by_noise
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
@@ -82,14 +82,9 @@ class OneStepUpdate:
     by_data: Array
 
 
-class RandomEffects(NamedTuple):
-    """Effects whose k coefficients together have the covariance ``root root^T``, root (k, l)."""
-
-    effects: tuple[Effect, ...]
-    root: Array
-
-
-NO_RANDOM_EFFECTS = RandomEffects((), np.zeros((0, 0)))
+FALSE_ALARM = 0.005
+"""Chance at which a session that agrees with its model shows a violation of a sort: one that has a
+name, a discrepancy, a measured pose that stands against all others."""
 
 
 class ScoreTests:
@@ -104,22 +99,21 @@ class ScoreTests:
         self,
         assembled: Assembled,
         info: Information,
-        listed: Sequence[Effect],
+        listed: Sequence[Column],
         families: Sequence[int] | None = None,
         *,
         singles: bool = False,
-        beside: RandomEffects | None = None,
+        beside: Sequence[Column] = (),
         variance: float = 1.0,
     ) -> None:
         """As the module says.
 
         families : of which each listed one is; among many departures of one kind the single one
         has to gain more, and those of other kinds do not pay for it. One family if absent; single
-        readings are one of their own. beside : what counts as further unknowns, known beforehand
-        to be small. variance : factor on that of all residuals, for what else they are known to be
+        readings are one of their own. beside : columns with a prior, which count as further
+        unknowns. variance : factor on that of all residuals, for what else they are known to be
         wrong by.
         """
-        beside = beside or NO_RANDOM_EFFECTS
         self._variance, self._scatter = variance, dict[int, float]()
         basis = _basis_beside(assembled, info, beside)
         self._problem = assembled, info, listed, basis, beside
@@ -191,10 +185,10 @@ class ScoreTests:
 
     def _scattered(self, k: int, freed: Sequence[int]) -> float:
         """The factor f of a listed departure beside those that are free already."""
-        assembled, info, listed, basis, effects = self._problem
+        assembled, info, listed, basis, random = self._problem
         made, problem = self._made, info.problem
-        beside = [f for f in freed if f < len(made.listed)]  # single readings stay as they are
-        every = [*beside, k]
+        # single readings stay as they are
+        every = [*(f for f in freed if f < len(made.listed)), k]
         of_basis = np.concatenate([made.with_basis(f) for f in every]).T
         free = _ProjectedColumns.of(made, every)
         value, n = -free.inverse @ free.value, made.count(k)
@@ -204,13 +198,13 @@ class ScoreTests:
         part = np.concatenate([-gain, np.eye(n)])
         throughout = [listed[f] for f in every if listed[f].station is None]
         columns = columns_of(assembled, info.state, throughout)
-        random = columns_of(assembled, info.state, effects.effects)
+        by_random, root = columns_of(assembled, info.state, random), prior_root(random)
         scatter, clusters = np.zeros((n, n)), 0
         for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
             linear = piece.linear
-            further = [random(cut, linear) @ effects.root, columns(cut, linear)]
+            further = [by_random(cut, linear) @ root, columns(cut, linear)]
             rows, remainder = eliminated_beside(linear, np.concatenate(further, axis=-1))
-            count = taken = problem.unknowns.count + effects.root.shape[1]
+            count = taken = problem.unknowns.count + root.shape[1]
             wide: list[Array] = []
             for f in every:
                 number = listed[f].count
@@ -386,21 +380,22 @@ def shared_basis(info: Information) -> Array:
     return half[:, np.any(half != 0, axis=0)]
 
 
-def _basis_beside(assembled: Assembled, info: Information, beside: RandomEffects) -> Array:
+def _basis_beside(assembled: Assembled, info: Information, beside: Sequence[Column]) -> Array:
     """B (na + l, nb + l): the rows by the shared unknowns and by random effects, in their own
     standard deviations, times it are orthonormal; those that say so of the effects are among them.
 
     With Q = J B0 the orthonormal rows of the unknowns alone and D the effects' columns, the further
     ones are ``(D - Q Q^T D) L^-T`` with ``L L^T = 1 + D^T D - (Q^T D)^T Q^T D``.
     """
-    basis, count = shared_basis(info), beside.root.shape[1]
+    basis, root = shared_basis(info), prior_root(beside)
+    count = root.shape[1]
     if not count:
         return basis
-    columns = columns_of(assembled, info.state, beside.effects)
+    columns = columns_of(assembled, info.state, beside)
     across, squared = np.zeros((basis.shape[1], count)), np.eye(count)
     na = len(basis)
     for cut, piece in zip(divisions(*assembled.problem.extent), info.pieces(), strict=True):
-        rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ beside.root)
+        rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ root)
         flat = rows.reshape(-1, na + count)
         across += (flat[:, :na] @ basis).T @ flat[:, na:]
         squared += flat[:, na:].T @ flat[:, na:]
@@ -413,10 +408,10 @@ def _basis_beside(assembled: Assembled, info: Information, beside: RandomEffects
 def _products(
     assembled: Assembled,
     info: Information,
-    listed: Sequence[Effect],
+    listed: Sequence[Column],
     basis: Array,
     singles: bool,
-    beside: RandomEffects,
+    beside: Sequence[Column],
 ) -> _Products:
     """Of the departures' columns; basis : of the unknowns and the random effects beside them."""
     problem, observed = assembled.problem, assembled.observed
@@ -440,15 +435,15 @@ def _products(
     )
     throughout = [effect for effect in listed if effect.station is None]
     columns = columns_of(assembled, info.state, throughout, singles=singles)
-    random, n_random = columns_of(assembled, info.state, beside.effects), beside.root.shape[1]
+    random, root = columns_of(assembled, info.state, beside), prior_root(beside)
     for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
         linear = piece.linear
-        further = [random(cut, linear) @ beside.root, columns(cut, linear)]
+        further = [random(cut, linear) @ root, columns(cut, linear)]
         rows, value = eliminated_beside(linear, np.concatenate(further, axis=-1))
         count = problem.unknowns.count
         if not cut.start:
             reference_values = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
-        first, split = count + n_random, rows.shape[-1] - motors
+        first, split = count + root.shape[1], rows.shape[-1] - motors
         own = [rows[..., stations], rows[..., first:split], rows[..., :first] @ basis]
         wide = np.concatenate([*own, value[..., None]], axis=-1)
         for begin in begins:
@@ -469,6 +464,13 @@ def _products(
     )
 
 
+def prior_root(columns: Sequence[Column]) -> Array:
+    """Root (k, l) of the covariance of all numbers of columns with a prior."""
+    from scipy.linalg import block_diag
+
+    return np.array(block_diag(np.zeros((0, 0)), *(one.prior for one in columns)))
+
+
 def eliminated_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
     """Rows (K', r, na + k) with columns (K', r, k) beside the unknowns' and residuals (K', r), of
     which the configurations' own unknowns are eliminated. Rows that are weighted away or hold
@@ -484,7 +486,7 @@ def eliminated_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
 
 
 def columns_of(
-    assembled: Assembled, state: BatchState, listed: Sequence[Effect], *, singles: bool = False
+    assembled: Assembled, state: BatchState, listed: Sequence[Column], *, singles: bool = False
 ) -> Callable[[slice, Linear], Array]:
     """Gives the columns (K', r, k) of some configurations, of which the problem's rows are given,
     by effects throughout, in their order, then by the single readings.
@@ -500,8 +502,11 @@ def columns_of(
         where = slice(end - effect.count, end)
         if effect.readings is not None:
             readings[..., where] = effect.readings[assembled.observed]
-        edges = None if effect.edges is None else places.edges.filled(effect.edges)
-        poses = None if effect.poses is None else places.poses.filled(effect.poses)
+        parts = effect.edges_of(len(places.edges.row)), effect.poses_of(len(places.poses.row))
+        edges, poses = (
+            None if part is None else at.filled(part)
+            for at, part in zip(places, parts, strict=False)
+        )
         placed.append((where, edges, poses))
         if effect.motion is not None:
             moving.append((where, effect.motion[:, assembled.observed]))

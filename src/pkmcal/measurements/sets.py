@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -163,45 +163,3 @@ class Measurements:
     def on_platform(self) -> Booleans:
         """(M,) which of the mounts move with the platform."""
         return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)
-
-
-@dataclass(frozen=True)
-class Effect:
-    """What k numbers do to what was measured, to first order: from what was measured to what should
-    have been.
-
-    edges : (N, 2, k) turn of the normals, in their bases. readings : (K, m, k). poses : (N', 6, k)
-    left perturbation of T_station_target. motion : (S, K, 6, k) left perturbation (omega, tau) of
-    the stations' poses, by configuration. Absent: none. Or, where ``station`` is given, the camera
-    or tracker of that number stands elsewhere from configuration ``since`` on, by (omega, tau).
-    """
-
-    edges: Array | None = None
-    readings: Array | None = None
-    poses: Array | None = None
-    motion: Array | None = None
-    station: int | None = None
-    since: int = 0
-
-    @property
-    def count(self) -> int:
-        """How many numbers, k."""
-        if self.station is not None:
-            return 6
-        parts = (self.edges, self.readings, self.poses, self.motion)
-        return max((part.shape[-1] for part in parts if part is not None), default=0)
-
-
-@dataclass(frozen=True)
-class ModelViolation:
-    """Something that a session takes for granted and that may be otherwise.
-
-    code : of its finding. of : what departs, by name. facts : of its finding, from the estimates
-    and their standard deviations (k,). effect : what it does to what was measured; empty
-    for a single reading, see :class:`pkmcal.identify.score.ScoreTests`.
-    """
-
-    code: str
-    of: str
-    facts: Callable[[Array, Array], dict[str, Any]]
-    effect: Effect = field(default_factory=Effect)

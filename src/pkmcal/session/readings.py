@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import pi
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
-from pkmcal.measurements import Effect, ModelViolation
+from pkmcal.measurements import Column
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
@@ -224,39 +224,39 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
     )
 
 
-def reading_violations(
-    joints: Array, columns: Sequence[str], units: Sequence[str], present: Array
-) -> tuple[list[ModelViolation], list[ModelViolation]]:
-    """What may be otherwise with readings (K, m): of each its scale, beyond its tolerance, and its
-    play, by which it differs with the way from which its motor came, in the order of the table.
+def scale_columns(joints: Array, columns: Sequence[str], present: Array) -> Iterator[Column]:
+    """Scale of each of the readings (K, m), beyond its tolerance, in the order of the table.
 
-    units : (m,). present : (m,) the scales of the estimate, over the drawing's. A scale that is
-    free beside its tolerance leaves that one to the drawing again, so the value that fits is all of
-    the difference, as the present scale counts it.
+    present : (m,) the scales of the estimate, over the nominal model's. A scale that is free beside
+    its prior leaves the parameter at its nominal value, so the value that fits is all of the
+    difference, relative to the present scale.
     """
-    direction = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
-    scales: list[ModelViolation] = []
-    plays: list[ModelViolation] = []
-    for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
-        one = np.eye(len(columns))[m]
+    for m, name in enumerate(columns):
 
-        def scale(
+        def facts(
             value: Array, sigma: Array, name: str = name, own: float = float(present[m])
         ) -> dict[str, Any]:
             change = own * value[0]
             return {"column": name, "value": change, "sigma": sigma[0], "factor": 1 + change}
 
-        def play(value: Array, sigma: Array, name: str = name, unit: str = unit) -> dict[str, Any]:
+        by = (joints * np.eye(len(columns))[m])[..., None]
+        yield Column("readings.scale", name, "reading scale", readings=by, facts=facts)
+
+
+def play_columns(joints: Array, columns: Sequence[str], units: Sequence[str]) -> Iterator[Column]:
+    """Play of each motor: its reading (K, m) differs with the direction in which it came."""
+    direction = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
+    for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
+
+        def facts(value: Array, sigma: Array, name: str = name, unit: str = unit) -> dict[str, Any]:
             return {"column": name, "value": value[0], "sigma": sigma[0], "unit": unit}
 
-        by_scale, by_path = ((x * one)[..., None] for x in (joints, direction))
-        scales.append(ModelViolation("readings.scale", name, scale, Effect(readings=by_scale)))
-        plays.append(ModelViolation("readings.play", name, play, Effect(readings=by_path)))
-    return scales, plays
+        by = (direction * np.eye(len(columns))[m])[..., None]
+        yield Column("readings.play", name, "backlash", readings=by, facts=facts)
 
 
-def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
-    """A single reading that is wrong."""
+def wrong_reading(column: str, unit: str, configuration: str, by: Array | None = None) -> Column:
+    """A single reading that is wrong; by : (K, m, 1), one at that reading."""
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {
@@ -267,7 +267,8 @@ def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
             "unit": unit,
         }
 
-    return ModelViolation("readings.single", f"{column}, {configuration}", facts)
+    name = f"{column}, {configuration}"
+    return Column("readings.single", name, "reading", readings=by, facts=facts)
 
 
 def _check_movement(table: CsvTable, noise: float) -> list[Finding]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.measurements import Effect, ModelViolation
+from pkmcal.measurements import Column
 from pkmcal.wording import amount
 
 FEWEST_BESIDE_MOVEMENT = 3
@@ -17,9 +17,9 @@ MOVEMENT_MOMENTS_TRIED = 12
 """Times at most, spread over a station's configurations, at which it may have moved."""
 
 
-def movement_violations(
+def movement_columns(
     station: int, name: str, used: Integers, configurations: Sequence[str], what: str = "camera"
-) -> Iterator[ModelViolation]:
+) -> Iterator[Column]:
     """That a station stands elsewhere from some configuration on.
 
     station, name : its number and name. used : configurations of which it measured something, in
@@ -40,8 +40,14 @@ def movement_violations(
                 },
             }  # fmt: skip
 
-        effect = Effect(station=station, since=int(used[k]))
-        yield ModelViolation("station.moved", name, facts, effect)
+        yield Column(
+            "station.moved",
+            name,
+            "station moved",
+            station=station,
+            since=int(used[k]),
+            facts=facts,
+        )
 
 
 def how_far(change: Array) -> str:
