@@ -260,7 +260,7 @@ def test_a_machine_without_a_map_says_why():
 
 def test_frames_are_no_error(small):
     """Those by three joints in place of the truth's: other numbers, the same machine."""
-    state = State(small.machine.values, np.eye(4)[None], small.poses, np.zeros(1))
+    state = State(small.machine.values, np.eye(4)[None], small.poses)
     values = in_gauge(small.machine, state, ThreeCentres((0, 2, 4)))
     other = small.machine.with_values(values.theta)
     joints = small.machine.inverse(small.poses)

@@ -40,6 +40,7 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
 from pkmcal.measurements import Column, PoseSet, Rejection
+from pkmcal.measurements.effects import by_board_size
 from pkmcal.observe.repeats import groups_of
 from pkmcal.wording import count, listed
 
@@ -478,11 +479,9 @@ def board_size_column(poses: PoseSet, mount: int, file: str) -> Column:
     mount : the board's number. Where the size is an unknown with a tolerance, freeing it takes the
     unknown back to what the file says: the value that fits is the whole difference.
     """
-    mine = np.flatnonzero(poses.mount == mount)
-    by = np.zeros((len(mine), 6, 1))
-    by[:, 3:, 0] = poses.T_station_target[mine, :3, 3]
+    own, by = by_board_size(poses, mount)
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {"value": value[0], "sigma": sigma[0], "file": file, "factor": 1 + value[0]}
 
-    return Column("board.size", file, "board size", poses=by, pose_rows=mine, facts=facts)
+    return Column("board.size", file, "board size", poses=by, pose_rows=own, facts=facts)

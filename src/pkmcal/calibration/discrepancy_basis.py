@@ -29,7 +29,6 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.score import prior_root
 from pkmcal.identify.tool import ToolError
 from pkmcal.identify.unidentified import only_heights
-from pkmcal.identify.unknowns import own_blocks
 from pkmcal.measurements import Column, Measurements
 from pkmcal.outcome.finding import Finding, doubtful
 
@@ -335,9 +334,7 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
     yield Component(Column("legs.shape", edges=effect), (np.eye(effect.shape[-1]),))
 
 
-def with_discrepancy(
-    measurements: Measurements, estimate: Estimate, problem: Problem, discrepancy: Discrepancy
-) -> Estimate:
+def with_discrepancy(estimate: Estimate, problem: Problem, discrepancy: Discrepancy) -> Estimate:
     """The estimate whose covariances contain the discrepancy; problem : as the estimate ended."""
     if not discrepancy.scales:
         return estimate
@@ -345,18 +342,15 @@ def with_discrepancy(
     gauge = default_gauge(machine)
     more = machine_covariance(problem, machine, estimate.state, shared, gauge)
     joint = estimate.joint_covariance + more
-    n, variance = len(machine.values), np.diag(shared)
-    optics, factor = own_blocks(shared, u.optics, u.n_optics), measurements.intrinsics_factor
+    n, covariance = len(machine.values), dict(estimate.column_covariance)
+    for code in covariance:
+        covariance[code] = covariance[code] + shared[u.of_code(code), u.of_code(code)]
     return replace(
         estimate,
         joint_covariance=joint,
         # what is left out may make a value less sure than the drawing alone has it
         data_share=np.maximum(data_share(machine, estimate.state.theta, joint[:n, :n], gauge), 0.0),
-        edge_shift_sigma=np.sqrt(estimate.edge_shift_sigma**2 + optics[:, 0, 0]),
-        intrinsics_covariance=estimate.intrinsics_covariance
-        + factor @ optics[:, 1:, 1:] @ factor.mT,
-        breathing_sigma=np.sqrt(estimate.breathing_sigma**2 + variance[u.breathing]),
-        size_sigma=np.sqrt(estimate.size_sigma**2 + variance[u.sizes]),
+        column_covariance=covariance,
     )
 
 

@@ -40,6 +40,7 @@ from pkmcal.identify.score import (
 from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements, Observation
+from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms.closure import scales as scales_of
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
@@ -128,7 +129,10 @@ def model_violations(
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
     tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
-    families.append([one.column for one in tubes])
+    further = {one.code: list[Column]() for one in columns_of_effects(measurements)}
+    for one in columns_of_effects(measurements):
+        further[one.code] += [one] if one.prior is None else []
+    families += [*further.values(), [one.column for one in tubes]]
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
@@ -167,7 +171,7 @@ def model_violations(
     if discrepancy.scales and value:
         tests, value = tested(discrepancy.random)
     before = tool_of(session, estimate)
-    estimate = with_discrepancy(measurements, estimate, ended[1].problem, discrepancy)
+    estimate = with_discrepancy(estimate, ended[1].problem, discrepancy)
     tool = tool_of(session, estimate) if discrepancy.scales else before
     surface = None
     if any(one.code == UNEVEN_BED for one in discrepancy.scales):

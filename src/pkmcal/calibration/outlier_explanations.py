@@ -17,6 +17,7 @@ from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import FALSE_ALARM
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
@@ -115,12 +116,11 @@ def _platforms(
     """
     poses, state = measurements.poses.select(which), estimate.state
     T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]
-    tolerance = np.array([mount.tolerance for mount in measurements.mounts])
-    size = np.zeros(len(tolerance))
-    if len(state.sizes):  # the papers' methods estimate none
-        size[tolerance > 0] = state.sizes
+    size = np.array([mount.tolerance for mount in measurements.mounts])
+    # the papers' methods estimate no size
+    size[size > 0] = state.columns.get(BOARD_SIZE, 0.0)
     T_station_target = poses.T_station_target.copy()
-    T_station_target[:, :3, 3] *= (1 + (tolerance * size)[poses.mount])[:, None]
+    T_station_target[:, :3, 3] *= (1 + size[poses.mount])[:, None]
     T_base_platform = inverse(T_camera_base) @ T_station_target @ inverse(T_mount)
     # a turn and shift of the target, as one of the platform in the base's frame
     turn = T_camera_base[:, :3, :3].mT

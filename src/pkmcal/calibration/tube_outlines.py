@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.identify.assembly import lines
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.line_shading import SHADING_FREEDOM
 from pkmcal.identify.score import FALSE_ALARM, Score
 from pkmcal.measurements import Column, Measurements
+from pkmcal.measurements.effects import EDGE_SHIFT, lines
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.session.load import Session
 
@@ -56,7 +56,7 @@ def outlines(session: Session, measurements: Measurements, estimate: Estimate) -
     grown = estimate.machine.values - table.drawing
     station, leg, tube = keys[:, :3].T
     tubes = np.unique(keys[:, 1:3], axis=0)
-    edge = float(np.max(estimate.edge_shift_sigma, initial=0.0))
+    edge = float(np.max(estimate.column_sigma(EDGE_SHIFT), initial=0.0))
     results: list[tuple[Score, Integers, float, float]] = []
     for j, t in tubes.tolist():
         mine = np.flatnonzero((leg == j) & (tube == t))

@@ -78,7 +78,6 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
         theta=truth.machine.values,
         T_camera_base=truth.T_camera_base,
         T_base_platform=truth.T_base_platform,
-        edge_shift=np.zeros_like(estimate.state.edge_shift),
     )
     drawing = calibration.session.machine
     covariance, table = in_gauge(drawing, true, default_gauge(drawing)), drawing.parameters

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.assembly import SHIFT_SIGMA
+from pkmcal.measurements.effects import SHIFT_SIGMA
 
 SHADING_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is

@@ -50,8 +50,15 @@ from pkmcal.measurements.edges import (
     edge_rows,
     rows_at_blocks,
 )
+from pkmcal.measurements.effects import SHADING
 from pkmcal.measurements.poses import PoseBlocks, PoseData, PoseRows, pose_rows
-from pkmcal.measurements.readings import by_noise, joint_rows, least_joint_noise
+from pkmcal.measurements.readings import (
+    ReadingColumns,
+    by_noise,
+    closures_by_readings,
+    joint_rows,
+    least_joint_noise,
+)
 from pkmcal.measurements.rows import Kinds, RowsOfKind
 from pkmcal.mechanisms.closure import (
     Closure,
@@ -91,7 +98,8 @@ class Problem:
     blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns and prior_target : (c,).
     frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
-    pose_blocks, pose_data : of boards. link_blocks, link_data : of links. slopes : (B, K, E)
+    pose_blocks, pose_data : of boards. link_blocks, link_data : of links. reading_columns : effects
+    on the readings. slopes : (B, K, E)
     closures by their readings, which tell their noise, where they are held; None where they are the
     state's own. structure_cache : the :attr:`structure`, which problems of the same measurements
     share.
@@ -111,6 +119,7 @@ class Problem:
     pose_data: PoseData
     link_blocks: LinkBlocks
     link_data: LinkData
+    reading_columns: ReadingColumns
     slopes: Array | None = None
     structure_cache: Structure | None = None
 
@@ -173,6 +182,7 @@ class Problem:
             pose_data=self.pose_data.among(configurations),
             link_blocks=structure.link_blocks,
             link_data=self.link_data.among(configurations),
+            reading_columns=self.reading_columns.among(configurations),
             slopes=None if self.slopes is None else self.slopes[:, configurations],
         )
 
@@ -213,7 +223,30 @@ class Problem:
 
     def shaded(self, sigma: Array) -> Problem:
         """The same problem with other standard deviations (B, n) px of the lines' shading."""
-        return replace(self, data=replace(self.data, shading=sigma))
+        unit = np.repeat(self.data.unit, max(len(sigma) // len(self.data.unit), 1), axis=0)
+        unit[:, self._lines] = sigma
+        return replace(self, data=replace(self.data, unit=unit))
+
+    @property
+    def shading(self) -> Array:
+        """Standard deviations (B or 1, n) px of the lines' shading."""
+        return self.data.unit[:, self._lines]
+
+    def lines_of(self, state: BatchState) -> Array:
+        """Shifts (B, n) of the lines, in their standard deviations."""
+        return state.columns[:, self._lines]
+
+    @property
+    def _lines(self) -> slice:
+        """The lines among the columns of effects."""
+        lines, first = self.unknowns.of_code(SHADING), self.unknowns.effects.start
+        return slice(lines.start - first, lines.stop - first)
+
+    def with_shading_units(self, state: BatchState, sigma: Array) -> BatchState:
+        """The same state as one of the problem with other deviations of the lines' shading."""
+        columns = state.columns.copy()
+        columns[:, self._lines] *= self.shading / sigma
+        return replace(state, columns=columns)
 
     def opened(self, state: BatchState) -> tuple[Problem, BatchState]:
         """The same problem and state with every parameter of the machine an unknown of its own.
@@ -238,7 +271,8 @@ class Problem:
         """The closure of all runs and configurations, (B, K, E)."""
         theta = self.theta(state)[:, None, :]
         internal = state.internal if self.layout.n_internal else None
-        return closure(self.layout, theta, self.data.joints, state.T_base_platform, internal)
+        joints = self.reading_columns.corrected(self.data.joints, state.columns)
+        return closure(self.layout, theta, joints, state.T_base_platform, internal)
 
     def residuals(self, state: BatchState) -> Values:
         """Residuals; NaN where a leg passes through the camera."""
@@ -256,7 +290,7 @@ class Problem:
     def _evaluated(self, state: BatchState) -> _Evaluated:
         c = self.closure(state)
         edges, poses, links = self._edges(state, c), self._poses(state), self._links(state)
-        of_edges = edges.value(state.optics, state.shading, state.breathing)
+        of_edges = edges.value(state.columns)
         parts = (
             _in_rows(rows_at_blocks(self.blocks, of_edges)[..., None]),
             self._by_noise(c, c.rows.value[..., None]),
@@ -277,6 +311,11 @@ class Problem:
         by_own = np.concatenate([by_pose, by_board, no_own], axis=2)
         by_own = np.where(np.isfinite(by_own.sum(axis=-1, keepdims=True)), by_own, 0.0)
         rest = self._of_rest(by_closures, np.concatenate([by_boards, by_links], axis=2))
+        if len(self.reading_columns.column):
+            by_readings = self.by_readings(evaluated.closure, self.reading_columns.by)
+            columns = self.unknowns.effects.start + self.reading_columns.column
+            equations = np.arange(by_readings.shape[2])[:, None]
+            rest[:, :, equations, columns] += np.nan_to_num(by_readings)
         for k, columns in zip(*self.structure.strips.linked_places, strict=True):
             rest[:, k, :, columns] += np.moveaxis(by_own[:, k], -1, 0)
             by_own[:, k] = 0.0
@@ -295,22 +334,18 @@ class Problem:
         by own unknowns, by the structure's ``strip_parameters``, and the residuals. Zero where they
         are lost.
         """
-        data, u, ends_by = edges.data, self.unknowns, edges.ends_by(self.layout.freedoms)
-        tube, line = self.structure.own_columns
-        breathes = int(u.n_breathing > 0)  # a view's own station alone
-        widths = (ends_by.shape[-1], len(tube), u.n_optics, len(line), breathes, 1)
+        by_columns, ends_by = edges.data.by_columns, edges.ends_by(self.layout.freedoms)
+        tube = self.structure.own_radii
+        widths = (ends_by.shape[-1], len(tube), len(by_columns), 1)
         numbers = np.empty((len(value), sum(widths), *value.shape[1:]))
-        of_ends, of_radius, of_optics, of_line, of_breathing, _ = (
+        of_ends, of_radius, of_columns, _ = (
             numbers[:, stop - width : stop]
             for width, stop in zip(widths, accumulate(widths), strict=True)
         )
         by_ends = edges.by_ends().transpose(1, 2, 0, 3)
         np.matmul(ends_by.mT, by_ends, out=of_ends.swapaxes(1, 2))
         np.multiply(edges.by_radius()[:, None], tube, out=of_radius)
-        of_optics[...] = data.by_optics.swapaxes(0, 1)
-        if u.n_lines:
-            np.multiply(data.by_line[:, None], line, out=of_line)
-        of_breathing[...] = data.by_breathing.swapaxes(0, 1)
+        of_columns[...] = by_columns.swapaxes(0, 1)
         numbers[:, -1] = value
         lost = ~np.isfinite(value)
         if lost.any():
@@ -369,19 +404,16 @@ class Problem:
         if not boards.present.size:
             none = (*poses.value.shape[:2], 0)
             return np.zeros((*none, u.count)), np.zeros((*none, self.layout.own_motion.shape[1]))
+        effects = np.where(boards.column < 0, u.count, u.effects.start + boards.column)
         parts = [
             (numbered_columns(u.stations, boards.station, 6), poses.by_station),
-            (numbered_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
+            (effects, poses.by_columns),
             (numbered_columns(u.mounts, boards.mount, 6), poses.by_mount),
         ]
-        if u.n_breathing:
-            parts.append((numbered_columns(u.breathing, boards.station, 1), poses.by_breathing))
-        if u.n_sizes:  # an exact size's rows are zero, whatever column they are written to
-            number = np.maximum(boards.size[boards.mount], 0)
-            parts.append((numbered_columns(u.sizes, number, 1), poses.by_size))
-        out = np.zeros((*poses.value.shape, u.count))
+        out = np.zeros((*poses.value.shape, u.count + 1))  # the last column is none's
         for columns, values in parts:
             np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
+        out = out[..., :-1]
         own = np.zeros((*poses.value.shape, self.layout.own_motion.shape[1]))
         by_pose = poses.by_platform[..., self.layout.freedoms]
         own[..., : by_pose.shape[-1]] = by_pose
@@ -420,7 +452,7 @@ class Problem:
         n_effective = np.where(self.blocks.n_effective > 0, self.blocks.n_effective, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(n_effective)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
-        rows = edges.value(state.optics, state.shading, state.breathing)
+        rows = edges.value(state.columns)
         rows = rows_at_blocks(self.blocks, rows)
         links = plain._links(state).value[..., None]  # noqa: SLF001
         return Kinds(rows, plain._poses(state).value, links)  # noqa: SLF001
@@ -434,10 +466,7 @@ class Problem:
         u = self.unknowns
         x = np.zeros((len(state.z), u.count))
         x[:, u.machine] = state.z
-        x[:, u.optics] = state.optics.reshape(len(x), -1)
-        x[:, u.shading] = state.shading
-        x[:, u.breathing] = state.breathing
-        x[:, u.sizes] = state.sizes
+        x[:, u.effects] = state.columns
         mounts = x[:, u.mounts].reshape(len(x), -1, 6)  # of which only places are known
         mounts[..., 3:] = state.T_mount[..., :3, 3]
         # of stations only that they are level: where the base's z axis points, that turns them
@@ -450,7 +479,7 @@ class Problem:
 
     @cached_property
     def _view_data(self) -> ViewData:
-        return ViewData.of(self.blocks, self.data, breathe=self.unknowns.n_breathing > 0)
+        return ViewData.of(self.blocks, self.data)
 
     def _poses(self, state: BatchState) -> PoseRows:
         return pose_rows(
@@ -459,15 +488,19 @@ class Problem:
             state.T_camera_base,
             state.T_base_platform,
             state.T_mount,
-            state.optics,
-            state.breathing,
-            state.sizes,
+            state.columns,
         )
 
     def joint_noise_times(self, factor: Array, state: BatchState) -> Array:
         """The readings' noise (B,) times a factor, but not less than their closures can tell."""
         least = least_joint_noise(self.layout, self.closure(state).by_reading)
         return np.maximum(factor * self.joint_noise, np.minimum(least, self.joint_noise))
+
+    def by_readings(self, c: Closure, by: Array) -> Array:
+        """Rows (B, K, E, k) of the closures, in standard deviations, where the readings change by
+        ``by`` (K, m, k).
+        """
+        return self._by_noise(c, closures_by_readings(self.layout, c.by_reading, by))
 
     def _by_noise(self, c: Closure, rows: Array) -> Array:
         """Rows (B, K, E, n) of the closure in standard deviations."""
@@ -522,12 +555,9 @@ class Problem:
             state.z + z - by_moves[..., 0] @ self.structure.to_free.T,
             poses[:, :first_pose],
             poses[:, first_pose:first_mount],
-            state.optics + shared[:, u.optics].reshape(state.optics.shape),
+            state.columns + shared[:, u.effects],
             poses[:, first_mount:-2],
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
-            state.shading + shared[:, u.shading],
-            state.breathing + shared[:, u.breathing],
-            state.sizes + shared[:, u.sizes],
         )
         inner = self._in_frames(inner, poses[:, -2:], slides)
         return self._closed(state, inner, shared, own)

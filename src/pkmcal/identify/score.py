@@ -41,7 +41,6 @@ from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Column
-from pkmcal.measurements.readings import by_noise
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
 
@@ -513,13 +512,9 @@ def columns_of(
 
     def columns(cut: slice, linear: Linear) -> Array:
         part = problem.among(cut)
-        c, layout = part.closure(part.state_among(state, cut)), part.layout
+        c = part.closure(part.state_among(state, cut))
         out = np.zeros((len(part.blocks.present), part.n_rows, readings.shape[-1]))
-        row = np.where(layout.row_motor >= 0, layout.row_motor, 0)
-        by = np.where(layout.row_motor >= 0, c.by_reading[0], 0.0)[..., None]
-        by = by * readings[cut][:, row]
-        noise = part.joint_noise[:1, None, None]
-        out[:, part.closure_rows] = by_noise(layout, noise, c.by_reading, by[None])[0]
+        out[:, part.closure_rows] = part.by_readings(c, readings[cut])[0]
         of_edges = part.data.weighed[0]
         of_poses = (np.sqrt(part.pose_data.weight)[..., None, None] * part.pose_data.whiten)[0]
         before, after = (out[:, kind.rows] for kind in part.kinds[:2])

@@ -31,7 +31,6 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
         machine.values,
         stations,
         poses,
-        np.zeros(measurements.n_cameras),
         T_mount=start_mounts(measurements, stations, poses),
         on_platform=measurements.on_platform,
         internal=fk.internal,

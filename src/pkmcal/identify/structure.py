@@ -150,48 +150,27 @@ class Structure:
     @cached_property
     def strip_parameters(self) -> Integers:
         """Of each group of views the columns (groups, w) that its edges' derivatives are by: the
-        parameters of both ends, the station, the radii, its camera's, its lines' and its breathing.
+        parameters of both ends, the station, the radii, the effects.
         """
         u, layout, views = self.unknowns, self.layout, self.blocks.views
         first = np.array([cut.start for cut in views.groups], dtype=int)
-        leg, station, camera = views.leg[first], views.station[first], views.camera[first]
-        none = self.width - 1
-        radii = np.full((len(first), len(self.own_columns[0])), none)
+        leg, none = views.leg[first], self.width - 1
+        radii = np.full((len(first), len(self.own_radii)), none)
         for k, one in enumerate(leg):
             radii[k, : len(layout.radius[one])] = self.column[layout.radius[one]]
-        lines = np.full((len(first), len(self.own_columns[1])), none)
-        for own, item in zip(lines, self._lines, strict=True):
-            own[: len(item)] = u.shading.start + item
+        effects = self.blocks.view_columns.of_groups
         parts = [self.column[layout.b_index[leg]], self.column[layout.a_index[leg]]]
-        parts += [numbered_columns(u.stations, station, 6), radii]
-        parts += [numbered_columns(u.optics, camera, u.n_optics), lines]
-        if u.n_breathing:
-            parts.append(numbered_columns(u.breathing, station, 1))
+        parts += [numbered_columns(u.stations, views.station[first], 6), radii]
+        parts += [np.where(effects < 0, none, u.effects.start + effects)]
         return np.concatenate(parts, axis=1)
 
     @cached_property
-    def _lines(self) -> list[Integers]:
-        """The lines that each group of views sees."""
-        views = self.blocks.views
-        if not self.unknowns.n_lines:
-            return [np.zeros(0, dtype=int) for _ in views.groups]
-        line = np.where(views.present, views.taken(self.blocks.line), -1)
-        return [np.unique(line[cut][line[cut] >= 0]) for cut in views.groups]
-
-    @cached_property
-    def own_columns(self) -> tuple[Array, Array]:
-        """Which of its leg's radii and of its group's lines each row depends on: ones in
-        (radii, N, n) and (lines, N, n).
-        """
-        blocks, views, n_rows = self.blocks, self.blocks.views, 2 * self.blocks.side.shape[-1]
+    def own_radii(self) -> Array:
+        """Which of its leg's radii each row depends on: ones in (radii, N, n)."""
+        views, n_rows = self.blocks.views, 2 * self.blocks.side.shape[-1]
         radii = max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
-        used = views.taken(blocks.tube) == np.arange(radii)[:, None, None]
-        number = np.zeros((max((len(own) for own in self._lines), default=0), *views.place.shape))
-        for cut, own in zip(views.groups, self._lines, strict=True):
-            if own.size:
-                line = views.taken(blocks.line)[cut]
-                number[: len(own), cut] = line == own[:, None, None]
-        return np.repeat(used.astype(float), n_rows, -1), np.repeat(number, n_rows, -1)
+        used = views.taken(self.blocks.tube) == np.arange(radii)[:, None, None]
+        return np.repeat(used.astype(float), n_rows, -1)
 
     @cached_property
     def turn(self) -> _Turn | None:

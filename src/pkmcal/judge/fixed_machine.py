@@ -28,8 +28,9 @@ from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.unknowns import BatchState, Name
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.effects import INTRINSICS
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import RANK_TOLERANCE, column_space
@@ -107,7 +108,7 @@ class Held:
     observed: Booleans
     problem: Problem
     state: BatchState
-    unknowns: tuple[Name, ...]
+    unknowns: tuple[str, ...]
 
     def residuals(self) -> Array:
         """Root mean squares of each configuration's residuals in standard deviations, (K,).
@@ -184,8 +185,12 @@ def hold(
         return Held(still, assembled.observed, problem, state, ("machine",))
     opened = assemble(still, magnified, default_gauge(still), shading=irls_weight.shading)
     problem = opened.trusting(irls_weight.weights)
-    state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
-    return Held(still, assembled.observed, problem, state, ("machine", "intrinsics"))
+    u = problem.unknowns
+    new = u.columns(INTRINSICS)
+    columns = np.zeros((len(state.columns), u.effects.stop - u.effects.start))
+    columns[:, np.delete(np.arange(columns.shape[1]), new - u.effects.start)] = state.columns
+    state = replace(state, columns=columns)
+    return Held(still, assembled.observed, problem, state, ("machine", INTRINSICS))
 
 
 def _is_enough(problem: Problem, state: BatchState) -> bool:

@@ -6,7 +6,6 @@ from pkmcal.measurements.line_cells import SHADING_CORRELATION_ANGLE, TUBE_CORRE
 from pkmcal.measurements.links import LinkRows, LinkSet
 from pkmcal.measurements.poses import PoseSet
 from pkmcal.measurements.sets import (
-    BREATHING_SIGMA,
     Measurements,
     Mount,
     Observation,
@@ -16,7 +15,6 @@ from pkmcal.measurements.sets import (
 )
 
 __all__ = [
-    "BREATHING_SIGMA",
     "OWN_SHADING",
     "SHADING_CORRELATION_ANGLE",
     "SHADING_SIGMA",

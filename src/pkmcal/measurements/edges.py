@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import ClassVar, TypeVar, final
+from typing import ClassVar, NamedTuple, TypeVar, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,25 +166,26 @@ class EdgeBlocks:
     fitted in photographs, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
     of one tube at one station, with one 2g x 2g whitening matrix and one robust weight.
 
-    leg : (1, G). station, camera, radius : (K, G) station, camera, position of the tube's radius.
-    side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
-    its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
-    empty where nothing is shaded. tube : (K, G) number of the tube on its leg. n_effective : (K, G)
-    how many of its line share an edge's own shading, see :mod:`~pkmcal.measurements.line_cells`,
-    zero where nothing is shaded. cell : (K, G) which of the ``cells`` each is in, -1 for none.
+    leg : (1, G). station, radius : (K, G) station, position of the tube's radius. side : (K, G, g).
+    present : (K, G) False for padding. column : (K, G, w) which of the estimate's columns move each
+    edge, -1 for none. alone : (K, G) px, standard deviation of the shading of edges that are a line
+    of their own, zero for all others. tube : (K, G) number of the tube on its leg. n_effective :
+    (K, G) how many of its line share an edge's own shading, see
+    :mod:`~pkmcal.measurements.line_cells`, zero where nothing is shaded. cell : (K, G) which of the
+    ``cells`` each is in, -1 for none.
     """
 
     leg: Integers
     station: Integers
-    camera: Integers
     radius: Integers
     side: Integers
     present: Booleans
+    column: Integers
+    alone: Array
     tube: Integers
     n_effective: Array
     cell: Integers
     cells: LineCells
-    line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
 
     def among(self, configurations: slice) -> EdgeBlocks:
         """Those of some configurations."""
@@ -207,8 +208,23 @@ class EdgeBlocks:
         place[view, slot] = (keys[2] * self.present.shape[1]) + number[order]
         present = np.zeros(place.shape, dtype=bool)
         present[view, slot] = True
-        camera = self.camera.ravel()[place[:, 0]] if place.size else station
-        return EdgeViews(configuration, leg, station, camera, place, present)
+        return EdgeViews(configuration, leg, station, place, present)
+
+    @cached_property
+    def view_columns(self) -> ViewColumns:
+        """The columns that move the edges of each view."""
+        views = self.views
+        group = np.repeat(np.arange(len(views.groups)), [c.stop - c.start for c in views.groups])
+        column = views.taken(self.column)
+        used, base = column >= 0, int(self.column.max(initial=0)) + 1
+        keys, inverse = np.unique((group[:, None, None] * base + column)[used], return_inverse=True)
+        of_group, number = np.divmod(keys, base)
+        slot = np.arange(len(keys)) - np.searchsorted(of_group, of_group)
+        of_groups = np.full((len(views.groups), int(slot.max(initial=-1)) + 1), -1)
+        of_groups[of_group, slot] = number
+        slots = np.full(column.shape, -1)
+        slots[used] = slot[inverse.reshape(-1)]
+        return ViewColumns(of_groups, of_groups[group], slots)
 
     @cached_property
     def number(self) -> Integers:
@@ -218,19 +234,29 @@ class EdgeBlocks:
         return out.reshape(self.present.shape)
 
 
+class ViewColumns(NamedTuple):
+    """Columns that move the edges of views: of_groups (groups, W) of each group, in increasing
+    order, -1 where there are fewer; of_views (N, W) the same by view; slots (N, m, w) which of
+    these each block's own columns are, -1 for none.
+    """
+
+    of_groups: Integers
+    of_views: Integers
+    slots: Integers
+
+
 @dataclass(frozen=True)
 class EdgeViews:
     """What is seen of one leg in one photograph, N times: up to m blocks, whose edges are those of
     one line. Views of one leg from one station stand side by side.
 
-    configuration, leg, station, camera : (N,). place : (N, m) where each block is among those of
+    configuration, leg, station : (N,). place : (N, m) where each block is among those of
     all configurations, (K G). present : (N, m) False for padding, which has another block's place.
     """
 
     configuration: Integers
     leg: Integers
     station: Integers
-    camera: Integers
     place: Integers
     present: Booleans
 
@@ -257,35 +283,33 @@ class EdgeData:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
 
     basis : (B, K, G, g, 3, 2). white : (B, K, G, 2g, 2g) whitening of each block's noise as it was
-    stated, shading left out. optics : (B, K, G, 2g, w) change of
-    the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
-    shift (px), then its intrinsics where they are refined (in units of their prior).
-    joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
-    shading : (B, n) px by which one unit of each line's shading moves its edges, its standard
-    deviation; n = 1 where all have the same. breathing : (B, K, G, 2g, 1) the same change as optics
-    by a unit of their station's focal breathing; zero numbers where nothing breathes. scale :
-    (B, K, G) factor on the stated noise. own : (B, K, G) px, standard deviation of the shading of
-    each edge beside its line's, that of all who share it counted.
+    stated, shading left out. shift : (B, K, G, 2g) change of the measured normals by a pixel
+    outward. joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale
+    squared. columns : (B, K, G, 2g, w) derivatives of the rows, before they are whitened, by the
+    blocks' ``column``. unit : (B or 1, n) by what the n columns of the estimate are multiplied:
+    standard deviations, px, of the lines' shading, one of all others. scale : (B, K, G) factor on
+    the stated noise. own : (B, K, G) px, standard deviation of the shading of each edge beside its
+    line's, that of all who share it counted.
     """
 
     basis: Array
     white: Array
-    optics: Array
+    shift: Array
     joints: Array
     weight: Array
-    shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
-    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
+    columns: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 0)))
+    unit: Array = field(default_factory=lambda: np.ones((1, 0)))
     scale: Array = field(default_factory=lambda: np.ones((1, 1, 1)))
     own: Array = field(default_factory=lambda: np.zeros((1, 1, 1)))
 
     def among(self, configurations: slice) -> EdgeData:
         """Those of some configurations."""
-        return replace(among(self, configurations, 1), shading=self.shading)
+        return replace(among(self, configurations, 1), unit=self.unit)
 
     @cached_property
     def by_shift(self) -> Array:
         """Rows by a pixel of shift, in the noise as it was stated, (B or 1, K, G, 2g)."""
-        return (self.white @ self.optics[..., :1])[..., 0]
+        return (self.white @ self.shift[..., None])[..., 0]
 
     @cached_property
     def whiten(self) -> Array:
@@ -313,24 +337,19 @@ class ViewData:
     are 2g of each of its m blocks. With the rows last NumPy runs along those of all views, and a
     number costs a nanosecond an operation.
 
-    of_normals : (g, ..., 3, n) rows by changes of the normals, camera frame. by_optics : (w, ...,
-    n) by the unknowns of their camera. by_breathing : (1, ..., n) by their station's focal
-    breathing, none where nothing breathes. by_line : (..., n) by their line's shading, which moves
-    them as the camera's shift moves all; edges that are their station's only one of a line have
-    theirs among their noise. counts : (..., n) whether the block is there and has a weight. sign :
-    (g, N, n) of the edges' sides.
+    of_normals : (g, ..., 3, n) rows by changes of the normals, camera frame. by_columns : (W, ...,
+    n) by the columns of their group (:class:`ViewColumns`). counts : (..., n) whether the
+    block is there and has a weight. sign : (g, N, n) of the edges' sides.
     """
 
     of_normals: Array
-    by_optics: Array
-    by_breathing: Array
-    by_line: Array
+    by_columns: Array
     counts: Booleans
     sign: Array
 
     @classmethod
-    def of(cls, blocks: EdgeBlocks, data: EdgeData, *, breathe: bool) -> ViewData:
-        """The numbers of all edges that are there; breathe : whether focal lengths do."""
+    def of(cls, blocks: EdgeBlocks, data: EdgeData) -> ViewData:
+        """The numbers of all edges that are there."""
         views = blocks.views
         counts = (views.taken(data.weight, 1) > 0) & views.present
         white = np.where(counts[..., None, None], views.taken(data.weighed, 1), 0.0)
@@ -341,24 +360,22 @@ class ViewData:
             """Numbers (..., m, 2g) of blocks."""
             return numbers.reshape(*numbers.shape[:-2], numbers.shape[-2] * each)
 
-        def rows(by_unknowns: Array) -> Array:
-            return by_row(np.einsum("...krq,...kqw->w...kr", white, by_unknowns, order="C"))
-
-        by_optics = rows(views.taken(data.optics, 1))
-        by_line, by_breathing = by_optics[0], by_optics[:0]
-        if blocks.line.size:
-            line, sigma = views.taken(blocks.line), data.shading
-            own = sigma[:, line] if sigma.shape[1] > 1 else sigma[..., None]
-            by_line = by_line * np.repeat(np.where(line < 0, 0.0, own), each, axis=-1)
-        if breathe:
-            by_breathing = rows(views.taken(data.breathing, 1))
+        by_column = np.einsum(
+            "...krq,...kqw->w...kr", white, views.taken(data.columns, 1), order="C"
+        )
+        if np.any(data.unit != 1):
+            unit = data.unit[:, views.taken(blocks.column)]
+            by_column = by_column * np.moveaxis(unit, -1, 0)[..., None]
+        to = blocks.view_columns
+        by_columns = np.zeros((to.of_groups.shape[1], *by_row(by_column).shape[1:]))
+        for by, slot in zip(by_row(by_column), np.moveaxis(to.slots, -1, 0), strict=True):
+            for k in np.unique(slot[slot >= 0]).tolist():
+                by_columns[k] += np.where(np.repeat(slot == k, each, axis=-1), by, 0.0)
         of_normals = split.swapaxes(-3, -2) @ views.taken(data.basis, 1).mT  # (..., m, g, 2g, 3)
         side = np.moveaxis(views.taken(blocks.side), -1, 0)
         return cls(
             by_row(np.moveaxis(of_normals, (-3, -1), (0, -3))),
-            by_optics,
-            by_breathing,
-            by_line,
+            by_columns,
             np.repeat(counts, each, axis=-1),
             np.repeat(SIDE_SIGNS[side], each, axis=-1),
         )
@@ -385,27 +402,17 @@ class EdgeRows:
     cosine: Array
     by_frame: Array
 
-    def value(self, optics: Array, shading: Array, breathing: Array) -> Array:
-        """Rows (B, N, n), zero where they do not count, with the cameras' unknowns (B, C, w), the
-        lines' shading (B, n) and the stations' focal breathing (B, S), none where there is none.
-        """
-        data, views = self.data, self.blocks.views
+    def value(self, columns: Array) -> Array:
+        """Rows (B, N, n), zero where they do not count, at numbers (B, n) of the columns."""
+        data, (_, of_views, _) = self.data, self.blocks.view_columns
         (_, along_m, along_w), *others = self.by_frame
         rows = self.cosine[0] * along_m - self.sine * along_w
         for cosine, (_, along_m, along_w) in zip(self.cosine[1:], others, strict=True):
             rows += cosine * along_m - self.sine * along_w
-        for by_unknown, unknown in zip(data.by_optics, optics.transpose(2, 0, 1), strict=True):
-            rows += by_unknown * unknown[:, views.camera, None]
-        if shading.shape[-1]:
-            shift = shading[:, views.taken(self.blocks.line)]
-            rows += data.by_line * self._of_blocks(shift)
-        if breathing.shape[-1]:
-            rows += data.by_breathing[0] * breathing[:, views.station, None]
+        numbers = np.pad(columns, ((0, 0), (0, 1)))  # the last is none's
+        for by, column in zip(data.by_columns, of_views.T, strict=True):
+            rows += by * numbers[:, column, None]
         return np.where(data.counts, rows, 0.0)
-
-    def _of_blocks(self, numbers: Array) -> Array:
-        """Numbers of blocks (..., m) for each of their rows, (..., n)."""
-        return np.repeat(numbers, 2 * len(self.cosine), axis=-1)
 
     def _of_views(self, numbers: Array) -> Array:
         """Numbers of views (...) for each of their rows, (..., n)."""

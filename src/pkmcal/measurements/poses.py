@@ -83,44 +83,33 @@ class PoseSet:
 class PoseBlocks:
     """Where the poses are: K configurations of G poses, padded; the same for all runs.
 
-    station, mount, camera : (K, G). present : (K, G) False for padding. on_platform : (M,) of the
-    mounts. tolerance : (M,) of the sizes of boards, relative; those that have one are unknowns, in
-    their order.
+    station, mount : (K, G). present : (K, G) False for padding. on_platform : (M,) of the mounts.
+    column : (K, G, w) which of the estimate's columns move each pose, -1 for none.
     """
 
     station: Integers
     mount: Integers
     present: Booleans
     on_platform: Booleans
-    camera: Integers
-    tolerance: Array
-
-    @property
-    def size(self) -> Integers:
-        """(M,) number of each mount's size among those that are unknown; -1 for an exact one."""
-        unsure = self.tolerance > 0
-        return np.where(unsure, np.cumsum(unsure) - 1, -1)
+    column: Integers
 
     def among(self, configurations: slice) -> PoseBlocks:
         """Those of some configurations."""
-        whole = among(self, configurations, 0)
-        return replace(whole, on_platform=self.on_platform, tolerance=self.tolerance)
+        return replace(among(self, configurations, 0), on_platform=self.on_platform)
 
 
 @dataclass(frozen=True)
 class PoseData:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
 
-    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
-    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
-    breathing : (B, K, G, 6, 1) by their station's focal breathing.
+    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). columns :
+    (B, K, G, 6, w) derivatives of the error, before it is whitened, by the poses' ``column``.
     """
 
     T_station_target: Array
     whiten: Array
     weight: Array
-    optics: Array
-    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 6, 0)))
+    columns: Array
 
     def among(self, configurations: slice) -> PoseData:
         """Those of some configurations."""
@@ -129,17 +118,14 @@ class PoseData:
 
 class PoseRows(NamedTuple):
     """Rows (B, K, G, 6) and their derivatives, (B, K, G, 6, 6) each: by their station, by the
-    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w), by their
-    station's focal breathing and by their board's size (B, K, G, 6, 1).
+    platform's pose and by their mount; by their columns (B, K, G, 6, w).
     """
 
     value: Array
     by_station: Array
     by_platform: Array
     by_mount: Array
-    by_optics: Array
-    by_breathing: Array
-    by_size: Array
+    by_columns: Array
 
 
 def pose_rows(
@@ -148,20 +134,16 @@ def pose_rows(
     T_camera_base: Array,
     poses: Array,
     T_mount: Array,
-    optics: Array,
-    breathing: Array,
-    sizes: Array,
+    columns: Array,
 ) -> PoseRows:
     """Whitened errors of the predicted poses.
 
-    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
-    (B, C, w), breathing (B, S) or (B, 0), sizes (B, n). A board that is larger by a share s stands
-    farther from the camera by the same share.
+    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), columns
+    (B, n).
     """
     if not blocks.present.size:
         none = np.zeros((*poses.shape[:2], 0, 6, 6))
-        optics = np.zeros((*none.shape[:-1], optics.shape[-1]))
-        return PoseRows(none[..., 0], none, none, none, optics, none[..., :1], none[..., :1])
+        return PoseRows(none[..., 0], none, none, none, none[..., :0])
     moving = blocks.on_platform[blocks.mount][..., None, None]
     camera = T_camera_base[:, blocks.station]
     body = np.where(moving, poses[:, :, None], np.eye(4))
@@ -181,22 +163,15 @@ def pose_rows(
         out[..., 3:, 3:] = by_shift
         return weigh @ out
 
-    eye, by_optics, by_breathing = np.eye(3), weigh @ data.optics, weigh @ data.breathing
-    value = (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0]
-    if breathing.shape[-1]:
-        value = value + by_breathing[..., 0] * breathing[:, blocks.station, None]
-    away = -blocks.tolerance[blocks.mount][..., None] * data.T_station_target[..., :3, 3]
-    by_size = weigh @ np.concatenate([np.zeros_like(away), away], axis=-1)[..., None]
-    if sizes.shape[-1]:
-        value = value + by_size[..., 0] * sizes[:, blocks.size[blocks.mount], None]
+    eye, by_columns = np.eye(3), weigh @ data.columns
+    numbers = np.pad(columns, ((0, 0), (0, 1)))[:, blocks.column]  # the last is none's
+    value = (weigh @ error[..., None] + by_columns @ numbers[..., None])[..., 0]
     return PoseRows(
         value,
         rows(eye, -skew(place[..., 0]), eye),
         np.where(moving, rows(rot_c, -rot_c @ skew(arm[..., 0]), rot_c), 0.0),
         rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
-        by_optics,
-        by_breathing,
-        by_size,
+        by_columns,
     )
 
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal, TypeVar
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.measurements.columns import Column
 from pkmcal.measurements.edges import EdgeSet, Rejection
 from pkmcal.measurements.links import LinkSet
 from pkmcal.measurements.poses import PoseSet
-
-BREATHING_SIGMA = 1.5e-3
-"""Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
-focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
-mm) changes by 0.3 % from 3 m to 1 m, as one walks about a machine, so half of that to each side."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +46,8 @@ class Observation:
 
 
 Set = TypeVar("Set", PoseSet, EdgeSet)
+Effect = Callable[["Measurements"], Iterable[Column]]
+"""An effect on measurements: its columns."""
 
 
 def concatenate(sets: Sequence[Set]) -> Set:
@@ -97,8 +95,9 @@ class Measurements:
     refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
     those units from the calibration's values. poses : of boards or targets, each on one of the
     ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
-    gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
-    they were measured, in BREATHING_SIGMA; empty where none breathes. links : measurements that
+    gives edges in photographs. focal_at : (S,) relative excess of the stations' focal lengths at
+    which they were measured; empty where none is held by hand. effects : further effects beside
+    those that every estimate counts (:mod:`pkmcal.measurements.effects`). links : measurements that
     link two configurations, one set for each kind. level : (S,) stations whose z
     axis is the base's, exactly; empty where there is none. imputation_covariance : by what part of
     its variance by noise a result varies besides, with where its edges were looked for.
@@ -114,10 +113,11 @@ class Measurements:
     poses: PoseSet = field(default_factory=PoseSet.empty)
     mounts: tuple[Mount, ...] = ()
     shaded: bool = False
-    breathing_at: Array = field(default_factory=lambda: np.zeros(0))
+    focal_at: Array = field(default_factory=lambda: np.zeros(0))
     level: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
     imputation_covariance: float = 0.0
     links: tuple[LinkSet, ...] = ()
+    effects: tuple[Effect, ...] = ()
 
     __repr__ = short_repr
 

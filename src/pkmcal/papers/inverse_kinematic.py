@@ -26,7 +26,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
-from pkmcal.identify.unknowns import Name, Unknowns
+from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine, kinematics
@@ -112,7 +112,7 @@ class ImplicitProblem:
     def unknowns(self) -> Unknowns:
         """Which unknown stands in which column, na in all."""
         n_free = self.free.shape[1]
-        return Unknowns(n_free, self.n_stations, n_cameras=0, n_mounts=self.n_mounts)
+        return Unknowns(n_free, self.n_stations, n_mounts=self.n_mounts)
 
     def theta(self, state: ImplicitState) -> Array:
         """Machine parameters (B, P)."""
@@ -434,7 +434,7 @@ def _tilts(problem: ImplicitProblem) -> Integers:
     """Columns of what the axis found beforehand tells: the mounts' turns that the machine itself
     cannot make and, where there is one axis and one camera, the camera's.
     """
-    names: tuple[Name, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
+    names: tuple[str, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
     bodies = problem.unknowns.columns(*names).reshape(-1, 6)
     return bodies[:, :3][:, ~problem.layout.motion[:3].any(axis=1)].ravel()
 
