@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import groupby, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -129,10 +129,9 @@ def model_violations(
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
     tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
-    further = {one.code: list[Column]() for one in columns_of_effects(measurements)}
-    for one in columns_of_effects(measurements):
-        further[one.code] += [one] if one.prior is None else []
-    families += [*further.values(), [one.column for one in tubes]]
+    further = [one for one in columns_of_effects(measurements) if one.prior is None]
+    families += [list(group) for _, group in groupby(further, key=lambda one: one.code)]
+    families.append([one.column for one in tubes])
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])

@@ -68,7 +68,7 @@ def assemble(
     """
     _check(machine, measurements)
     observed = observed_configurations(measurements)
-    columns = [one for one in columns_of_effects(measurements) if one.prior is not None]
+    columns = _unknown_columns(measurements)
     edges = _places(measurements.edges.configuration, observed, measurements.edges.leg)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     one = np.zeros(len(measurements.poses), dtype=int)
@@ -174,6 +174,19 @@ def _places(configuration: Integers, visible: Booleans, kind: Integers) -> Place
     place[order] = np.arange(len(row)) - first
     each = int(place.max(initial=-1)) + 1
     return Places(row, each * number + place, (int(visible.sum()), each * len(kinds)))
+
+
+def _unknown_columns(measurements: Measurements) -> list[Column]:
+    """The columns that have a prior."""
+    columns = [one for one in columns_of_effects(measurements) if one.prior is not None]
+    for one in columns:
+        if one.motion is not None or one.station is not None:
+            raise InputError(
+                what=f"the effect {one.code} cannot have a prior: motions of stations are linear"
+                " about a solution only",
+                next_step="state what it does to edges, poses or readings, or leave its prior out",
+            )
+    return columns
 
 
 def _codes(columns: Sequence[Column]) -> tuple[tuple[str, int], ...]:
