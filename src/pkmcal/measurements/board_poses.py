@@ -1,4 +1,4 @@
-"""Poses of a board, or of what is fixed like one, in images.
+"""Poses of a calibration board in images.
 
 Rows: :func:`pkmcal.measurements.poses.pose_rows`, all six numbers. The corners of one image enter
 as the pose that they determine, with its covariance.
@@ -13,7 +13,7 @@ from pkmcal.measurements.contract import ImageKind
 
 @final
 class BoardPoses(ImageKind):
-    """Place and turn of a board."""
+    """Position and orientation of a board."""
 
     code: ClassVar = "boards"
     one: ClassVar = "board"

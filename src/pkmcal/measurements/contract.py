@@ -1,13 +1,13 @@
-"""What a kind of measurement has to say of itself: one file a kind, found by enumeration.
+"""The contract of a kind of measurement: one file a kind, found by enumeration.
 
 A kind is a final subclass of one of four:
 
 - :class:`ImageKind`: measured in images, where a station observes it;
-- :class:`TargetKind`: a table of what a tracker, a measuring machine or a probe measured of a
-  target on the platform;
+- :class:`TargetKind`: a table of measurements of a target on the platform by a tracker, a measuring
+  machine or a probe;
 - :class:`LinkKind`: a table of numbers that link two configurations each, under a key of its own in
   session.yaml;
-- :class:`MotorKind`: what the motors read.
+- :class:`MotorKind`: joint readings of the motors.
 
 Rows, Jacobian and noise stand beside the kind, in standard deviations: edges in
 :mod:`~pkmcal.measurements.edges`, targets of boards and trackers alike in
@@ -43,15 +43,16 @@ DISPLAY_UNITS = {"m": ("mm", 1e3), "px": ("px", 1.0)}
 """Unit in reports and the factor to it, by a kind's own unit."""
 LEAST_NOISE = 1e-12
 NOISE_FIELD_RANGE = Field(ge=LEAST_NOISE, lt=10)
-"""m or rad; nothing measures better, nor is of any use that measures worse."""
+"""Range of a stated standard deviation, m or rad: no instrument is better, none that is worse is of
+use."""
 
 
 class MeasurementKind(ABC):
     """A kind of measurement.
 
-    code : for programs. one : what one of them is called, label : its plural, in reports and
-    messages. unit : of its numbers. numbers
-    : how many each measurement has at most. joins : configurations that each depends on.
+    code : for programs. one, label : name of a measurement and its plural, in reports and messages.
+    unit : of its numbers. numbers : most numbers of a measurement. joins : configurations that each
+    measurement depends on.
     """
 
     code: ClassVar[str]
@@ -63,24 +64,24 @@ class MeasurementKind(ABC):
 
 
 class ImageKind(MeasurementKind):
-    """Measured in images. observe : the word under ``stations.*.observe``."""
+    """A kind that is measured in images. observe : its word under ``stations.*.observe``."""
 
     observe: ClassVar[str]
 
 
 class MotorKind(MeasurementKind):
-    """What the motors read. key : in session.yaml."""
+    """Joint readings. key : of session.yaml."""
 
     key: ClassVar[str]
 
 
 class TargetKind(MeasurementKind, ABC):
-    """A tracker's table, under ``stations.*.tracker``.
+    """A kind that is the table of a tracker, under ``stations.*.tracker``.
 
     headers : columns beside the configuration's, in any order, of each form of the table. known :
-    which of (omega, tau) of T_tracker_target are measured. fewest_rows : that fix the tracker's
-    place and leave something that is known. levels : whether the tracker's z axis may be stated to
-    be the base's.
+    which of (omega, tau) of T_tracker_target are measured. fewest_rows : least number of rows that
+    determine the tracker's pose and leave information about the machine. levels : whether the z
+    axis of the tracker may be stated to be that of the base.
     """
 
     headers: ClassVar[tuple[tuple[str, ...], ...]]
@@ -90,13 +91,13 @@ class TargetKind(MeasurementKind, ABC):
 
     @classmethod
     def turns(cls) -> bool:
-        """Whether turns are measured, which need a stated noise."""
+        """Whether rotations are measured, which need a stated noise."""
         return any(k < 3 for k in cls.known)
 
     @classmethod
     def whiten(cls, position: float, rotation: float | None) -> Array:
-        """Whitening (6, 6) of one measurement, by standard deviations in m and rad; rows of zeros
-        for what is not measured.
+        """Whitening matrix (6, 6) of a measurement, from standard deviations in m and rad; zero
+        rows for numbers that are not measured.
         """
         sigma = np.repeat([rotation or 1.0, position], 3)
         return np.diag(np.where(np.isin(np.arange(6), cls.known), 1 / sigma, 0.0))
@@ -104,22 +105,22 @@ class TargetKind(MeasurementKind, ABC):
     @classmethod
     @abstractmethod
     def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
-        """A first T_tracker_base (4, 4) from measurements (N, 4, 4) and the platform's places
-        (N, 3) by the nominal model; None where whole poses tell it themselves.
+        """Initial T_tracker_base (4, 4) from measurements (N, 4, 4) and the platform's positions
+        (N, 3) by the nominal model; None where whole poses determine it.
         """
 
     @classmethod
     def lengths(cls, T_tracker_target: Array) -> Array:
-        """The measured lengths (N, n), m."""
+        """Measured lengths (N, n), m."""
         return T_tracker_target[:, [k - 3 for k in cls.known if k >= 3], 3]
 
 
 class LinkKind(MeasurementKind, ABC):
-    """Numbers that link two configurations, under a key of their own in session.yaml.
+    """A kind whose numbers link two configurations each, under a key of its own in session.yaml.
 
-    key, schema : of session.yaml. Each measurement is one number with a standard deviation of its
-    own, and hangs on a point of the platform that is estimated with the machine. Where residuals
-    ask for larger deviations, all kinds of links share one factor.
+    key, schema : of session.yaml. Each measurement is one number with its own standard deviation
+    and refers to a point of the platform that is estimated with the machine. Where residuals
+    require larger standard deviations, all kinds of links share one factor.
     """
 
     key: ClassVar[str]
@@ -130,25 +131,25 @@ class LinkKind(MeasurementKind, ABC):
     @classmethod
     @abstractmethod
     def table(cls, node: Any) -> str:
-        """The table's file as session.yaml names it. node : of the schema."""
+        """File of the table as session.yaml names it. node : of the schema."""
 
     @classmethod
     @abstractmethod
     def noise(cls, node: Any) -> float | None:
-        """The standard deviation of a measurement as session.yaml states it."""
+        """Standard deviation of a measurement as session.yaml states it."""
 
     @classmethod
     @abstractmethod
     def read(cls, node: Any, path: Path, names: tuple[str, ...], machine: Machine) -> LinkSet:
-        """Read the table; every fault is an InputError with line and column.
+        """Read the table. Raises `InputError` with line and column for every fault.
 
-        node : of the schema. path : of the file. names : the session's configurations.
+        node : of the schema. path : of the file. names : configurations of the session.
         """
 
     @classmethod
     @abstractmethod
     def check_start(cls, links: LinkSet, T_base_platform: Array) -> None:
-        """Raise `InputError` for what the nominal model's poses (K, 4, 4) show to be wrong, such as
+        """Raise `InputError` for faults that the nominal model's poses (K, 4, 4) show, such as
         another unit.
         """
 
@@ -158,7 +159,7 @@ Kind = TypeVar("Kind", bound=MeasurementKind)
 
 @cache
 def measurement_kinds() -> dict[str, type[MeasurementKind]]:
-    """Every kind of this folder, by its code."""
+    """All kinds of this folder, by code."""
     package = __name__.rpartition(".")[0]
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
@@ -166,12 +167,12 @@ def measurement_kinds() -> dict[str, type[MeasurementKind]]:
 
 
 def kinds_of(base: type[Kind]) -> dict[str, type[Kind]]:
-    """Those of one sort, by their codes."""
+    """Kinds that are subclasses of ``base``, by code."""
     return {code: kind for code, kind in measurement_kinds().items() if issubclass(kind, base)}
 
 
 def _concrete(base: type[MeasurementKind]) -> list[type[MeasurementKind]]:
-    """Subclasses that have a code, in the order of their files."""
+    """Subclasses with a code, in the order of their files."""
     out: list[type[MeasurementKind]] = []
     for kind in base.__subclasses__():
         out += [kind] if "code" in vars(kind) else _concrete(kind)
@@ -179,8 +180,8 @@ def _concrete(base: type[MeasurementKind]) -> list[type[MeasurementKind]]:
 
 
 def configuration_rows(table: CsvTable, names: tuple[str, ...]) -> Integers:
-    """Rows (N,) of the readings of the configurations that a table names, (N, 2) of pairs. Raises
-    `InputError` for one that has no readings.
+    """Rows (N,) of the readings, for the configurations named in a table; (N, 2) for pairs. Raises
+    `InputError` for a configuration without readings.
     """
     number = {name: k for k, name in enumerate(names)}
     written = table.pairs if isinstance(table, PairTable) else tuple((n,) for n in table.names)

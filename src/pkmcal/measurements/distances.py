@@ -9,8 +9,8 @@ With the unit vector e from the first mark to the second, a perturbation (omega,
 the second configuration changes the distance by ``e . (omega x R_2 m + tau)``, the first by as much
 the other way, and a shift tau of the tool's point by ``e . (R_2 - R_1) tau``.
 
-Distances tell the size of a machine, which heights of a bed leave to the nominal model. Klipper's
-``DELTA_ANALYZE`` uses them in the same way, from a part of a fixed shape
+Distances determine the size of a machine, which heights of a bed leave to the nominal model.
+Klipper's ``DELTA_ANALYZE`` uses them in the same way, from a part of a fixed shape
 (https://www.klipper3d.org/Delta_Calibrate.html).
 """
 
@@ -37,8 +37,8 @@ from pkmcal.mechanisms import Machine, check_plausible
 
 END_COLUMNS, VALUE_COLUMN, SIGMA_COLUMN = ("from", "to"), "distance", "sigma"
 LONGEST_IN_SIZES = 4.0
-"""Longest distance in times of the machine's size: a tool reaches no further than the machine is
-large to either side, and a nominal model may be wrong by a factor of two."""
+"""Longest distance, in sizes of the machine: a tool reaches one size to either side, and a nominal
+model may be wrong by a factor of two."""
 OTHER_UNIT_RATIO = 10.0
 """Ratio of measured to nominal distances, all of them, from which they are in another unit: inches
 for millimetres make 25.4, and no nominal model is wrong by ten."""
@@ -56,7 +56,7 @@ class DistancesDocument(Schema):
 
 @dataclass(frozen=True)
 class DistanceSet(LinkSet):
-    """N distances in m; the mount's place is the tool's point."""
+    """N distances in m; the position of the mount is the tool's point."""
 
     @property
     def kind(self) -> str:
@@ -64,7 +64,7 @@ class DistanceSet(LinkSet):
         return Distances.code
 
     def rows(self, first: Array, second: Array, mount: Array) -> LinkRows:
-        """Residuals and derivatives; see the module."""
+        """Residuals and derivatives, as in the module's docstring."""
         point = mount[..., :3, 3:]
         arms = [(T[..., :3, :3] @ point)[..., 0] for T in (first, second)]
         apart = arms[1] + second[..., :3, 3] - arms[0] - first[..., :3, 3]
@@ -90,7 +90,7 @@ class Distances(LinkKind):
 
     @classmethod
     def table(cls, node: DistancesDocument) -> str:
-        """The table's file."""
+        """File of the table."""
         return node.file
 
     @classmethod
@@ -102,7 +102,7 @@ class Distances(LinkKind):
     def read(
         cls, node: DistancesDocument, path: Path, names: tuple[str, ...], machine: Machine
     ) -> DistanceSet:
-        """Read the table; every fault is an InputError with line and column."""
+        """Read the table. Raises `InputError` with line and column for every fault."""
         table = read_pairs(path, END_COLUMNS, (VALUE_COLUMN,), (SIGMA_COLUMN,), label=node.file)
         table.check_kinds(["m"] * len(table.columns))
         rows = configuration_rows(table, names)

@@ -1,4 +1,4 @@
-"""Edges of a leg's side at a station gathered by their normals: near ones are shaded alike."""
+"""Cells of edges with nearly the same normal, whose shading is correlated."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, short_repr
 
 SHADING_CORRELATION_ANGLE = np.radians(7.0)
-"""Angle between the normals of two edges of one side of a tube at one station over which their
-shading ceases to be the same, by exp(-angle / SHADING_CORRELATION_ANGLE): what a surface mirrors,
-and where its highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree
-by half at 5 degrees once what all have in common is taken off."""
+"""Correlation angle of the shading of edges of one side of a tube at one station: the correlation
+is exp(-angle / SHADING_CORRELATION_ANGLE), for mirror images and highlights turn with the surface.
+Edges of path-traced tubes, of metal and painted, are correlated by half at 5 degrees once their
+mean is subtracted."""
 
 TUBE_CORRELATION = 0.4
-"""The same between edges of two tubes of a leg on one side: they see the same light, and mirror the
-same, in part. Of path-traced legs of five finishes 0.2 to 0.6."""
+"""Correlation between the shading of two tubes of a leg on one side: they are lit and mirror alike,
+in part. 0.2 to 0.6 for path-traced legs of five finishes."""
 CELLS_AN_ANGLE, CELLS_AN_ANGLE_OF_MANY, MANY_EDGES = 64, 8, 10_000
-"""Cells along SHADING_CORRELATION_ANGLE, and where there are so many edges that hardly one would
-have a cell of its own: those of a cell are alike to a hundredth, and to a tenth."""
+"""Cells along SHADING_CORRELATION_ANGLE, and the coarser ones for many edges: normals of a cell
+agree to a hundredth of the angle, and to a tenth."""
 
 
 @dataclass(frozen=True)
 class LineCells:
-    """N edges of L lines in C cells; those of one side of a leg at a station stand side by side.
+    """N edges of L lines in C cells; the cells of one side of a leg at a station are contiguous.
 
-    cell : (N,) of each edge, -1 where it is a line of its own. first : (sides + 1,) where the
-    sides' cells begin. line : (C,). middle : (C, 3) unit normals. count : (C,) edges in each.
+    cell : (N,) of each edge, -1 where it is a line of its own. first : (sides + 1,) first cell of
+    each side. line : (C,). middle : (C, 3) unit normals. count : (C,) edges in each.
     """
 
     cell: Integers
@@ -41,9 +41,7 @@ class LineCells:
 
     @classmethod
     def of(cls, normal: Array, line: Integers, side: Integers) -> LineCells:
-        """The cells of edges with normals (N, 3) and lines (N,), -1 for none, which are on sides
-        (L,).
-        """
+        """Cells of edges with normals (N, 3) and lines (N,), -1 for none; side : (L,) of lines."""
         mine = line >= 0
         fine = CELLS_AN_ANGLE if len(line) < MANY_EDGES else CELLS_AN_ANGLE_OF_MANY
         place = np.round(fine * normal / SHADING_CORRELATION_ANGLE).astype(int)
@@ -59,9 +57,9 @@ class LineCells:
         return cls(cell, first, keys[:, 1], middle, count)
 
     def correlated_groups(self) -> Iterator[tuple[slice, Array, Array]]:
-        """Of side after side its cells, and how alike two of them err, (c, c): in their shift by
-        exp(-angle / SHADING_CORRELATION_ANGLE), if on two tubes by TUBE_CORRELATION of that; in
-        their tilt on one tube alone.
+        """Cells of each side, with the correlations (c, c) of their shifts and of their tilts: of
+        shifts exp(-angle / SHADING_CORRELATION_ANGLE), times TUBE_CORRELATION between two tubes; of
+        tilts the same on one tube, zero between tubes.
         """
         for start, end in zip(self.first[:-1], self.first[1:], strict=True):
             own = slice(int(start), int(end))
@@ -73,9 +71,9 @@ class LineCells:
 
     @property
     def n_effective(self) -> Array:
-        """How many edges of its line share an edge's own shading, itself among them, (N,): the sum
-        over them of how alike they err. Of n edges with the same normal each counts as one n-th,
-        whatever their number; an edge that is a line of its own is alone.
+        """Number of edges of its line that share an edge's own shading, itself included, (N,): the
+        sum of their correlations. Each of n edges with the same normal counts as one n-th; the
+        number is one for an edge that is a line of its own.
         """
         many = np.ones(len(self.count) + 1)
         for own, _, similar in self.correlated_groups():

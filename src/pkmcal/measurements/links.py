@@ -1,8 +1,8 @@
 """Measurements that link two configurations: one number each, such as a distance.
 
-A row of such a measurement depends on the poses of both configurations. So the pose of a
-configuration that takes part in a link is an unknown that all rows share; the poses of all others
-are eliminated configuration by configuration (:mod:`pkmcal.identify.problem`).
+A row of a link depends on the poses of both configurations. The pose of a linked configuration is
+therefore a shared unknown; the poses of all other configurations are eliminated one by one
+(:mod:`pkmcal.identify.problem`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class LinkSet(ABC):
     """N measurements of one kind that link two configurations each.
 
     label : the table's name in messages. configuration : (N, 2) rows of the readings. mount : (N,)
-    what is fixed to the platform. value : (N,) as measured, sigma : (N,) its standard deviation, in
+    number of the mount. value : (N,) as measured, sigma : (N,) its standard deviation, in
     SI. lines : (N,) of the table, from 1.
     """
 
@@ -63,7 +63,7 @@ class LinkSet(ABC):
         """
 
     def select(self, keep: Booleans | Integers) -> Self:
-        """The links at a mask or at positions."""
+        """The links selected by a mask or by positions."""
         arrays = {
             f.name: getattr(self, f.name)[keep]
             for f in fields(self)
@@ -72,5 +72,5 @@ class LinkSet(ABC):
         return replace(self, **arrays)
 
     def at_mount(self, number: int) -> Self:
-        """The same links with one mount."""
+        """The links with another mount."""
         return replace(self, mount=np.full(len(self), number))

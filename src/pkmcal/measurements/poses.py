@@ -1,4 +1,4 @@
-"""Poses of boards and targets: measurements of all kinds that have them, and their rows.
+"""Poses of boards and targets: the measurements of all such kinds, and their rows.
 
 Six rows each, of which a kind may measure a part: predicted as ``T_camera_base T_base_platform
 T_platform_board``, or ``T_camera_base T_base_board`` for a board fixed to the base ([A] 3.3). The
@@ -26,11 +26,12 @@ class PoseSet:
     mount : (N,) what the target is fixed to.
     T_station_target : (N, 4, 4) target to station (camera or tracker) coordinates, m.
     whiten : (N, 6, 6) for the left perturbation (omega, tau) of T_station_target, rad and m:
-        whiten @ error has unit covariance. Rows of what is not measured (a point's turn) are zero.
+        whiten @ error has unit covariance. Rows of numbers that are not measured (the rotation of a
+        point) are zero.
     by_intrinsics : (N, 6, n) that perturbation by the camera's parameters, with the corners'
-        pixels held; n = 0 where nobody asked.
-    by_focal : (N, 6) the same by the relative excess of the focal lengths, where these breathe from
-        photograph to photograph; else zero.
+        pixels fixed; n = 0 where it is not needed.
+    by_focal : (N, 6) the same by the relative excess of the focal lengths, where these differ from
+        image to image; else zero.
     """
 
     station: Integers
@@ -44,7 +45,7 @@ class PoseSet:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Poses without derivatives by intrinsics get empty ones, so that all select alike."""
+        """Set absent derivatives to empty or zero ones of the right length."""
         if len(self.by_intrinsics) != len(self.station):
             object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 6, 0)))
         if len(self.by_focal) != len(self.station):
@@ -52,7 +53,7 @@ class PoseSet:
 
     @classmethod
     def empty(cls) -> PoseSet:
-        """No pose."""
+        """A set without poses."""
         none = np.zeros(0, dtype=int)
         return cls(none, none, none, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
@@ -61,17 +62,17 @@ class PoseSet:
 
     @property
     def rows(self) -> Integers:
-        """(N,) how many of its six numbers each measurement has."""
+        """(N,) how many of the six numbers each measurement has."""
         return np.any(self.whiten != 0, axis=-1).sum(axis=-1)
 
     def select(self, mask: Booleans | Integers) -> PoseSet:
-        """The poses that a mask or an index picks."""
+        """The poses selected by a mask or by positions."""
         return PoseSet(*(getattr(self, f.name)[mask] for f in fields(self)))
 
     def transform(self, change: Array) -> PoseSet:
-        """The poses as cameras with other parameters see them; change : (S, n), by station.
+        """The poses by cameras with other parameters; change : (S, n), by station.
 
-        To first order: a camera's calibration is good to a thousandth, so what is left out is a
+        To first order: a camera's calibration is good to a thousandth, so the remainder is a
         millionth.
         """
         n = self.by_intrinsics.shape[-1]
@@ -81,7 +82,7 @@ class PoseSet:
 
 @dataclass(frozen=True)
 class PoseBlocks:
-    """Where the poses are: K configurations of G poses, padded; the same for all runs.
+    """Positions of the poses: K configurations of G poses, padded; the same for all runs.
 
     station, mount : (K, G). present : (K, G) False for padding. on_platform : (M,) of the mounts.
     column : (K, G, w) which of the estimate's columns move each pose, -1 for none.
@@ -94,13 +95,13 @@ class PoseBlocks:
     column: Integers
 
     def among(self, configurations: slice) -> PoseBlocks:
-        """Those of some configurations."""
+        """The blocks of some configurations."""
         return replace(among(self, configurations, 0), on_platform=self.on_platform)
 
 
 @dataclass(frozen=True)
 class PoseData:
-    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
+    """Measured values of each run; leading axis B, or 1 where all runs share them.
 
     T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). columns :
     (B, K, G, 6, w) derivatives of the error, before it is whitened, by the poses' ``column``.
@@ -112,7 +113,7 @@ class PoseData:
     columns: Array
 
     def among(self, configurations: slice) -> PoseData:
-        """Those of some configurations."""
+        """The data of some configurations."""
         return among(self, configurations, 1)
 
 
@@ -157,7 +158,7 @@ def pose_rows(
     turn = turn_jacobian(error[..., :3])
 
     def rows(by_turn: Array, by_shift_turn: Array, by_shift: Array) -> Array:
-        """Derivative by (omega, tau) from those of the pose's turn and place."""
+        """Derivative by (omega, tau) from those of the rotation and the translation."""
         out = np.zeros((*np.broadcast_shapes(by_turn.shape, place.shape)[:-2], 6, 6))
         out[..., :3, :3], out[..., 3:, :3] = turn @ by_turn, by_shift_turn
         out[..., 3:, 3:] = by_shift
@@ -176,7 +177,7 @@ def pose_rows(
 
 
 def turn_jacobian(phi: Array) -> Array:
-    """Change of a rotation vector (..., 3) by a further turn from the left, (..., 3, 3).
+    """Derivative of a rotation vector (..., 3) by a further rotation from the left, (..., 3, 3).
 
     The inverse left Jacobian of SO(3), with its series near zero.
     """

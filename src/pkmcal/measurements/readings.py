@@ -1,7 +1,7 @@
-"""Readings of the motors: the kind, and the rows of the closures with their noise.
+"""Joint readings: the kind, its rows (the closures of the limbs) and their noise.
 
-One row a limb, ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened; what no reading enters
-(rods of constant length, joints' axes) is taken as perfect and held to PERFECT_CLOSURE_SIGMA.
+One row a limb, ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened. Closures without a reading
+(rods of constant length, axes of joints) count as exact, to PERFECT_CLOSURE_SIGMA.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pkmcal.measurements.contract import MotorKind
 from pkmcal.mechanisms.layout import LimbLayout
 
 PERFECT_CLOSURE_SIGMA = 1e-6
-"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of
-a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
+"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of a
+good encoder's noise, which loses no information, and large enough to keep digits."""
 
 
 @final
 class Readings(MotorKind):
-    """Lengths, places of sliders and angles of cranks, as the motors read them."""
+    """Lengths, positions of sliders and angles of cranks, as the motors read them."""
 
     code: ClassVar = "readings"
     one: ClassVar = "reading"
@@ -40,7 +40,7 @@ class ReadingColumns:
     column: Integers
 
     def among(self, configurations: slice) -> ReadingColumns:
-        """Those of some configurations."""
+        """The columns of some configurations."""
         return replace(self, by=self.by[configurations])
 
     def corrected(self, joints: Array, columns: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What all sorts of rows have in common: places of measurements in configurations, padded.
+"""Common parts of all kinds of rows: positions of measurements in configurations, padded.
 
 Measurements stand in K configurations of G places each, padded to a common count.
 """
@@ -17,11 +17,10 @@ Numbers = TypeVar("Numbers")
 
 
 class Kinds(NamedTuple, Generic[Item]):
-    """Something of each sort of rows: of the edges, of the poses of boards and targets, and of what
-    links configurations.
+    """A value for each kind of rows: edges, poses of boards and targets, links.
 
-    An estimate weighs, counts and scales all kinds alike. Readings are none: no robust weight lets
-    them go.
+    An estimate weights, counts and scales these kinds alike. Readings are not among them, for they
+    have no robust weights.
     """
 
     edges: Item
@@ -31,9 +30,9 @@ class Kinds(NamedTuple, Generic[Item]):
 
 @dataclass(frozen=True)
 class RowsOfKind:
-    """The rows of one sort in a problem.
+    """The rows of one kind in a problem.
 
-    rows : those of a configuration that are its. present : (K, G) False for padding. weight :
+    rows : of a configuration. present : (K, G) False for padding. weight :
     (B or 1, K, G). whiten : (B or 1, K, G, n, n).
     """
 
@@ -44,15 +43,15 @@ class RowsOfKind:
 
     @property
     def count(self) -> Integers:
-        """Residuals of each measurement, (K, G): a board's pose has six, a point's three of them,
+        """Number of residuals of each measurement, (K, G): a board's pose has six, a point three,
         padding none.
         """
         return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
 
 
 def among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
-    """All arrays of a dataclass cut along the configurations' axis; what is the same for all of
-    them, a single one or none, stays.
+    """A dataclass whose arrays are cut along the axis of the configurations; arrays of length one
+    or zero along it, which hold for all configurations, stay.
     """
     whole: Any = numbers
     cut = (slice(None),) * axis + (configurations,)

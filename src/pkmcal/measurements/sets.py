@@ -1,4 +1,4 @@
-"""What was measured, of all kinds together: plain and frozen."""
+"""Measurements of all kinds together: plain, frozen data."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from pkmcal.measurements.poses import PoseSet
 
 @dataclass(frozen=True)
 class Observation:
-    """What the photographs of a session gave.
+    """Measurements from the images of a session.
 
-    edges : the measurements.
-    rejected : what was left out, with its reason.
-    points, point_edge : (M, 2) sub-pixel edge points (px) and the edge that each supports,
-        for pictures and residuals.
-    T_camera_base : (S, 4, 4) poses of the stations as the search left them.
+    edges : silhouette edges.
+    rejected : measurements that were rejected, with their reasons.
+    points, point_edge : (M, 2) sub-pixel edge points (px), and the edge that each supports, for
+        pictures and residuals.
+    T_camera_base : (S, 4, 4) poses of the stations after the search.
     poses : of boards, and of trackers' targets.
-    binning : (S,) pixels of each station's photographs across, and down, that were one where edges
-        were looked for: what of an edge is in pixels, is in these.
+    binning : (S,) pixels of each station's images, across and down, that were averaged to one for
+        the measurement of edges; pixel values of edges refer to these.
     """
 
     edges: EdgeSet
@@ -40,7 +40,7 @@ class Observation:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Where nothing is said of binning, there is none."""
+        """Default to no binning."""
         if not len(self.binning):
             object.__setattr__(self, "binning", np.ones(len(self.T_camera_base), dtype=int))
 
@@ -51,7 +51,7 @@ Effect = Callable[["Measurements"], Iterable[Column]]
 
 
 def concatenate(sets: Sequence[Set]) -> Set:
-    """One set or more as one; cameras with fewer parameters get zeros for the rest."""
+    """Concatenation of sets; derivatives by the intrinsics are padded with zeros to the widest."""
     widest = max(s.by_intrinsics.shape[-1] for s in sets)
     padded = [
         np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
@@ -67,16 +67,16 @@ def concatenate(sets: Sequence[Set]) -> Set:
 
 
 def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
-    """Edges by the number of their station, whatever number it had, as one set."""
+    """Concatenation of edges, numbered by the stations that are the keys."""
     return concatenate([replace(e, station=np.full(len(e), k)) for k, e in edges.items()])
 
 
 @dataclass(frozen=True)
 class Mount:
-    """What a board or a tracker's target is fixed to; its place there is estimated.
+    """The body to which a board or a tracker's target is fixed; its pose there is estimated.
 
-    tolerance : standard deviation of a board's size, relative: its squares are all larger or
-    smaller by one factor, which is estimated where the data tell it.
+    tolerance : prior sigma of a board's size, relative: all squares are larger or smaller by one
+    factor, which is estimated.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class Measurements:
-    """Everything that was measured, nothing that was assumed.
+    """All measurements of a session, with their stated noise.
 
     edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
     standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
@@ -133,7 +133,7 @@ class Measurements:
         return np.concatenate([none, *(links.configuration for links in self.links)])
 
     def link_at(self, number: int) -> tuple[LinkSet, int]:
-        """The set of a link, by its number among all, and its number there."""
+        """Set of a link, from its number among all links, and its number in the set."""
         for links in self.links:
             if number < len(links):
                 return links, number
@@ -141,12 +141,12 @@ class Measurements:
         raise IndexError(number)
 
     def links_among(self, keep: Booleans) -> Booleans:
-        """(n,) links of which both configurations are among those to keep, (K,)."""
+        """(n,) links whose configurations are both to be kept; keep : (K,)."""
         first, second = self.link_ends.T
         return keep[first] & keep[second]
 
     def with_links(self, keep: Booleans) -> Measurements:
-        """The same with some of the links, (n,)."""
+        """The measurements with some of the links; keep : (n,)."""
         ends = np.cumsum([len(links) for links in self.links]).tolist()
         parts = [
             links.select(keep[end - len(links) : end])
@@ -161,5 +161,5 @@ class Measurements:
 
     @property
     def on_platform(self) -> Booleans:
-        """(M,) which of the mounts move with the platform."""
+        """(M,) whether each mount moves with the platform."""
         return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)

@@ -1,4 +1,4 @@
-"""Points of a reflector or a ball on the platform, as a tracker or a measuring machine sees them.
+"""Positions of a reflector or a ball on the platform, by a tracker or a measuring machine.
 
 Rows: :func:`pkmcal.measurements.poses.pose_rows`, the last three numbers.
 """
@@ -16,7 +16,7 @@ from pkmcal.measurements.contract import POINT_COLUMNS, TargetKind
 
 @final
 class TrackerPoints(TargetKind):
-    """Place of a target."""
+    """Position of a target."""
 
     code: ClassVar = "points"
     one: ClassVar = "point"
@@ -29,6 +29,6 @@ class TrackerPoints(TargetKind):
 
     @classmethod
     def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
-        """The points laid over the platform's places."""
+        """Registration of the points with the platform's positions."""
         good = np.isfinite(platform).all(axis=1)
         return register(platform[good], T_tracker_target[good, :3, 3])

@@ -1,4 +1,4 @@
-"""Whole poses of a target on the platform, as a laser tracker or a measuring machine sees them.
+"""Poses of a target on the platform, by a laser tracker or a measuring machine.
 
 Rows: :func:`pkmcal.measurements.poses.pose_rows`, all six numbers.
 """
@@ -18,7 +18,7 @@ from pkmcal.measurements.contract import (
 
 @final
 class TrackerPoses(TargetKind):
-    """Place and turn of a target."""
+    """Position and orientation of a target."""
 
     code: ClassVar = "poses"
     one: ClassVar = "pose"
@@ -34,6 +34,6 @@ class TrackerPoses(TargetKind):
 
     @classmethod
     def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
-        """None: whole poses tell the tracker's place themselves."""
+        """None: whole poses determine the pose of the tracker."""
         del T_tracker_target, platform
         return None
