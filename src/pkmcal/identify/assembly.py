@@ -1,4 +1,4 @@
-"""From a machine and its measurements to the least-squares problem, and back."""
+"""Assembly of the least-squares problem from a machine and its measurements."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 
 LEVEL_SIGMA = 1e-6
-"""rad, of a bed that is level by definition: a tenth of a micrometre over a printer's bed."""
+"""Standard deviation, rad, of a bed that is level by definition: a tenth of a micrometre over a
+printer's bed."""
 
 
 @dataclass(frozen=True)
 class Assembled:
-    """A problem and where its rows come from.
+    """A problem and the origin of its rows.
 
     observed : (K,) configurations with at least one edge, link, or pose of a board on the platform,
-    or all without a station; only they are in the problem. places : where each kind's measurements
-    stand among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, the
-    code of an effect, mount, level or gauge.
+    or all without a station; only these are in the problem. places : positions of the measurements
+    of each kind among the observed configurations. priors : names of the kinds of the prior rows,
+    (c,): drawing, the code of an effect, mount, level or gauge.
     """
 
     problem: Problem
@@ -60,11 +61,11 @@ def assemble(
     shading: float | Array = SHADING_SIGMA,
     share: float = 1.0,
 ) -> Assembled:
-    """The joint problem of one session (B = 1), every edge a block of its own.
+    """The joint problem of one session (B = 1), with every edge in its own block.
 
-    shading : px, standard deviation of the lines' shading, of all or of each (n,), where an
-    estimate has told it. share : of the configurations how many are to count together in the end,
-    where these are candidates, for the edges that share their shading.
+    shading : px, standard deviation of the lines' shading, for all or for each (n,), from an
+    earlier estimate. share : of candidate configurations, the part that will be measured, by which
+    edges that share their shading are counted.
     """
     _check(machine, measurements)
     observed = observed_configurations(measurements)
@@ -116,8 +117,8 @@ def assemble(
 
 
 def observed_configurations(measurements: Measurements) -> Booleans:
-    """(K,) configurations of which something was seen that depends on the platform's pose; all
-    where nothing but readings was measured, which then stand against each other.
+    """(K,) configurations with a measurement that depends on the platform's pose; all where only
+    readings were measured.
     """
     poses, n = measurements.poses, len(measurements.joints)
     if not measurements.n_stations:
@@ -162,8 +163,8 @@ def _check(machine: Machine, measurements: Measurements) -> None:
 
 
 def _places(configuration: Integers, visible: Booleans, kind: Integers) -> Places:
-    """Measurements of one configuration after the other in a row of its own, where each kind (N,)
-    of them has as many places as every other, side by side.
+    """Positions of measurements: one row for each visible configuration, in which each kind (N,)
+    has the same number of consecutive positions.
     """
     row = np.maximum(np.cumsum(visible) - 1, 0)[configuration]
     kinds, number = np.unique(kind, return_inverse=True)
@@ -249,7 +250,7 @@ def _edges(
     visible: Booleans,
     share: float,
 ) -> tuple[EdgeBlocks, EdgeData]:
-    """The edges at their places, and the readings of the seen configurations."""
+    """The edges at their positions, and the readings of the observed configurations."""
     edges, (keys, line) = measurements.edges, lines(measurements)
     radius = machine.layout.radius_of(edges.leg, edges.tube)
     parts = [(one.edges, one.edge_rows) for one in columns]
@@ -295,7 +296,7 @@ def _edges(
 def _poses(
     measurements: Measurements, columns: Sequence[Column], at: Places
 ) -> tuple[PoseBlocks, PoseData]:
-    """The boards' poses at their places."""
+    """The poses at their positions."""
     poses = measurements.poses
     parts = [(one.poses, one.pose_rows) for one in columns]
     column, by_columns = _by_measurement(len(poses), 6, columns, parts)
@@ -314,7 +315,7 @@ def _poses(
 
 
 def _links(measurements: Measurements, visible: Booleans) -> tuple[LinkBlocks, LinkData]:
-    """The links, each among the rows of its second configuration."""
+    """The links; each is among the rows of its second configuration."""
     rows = np.cumsum(visible) - 1  # of each configuration among the seen ones
     ends = [np.zeros((0, 2), dtype=int), *(one.configuration for one in measurements.links)]
     ends = np.concatenate(ends)
@@ -341,16 +342,16 @@ def prior_rows(
     on_platform: Booleans,
     level: Booleans,
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
+    """Prior rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
-    Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
-    can be met exactly, hence fix the frames and pull on nothing else. columns : the effects, each
-    with the square root of its prior covariance. on_platform : (M,) mounts. level : (S,) stations
-    that do not tilt against the base.
+    Without the nominal model's priors the frames are free, so the constraints of the gauge are
+    rows: they can be met exactly, hence fix the frames and affect nothing else. columns : the
+    effects, each with the square root of its prior covariance. on_platform : (M,) mounts. level :
+    (S,) stations that do not tilt against the base.
 
-    What is on a platform is as near its start as the machine is large. Where a platform turns about
-    one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
-    seems to, and would carry the board off by metres.
+    The prior sigma of the position of a mount on the platform is the size of the machine. Where a
+    platform rotates about one axis, no measurement determines the height of the board along it, and
+    a tilt by a tenth of a degree would seem to, by metres.
     """
     table, u = machine.parameters, unknowns
     first, tolerance = table.first_of_free(), table.tolerances_free()
@@ -391,8 +392,8 @@ def prior_rows(
 
 
 def machine_size(machine: Machine) -> float:
-    """How large a machine is, m: from the platform to the farthest joint on the base, and from the
-    tool to the farthest on the platform.
+    """Size of a machine, m: the distance from the platform to the farthest joint on the base, plus
+    that from the tool to the farthest joint on the platform.
     """
     base = np.linalg.norm(machine.base_centers() - machine.home()[:3, 3], axis=-1)
     platform = np.linalg.norm(machine.platform_centers(), axis=-1)
@@ -400,7 +401,7 @@ def machine_size(machine: Machine) -> float:
 
 
 def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState:
-    """A state as a batch of one, free parameters only."""
+    """A state as a batch of one run, with its free parameters only."""
     u = assembled.problem.unknowns
     columns = np.zeros((1, u.effects.stop - u.effects.start))
     for code, count in u.codes:
@@ -422,8 +423,8 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
 
 
 def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
-    """The first run of a batch as a state; unseen configurations keep the start's pose, and the
-    lines' shading begins anew, for its unit changes from estimate to estimate.
+    """The first run of a batch as a state. Unobserved configurations keep the pose of ``start``;
+    the lines' shading is left out, for its unit changes from estimate to estimate.
     """
     u = assembled.problem.unknowns
     parts = {code: u.of_code(code) for code, _ in u.codes if code != SHADING}

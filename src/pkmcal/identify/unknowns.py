@@ -1,18 +1,19 @@
-"""The unknowns of the joint estimate: their names, their columns, and their values in many runs.
+"""Unknowns of the joint estimate: their names, their columns, and their values in B runs.
 
-Shared by all configurations, in this order of columns:
+The shared unknowns stand in this order of columns:
 
-- **machine** : free combinations z of its parameters, ``theta = drawing + free z``.
+- **machine** : free combinations z of its parameters, ``theta = nominal + free z``.
 - **stations** : left perturbation (omega, tau) of each T_camera_base.
 - **columns** : numbers of the effects on measurements that have a prior, those of one code side by
   side (:mod:`pkmcal.measurements.effects`).
 - **mounts** : left perturbation of each T_mount, of boards and targets.
 - **linked** : the own unknowns, see below, of each configuration that a measurement links to
-  another: the rows of both depend on them, so they are shared.
+  another: the rows of both depend on them.
 
-Each other configuration has unknowns of its own besides: the platform's motion (left perturbation
-of T_base_platform, along the directions that the machine has) and, on an articulated platform, its
-hinges; :attr:`~pkmcal.mechanisms.layout.LimbLayout.own_motion` says how.
+Each other configuration has unknowns of its own, nuisance parameters that are eliminated first: the
+platform's motion (left perturbation of T_base_platform, along the directions that the machine has)
+and, on an articulated platform, its hinges
+(:attr:`~pkmcal.mechanisms.layout.LimbLayout.own_motion`).
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from pkmcal.arrays import Array, Integers
 
 @dataclass(frozen=True)
 class Unknowns:
-    """How many of each there are, and so in which columns each stands.
+    """Numbers of the shared unknowns, and the columns where they stand.
 
-    n_free : of the machine. codes : of the effects, in their order, with the number of their
-    columns. n_linked : own unknowns, all together, of the configurations that are linked.
+    n_free : of the machine. codes : of the effects, in their order, each with the number of its
+    columns. n_linked : own unknowns of all linked configurations together.
     """
 
     n_free: int
@@ -41,22 +42,22 @@ class Unknowns:
 
     @cached_property
     def machine(self) -> slice:
-        """The machine's columns."""
+        """Columns of the machine."""
         return slice(0, self.n_free)
 
     @cached_property
     def stations(self) -> slice:
-        """The stations' columns, six each."""
+        """Columns of the stations, six each."""
         return slice(self.n_free, self.n_free + 6 * self.n_stations)
 
     @cached_property
     def effects(self) -> slice:
-        """The columns of all effects."""
+        """Columns of all effects."""
         first = self.stations.stop
         return slice(first, first + sum(count for _, count in self.codes))
 
     def of_code(self, code: str) -> slice:
-        """The columns of the effects of a code."""
+        """Columns of the effects of a code; an empty slice where there is none."""
         first = self.effects.start
         for one, count in self.codes:
             if one == code:
@@ -66,12 +67,12 @@ class Unknowns:
 
     @cached_property
     def mounts(self) -> slice:
-        """The mounts' columns, six each."""
+        """Columns of the mounts, six each."""
         return slice(self.effects.stop, self.effects.stop + 6 * self.n_mounts)
 
     @cached_property
     def linked(self) -> slice:
-        """The columns of linked configurations' own unknowns."""
+        """Columns of the own unknowns of linked configurations."""
         return slice(self.mounts.stop, self.mounts.stop + self.n_linked)
 
     @cached_property
@@ -80,8 +81,8 @@ class Unknowns:
         return self.linked.stop
 
     def columns(self, *names: str) -> Integers:
-        """Where the named unknowns stand, in increasing order: machine, stations, mounts, linked,
-        or effects by their code.
+        """Columns of the named unknowns in increasing order. names : machine, stations, mounts,
+        linked, or codes of effects.
         """
         parts = [getattr(self, n) if n in PARTS else self.of_code(n) for n in names]
         none = np.zeros(0, dtype=int)
@@ -93,7 +94,9 @@ PARTS = ("machine", "stations", "mounts", "linked")
 
 
 def own_blocks(matrix: Array, part: slice, width: int) -> Array:
-    """Each one's own block of a covariance, (n, width, width), of unknowns ``width`` wide each."""
+    """Diagonal blocks (n, width, width) of a covariance, of unknowns with ``width`` columns
+    each.
+    """
     n = (part.stop - part.start) // width
     own = matrix[part, part].reshape(n, width, n, width)
     return np.einsum("iaib->iab", own)
@@ -101,7 +104,7 @@ def own_blocks(matrix: Array, part: slice, width: int) -> Array:
 
 @dataclass(frozen=True)
 class BatchState:
-    """Values of the unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
+    """Values of the unknowns in B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
     T_base_platform (B, K, 4, 4), columns (B, n) numbers of the effects, T_mount (B, M, 4, 4) of
     boards, internal (B, K, n) of articulated platforms. linked : (B, J, 4, 4) T_base_platform of
     the linked configurations, in the state of some configurations only; else none, for
@@ -117,7 +120,7 @@ class BatchState:
     linked: Array = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
 
     def __post_init__(self) -> None:
-        """Runs without boards or hinges get none each, so that all fields select alike."""
+        """Set absent fields to empty ones for each run."""
         none = {
             "internal": (self.T_base_platform.shape[1], 0),
             "T_mount": (0, 4, 4),
