@@ -1,4 +1,4 @@
-"""What goes into an identification and what comes out of it: plain, frozen, saveable."""
+"""State and result of an estimate: plain, frozen data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pkmcal.mechanisms import Machine
 
 @dataclass(frozen=True)
 class State:
-    """One value of every unknown.
+    """Values of all unknowns.
 
     theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
     columns : numbers (n,) of the effects on measurements by their code, change from where the
@@ -37,13 +37,13 @@ class State:
 
 
 def estimated_unknowns(state: State) -> Unknowns:
-    """The unknowns that results are told of: all parameters, stations and mounts."""
+    """Unknowns of results: all parameters, stations and mounts."""
     return Unknowns(state.theta.size, len(state.T_camera_base), n_mounts=len(state.T_mount))
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """How well the model explains the data.
+    """Goodness of fit and noise of an estimate.
 
     chi2, dof : of all residuals in use (robust weights count as fractions of a datum).
     chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
@@ -91,10 +91,10 @@ class Statistics:
 
     @property
     def chi2_as_stated(self) -> float:
-        """Chi-square per degree of freedom of the noise as it was stated, NaN without freedoms.
+        """Chi-square per degree of freedom with the stated noise, NaN without degrees of freedom.
 
-        With the noise as found it is 1 or so for any model, however wrong: its factors were chosen
-        for that.
+        With the estimated noise it is about 1 for any model, however wrong, for the factors on the
+        noise are chosen so.
         """
         chi2 = self.chi2_edges * self.noise_scale**2 + self.chi2_poses * self.pose_scale**2
         chi2 += self.chi2_joints * self.reading_scale**2 + self.chi2_drawing
@@ -104,7 +104,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Estimate:
-    """An identification's result, in the frames that ``gauge`` names.
+    """Result of an estimate, in the frames that ``gauge`` names.
 
     machine : with the identified values. state : all unknowns.
     joint_covariance : (n, n) of the machine's parameters, the stations and the mounts together, in
@@ -151,8 +151,8 @@ class Estimate:
     __repr__ = short_repr
 
     def stated_edge_noise(self, measurements: Measurements) -> Measurements:
-        """Measurements of the estimate, all or some, with the noise of readings and edges as the
-        data show it; what each edge counts besides is ``edge_trust``.
+        """Measurements of the estimate, all or some, with the estimated noise of readings and
+        edges; ``edge_trust`` is a further factor on the weight of each edge.
         """
         scale, edges = self.statistics.reading_scale, measurements.edges
         value = self.edge_noise
@@ -167,18 +167,18 @@ class Estimate:
 
     @property
     def covariance(self) -> Array:
-        """(P, P) of the machine's parameters."""
+        """Covariance (P, P) of the machine's parameters."""
         at = self._estimated_unknowns.machine
         return self.joint_covariance[at, at]
 
     @property
     def station_covariance(self) -> Array:
-        """(S, 6, 6) of each station's own place, left perturbation of T_camera_base."""
+        """Covariance (S, 6, 6) of each station's pose, left perturbation of T_camera_base."""
         return own_blocks(self.joint_covariance, self._estimated_unknowns.stations, 6)
 
     @property
     def mount_covariance(self) -> Array:
-        """(M, 6, 6) of each mount's own place, left perturbation of T_mount."""
+        """Covariance (M, 6, 6) of each mount's pose, left perturbation of T_mount."""
         return own_blocks(self.joint_covariance, self._estimated_unknowns.mounts, 6)
 
     @property

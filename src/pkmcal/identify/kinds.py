@@ -1,4 +1,4 @@
-"""What the rows of each kind say once the configurations' own unknowns are eliminated.
+"""Information of the rows of each kind, with the own unknowns of configurations eliminated.
 
 Sums over all configurations, found in one pass in which the rows themselves are written, reduced
 and forgotten.
@@ -50,7 +50,7 @@ class KindRows(NamedTuple):
 
 
 def kind_sums(problem: Problem, state: BatchState) -> KindSums:
-    """Those of a problem's rows at a state."""
+    """Sums over the rows of a problem at a state."""
     n_runs, na = len(state.z), problem.unknowns.count
     trace, normal = np.zeros((n_runs, ROWS_KINDS)), np.zeros((n_runs, ROWS_KINDS, na, na))
     every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, ROWS_KINDS))
@@ -102,7 +102,7 @@ def _rows_of_kind(
 
 
 def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:
-    """Of the closures' rows (B, K, E, n) those of the readings, (B, K, m, n)."""
+    """Rows of the readings (B, K, m, n) from those of the closures (B, K, E, n)."""
     return joint_rows(problem.layout, by_reading[:, :, None], closures.mT).mT
 
 

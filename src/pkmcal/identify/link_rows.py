@@ -18,7 +18,7 @@ from pkmcal.measurements import LinkRows, LinkSet
 
 @dataclass(frozen=True)
 class LinkBlocks:
-    """Where the links are: K configurations of G rows, padded; the same for all runs.
+    """Positions of the links: K configurations of G rows, padded; the same for all runs.
 
     sets : the links by kind, N of them together, in which ``configuration`` counts the linked
     configurations, from 0. linked : (J,) which of all configurations these are. number : (K,) which
@@ -48,7 +48,7 @@ class LinkBlocks:
         return np.concatenate([none, *(one.mount for one in self.sets)])
 
     def among(self, configurations: slice) -> LinkBlocks:
-        """Those of some configurations; all linked ones stay among the unknowns."""
+        """The links of some configurations; all linked ones stay among the unknowns."""
         first, stop, _ = configurations.indices(len(self.number))
         keep = (self.at.row >= first) & (self.at.row < stop)
         ends = np.cumsum([len(one) for one in self.sets])
@@ -72,7 +72,7 @@ class LinkData:
     whiten: Array
 
     def among(self, configurations: slice) -> LinkData:
-        """Those of some configurations."""
+        """The data of some configurations."""
         return LinkData(self.weight[:, configurations], self.whiten[:, configurations])
 
 

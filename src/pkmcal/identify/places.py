@@ -1,4 +1,4 @@
-"""Where measurements stand among configurations of a common number of places, padded."""
+"""Positions of measurements in configurations, padded to a common number."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ FilledNumbers = TypeVar("FilledNumbers", Array, Integers)
 
 @dataclass(frozen=True)
 class Places:
-    """Where N measurements stand among K' configurations of G places each: row, place (N,)."""
+    """Positions of N measurements among K' configurations of G each: row, place (N,)."""
 
     row: Integers
     place: Integers
     shape: tuple[int, int]
 
     def filled(self, values: FilledNumbers) -> FilledNumbers:
-        """Values (N, ...) at their places, (K', G, ...); zero where there is none."""
+        """Scatter values (N, ...) to their positions, (K', G, ...); zero for padding."""
         count, each = self.shape
         out = np.zeros((count * each, *values.shape[1:]), dtype=values.dtype)
         out[self.row * each + self.place] = values
         return cast(FilledNumbers, out.reshape(*self.shape, *values.shape[1:]))
 
     def taken(self, values: Array) -> Array:
-        """Of values (K', G, ...) those at the measurements' places, (N, ...)."""
+        """Gather values (N, ...) from the positions of the measurements in (K', G, ...)."""
         return values[self.row, self.place]
 
     @property
     def present(self) -> Booleans:
-        """(K', G) where there is one."""
+        """(K', G) False for padding."""
         return self.filled(np.ones(len(self.row), dtype=int)).astype(bool)
