@@ -1,8 +1,8 @@
-"""What the session takes for granted, tested: readings, lenses, boards, tripods, tubes.
+"""Model violations of a session: readings, cameras, boards, stations, tubes.
 
-Each departure is declared beside the thing that it departs from, with what it would do to the
-measurements and in which words it is told; here they are put together and tested, all at one level
-(:mod:`pkmcal.identify.score` says what freeing each would gain).
+Each violation is a column (:mod:`pkmcal.measurements.columns`) that is made beside its subject,
+with its derivatives and the facts of its finding. Here all of them are score-tested at one
+false-alarm level (:mod:`pkmcal.identify.score`).
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from pkmcal.session import readings, station_movement
 from pkmcal.session.load import Session
 
 MOST_TOOL_SHIFT = 1.0
-"""Standard deviations by which a departure moves the tool, beyond which the result is refused."""
+"""Shift of the tool by a violation, in standard deviations, beyond which the result is refused."""
 
 
 @dataclass(frozen=True)
 class DetectedViolation:
-    """A departure that the data show.
+    """A model violation that the data show.
 
-    finding : for the verdict, a reason where it moves the tool by more than MOST_TOOL_SHIFT.
+    finding : for the verdict, a reason where it shifts the tool by more than MOST_TOOL_SHIFT.
     value, sigma : (k,) estimates of its numbers, all that were found free together. tool : by how
     many of its standard deviations the platform's position moves if it is taken up, root mean
     square over the session's poses. shift : the same in m. kind : word for calibration.json.
@@ -70,21 +70,21 @@ class DetectedViolation:
 
     @property
     def code(self) -> str:
-        """Of its finding."""
+        """Code of the finding."""
         return self.finding.code
 
     @property
     def of(self) -> str:
-        """What departs, by name."""
+        """Name of the subject."""
         return self.finding.subject
 
     @property
     def against(self) -> bool:
-        """Whether the result should not be used for it."""
+        """Whether the violation makes the result unusable."""
         return self.finding.level is Level.WRONG
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Entry of calibration.json."""
         return {
             "code": self.code,
             "kind": self.kind,
@@ -100,9 +100,9 @@ class DetectedViolation:
 
 
 class ModelViolations(NamedTuple):
-    """What the data show that the model does not have.
+    """Deviations of the data from the model.
 
-    violations : violations that have a name, the surest first. errors : components of the model
+    violations : named violations, the smallest p-value first. errors : components of the model
     discrepancy beside them. estimate : whose covariance contains the discrepancy. random : the
     discrepancy's columns.
     """
@@ -120,10 +120,10 @@ def model_violations(
     estimate: Estimate,
     ended: tuple[Assembled, Information],
 ) -> ModelViolations:
-    """What the data show that the model does not have.
+    """Deviations of the data from the model, with and without names.
 
-    A violation is named only if it explains more than the discrepancy does: what is found at first
-    is tested once more beside the discrepancy. ended : the estimate's problem at its end,
+    A violation is named only if it explains more than the discrepancy does: those that are detected
+    first are tested once more beside the discrepancy. ended : the estimate's problem at its end,
     :func:`pkmcal.identify.bundle.linearize_at_solution`.
     """
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
@@ -189,7 +189,7 @@ def model_violations(
 
 
 def tool_of(session: Session, estimate: Estimate) -> ToolError:
-    """The tool at the session's poses."""
+    """Error of the tool at the session's poses."""
     used, machine = estimate.configurations, estimate.machine
     return tool_error(
         session.machine,
@@ -202,7 +202,7 @@ def tool_of(session: Session, estimate: Estimate) -> ToolError:
 
 
 def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
-    """A tube's departure by the value that its lines tell."""
+    """Update of a tube's violation with the value from the median of its lines."""
     value, sigma = np.array([one.value]), np.array([one.sigma])
     return OneStepUpdate(
         value, sigma, fit.by_data * (one.value / fit.value[0] if fit.value[0] else 0.0)

@@ -1,4 +1,4 @@
-"""Tubes whose outlines are not those of the drawing: a sleeve, a ring, a cable along a leg.
+"""Tubes whose outlines differ from the nominal model: a sleeve, a ring, a cable along a leg.
 
 Each side of a tube has a shift of its own at each station, for light shifts outlines (shading), and
 a tube has a radius with its tolerance. Shifts have Student's distribution: most are small, and a
@@ -24,9 +24,9 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.session.load import Session
 
 DISTANCE_SAMPLE_EDGES = 4000
-"""Edges, spread over all, by which it is told how far away each line is."""
+"""Edges, evenly of all, from which the distance of each line is computed."""
 OF_MEDIAN = 1.25
-"""Deviation of a median in that of a mean, of normal numbers."""
+"""Standard deviation of a median, over that of a mean, of normal numbers."""
 OF_MIDDLE = 1.48
 """Standard deviation of normal numbers in the median of their distances from the middle."""
 

@@ -62,10 +62,10 @@ from pkmcal.measurements import Column
 from pkmcal.solver.elimination import divisions
 
 NAMED = "named."
-"""Begins the codes of violations that have names elsewhere."""
+"""Prefix of the codes of named violations."""
 COLUMNS_BY_UNKNOWNS = 4
-"""Columns of all components in times of the unknowns': rows are gone through in so much smaller
-pieces, which take no more memory."""
+"""Columns of all components, over those of the unknowns: the rows are processed in pieces smaller
+by this factor, in the same memory."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Component:
 
 @dataclass(frozen=True)
 class ComponentScale:
-    """A component that the data show. scale : s, in the unit of its functions. ratio : twice the
+    """A detected component. scale : s, in the unit of its functions. ratio : twice the
     logarithm of the likelihood ratio against no such component. length : correlation length of the
     likeliest root, m; None where the component has none.
     """
@@ -135,7 +135,7 @@ class ComponentScale:
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What the data show of the components.
+    """Estimated model discrepancy.
 
     scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
     shared unknowns. random : their columns, with the priors that the data show. mean,
@@ -166,7 +166,7 @@ class _Products:
 
 
 def no_discrepancy(info: Information) -> Discrepancy:
-    """None at all."""
+    """A discrepancy without components."""
     na = info.problem.unknowns.count
     return Discrepancy((), np.zeros((na, na)), (), np.zeros(0), np.zeros((0, 0)))
 
@@ -238,7 +238,7 @@ def discrepancy_of(
 
 
 class _Search:
-    """Components taken up one after the other.
+    """Forward selection of components.
 
     root : (c, l) prior root of all columns that are taken up. gain : of the log likelihood.
     """
@@ -251,7 +251,7 @@ class _Search:
         options: DiscrepancyOptions,
         enlarged: int | None,
     ) -> None:
-        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
+        """Select components; enlarged : kind of rows with enlarged noise, None for none."""
         self.products, self.components, self.parts = products, components, parts
         self.options = options
         self.scales: list[ComponentScale] = []
@@ -286,7 +286,7 @@ class _Search:
             self.root = np.concatenate([self.root, more], axis=1)
 
     def _remainder(self) -> tuple[Array, Array]:
-        """M and h of all columns beside the noise that the taken ones are."""
+        """M and h of all columns beside the selected components as noise."""
         n = len(self.root)
         squared, value = self.products.squared[:n, :n], self.products.value[:n]
         across = squared @ self.root
@@ -297,14 +297,16 @@ class _Search:
 
     @property
     def _posterior(self) -> Array:
-        """(l, l) covariance of the taken coefficients, in their prior deviations."""
+        """Posterior covariance (l, l) of the selected coefficients, in prior standard
+        deviations.
+        """
         n = len(self.root)
         information = self.root.T @ self.products.squared[:n, :n] @ self.root
         return np.linalg.inv(np.eye(len(information)) + information)
 
     @property
     def likelihood(self) -> float:
-        """Logarithm of the restricted likelihood with all that are taken up."""
+        """Logarithm of the restricted likelihood with the selected components."""
         return self.products.likelihood + self.gain
 
     @property
@@ -316,7 +318,7 @@ class _Search:
         return -covariance @ (self.root.T @ self.products.value[: len(self.root)]), covariance
 
     def _scale(self, squared: Array, value: Array, whole: Array) -> tuple[float, float]:
-        """The likeliest scale, 0 for none, and twice its log likelihood ratio."""
+        """Maximum-likelihood scale, 0 for none, and twice its log likelihood ratio."""
         m, vectors = np.linalg.eigh((squared + squared.T) / 2)
         visible = m > self.options.rank * float(np.trace(whole))
         m, z = m[visible], vectors[:, visible].T @ value
@@ -350,7 +352,7 @@ def _noise_shares(
 
 
 def _with_noise(assembled: Assembled, factors: tuple[float, float]) -> Assembled:
-    """The problem with the noise of readings, and of poses, times a factor each."""
+    """The problem with the noise of readings, and of poses, multiplied by a factor each."""
     problem = assembled.problem
     poses = replace(problem.pose_data, weight=problem.pose_data.weight / factors[1] ** 2)
     problem = replace(problem, joint_noise=problem.joint_noise * factors[0], pose_data=poses)
@@ -358,7 +360,7 @@ def _with_noise(assembled: Assembled, factors: tuple[float, float]) -> Assembled
 
 
 def _products(assembled: Assembled, info: Information, listed: Sequence[Column]) -> _Products:
-    """Products of the effects' columns, and the restricted likelihood without them."""
+    """Products of the columns, and the restricted likelihood without them."""
     problem, basis = assembled.problem, shared_basis(info)
     columns = columns_of(assembled, info.state, [_as_motion(assembled, one) for one in listed])
     n, count = sum(one.count for one in listed), problem.unknowns.count
@@ -414,7 +416,7 @@ def _log_noise(assembled: Assembled) -> float:
 
 
 def _as_motion(assembled: Assembled, column: Column) -> Column:
-    """A station that stands elsewhere from some configuration on, as a motion by configuration."""
+    """A moved station as a motion by configuration."""
     if column.station is None:
         return column
     unknowns = assembled.problem.unknowns
