@@ -68,8 +68,8 @@ def tool_error(calibration: Any, estimate: Any, truth: TrueMachine) -> float:
 def allowed(folder: Path, draws: int, seed: int) -> tuple[float, ...]:
     """Tool errors, mm: as calibrated, and over draws with whole errors and with half of them."""
     from pkmcal.calibration import calibrate
-    from pkmcal.identify.assembly import lines
     from pkmcal.identify.bundle import bundle
+    from pkmcal.measurements.effects import lines
 
     with tempfile.TemporaryDirectory() as temporary:
         copy = Path(temporary) / folder.name

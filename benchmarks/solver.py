@@ -156,7 +156,7 @@ def dumped(problem: Problem, start: BatchState) -> dict[str, np.ndarray]:
     k, g = np.nonzero(blocks.present)
     of_leg, station = np.broadcast_to(blocks.leg, blocks.present.shape)[k, g], blocks.station[k, g]
     tube = np.argmax(radius[of_leg] == blocks.radius[k, g][:, None], axis=1)
-    index = [k, station, of_leg, tube, blocks.side[k, g, 0], blocks.camera[k, g]]
+    index = [k, station, of_leg, tube, blocks.side[k, g, 0], blocks.column[k, g, 0]]
     return {
         "T_base_platform": start.T_base_platform[0],
         "T_camera_base": start.T_camera_base[0],
@@ -166,14 +166,14 @@ def dumped(problem: Problem, start: BatchState) -> dict[str, np.ndarray]:
         "drawn_rods": problem.drawing[rod],
         "leg_tolerances": sigma[u.machine][leg],
         "rod_tolerances": sigma[u.machine][rod],
-        "shifts": start.optics[0, :, 0],
-        "shift_sigma": sigma[u.optics][:1],
+        "shifts": start.columns[0],
+        "shift_sigma": sigma[u.effects][:1],
         "readings": data.joints[0],
         "reading_noise": problem.joint_noise,
         "edge_index": np.stack(index, axis=1),
         "edge_basis": data.basis[0, k, g, 0],
         "edge_whiten": data.whiten[0, k, g],
-        "edge_shift": data.optics[0, k, g, :, 0],
+        "edge_shift": data.shift[0, k, g],
     }
 
 

@@ -14,6 +14,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.refinement import observation_of
 from pkmcal.calibration.results import calibration_document
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import Photographs
 from pkmcal.observe.images import binned
@@ -150,7 +151,7 @@ def test_photographs_larger_than_sharp(blurred, calibrated):
     document = calibration_document(calibration)
     assert [station["binning"] for station in document["stations"]] == [2, 2, 2]
     shift = document["cameras"][0]["edge_shift"]
-    assert shift == pytest.approx(2 * calibration.estimate.state.edge_shift[0])
+    assert shift == pytest.approx(2 * calibration.estimate.state.columns[EDGE_SHIFT][0])
 
 
 def test_stations_of_one_camera_are_binned_alike(calibrated):

@@ -21,6 +21,7 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.identify.tool import tool_error
 from pkmcal.measurements import EdgeSet, Measurements, Mount
+from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.simulation.placement import draw_configurations
@@ -72,13 +73,16 @@ def test_derivatives_by_the_size_are_those_of_the_residuals():
     assembled = assemble(drawing, both, default_gauge(drawing))
     start = start_state(drawing, both, CAMERA[None])
     state = batch_of(drawing, assembled, replace(start, T_mount=np.tile(np.eye(4), (2, 1, 1))))
-    state = replace(state, sizes=np.array([[0.4]]))
     problem = assembled.problem
-    sizes = problem.unknowns.sizes
+    sizes = problem.unknowns.of_code(BOARD_SIZE)
+    at = sizes.start - problem.unknowns.effects.start
+    state.columns[0, at] = 0.4 * TOLERANCE
     assert sizes.stop - sizes.start == 1
     by = problem.linearize(state).by_shared[0, :, :, sizes.start]
     ahead, behind = (
-        problem.residuals(replace(state, sizes=state.sizes + step)).value[0]
+        problem.residuals(
+            replace(state, columns=state.columns + step * (np.arange(state.columns.shape[1]) == at))
+        ).value[0]
         for step in (1e-3, -1e-3)
     )
     np.testing.assert_allclose(by, (ahead - behind) / 2e-3, rtol=1e-6, atol=1e-8)
@@ -90,7 +94,7 @@ def test_readings_of_carriages_tell_how_large_the_board_is():
     drawing = load_mechanism("linear-delta")
     _, data = seen_by(drawing, np.random.default_rng(1), 0.003, TOLERANCE)
     result = estimated(drawing, data)
-    value, sigma = TOLERANCE * result.state.sizes[0], TOLERANCE * result.size_sigma[0]
+    value, sigma = result.state.columns[BOARD_SIZE][0], result.column_sigma(BOARD_SIZE)[0]
     assert sigma < 0.3 * TOLERANCE
     assert abs(value - 0.003) < 4 * sigma
 

@@ -26,6 +26,7 @@ from pkmcal.identify.covariance import (
 from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.solver.search import Stop, take
 from test_identify_scene import JOINT_NOISE, exact, guess, make_scene
@@ -93,7 +94,7 @@ def test_uncertainty_is_what_repeats_show():
     runs = 200
     scene = make_scene(rng, runs=runs, configurations=8, n_stations=2, in_view=0.6)
     assembled, truth = scene.batch(rng)
-    start = replace(truth, z=0 * truth.z, optics=0 * truth.optics)
+    start = replace(truth, z=0 * truth.z, columns=0 * truth.columns)
     result = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
     assert set(result.solution.stop) == {Stop.CONVERGED}
     solution = result.solution.state
@@ -161,7 +162,7 @@ def test_shading_is_as_large_as_the_edges_say(sigma):
     scene = shaded(make_scene(rng, runs=8, configurations=6, n_stations=2), sigma, rng)
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    values = np.sqrt(np.mean(result.info.problem.data.shading**2))
+    values = np.sqrt(np.mean(result.info.problem.shading**2))
     assert values == pytest.approx(sigma, rel=0.1)
     error = (result.solution.state.z - truth.z) ** 2
     variance = np.einsum("bii->bi", result.covariance)[:, : error.shape[1]]
@@ -179,7 +180,7 @@ def test_a_line_that_is_another_things_edge_is_let_go():
     scene = replace(scene, shading=np.where(wrong, -3.0, scene.shading))
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    assert np.median(result.info.problem.data.shading) == pytest.approx(0.1, rel=0.2)
+    assert np.median(result.info.problem.shading) == pytest.approx(0.1, rel=0.2)
     error = (result.solution.state.z - truth.z) ** 2
     variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
     assert np.mean(error / variance) == pytest.approx(1, abs=0.25)
@@ -447,9 +448,11 @@ def test_two_cameras_have_their_own_edge_shift():
     m = scene.measurements(rng)
     m = replace(m, camera_of_station=np.array([0, 1, 0]))
     value = estimate(scene, m, rng)
-    assert value.state.edge_shift.shape == (2,)
+    assert value.state.columns[EDGE_SHIFT].shape == (2,)
     np.testing.assert_allclose(
-        value.state.edge_shift, scene.edge_shift[0], atol=4 * value.edge_shift_sigma.max()
+        value.state.columns[EDGE_SHIFT],
+        scene.edge_shift[0],
+        atol=4 * value.column_sigma(EDGE_SHIFT).max(),
     )
 
 
@@ -542,5 +545,5 @@ def test_what_looks_scatter_by_is_in_the_deviations_and_nowhere_else():
     assert np.all(after <= 1.5001 * before)
     np.testing.assert_allclose(after[drawn], before[drawn], rtol=0.02)
     assert np.all(more.data_share > -0.01)  # no less is known than was drawn
-    for name in ("edge_shift_sigma", "line_shift_sigma"):
-        assert np.all(getattr(more, name) >= getattr(fit, name))
+    assert np.all(more.column_sigma(EDGE_SHIFT) >= fit.column_sigma(EDGE_SHIFT))
+    assert np.all(more.line_shift_sigma >= fit.line_shift_sigma)

@@ -228,8 +228,7 @@ def free_errors(drawing, estimate, truth):
     Axes by their turns: along them, components change by squares of small angles only.
     """
     table = drawing.parameters
-    shift = np.zeros_like(estimate.state.edge_shift)
-    values = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform, shift)
+    values = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform)
     true = in_gauge(drawing, values, default_gauge(drawing)).theta
     error = table.to_free(estimate.machine.values) - table.to_free(true)
     to_free = np.linalg.pinv(table.free_matrix())

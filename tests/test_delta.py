@@ -101,7 +101,7 @@ def test_frames_change_no_reading(name):
     assert basis.shape[1] == {"delta": 9, "linear-delta": 9, "h4": 3}.get(name, 12)
     y = basis @ rng.normal(size=basis.shape[1]) * 0.2
     e, f = perturb(np.eye(4), y[:6]), perturb(np.eye(4), y[6:])
-    state = State(machine.values, np.eye(4)[None], poses, np.zeros(1))
+    state = State(machine.values, np.eye(4)[None], poses)
     shifted = changed_frames(machine.layout, state, e, f)
     readings = machine.inverse(poses)
     finite = np.isfinite(readings).all(axis=1)

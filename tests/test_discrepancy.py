@@ -23,10 +23,10 @@ from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import Component, discrepancy_of
 from pkmcal.identify.kinds import READING_ROWS_KIND
-from pkmcal.identify.score import RandomEffects, ScoreTests, columns_of
+from pkmcal.identify.score import ScoreTests, columns_of
 from pkmcal.identify.start import start_state
 from pkmcal.identify.tool import tool_error
-from pkmcal.measurements import Effect
+from pkmcal.measurements import Column
 from test_model_violations import measured, scales
 
 FEW = 14
@@ -92,11 +92,11 @@ def test_scale_and_covariance_are_those_of_dense_algebra():
     estimate = replace(estimate, statistics=replace(estimate.statistics, reading_scale=1.0))
     assembled, info = linearize_at_solution(data, estimate)
     root = np.array([[1.0, 0, 0], [0.5, 1, 0], [0, 0, 2.0]])
-    one = Component("functions", Effect(readings=functions), (root,))
+    one = Component(Column("functions", readings=functions), (root,))
     result = discrepancy_of(assembled, info, [one])
     (scaled,) = result.scales
 
-    J, r, G = dense(assembled, info, [one.effect])
+    J, r, G = dense(assembled, info, [one.column])
     length = np.maximum(np.linalg.norm(J, axis=0), 1e-30)
     u, s, _ = np.linalg.svd(J / length, full_matrices=True)
     residual = u[:, np.sum(s > 1e-10 * s[0]) :]
@@ -124,11 +124,10 @@ def test_scores_beside_random_effects_are_those_of_correlated_noise():
     rng = np.random.default_rng(6)
     _, data, estimate, _ = session_estimate(6, lambda q: 2e-3 * q * (np.arange(6) == 1), count=FEW)
     assembled, info = linearize_at_solution(data, estimate)
-    random = Effect(readings=rng.standard_normal((FEW, 6, 2)))
     root = 2e-4 * np.array([[1.0, 0.0], [0.3, 0.7]])
-    tests = [Effect(readings=by) for by in scales(data)[:2]]
-    beside = RandomEffects((random,), root)
-    scores = ScoreTests(assembled, info, tests, beside=beside).scores()
+    random = Column("random", readings=rng.standard_normal((FEW, 6, 2)), prior=root)
+    tests = [Column("test", readings=by) for by in scales(data)[:2]]
+    scores = ScoreTests(assembled, info, tests, beside=[random]).scores()
     J, r, G = dense(assembled, info, [*tests, random])
     V = np.eye(len(r)) + G[:, 2:] @ root @ root.T @ G[:, 2:].T
     white = np.linalg.inv(np.linalg.cholesky(V))
@@ -312,8 +311,8 @@ def test_components_act_in_the_readings_units():
     codes = [one.code for one in components]
     assert len(set(codes)) == len(codes)
     for one in components:
-        assert one.effect.count == len(one.roots[0])
+        assert one.column.count == len(one.roots[0])
         if READING_ROWS_KIND in one.inflates:
             for root in one.roots:
-                size = np.sum((one.effect.readings @ root) ** 2, axis=-1)
+                size = np.sum((one.column.readings @ root) ** 2, axis=-1)
                 assert np.mean(size) == pytest.approx(1, rel=0.2)

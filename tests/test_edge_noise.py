@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from pkmcal.identify import line_shading
-from pkmcal.identify.assembly import SHIFT_SIGMA, assemble, lines
+from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import bundle, linearize_at_solution, solve_batch
 from pkmcal.identify.error_correlation import covariance_of_correlated
 from pkmcal.identify.gauge import default_gauge
@@ -23,6 +23,7 @@ from pkmcal.measurements import (
     concatenate,
 )
 from pkmcal.measurements.edges import EdgeData
+from pkmcal.measurements.effects import SHIFT_SIGMA, lines
 from pkmcal.measurements.line_cells import LineCells
 from pkmcal.solver.search import minimise
 from test_identify_scene import make_scene
@@ -272,7 +273,7 @@ def test_the_whitening_is_a_root_of_the_inverse_cotold(entries, scale, own):
     shift = np.array(entries[3:5])
     white = np.linalg.inv(root)
     data = EdgeData(
-        np.zeros((1, 1, 1, 1, 3, 2)), white[None, None, None], shift[None, None, None, :, None],
+        np.zeros((1, 1, 1, 1, 3, 2)), white[None, None, None], shift[None, None, None],
         np.zeros((1, 1, 1)), np.ones((1, 1, 1)),
         scale=np.full((1, 1, 1), scale), own=np.full((1, 1, 1), own),
     )  # fmt: skip

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import pkmcal
-from pkmcal.calibration.model_violations import KINDS
 from pkmcal.errors import InputError, ResultError
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import (
@@ -34,6 +33,10 @@ FIELDS = {
 }
 MAKERS = {"finding", "wrong", "doubtful", "note"}
 DEPARTURE_FACTS = ("calibration/model_violations.py", "cameras/contract.py", "session/readings.py")
+
+
+VIOLATIONS = {code for code in ENTRIES if "tool_shift_sigmas" in FIELDS[code]}
+FACTS_OF_VIOLATIONS = set[str]().union(*(FIELDS[code] for code in VIOLATIONS))
 
 
 def keys(tree: ast.AST) -> set[str]:
@@ -61,26 +64,29 @@ def codes_of(code: ast.expr, facts: set[str]) -> set[str]:
     return set()
 
 
+def tells(call: ast.Call) -> bool:
+    """Whether it makes a column whose facts are those of a finding."""
+    return getattr(call.func, "id", "") == "Column" and any(k.arg == "facts" for k in call.keywords)
+
+
 @cache
 def calls() -> list[tuple[str, set[str], set[str]]]:
     """Every place where a finding is made: its file and line, codes, and the facts given."""
     texts = {path: path.read_text(encoding="utf-8") for path in SOURCE.rglob("*.py")}
     trees = {
-        p: ast.parse(text)
-        for p, text in texts.items()
-        if re.search(r"finding|ModelViolation", text)
+        p: ast.parse(text) for p, text in texts.items() if re.search(r"finding|\bColumn\(", text)
     }
     del trees[SOURCE / "outcome" / "finding.py"]
     detections = set[str]().union(*(keys(trees[SOURCE / name]) for name in DEPARTURE_FACTS))
     out: list[tuple[str, set[str], set[str]]] = []
     for path, tree in trees.items():
         nodes = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
-        made = [n for n in nodes if getattr(n.func, "id", "") in MAKERS | {"ModelViolation"}]
+        made = [n for n in nodes if getattr(n.func, "id", "") in MAKERS or tells(n)]
         inside = keys(tree) if made else set[str]()
         for node in made:
             facts = {k.arg for k in node.keywords if k.arg} | {"subject"}
             others = any(k.arg is None for k in node.keywords)
-            if others or getattr(node.func, "id", "") == "ModelViolation":
+            if others or tells(node):
                 facts |= inside | detections
             where = f"{path.relative_to(SOURCE)}:{node.lineno}"
             out.append((where, codes_of(node.args[0], facts), facts))
@@ -138,8 +144,15 @@ def test_no_failure_is_dropped():
                 assert used or raised, f"{path.relative_to(SOURCE)}:{node.lineno}"
 
 
-def test_departures_keep_their_kinds_in_files():
-    assert {code for code in ENTRIES if "tool_shift_sigmas" in FIELDS[code]} == KINDS.keys()
+def test_violations_have_kinds_for_files():
+    """A column with facts says its kind, and each violation's sentence has such a column."""
+    codes = set[str]()
+    for path in SOURCE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and tells(node):
+                assert len(node.args) == 3, f"{path}:{node.lineno}: a column without its kind"
+                codes |= codes_of(node.args[0], FACTS_OF_VIOLATIONS)
+    assert codes >= VIOLATIONS
 
 
 @pytest.mark.parametrize(

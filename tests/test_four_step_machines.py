@@ -120,7 +120,7 @@ def make_scene(
     measurements = Measurements(
         edges, joints, JOINT_NOISE, n_stations, np.zeros(n_stations, dtype=int)
     )
-    truth = State(machine.values, T, poses, np.zeros(1))
+    truth = State(machine.values, T, poses)
     return Scene(drawing, in_gauge(drawing, truth, default_gauge(drawing)), measurements)
 
 

@@ -37,7 +37,8 @@ from pkmcal.geometry.rigid import angle_between, apply, perturb, pose, pose_diff
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
+from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
+from pkmcal.measurements.effects import FOCAL_EXCESS, FOCAL_SIGMA, SHADING
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import background, legs
 from pkmcal.observe.background import Texture
@@ -411,8 +412,8 @@ def test_focal_lengths_are_found_within_their_deviations(breathed):
     stations = calibration_document(calibration)["stations"]
     values = np.array([station["focal_scale"] for station in stations])
     sigma = np.array([station["sigma_focal_scale"] for station in stations])
-    assert np.all(sigma <= BREATHING_SIGMA)  # no data take away what is known beforehand
-    assert sigma.min() < 0.99 * BREATHING_SIGMA
+    assert np.all(sigma <= FOCAL_SIGMA)  # no data take away what is known beforehand
+    assert sigma.min() < 0.99 * FOCAL_SIGMA
     assert np.all(np.abs(values - truth.focal_scale) < 3.5 * sigma)
 
 
@@ -456,13 +457,13 @@ def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
     state = batch_of(calibration.session.machine, assembled, calibration.estimate.state)
     problem, u = assembled.problem, assembled.problem.unknowns
     linear = problem.linearize(state)
-    step = 1e-3
+    step = 1e-3 * FOCAL_SIGMA
     for s in range(3):
         change = np.zeros((1, u.count))
-        change[0, u.breathing.start + s] = step
+        change[0, u.of_code(FOCAL_EXCESS).start + s] = step
         shifted = problem.retract(state, change, np.zeros((1, 3, 6)))
-        slope = (problem.residuals(shifted).value - problem.residuals(state).value) / step
-        here = linear.by_shared[..., u.breathing.start + s]
+        slope = (problem.residuals(shifted).value - problem.residuals(state).value) / 1e-3
+        here = FOCAL_SIGMA * linear.by_shared[..., u.of_code(FOCAL_EXCESS).start + s]
         np.testing.assert_allclose(slope[linear.usable], here[linear.usable], atol=1e-6)
         assert np.abs(here).max() > 0.1
 
@@ -474,7 +475,7 @@ def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
     calibration, _ = breathed
     machine = calibration.session.machine
     assembled = assemble(machine, calibration.measurements, default_gauge(machine))
-    assert assembled.problem.unknowns.n_lines == 0
+    assert assembled.problem.unknowns.columns(SHADING).size == 0
     plain = replace(calibration.measurements, shaded=False)
     noise = [
         np.linalg.inv(assemble(machine, m, default_gauge(machine)).problem.data.whiten[0, 0, 0])

@@ -184,7 +184,7 @@ def measured(machine, poses, T_camera_base, seed=0):
     )
     n = len(T_camera_base)
     measurements = Measurements(edges, joints, JOINT_NOISE, n, np.zeros(n, dtype=int))
-    return measurements, State(true.values, T_camera_base, poses, np.zeros(1))
+    return measurements, State(true.values, T_camera_base, poses)
 
 
 def steps(n, column, size):

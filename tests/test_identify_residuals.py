@@ -17,6 +17,7 @@ from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState, Unknowns
+from pkmcal.measurements.effects import EDGE_SHIFT, FOCAL_EXCESS, INTRINSICS, SHADING
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.studies.paper_a import HexapodByAxes
@@ -73,7 +74,7 @@ def test_jacobian_at_random_points():
     shifted = replace(
         truth,
         T_base_platform=perturb(truth.T_base_platform, step),
-        optics=rng.normal(size=(3, 1, 1)),
+        columns=rng.normal(size=(3, 1)),
     )
     check(assembled.problem, shifted, rng)
 
@@ -123,7 +124,7 @@ def test_jacobian_of_edges_that_are_whitened_in_pairs():
     problem = joint_problem(data.machine, data, ThreeCentres())
     z = (data.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
     T = np.broadcast_to(data.view.T_camera_base, (2, 3, 4, 4))
-    check(problem, BatchState(z, T, data.T_base_platform, np.zeros((2, 1, 1))), rng)
+    check(problem, BatchState(z, T, data.T_base_platform, np.zeros((2, 1))), rng)
 
 
 def test_jacobian_of_stations_whose_focal_lengths_breathe():
@@ -132,11 +133,11 @@ def test_jacobian_of_stations_whose_focal_lengths_breathe():
     scene = make_scene(rng, configurations=3)
     case = scene.measurements(rng)
     edges = replace(case.edges, by_focal=rng.normal(size=(len(case.edges), 2)))
-    case = replace(case, edges=edges, breathing_at=np.zeros(case.n_stations))
+    case = replace(case, edges=edges, focal_at=np.zeros(case.n_stations))
     assembled = assemble(scene.machine, case, ThreeCentres())
     stations = guess(rng, scene.T_camera_base)
     state = batch_of(scene.machine, assembled, start_state(scene.machine, case, stations))
-    assert assembled.problem.unknowns.n_breathing == case.n_stations == 3
+    assert assembled.problem.unknowns.columns(FOCAL_EXCESS).size == case.n_stations == 3
     check(assembled.problem, state, rng)
 
 
@@ -195,8 +196,8 @@ def test_sign_of_the_edge_shift():
     measurements = replace(clean, edges=edges)
     start = start_state(scene.machine, measurements, scene.T_camera_base)
     fit = bundle(scene.machine, measurements, start, robust=False, scale_noise=False)
-    assert fit.state.edge_shift[0] == pytest.approx(0.4, abs=0.02)
-    assert fit.state.edge_shift[0] / fit.edge_shift_sigma[0] > 10
+    assert fit.state.columns[EDGE_SHIFT][0] == pytest.approx(0.4, abs=0.02)
+    assert fit.state.columns[EDGE_SHIFT][0] / fit.column_sigma(EDGE_SHIFT)[0] > 10
 
 
 def moved_outward(normal, middle, pixels):
@@ -235,19 +236,22 @@ def test_an_edge_that_cannot_be_predicted_counts_for_nothing():
 
 
 def test_unknowns_stand_one_after_the_other():
-    unknowns = Unknowns(5, n_stations=2, n_cameras=2, n_optics=3, n_lines=4, n_mounts=1)
+    codes = ((EDGE_SHIFT, 2), (INTRINSICS, 4), (SHADING, 4))
+    unknowns = Unknowns(5, n_stations=2, codes=codes, n_mounts=1)
     parts = [
         unknowns.machine,
         unknowns.stations,
-        unknowns.optics,
-        unknowns.shading,
+        unknowns.of_code(EDGE_SHIFT),
+        unknowns.of_code(INTRINSICS),
+        unknowns.of_code(SHADING),
         unknowns.mounts,
     ]
-    assert [part.stop - part.start for part in parts] == [5, 12, 6, 4, 6]
+    assert [part.stop - part.start for part in parts] == [5, 12, 2, 4, 4, 6]
     columns = np.concatenate([np.arange(part.start, part.stop) for part in parts])
     np.testing.assert_array_equal(columns, np.arange(unknowns.count))
-    assert unknowns.columns("edge shifts").tolist() == [17, 20]
-    assert unknowns.columns("intrinsics", "machine").tolist() == [*range(5), 18, 19, 21, 22]
+    assert unknowns.columns(EDGE_SHIFT).tolist() == [17, 18]
+    assert unknowns.columns(INTRINSICS, "machine").tolist() == [*range(5), 19, 20, 21, 22]
+    assert unknowns.columns(FOCAL_EXCESS).size == 0
 
 
 def test_reduced_rows_are_the_least_squares_of_the_unknowns_kept():

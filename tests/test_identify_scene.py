@@ -17,6 +17,7 @@ from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import EdgeSet, Measurements
+from pkmcal.measurements.effects import EDGE_SHIFT, SHADING
 from pkmcal.mechanisms import (
     Machine,
     load_mechanism,
@@ -55,7 +56,10 @@ class Scene:
 
     def state(self, run: int = 0) -> State:
         return State(
-            self.theta[run], self.T_camera_base, self.poses[run], self.edge_shift[run : run + 1]
+            self.theta[run],
+            self.T_camera_base,
+            self.poses[run],
+            {EDGE_SHIFT: self.edge_shift[run : run + 1]},
         )
 
     def measurements(self, rng, noise: float = 1.0, wrong: float = 0.0, run: int = 0):
@@ -110,8 +114,9 @@ class Scene:
         problem = replace(assembled.problem, data=data)
         z = (self.theta - self.machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
         stations = np.broadcast_to(self.T_camera_base, (len(z), *self.T_camera_base.shape))
-        truth = BatchState(z, stations, self.poses, self.edge_shift[:, None, None])
-        truth = replace(truth, shading=np.zeros((len(z), assembled.problem.unknowns.n_lines)))
+        lines = np.zeros((len(z), assembled.problem.unknowns.columns(SHADING).size))
+        columns = np.concatenate([self.edge_shift[:, None], lines], axis=1)
+        truth = BatchState(z, stations, self.poses, columns)
         return replace(assembled, problem=problem), truth
 
 

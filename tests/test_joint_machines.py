@@ -80,7 +80,6 @@ class Session:
             truth.machine.values,
             truth.T_camera_base,
             truth.T_base_platform,
-            np.zeros(1),
             T_mount=self.T_mount,
             on_platform=self.measurements.on_platform,
         )

@@ -16,6 +16,7 @@ from pkmcal.identify.gauge import BestFit, centre_index, generators, transformat
 from pkmcal.identify.unidentified import Findings
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.papers import linear
 from pkmcal.papers.linear_together import base_together
 from pkmcal.papers.methods import linear_estimate
@@ -171,7 +172,7 @@ def test_deviations_are_true_for_base_platform_and_lengths(scenes):
         square, numbers = chi2(values, estimate.state.theta, estimate.covariance, estimate.machine)
         squares.append(square)
         count += numbers
-        shifts.append(estimate.state.edge_shift[0] / 0.3)
+        shifts.append(estimate.state.columns[EDGE_SHIFT][0] / 0.3)
     assert count == 12 * 30
     # within four deviations of a mean square of one
     assert np.sum(squares) / count == pytest.approx(1, abs=4 * np.sqrt(2 / count))

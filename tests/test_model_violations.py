@@ -12,10 +12,9 @@ import yaml
 
 from conftest import run
 from pkmcal import calibrate
-from pkmcal.boards.poses import board_size_violation, pose_set
+from pkmcal.boards.poses import board_size_column, pose_set
 from pkmcal.calibration.camera_refinement import edges_by_camera
 from pkmcal.calibration.localization import frozen_in
-from pkmcal.calibration.model_violations import FALSE_VIOLATION_CHANCE
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.calibration.tube_outlines import outlines
 from pkmcal.geometry.rigid import perturb
@@ -23,9 +22,9 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.score import ScoreTests, columns_of
+from pkmcal.identify.score import FALSE_ALARM, ScoreTests, columns_of
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import EdgeSet, Effect, Measurements, Mount, concatenate
+from pkmcal.measurements import Column, EdgeSet, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome.finding import doubtful
 from pkmcal.planning.subject import of_machine
@@ -82,9 +81,9 @@ def score_tests(drawing, data, where, readings, shifted, families=None):
     estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(drawing))
     info = Information(assembled.problem, batch_of(estimate.machine, assembled, estimate.state))
-    effects = [Effect(readings=by) for by in readings]
+    effects = [Column("readings.test", readings=by) for by in readings]
     if shifted:
-        effects.append(Effect(station=0, since=len(data.joints) // 2))
+        effects.append(Column("station.moved", station=0, since=len(data.joints) // 2))
     return estimate, ScoreTests(assembled, info, effects, families)
 
 
@@ -101,7 +100,7 @@ def plays(data):
 def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate():
     drawing, data, where = measured(1, scale=(2, 2e-3))
     estimate, tests = score_tests(drawing, data, where, scales(data), False)
-    value = tests.tests_beyond(FALSE_VIOLATION_CHANCE)
+    value = tests.tests_beyond(FALSE_ALARM)
     assert value[0][0] == 2
     fit = tests.fitted([2])[0]
     assert abs(fit.value[0] - 2e-3) < 4 * fit.sigma[0]
@@ -126,7 +125,7 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
     drawing = load_mechanism("gough-stewart")
     drawing, data, where = measured(1, scale=(2, 1e-2), machine=drawing)
     estimate, tests = score_tests(drawing, data, where, scales(data), False)
-    assert tests.tests_beyond(FALSE_VIOLATION_CHANCE)[0][0] == 2
+    assert tests.tests_beyond(FALSE_ALARM)[0][0] == 2
     fit = tests.fitted([2])[0]
     row = drawing.parameters.index("legs[3].scale")
     present = estimate.machine.values[row]
@@ -139,12 +138,12 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
 def test_play_and_a_pushed_camera_are_told_from_each_other():
     drawing, data, where = measured(2, play=(4, 4e-4))
     _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
-    assert [k for k, _ in tests.tests_beyond(FALSE_VIOLATION_CHANCE)] == [6 + 4]
+    assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == [6 + 4]
     assert tests.fitted([10])[0].value[0] == pytest.approx(4e-4, rel=0.2)
     step = np.array([0.0, 0.0, 0.0, 6e-4, -5e-4, 4e-4])
     drawing, data, where = measured(3, turned=step)
     _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
-    assert [k for k, _ in tests.tests_beyond(FALSE_VIOLATION_CHANCE)] == [12]
+    assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == [12]
     fit = tests.fitted([12])[0]
     off = fit.value - step
     assert np.all(np.abs(off) < 4 * fit.sigma + 0.05 * np.abs(step))
@@ -153,7 +152,7 @@ def test_play_and_a_pushed_camera_are_told_from_each_other():
 def test_two_departures_are_found_one_after_the_other():
     drawing, data, where = measured(4, scale=(0, 4e-3), play=(3, 5e-4))
     _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
-    assert {k for k, _ in tests.tests_beyond(FALSE_VIOLATION_CHANCE)} == {0, 6 + 3}
+    assert {k for k, _ in tests.tests_beyond(FALSE_ALARM)} == {0, 6 + 3}
     one, other = tests.fitted([0, 9])
     assert one.value[0] == pytest.approx(4e-3, rel=0.3)
     assert other.value[0] == pytest.approx(5e-4, rel=0.3)
@@ -162,7 +161,7 @@ def test_two_departures_are_found_one_after_the_other():
 def test_nothing_is_found_twice():
     drawing, data, where = measured(7, scale=(1, 6e-3))
     _, tests = score_tests(drawing, data, where, scales(data)[1:3], False, [0, 1])
-    results = [k for k, _ in tests.tests_beyond(FALSE_VIOLATION_CHANCE)]
+    results = [k for k, _ in tests.tests_beyond(FALSE_ALARM)]
     assert results[0] == 0
     assert len(results) == len(set(results))
 
@@ -173,8 +172,9 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(drawing))
     state, problem = batch_of(estimate.machine, assembled, estimate.state), assembled.problem
-    effects = [Effect(readings=scales(data)[1]), Effect(station=1, since=5)]
-    effects.append(Effect(edges=np.stack([data.edges.shift, data.edges.normal[:, :2]], axis=-1)))
+    effects = [Column("a", readings=scales(data)[1]), Column("b", station=1, since=5)]
+    turns = np.stack([data.edges.shift, data.edges.normal[:, :2]], axis=-1)
+    effects.append(Column("c", edges=turns))
     tests = ScoreTests(assembled, Information(problem, state), effects, [0, 1, 2], singles=True)
     own, m = problem.linearize(state), data.joints.shape[1]
     shared = own.by_shared[0]
@@ -231,7 +231,7 @@ def false_alarms(seeds):
 
 def test_right_sessions_have_chances_like_dice():
     chances = false_alarms(range(100, 112))
-    assert chances.min() > FALSE_VIOLATION_CHANCE / chances.shape[1] / 10
+    assert chances.min() > FALSE_ALARM / chances.shape[1] / 10
     assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
 
 
@@ -248,8 +248,8 @@ def test_errors_of_whole_configurations_are_no_departure():
         data = replace(data, joints=wrong)
         _, tests = score_tests(drawing, data, where, scales(data)[2:3], False)
         named += (
-            tests.scores()[0].adjusted < FALSE_VIOLATION_CHANCE,
-            len(tests.tests_beyond(FALSE_VIOLATION_CHANCE)),
+            tests.scores()[0].adjusted < FALSE_ALARM,
+            len(tests.tests_beyond(FALSE_ALARM)),
         )
         assert tests.fitted([0])[0].sigma[0] > 3e-4  # 5e-3 of twenty, as far as edges see it
     assert named[0] >= 3
@@ -260,7 +260,7 @@ def test_errors_of_whole_configurations_are_no_departure():
 def test_right_sessions_have_chances_like_dice_often():
     chances = false_alarms(range(500))
     count = chances.shape[1]
-    alarms = np.mean(chances.min(axis=1) < FALSE_VIOLATION_CHANCE / count)
+    alarms = np.mean(chances.min(axis=1) < FALSE_ALARM / count)
     assert alarms < 0.015
     assert abs(np.mean(chances < 0.1) - 0.1) < 0.02
 
@@ -273,7 +273,7 @@ def test_what_no_data_see_is_not_tested():
     offset[:, 1] = 1.0
     _, tests = score_tests(drawing, data, where, [nothing, offset], False)
     assert [score.dof for score in tests.scores()] == [0, 1]
-    assert tests.tests_beyond(FALSE_VIOLATION_CHANCE) == []
+    assert tests.tests_beyond(FALSE_ALARM) == []
     none, some = tests.fitted([0, 1])
     assert none.sigma[0] == np.inf
     offsets = np.flatnonzero(drawing.parameters.of_kind("offset"))
@@ -315,8 +315,8 @@ def test_boards_of_another_size_show_where_readings_give_the_scale():
     estimate = bundle(machine, data, start, scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(machine))
     info = Information(assembled.problem, batch_of(estimate.machine, assembled, estimate.state))
-    one = board_size_violation(boards, 0, "board.yaml")
-    fit = ScoreTests(assembled, info, [one.effect]).fitted([0])[0]
+    one = board_size_column(boards, 0, "board.yaml")
+    fit = ScoreTests(assembled, info, [one]).fitted([0])[0]
     assert abs(fit.value[0] - 0.004) < 4 * fit.sigma[0] + 2e-4
 
 
@@ -344,15 +344,15 @@ def outlined(seed, lines_off):
     session = SimpleNamespace(
         machine=drawing, station_names=("one", "two"), document={"mechanism": "mechanism.yaml"}
     )
-    values = list(outlines(session, data, estimate, FALSE_VIOLATION_CHANCE))
+    values = list(outlines(session, data, estimate))
     return values, 1e3 * np.median(away) if away.size else 0.0
 
 
 def test_a_tube_that_is_thicker_is_named():
     off = {(2, 0, s, side): 3.0 for s in (0, 1) for side in (0, 1)}
     (value,), thicker = outlined(11, off)
-    one = value.violation
-    assert (one.code, one.of) == ("tube.radius", "legs[3].tubes[1]")
+    one = value.column
+    assert (one.code, one.subject) == ("tube.radius", "legs[3].tubes[1]")
     assert value.value == pytest.approx(1e-3 * thicker, rel=0.15)
     facts = one.facts(np.array([0.0015]), np.array([0.0001]))
     assert (facts["leg"], facts["tube"], facts["value"]) == (3, 1, 0.0015)
@@ -363,9 +363,9 @@ def test_a_tube_that_is_thicker_is_named():
 
 def test_an_edge_that_is_off_alone_is_named_with_its_station():
     (value,), _ = outlined(12, {(4, 0, 1, 0): -4.0})
-    one = value.violation
+    one = value.column
     assert value.value < -5 * value.sigma
-    assert (one.code, one.of) == ("tube.edge", "legs[5].tubes[1], two")
+    assert (one.code, one.subject) == ("tube.edge", "legs[5].tubes[1], two")
     facts = one.facts(np.array([-0.002]), np.array([0.0001]))
     assert (facts["leg"], facts["tube"], facts["station"]) == (5, 1, "two")
 
@@ -385,7 +385,7 @@ def test_a_sleeve_is_named_and_harms_little(session):
     path.write_text(yaml.safe_dump(document))
     value = calibrate(session)
     (one,) = value.violations
-    assert (one.code, one.of) == ("tube.radius", "legs[2].tubes[1]")
+    assert (one.code, one.subject) == ("tube.radius", "legs[2].tubes[1]")
     assert abs(one.value[0] - 2e-3) < 4 * one.sigma[0]
     assert one.value[0] > 1e-3
     assert not one.against
@@ -421,7 +421,7 @@ def test_another_camera_is_named(session):
     path.write_text(yaml.safe_dump(document))
     value = calibrate(session)
     (one,) = value.violations
-    assert (one.code, one.of) == ("camera.focal", "cameras/camera.yaml")
+    assert (one.code, one.subject) == ("camera.focal", "cameras/camera.yaml")
     assert one.value[0] == pytest.approx(-0.03, rel=0.3)
     assert "--refine-camera" in one.finding.next_step
     assert one.finding in value.verdict.of("camera.focal")

@@ -173,7 +173,6 @@ def replace_start(machine, truth):
         machine.parameters.drawing,
         truth.view.T_camera_base,
         np.zeros((0, 4, 4)),
-        np.zeros(1),
         T_mount=truth.view.T_platform_board[None],
         on_platform=np.ones(1, dtype=bool),
     )

@@ -15,6 +15,7 @@ from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import EdgeSet, Observation, Rejection
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.pages.page import page_html
@@ -157,9 +158,9 @@ def make_estimate(machine, poses, T, edges, rng) -> Estimate:
     weights[:3] = 0.1
     return Estimate(
         machine=machine,
-        state=State(machine.values, T, poses, np.array([CAMERA_SHIFT])),
+        state=State(machine.values, T, poses, {EDGE_SHIFT: np.array([CAMERA_SHIFT])}),
         joint_covariance=np.diag(np.r_[sigma**2, np.tile([1e-8] * 3 + [4e-8] * 3, len(T))]),
-        edge_shift_sigma=np.array([0.012]),
+        column_covariance={EDGE_SHIFT: np.array([[0.012**2]])},
         edge_residuals=rng.normal(size=(count, 2)),
         edge_weights=weights,
         edge_noise=EdgeScatter(np.ones(2), np.full(2, 0.015), np.full(2, 100.0)),

@@ -36,7 +36,7 @@ def known(machine, share=0.02):
 
 @pytest.fixture(scope="module")
 def small():
-    """Hexapod with errors of its nominal model, with a covariance, in a few poses."""
+    """A hexapod whose drawing is off, with a covariance, in a few poses."""
     drawing = load_mechanism("gough-stewart")
     machine = true_machine(drawing, 1.0, np.random.default_rng(2))
     poses = poses_in(machine.limits(), Region(turn=0.2), 12)
@@ -62,7 +62,7 @@ def drawn_poses(case, draws=1500):
 
 
 def test_sigma_is_the_scatter_of_machines_drawn_by_the_covariance(small):
-    """Each drawn machine is fitted by all joint centres, without derivatives."""
+    """Each drawn machine is laid over by all joint centres, with no word of derivatives."""
     values = tool_error(
         small.drawing, small.machine, free_of_gauge(small.machine, small.covariance), small.poses
     )
@@ -104,7 +104,7 @@ def test_the_drawings_error_is_that_of_its_poses_at_the_same_readings(small):
 
 
 def test_frames_by_some_of_the_poses(small):
-    """Fitted on all poses or on the requested ones alone: equal if these are all."""
+    """Fitted on all poses or on those that are asked for alone, the same where these are all."""
     arguments = small.drawing, small.machine, small.covariance
     whole = tool_error(*arguments, small.poses, legs_observed=False)
     named = tool_error(*arguments, small.poses, legs_observed=False, fitted=np.arange(12))
@@ -132,7 +132,7 @@ def test_from_a_calibration_and_from_its_file(calibrated, tmp_path):
     assert (values.position > 0).all()
     np.testing.assert_allclose(again.position, values.position, rtol=1e-9)
     np.testing.assert_allclose(again.off, values.off, rtol=1e-6, atol=1e-12)
-    assert (values.off_position > 1.5 * values.position).all()  # the nominal error was larger
+    assert (values.off_position > 1.5 * values.position).all()  # the drawing was off by more
     with pytest.raises(InputError, match="what are no poses"):
         calibrated.tool_error(poses[0])
 
@@ -160,13 +160,13 @@ def test_every_machine_has_a_map(name):
         assert np.abs(place[:, cut.across] - u[there]).max() < 0.26 * cell
         assert np.abs(place[:, cut.up] - v[there]).max() < 0.26 * cell
         assert np.abs(place[:, cut.normal] - cut.level).max() < 0.26 * cell
-    # by the prior sigmas alone, fifty times the standard deviation
+    # by the drawing's tolerances alone, fifty times what is known
     ratio = np.median(made.before.position) / np.median(made.after.position)
     assert 20 < ratio < 120
 
 
 def test_a_map_of_a_region(small):
-    """Inside it, and the content of its document."""
+    """Inside it, and what its document tells."""
     region = Region(x=(-0.02, 0.03), y=(0.0, 0.04))
     made = map_of(small.drawing, small.machine, small.covariance, region)
     place = made.after.T_base_platform[:, :3, 3]
@@ -240,9 +240,7 @@ def test_machines_of_few_freedoms_are_drawn_by_what_they_do(name, plots, axes):
     ],
 )
 def test_a_plane_a_line_and_a_point_are_regions_too(name, region, slices, said):
-    """A plane is cut where it is, not at home; a line and a point have no slices, with
-    the reason.
-    """
+    """A plane is cut where it is, not at home; a line and a point have no slices, and say why."""
     part, made = page_of(name, **region)
     cuts = [(cut.across, cut.up, cut.level) for cut in made.slices]
     assert cuts == [(*plane[:2], pytest.approx(plane[2], abs=1e-6)) for plane in slices]
@@ -261,8 +259,8 @@ def test_a_machine_without_a_map_says_why():
 
 
 def test_frames_are_no_error(small):
-    """Frames by three joints instead of the truth's: other numbers, the same machine."""
-    state = State(small.machine.values, np.eye(4)[None], small.poses, np.zeros(1))
+    """Those by three joints in place of the truth's: other numbers, the same machine."""
+    state = State(small.machine.values, np.eye(4)[None], small.poses)
     values = in_gauge(small.machine, state, ThreeCentres((0, 2, 4)))
     other = small.machine.with_values(values.theta)
     joints = small.machine.inverse(small.poses)
@@ -283,7 +281,7 @@ def test_errors_beside_a_known_machine_are_those_of_its_poses(small):
     np.testing.assert_allclose(error.orientation, np.linalg.norm(off[:, :3], axis=1), atol=1e-12)
     k = small.drawing.parameters.of_kind("offset")
     np.testing.assert_allclose(error.offset, (small.drawing.values - small.machine.values)[k])
-    # by the poses too, where no legs determine the joints: never further apart
+    # by the poses too, where no legs tell where the joints are: never further apart
     by_poses = compare(small.drawing, small.machine, joints, legs_observed=False)
     assert np.sum(by_poses.position**2) < np.sum(error.position**2)
 

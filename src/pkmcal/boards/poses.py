@@ -38,7 +38,8 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
-from pkmcal.measurements import Effect, ModelViolation, PoseSet, Rejection
+from pkmcal.measurements import Column, PoseSet, Rejection
+from pkmcal.measurements.effects import by_board_size
 from pkmcal.observe.repeats import groups_of
 from pkmcal.wording import count, listed
 
@@ -515,7 +516,7 @@ def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[R
     return replace(poses, by_intrinsics=by), odd
 
 
-def board_size_violation(poses: PoseSet, mount: int, file: str) -> ModelViolation:
+def board_size_column(poses: PoseSet, mount: int, file: str) -> Column:
     """Model violation of a board whose size differs from its file beyond the prior sigma.
 
     mount : the board's number.
@@ -523,11 +524,9 @@ def board_size_violation(poses: PoseSet, mount: int, file: str) -> ModelViolatio
     The violation has no prior, so if the size is also an unknown with one, the estimate is the full
     difference from the file.
     """
-    by = np.zeros((len(poses), 6, 1))
-    mine = poses.mount == mount
-    by[mine, 3:, 0] = poses.T_station_target[mine, :3, 3]
+    own, by = by_board_size(poses, mount)
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {"value": value[0], "sigma": sigma[0], "file": file, "factor": 1 + value[0]}
 
-    return ModelViolation("board.size", file, facts, Effect(poses=by))
+    return Column("board.size", file, "board size", poses=by, pose_rows=own, facts=facts)

@@ -57,7 +57,6 @@ from pkmcal.files import closest, quoted, resolved
 from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import NO_RANDOM_EFFECTS, RandomEffects
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
@@ -67,7 +66,7 @@ from pkmcal.identify.unidentified import (
     only_heights,
 )
 from pkmcal.identify.verdict import RicherModel, judge
-from pkmcal.measurements import Measurements, Observation
+from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, doubtful, note
@@ -466,7 +465,7 @@ def _judge(
     ended = linearize_at_solution(value.turns.measurements, value.estimate)
     detections: tuple[DetectedViolation, ...] = ()
     errors: tuple[ModelError, ...] = ()
-    uneven = NO_RANDOM_EFFECTS
+    uneven: tuple[Column, ...] = ()
     without = value.estimate
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
         turns = value.turns
@@ -532,7 +531,7 @@ def _judge(
 
 
 def _findings(
-    measurements: Measurements, estimate: Estimate, info: Information, uneven: RandomEffects
+    measurements: Measurements, estimate: Estimate, info: Information, uneven: tuple[Column, ...]
 ) -> Findings:
     """What the data tell of the machine, in words, and the paper's conditions.
 

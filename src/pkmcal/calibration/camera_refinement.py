@@ -19,7 +19,6 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import (
-    BREATHING_SIGMA,
     EdgeSet,
     LinkSet,
     Measurements,
@@ -28,6 +27,7 @@ from pkmcal.measurements import (
     Set,
     concatenate,
 )
+from pkmcal.measurements.effects import FOCAL_EXCESS, INTRINSICS
 from pkmcal.session.load import Session
 
 
@@ -38,7 +38,7 @@ class CameraRefinement:
     files, calibrated : names and cameras as calibrated, C of them. factor : (C, n, r) the F above,
     r = 0 where cameras are held. at : (C, r). of_station : (S,) file of each station's camera.
     breathes : (S,) whether the station is a photograph by hand. breath : (S,) excess of its focal
-    lengths, in BREATHING_SIGMA.
+    lengths, relative.
     """
 
     files: tuple[str, ...]
@@ -77,7 +77,7 @@ class CameraRefinement:
     def at_station(self, number: int) -> Camera:
         """The camera of a station, with its own focal lengths where these breathe."""
         camera = self.camera(self.of_station[number])
-        excess = BREATHING_SIGMA * self.breath[number] * camera.focal_part
+        excess = self.breath[number] * camera.focal_part
         return replace(camera, parameters=camera.parameters + excess)
 
     def of(self, stations: Integers) -> CameraRefinement:
@@ -96,11 +96,11 @@ class CameraRefinement:
 
     def updated(self, estimate: Estimate) -> CameraRefinement:
         """The refinement after an estimate."""
-        state, at, breath = estimate.state, self.at, self.breath
-        if state.intrinsics.shape == at.shape:
-            at = at + state.intrinsics
-        if len(state.breathing):
-            breath = breath + state.breathing[: len(breath)]
+        columns, at, breath = estimate.state.columns, self.at, self.breath
+        if INTRINSICS in columns:
+            at = at + columns[INTRINSICS].reshape(at.shape)
+        if FOCAL_EXCESS in columns:
+            breath = breath + columns[FOCAL_EXCESS][: len(breath)]
         return replace(self, at=at, breath=breath)
 
     def result(self, estimate: Estimate, file: str) -> Camera:
@@ -108,8 +108,10 @@ class CameraRefinement:
         camera = self.updated(estimate).camera(file)
         if not self.refined:
             return camera
-        covariance = estimate.intrinsics_covariance[self.files.index(file)]
-        n = len(camera.parameters)
+        n, number, r = len(camera.parameters), self.files.index(file), self.at.shape[1]
+        own = slice(number * r, (number + 1) * r)
+        covariance = estimate.column_covariance[INTRINSICS][own, own]
+        covariance = self.factor[number] @ covariance @ self.factor[number].T
         return replace(camera, covariance=covariance[:n, :n])
 
 
@@ -189,11 +191,11 @@ def measurements_of(
     # What targets are fixed to: the board, then each tracker's own, then the points of links.
     mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
     poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
-    breathing = np.zeros(0)
+    focal_at = np.zeros(0)
     if cameras is not None and cameras.active and session.stations:
         if cameras.breathes.any():
-            poses, edges = _breathing(poses, cameras), _breathing(edges, cameras)
-            breathing = np.pad(cameras.breath, (0, len(session.trackers)))
+            poses, edges = _with_focal(poses, cameras), _with_focal(edges, cameras)
+            focal_at = np.pad(cameras.breath, (0, len(session.trackers)))
         change = [
             cameras.at_station(k).parameters - session.stations[k].camera.parameters
             for k in range(len(session.stations))
@@ -229,11 +231,11 @@ def measurements_of(
         intrinsics_factor=cameras.factor,
         intrinsics_at=cameras.at,
         shaded=len(measurements.edges) > 0,
-        breathing_at=breathing,
+        focal_at=focal_at,
     )
 
 
-def _breathing(measured: Set, cameras: CameraRefinement) -> Set:
+def _with_focal(measured: Set, cameras: CameraRefinement) -> Set:
     """What was measured, with what the excess of each photograph's focal lengths does to it."""
     each = [
         cameras.camera(file) if breathes else None

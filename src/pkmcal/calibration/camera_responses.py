@@ -22,7 +22,7 @@ from pkmcal.identify.bundle import bundle, linearize_at_solution
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import ScoreTests
 from pkmcal.identify.verdict import POLISHED_SHADING
-from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
+from pkmcal.measurements import Column, EdgeSet, Measurements, concatenate
 from pkmcal.observe.image_batches import Photographs
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.session.load import Session
@@ -216,7 +216,8 @@ def _scored(
     """chi2 that would be gained by going to where other edges are, for the edges of each camera,
     and the standard deviation of the way that fits.
     """
-    effects = [Effect(edges=_normal_turn(measurements.edges, edges)) for edges in other.values()]
+    turns = [_normal_turn(measurements.edges, edges) for edges in other.values()]
+    effects = [Column("camera.response", edges=turn) for turn in turns]
     if not effects:
         return {}, {}
     tests = ScoreTests(*linearize_at_solution(measurements, estimate), effects)

@@ -26,10 +26,10 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.score import prior_root
 from pkmcal.identify.tool import ToolError
 from pkmcal.identify.unidentified import only_heights
-from pkmcal.identify.unknowns import own_blocks
-from pkmcal.measurements import Effect, Measurements
+from pkmcal.measurements import Column, Measurements
 from pkmcal.outcome.finding import Finding, doubtful
 
 CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
@@ -168,7 +168,7 @@ def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
     effect[felt, 5] = basis
     either = READING_ROWS_KIND, POSE_ROWS_KIND  # a height is as much its readings' as its probe's
     in_metres = tuple((size * lengths).tolist())
-    return [Component(UNEVEN_BED, Effect(poses=effect), roots, either, in_metres)]
+    return [Component(Column(UNEVEN_BED, poses=effect), roots, either, in_metres)]
 
 
 def height_rows(measurements: Measurements) -> Integers:
@@ -194,8 +194,7 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
     if not basis.shape[1]:  # all of one pose
         return
     yield Component(
-        "readings.workspace",
-        Effect(readings=by_motor(basis)),
+        Column("readings.workspace", readings=by_motor(basis)),
         tuple(np.kron(root, each) for root in roots),
         (READING_ROWS_KIND,),
     )
@@ -206,14 +205,13 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
         alone = np.concatenate([x[:, :, None] * each for x in (sign, step)], axis=2)
         together = np.stack([sign, step], axis=2)
         yield Component(
-            "readings.step",
-            Effect(readings=np.concatenate([alone, together], axis=2)),
+            Column("readings.step", readings=np.concatenate([alone, together], axis=2)),
             (np.eye(2 * m + 2) / 2,),
             (READING_ROWS_KIND,),
         )
     time = functions_of_time(n)[used]
     yield Component(
-        "readings.time", Effect(readings=by_motor(time)), (np.eye(2 * m),), (READING_ROWS_KIND,)
+        Column("readings.time", readings=by_motor(time)), (np.eye(2 * m),), (READING_ROWS_KIND,)
     )
 
 
@@ -285,7 +283,7 @@ def _of_stations(measurements: Measurements, estimate: Estimate) -> Iterator[Com
     by_base = [_motion_in_station(T) @ unit for T in state.T_camera_base]
     motion = np.stack([np.einsum("ij,kp->kipj", by, straight) for by in by_base])
     motion = motion.reshape(len(by_base), n, 6, -1)
-    yield Component("base.workspace", Effect(motion=motion), (np.eye(motion.shape[-1]),))
+    yield Component(Column("base.workspace", motion=motion), (np.eye(motion.shape[-1]),))
     parts: list[Array] = []
     for s in stations:
         taken = [x.configuration[x.station == s] for x in (measurements.edges, measurements.poses)]
@@ -295,7 +293,7 @@ def _of_stations(measurements: Measurements, estimate: Estimate) -> Iterator[Com
             parts.append(part)
     if parts:
         motion = np.concatenate(parts, axis=-1)
-        yield Component("station.time", Effect(motion=motion), (np.eye(motion.shape[-1]),))
+        yield Component(Column("station.time", motion=motion), (np.eye(motion.shape[-1]),))
 
 
 def _motion_in_station(T: Array) -> Array:
@@ -333,12 +331,10 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
     turn = np.linalg.pinv(by_turn) @ (-outward / distance[..., None])
     own = np.eye(machine.n_legs)[edges.leg]
     effect = np.einsum("nij,nl->nijl", turn, own).reshape(len(edges), 2, -1)
-    yield Component("legs.shape", Effect(edges=effect), (np.eye(effect.shape[-1]),))
+    yield Component(Column("legs.shape", edges=effect), (np.eye(effect.shape[-1]),))
 
 
-def with_discrepancy(
-    measurements: Measurements, estimate: Estimate, problem: Problem, discrepancy: Discrepancy
-) -> Estimate:
+def with_discrepancy(estimate: Estimate, problem: Problem, discrepancy: Discrepancy) -> Estimate:
     """The estimate whose covariances contain the discrepancy; problem : as the estimate ended."""
     if not discrepancy.scales:
         return estimate
@@ -346,18 +342,15 @@ def with_discrepancy(
     gauge = default_gauge(machine)
     more = machine_covariance(problem, machine, estimate.state, shared, gauge)
     joint = estimate.joint_covariance + more
-    n, variance = len(machine.values), np.diag(shared)
-    optics, factor = own_blocks(shared, u.optics, u.n_optics), measurements.intrinsics_factor
+    n, covariance = len(machine.values), dict(estimate.column_covariance)
+    for code in covariance:
+        covariance[code] = covariance[code] + shared[u.of_code(code), u.of_code(code)]
     return replace(
         estimate,
         joint_covariance=joint,
         # what is left out may make a value less sure than the drawing alone has it
         data_share=np.maximum(data_share(machine, estimate.state.theta, joint[:n, :n], gauge), 0.0),
-        edge_shift_sigma=np.sqrt(estimate.edge_shift_sigma**2 + optics[:, 0, 0]),
-        intrinsics_covariance=estimate.intrinsics_covariance
-        + factor @ optics[:, 1:, 1:] @ factor.mT,
-        breathing_sigma=np.sqrt(estimate.breathing_sigma**2 + variance[u.breathing]),
-        size_sigma=np.sqrt(estimate.size_sigma**2 + variance[u.sizes]),
+        column_covariance=covariance,
     )
 
 
@@ -367,10 +360,10 @@ def bed_surface(
     """The bed's map, by the discrepancy's coefficients given the data."""
     felt, poses = height_rows(measurements), measurements.poses
     heights = [
-        np.zeros((len(felt), effect.count)) if effect.poses is None else effect.poses[felt, 5]
-        for effect in discrepancy.random.effects
+        np.zeros((len(felt), column.count)) if column.poses is None else column.poses[felt, 5]
+        for column in discrepancy.random
     ]
-    by = np.concatenate(heights, axis=1) @ discrepancy.random.root
+    by = np.concatenate(heights, axis=1) @ prior_root(discrepancy.random)
     place = estimate.state.T_base_platform[poses.configuration[felt], :2, 3]
     variance = np.einsum("ni,ij,nj->n", by, discrepancy.covariance, by)
     return BedSurface(

@@ -30,6 +30,7 @@ from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.unidentified import identified, only_heights
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
+from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import (
     ReadingHypothesis,
@@ -525,22 +526,20 @@ def size_notes(
     """A note on how large the board is, where that is not known exactly."""
     tolerances = [mount.tolerance for mount in measurements.mounts if mount.tolerance > 0]
     for tolerance, value, sigma in zip(
-        tolerances, estimate.state.sizes, estimate.size_sigma, strict=False
+        tolerances,
+        estimate.state.columns.get(BOARD_SIZE, ()),
+        estimate.column_sigma(BOARD_SIZE),
+        strict=False,
     ):
         file = session.document["board"]["file"]
-        if sigma <= UNTOLD_BOARD_SIZE_SIGMA:
-            yield note(
-                "board.size_estimate", file, value=tolerance * value, sigma=tolerance * sigma
-            )
+        if sigma <= UNTOLD_BOARD_SIZE_SIGMA * tolerance:
+            yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
-        # of the estimate's two sources, N(0, 1) is the file's: the rest is what all else tells
-        other = max(1 - sigma**2, np.finfo(float).eps)
+        # of the estimate's two sources, the prior is the file's: the rest is what all else tells
+        other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
         above_limit = {"tolerance": 100 * tolerance}
-        if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT:
-            above_limit |= {
-                "value": tolerance * value / other,
-                "sigma": tolerance * sigma / np.sqrt(other),
-            }
+        if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT * tolerance:
+            above_limit |= {"value": value / other, "sigma": sigma / np.sqrt(other)}
             yield note("board.size_disagrees", file, **above_limit)
         else:
             yield note("board.size_by_file", file, **above_limit)

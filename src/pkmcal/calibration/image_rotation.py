@@ -24,6 +24,7 @@ from pkmcal.cameras.contract import CENTER
 from pkmcal.cameras.files import written_camera
 from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.score import ScoreTests
+from pkmcal.measurements import Column
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.session.load import Session
 
@@ -88,7 +89,8 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, 
     cameras = {station.entry: (station.camera_file, station.camera) for station in session.stations}
     ways = {entry: _half_turn_change(camera) for entry, (_, camera) in cameras.items()}
     effects = [
-        changed.effect(entries == entry, attempt[:, None]) for entry, attempt in ways.items()
+        changed.of_stations(Column("image.turn"), entries == entry, attempt[:, None])
+        for entry, attempt in ways.items()
     ]
     fits = ScoreTests(*linearize_at_solution(turns.measurements, turns.estimate), effects).fitted(
         range(len(effects))

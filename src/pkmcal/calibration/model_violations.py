@@ -1,15 +1,15 @@
-"""What the session takes for granted, tested: readings, lenses, boards, tripods, tubes.
+"""Model violations of a session: readings, cameras, boards, stations, tubes.
 
-Each departure is declared beside the thing that it departs from, with what it would do to the
-measurements and in which words it is told; here they are put together and tested, all at one level
-(:mod:`pkmcal.identify.score` says what freeing each would gain).
+Each violation is a column (:mod:`pkmcal.measurements.columns`) that is made beside its subject,
+with its derivatives and the facts of its finding. Here all of them are score-tested at one
+false-alarm level (:mod:`pkmcal.identify.score`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import groupby, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,54 +31,33 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.discrepancy import discrepancy_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import (
+    FALSE_ALARM,
     MOST_VIOLATIONS_SOUGHT,
     OneStepUpdate,
-    RandomEffects,
     Score,
     ScoreTests,
 )
 from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.identify.unidentified import only_heights
-from pkmcal.measurements import Effect, Measurements, ModelViolation, Observation
+from pkmcal.measurements import Column, Measurements, Observation
+from pkmcal.measurements.effects import columns_of_effects
 from pkmcal.mechanisms.closure import scales as scales_of
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session import readings, station_movement
 from pkmcal.session.load import Session
 
-FALSE_VIOLATION_CHANCE = 0.005
-"""Chance at which any departure at all is found in a session that has none."""
 MOST_TOOL_SHIFT = 1.0
-"""Standard deviations by which a departure moves the tool, beyond which the result is refused."""
-
-
-KINDS = {
-    "readings.scale": "reading scale",
-    "readings.play": "backlash",
-    "readings.single": "reading",
-    "station.moved": "station moved",
-    "tube.radius": "tube radius",
-    "tube.edge": "tube edge",
-    "board.size": "board size",
-    "camera.focal": "focal length",
-    "camera.aspect": "pixel aspect",
-    "camera.centre": "picture centre",
-    "camera.distortion": "distortion",
-    "station.focal": "station's focal length",
-    "station.aspect": "station's pixel aspect",
-    "station.centre": "station's picture centre",
-    "station.distortion": "station's distortion",
-}
-"""``kind`` of a departure in calibration.json, by its code."""
+"""Shift of the tool by a violation, in standard deviations, beyond which the result is refused."""
 
 
 @dataclass(frozen=True)
 class DetectedViolation:
-    """A departure that the data show.
+    """A model violation that the data show.
 
-    finding : for the verdict, a reason where it moves the tool by more than MOST_TOOL_SHIFT.
+    finding : for the verdict, a reason where it shifts the tool by more than MOST_TOOL_SHIFT.
     value, sigma : (k,) estimates of its numbers, all that were found free together. tool : by how
     many of its standard deviations the platform's position moves if it is taken up, root mean
-    square over the session's poses. shift : the same in m.
+    square over the session's poses. shift : the same in m. kind : word for calibration.json.
     """
 
     finding: Finding
@@ -87,27 +66,28 @@ class DetectedViolation:
     score: Score
     tool: float
     shift: float
+    kind: str
 
     @property
     def code(self) -> str:
-        """Of its finding."""
+        """Code of the finding."""
         return self.finding.code
 
     @property
     def of(self) -> str:
-        """What departs, by name."""
+        """Name of the subject."""
         return self.finding.subject
 
     @property
     def against(self) -> bool:
-        """Whether the result should not be used for it."""
+        """Whether the violation makes the result unusable."""
         return self.finding.level is Level.WRONG
 
     def document(self) -> dict[str, Any]:
-        """For programs."""
+        """Entry of calibration.json."""
         return {
             "code": self.code,
-            "kind": KINDS[self.code],
+            "kind": self.kind,
             "of": self.of,
             "value": self.value,
             "sigma": self.sigma,
@@ -120,17 +100,17 @@ class DetectedViolation:
 
 
 class ModelViolations(NamedTuple):
-    """What the data show that the model does not have.
+    """Deviations of the data from the model.
 
-    violations : violations that have a name, the surest first. errors : components of the model
+    violations : named violations, the smallest p-value first. errors : components of the model
     discrepancy beside them. estimate : whose covariance contains the discrepancy. random : the
-    discrepancy's effects.
+    discrepancy's columns.
     """
 
     violations: tuple[DetectedViolation, ...]
     errors: tuple[ModelError, ...]
     estimate: Estimate
-    random: RandomEffects
+    random: tuple[Column, ...]
 
 
 def model_violations(
@@ -140,72 +120,57 @@ def model_violations(
     estimate: Estimate,
     ended: tuple[Assembled, Information],
 ) -> ModelViolations:
-    """What the data show that the model does not have.
+    """Deviations of the data from the model, with and without names.
 
-    A violation is named only if it explains more than the discrepancy does: what is found at first
-    is tested once more beside the discrepancy. ended : the estimate's problem at its end,
+    A violation is named only if it explains more than the discrepancy does: those that are detected
+    first are tested once more beside the discrepancy. ended : the estimate's problem at its end,
     :func:`pkmcal.identify.bundle.linearize_at_solution`.
     """
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
-    layout = estimate.machine.layout
-    present = scales_of(layout, estimate.machine.values) / scales_of(
-        layout, session.machine.parameters.drawing
-    )
-    first = [int(np.argmax(layout.actuated == m)) for m in range(len(columns))]
-    families = [
-        *readings.reading_violations(measurements.joints, columns, units, present[first]),
-        list(_lenses(session, observation, measurements)),
-        list(_lenses_of_stations(session, observation, measurements)),
-        list(_boards(session, measurements)),
-        list(_tripods(session, measurements)),
-    ]
-    tubes = list(
-        islice(
-            outlines(session, measurements, estimate, FALSE_VIOLATION_CHANCE),
-            MOST_VIOLATIONS_SOUGHT,
-        )
-    )
-    families.append([one.violation for one in tubes])
+    families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
+    tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
+    further = [one for one in columns_of_effects(measurements) if one.prior is None]
+    families += [list(group) for _, group in groupby(further, key=lambda one: one.code)]
+    families.append([one.column for one in tubes])
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
     reference_values = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
     in_view = np.flatnonzero(ended[0].observed)
 
-    def declared(k: int) -> ModelViolation:
+    def declared(k: int) -> Column:
         if k < len(listed):
             return listed[k]
         row, m = divmod(k - len(listed), len(columns))
-        wrong = readings.wrong_reading(columns[m], units[m], session.configurations[in_view[row]])
-        one = np.zeros((*measurements.joints.shape, 1))
-        one[in_view[row], m] = 1.0
-        return replace(wrong, effect=Effect(readings=one))
+        by = np.zeros((*measurements.joints.shape, 1))
+        by[in_view[row], m] = 1.0
+        configuration = session.configurations[in_view[row]]
+        return readings.wrong_reading(columns[m], units[m], configuration, by)
 
-    def tested(beside: RandomEffects | None) -> tuple[ScoreTests, list[tuple[int, Score]]]:
-        effects = [one.effect for one in listed]
+    def tested(beside: Sequence[Column]) -> tuple[ScoreTests, list[tuple[int, Score]]]:
         tests = ScoreTests(
             *ended,
-            effects,
+            listed,
             number.tolist(),
             singles=True,
             beside=beside,
             variance=1 + measurements.imputation_covariance,
         )
-        value = tests.tests_beyond(FALSE_VIOLATION_CHANCE, [k for k, _ in reference_values])
+        value = tests.tests_beyond(FALSE_ALARM, [k for k, _ in reference_values])
         return tests, [*value, *reference_values]
 
-    tests, value = tested(None)
+    tests, value = tested(())
     discrepancy = discrepancy_of(
         *ended,
         discrepancy_components(measurements, estimate),
-        [declared(k).effect for k, _ in value],
+        [declared(k) for k, _ in value],
         (estimate.statistics.reading_scale, estimate.statistics.pose_scale),
         only_heights(estimate),
     )
     if discrepancy.scales and value:
         tests, value = tested(discrepancy.random)
     before = tool_of(session, estimate)
-    estimate = with_discrepancy(measurements, estimate, ended[1].problem, discrepancy)
+    estimate = with_discrepancy(estimate, ended[1].problem, discrepancy)
     tool = tool_of(session, estimate) if discrepancy.scales else before
     surface = None
     if any(one.code == UNEVEN_BED for one in discrepancy.scales):
@@ -224,7 +189,7 @@ def model_violations(
 
 
 def tool_of(session: Session, estimate: Estimate) -> ToolError:
-    """The tool at the session's poses."""
+    """Error of the tool at the session's poses."""
     used, machine = estimate.configurations, estimate.machine
     return tool_error(
         session.machine,
@@ -237,16 +202,14 @@ def tool_of(session: Session, estimate: Estimate) -> ToolError:
 
 
 def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
-    """A tube's departure by the value that its lines tell."""
+    """Update of a tube's violation with the value from the median of its lines."""
     value, sigma = np.array([one.value]), np.array([one.sigma])
     return OneStepUpdate(
         value, sigma, fit.by_data * (one.value / fit.value[0] if fit.value[0] else 0.0)
     )
 
 
-def _detection(
-    one: ModelViolation, score: Score, fit: OneStepUpdate, tool: ToolError
-) -> DetectedViolation:
+def _detection(one: Column, score: Score, fit: OneStepUpdate, tool: ToolError) -> DetectedViolation:
     shifted = np.linalg.norm((tool.by_parameters @ fit.by_data)[:, 3:], axis=-1)
     shift = float(np.sqrt(np.nanmean(shifted**2)))
     sigma = float(np.sqrt(np.nanmean(tool.position**2)))
@@ -258,14 +221,36 @@ def _detection(
         for name, value in one.facts(fit.value, fit.sigma).items()
     }
     facts |= {"chance": score.adjusted, "tool_shift": shift, "tool_shift_sigmas": ratio}
-    result = Finding(one.code, level, facts, one.of)
-    return DetectedViolation(result, fit.value, fit.sigma, score, ratio, shift)
+    result = Finding(one.code, level, facts, one.subject)
+    return DetectedViolation(result, fit.value, fit.sigma, score, ratio, shift, one.kind)
+
+
+def _reading_scales(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Readings of another scale."""
+    del observation
+    layout, document = estimate.machine.layout, session.document["joints"]
+    drawn = scales_of(layout, session.machine.parameters.drawing)
+    present = scales_of(layout, estimate.machine.values) / drawn
+    first = [int(np.argmax(layout.actuated == m)) for m in range(len(document["columns"]))]
+    yield from readings.scale_columns(measured.joints, document["columns"], present[first])
+
+
+def _reading_plays(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Motors with play."""
+    del observation, estimate
+    names, units = session.document["joints"]["columns"], session.machine.joint_units
+    yield from readings.play_columns(measured.joints, names, units)
 
 
 def _lenses(
-    session: Session, observation: Observation, measured: Measurements
-) -> Iterator[ModelViolation]:
-    """A camera that is not as its file says, by the departures that its model declares."""
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
+    """Cameras that are not as their files say, by the violations that their models declare."""
+    del estimate
     if measured.intrinsics_factor.shape[-1]:
         return  # they are estimated already
     changed = CameraChange.of(session, observation, measured)
@@ -275,18 +260,18 @@ def _lenses(
     for file, camera in files.items():
         own = np.array([station.camera_file == file for station in session.stations])
         for part in camera.violations():
-            effect = changed.effect(own, part.columns)
-            yield ModelViolation(
-                f"camera.{part.code}", file, _of_lens(part.facts, file=file), effect
-            )
+            facts = _of_lens(part.facts, file=file)
+            one = Column(f"camera.{part.code}", file, LENS_KINDS[part.code], facts=facts)
+            yield changed.of_stations(one, own, part.columns)
 
 
 def _lenses_of_stations(
-    session: Session, observation: Observation, measured: Measurements
-) -> Iterator[ModelViolation]:
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
     """A station whose camera is another than that of the other stations with the same file; not of
     images by hand, whose focal lengths are estimated one by one.
     """
+    del estimate
     files = [station.camera_file for station in session.stations]
     shared = [
         files.count(station.camera_file) > 1 and not station.handheld
@@ -299,8 +284,18 @@ def _lenses_of_stations(
         station, own = session.stations[s], np.arange(len(files)) == s
         for part in station.camera.violations():
             facts = _of_lens(part.facts, file=station.camera_file, station=station.name)
-            effect = changed.effect(own, part.columns)
-            yield ModelViolation(f"station.{part.code}", station.name, facts, effect)
+            kind = f"station's {LENS_KINDS[part.code]}"
+            one = Column(f"station.{part.code}", station.name, kind, facts=facts)
+            yield changed.of_stations(one, own, part.columns)
+
+
+LENS_KINDS = {
+    "focal": "focal length",
+    "aspect": "pixel aspect",
+    "centre": "picture centre",
+    "distortion": "distortion",
+}
+"""``kind`` in calibration.json of the violations that camera models declare."""
 
 
 def _of_lens(facts: Mapping[str, Any], **where: str) -> Callable[[Array, Array], dict[str, Any]]:
@@ -340,30 +335,46 @@ class CameraChange:
         poses[..., : own.shape[-1]] = own
         return cls(edges, poses, measured.edges.station, measured.poses.station)
 
-    def effect(self, stations: Booleans, columns: Array) -> Effect:
-        """That of some stations' camera, (S,), by k numbers: ``columns`` (n, k) of its change."""
-        n = len(columns)
+    def of_stations(self, column: Column, stations: Booleans, change: Array) -> Column:
+        """A column with the derivatives by k numbers of some stations' camera, (S,): ``change``
+        (n, k) of its parameters.
+        """
+        n = len(change)
+        edges = np.flatnonzero(stations[self.edge_station])
         also = np.append(stations, False)[np.minimum(self.pose_station, len(stations))]
-        edges, poses = self.edges[..., :n] @ columns, self.poses[..., :n] @ columns
-        return Effect(
-            edges=np.where(stations[self.edge_station][:, None, None], edges, 0.0),
-            poses=np.where(also[:, None, None], poses, 0.0),
+        poses = np.flatnonzero(also)
+        return replace(
+            column,
+            edges=self.edges[edges, :, :n] @ change,
+            edge_rows=edges,
+            poses=self.poses[poses, :, :n] @ change,
+            pose_rows=poses,
         )
 
 
-def _boards(session: Session, measured: Measurements) -> Iterator[ModelViolation]:
+def _boards(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
     """Boards of another size."""
+    del observation, estimate
     for m, mount in enumerate(measured.mounts):
         if mount.name == "board":
-            from pkmcal.boards.poses import board_size_violation
+            from pkmcal.boards.poses import board_size_column
 
-            yield board_size_violation(measured.poses, m, session.document["board"]["file"])
+            yield board_size_column(measured.poses, m, session.document["board"]["file"])
 
 
-def _tripods(session: Session, measured: Measurements) -> Iterator[ModelViolation]:
+def _tripods(
+    session: Session, observation: Observation, measured: Measurements, estimate: Estimate
+) -> Iterator[Column]:
     """Stations that did not stand still."""
+    del observation, estimate
     for s, name in enumerate(session.station_names):
         in_view = [x.configuration[x.station == s] for x in (measured.edges, measured.poses)]
         what = "camera" if s < len(session.stations) else "tracker"
         used = np.unique(np.concatenate(in_view))
-        yield from station_movement.movement_violations(s, name, used, session.configurations, what)
+        yield from station_movement.movement_columns(s, name, used, session.configurations, what)
+
+
+TESTED = (_reading_scales, _reading_plays, _lenses, _lenses_of_stations, _boards, _tripods)
+"""What a session takes for granted and that may be otherwise; each is a family of columns."""

@@ -15,14 +15,14 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.score import FALSE_ALARM
 from pkmcal.measurements import Measurements
+from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
 from pkmcal.wording import listed
 
-FALSE_OUTVOTED_CHANCE = 0.005
-"""Chance at which any configuration of a right session disagrees."""
 UNLIKELY_EXPLANATION_CHANCE = 1e-4
 """Chance below which one reading, or another configuration's, is no explanation; so small because
 the machine's own uncertainty, about as large as that of a pose, is not counted."""
@@ -53,7 +53,7 @@ def outlier_explanations(
     if usual > MOST_USUAL_MISFIT**2:
         return
     noise = usual * noise
-    odd = _chance(m, chi2 / usual) < FALSE_OUTVOTED_CHANCE / len(which)
+    odd = _chance(m, chi2 / usual) < FALSE_ALARM / len(which)
     odd = np.flatnonzero(odd & (estimate.pose_weights[which] < 0.5))
     # rows of the table that say what the machine did in each odd one, (n, K)
     every = np.broadcast_to(poses[odd, None], (len(odd), len(joints), 4, 4)).reshape(-1, 4, 4)
@@ -88,7 +88,7 @@ def outlier_explanations(
                 else None
             )
             facts = one.facts(value[[motor]], sigma[[motor]])
-            yield doubtful("readings.outvoted", one.of, **facts, like=row)
+            yield doubtful("readings.outvoted", one.subject, **facts, like=row)
         elif same_station[n].any():
             yield _misnamed(
                 session, name, session.configurations[int(np.argmax(same_station[n]))], False
@@ -116,12 +116,11 @@ def _platforms(
     """
     poses, state = measurements.poses.select(which), estimate.state
     T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]
-    tolerance = np.array([mount.tolerance for mount in measurements.mounts])
-    size = np.zeros(len(tolerance))
-    if len(state.sizes):  # the papers' methods estimate none
-        size[tolerance > 0] = state.sizes
+    size = np.array([mount.tolerance for mount in measurements.mounts])
+    # the papers' methods estimate no size
+    size[size > 0] = state.columns.get(BOARD_SIZE, 0.0)
     T_station_target = poses.T_station_target.copy()
-    T_station_target[:, :3, 3] *= (1 + (tolerance * size)[poses.mount])[:, None]
+    T_station_target[:, :3, 3] *= (1 + size[poses.mount])[:, None]
     T_base_platform = inverse(T_camera_base) @ T_station_target @ inverse(T_mount)
     # a turn and shift of the target, as one of the platform in the base's frame
     turn = T_camera_base[:, :3, :3].mT

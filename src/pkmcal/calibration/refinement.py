@@ -41,6 +41,7 @@ from pkmcal.measurements import (
     concatenate,
     of_stations,
 )
+from pkmcal.measurements.effects import FOCAL_EXCESS, INTRINSICS
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import Photographs, placed_at
@@ -168,7 +169,7 @@ def refine_alternating(
         progress("Identifying", share + 0.05)
         before = estimate
         start, shifted = (
-            _at_cameras(estimate.state, cameras),
+            _without_camera_changes(estimate.state),
             max(station_edges.shift for station_edges in passes),
         )
         if turn == 0 and shifted > ASTRAY_EDGE_DISTANCE:
@@ -254,7 +255,7 @@ def imputation_variance(
                 session, photographs, drawn, turns.blur, turns.scatter, cameras.active
             )
             measurements = measurements_of(session, case.boards, _edges(passes), cameras)
-            ended = bundle(session.machine, measurements, _at_cameras(drawn.state, cameras))
+            ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
         except (PkmcalError, np.linalg.LinAlgError) as error:
             failures.append(str(error))
             continue
@@ -417,9 +418,10 @@ def _counted(
     return done
 
 
-def _at_cameras(state: State, cameras: CameraRefinement) -> State:
-    """A state whose cameras are where the refinement is now."""
-    return replace(state, intrinsics=np.zeros_like(cameras.at), breathing=np.zeros(0))
+def _without_camera_changes(state: State) -> State:
+    """A state whose cameras are where their edges were measured."""
+    other = {c: x for c, x in state.columns.items() if c not in (INTRINSICS, FOCAL_EXCESS)}
+    return replace(state, columns=other)
 
 
 def initial_guess(machine: Machine, measurements: Measurements, prior_state: State) -> State:
@@ -460,7 +462,7 @@ def identify_poses(
         progress("Identifying with the cameras", 0.6 + 0.3 * turn / MOST_MEASUREMENT_PASSES)
         cameras = cameras.updated(estimate)
         measurements = measurements_of(session, boards, None, cameras)
-        estimate = bundle(machine, measurements, _at_cameras(estimate.state, cameras))
+        estimate = bundle(machine, measurements, _without_camera_changes(estimate.state))
     observation = observation_of(session, [], boards, measurements, estimate)
     return RefinementResult(observation, measurements, estimate, cameras)
 

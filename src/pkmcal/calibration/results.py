@@ -24,7 +24,7 @@ from pkmcal.files import check_writable, entries, json_text, json_value, resolve
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
-from pkmcal.measurements import BREATHING_SIGMA
+from pkmcal.measurements.effects import BOARD_SIZE, EDGE_SHIFT, FOCAL_EXCESS
 from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.session.image_files import label_of
@@ -321,21 +321,21 @@ def _focal_scale(calibration: Calibration, number: int) -> dict[str, Any]:
     if number >= len(cameras.breathes) or not cameras.breathes[number]:
         return {}
     return {
-        "focal_scale": 1 + BREATHING_SIGMA * cameras.updated(estimate).breath[number],
-        "sigma_focal_scale": BREATHING_SIGMA * estimate.breathing_sigma[number],
+        "focal_scale": 1 + cameras.updated(estimate).breath[number],
+        "sigma_focal_scale": estimate.column_sigma(FOCAL_EXCESS)[number],
     }
 
 
 def _targets(calibration: Calibration) -> list[dict[str, Any]]:
     """Boards, and what trackers measured, on their body; sigma null where nothing tells it."""
     estimate, mounts = calibration.estimate, calibration.measurements.mounts
-    sizes = iter(zip(estimate.state.sizes, estimate.size_sigma, strict=True))
+    sizes = estimate.state.columns.get(BOARD_SIZE, ())  # the papers' methods estimate none
+    sizes = iter(zip(sizes, estimate.column_sigma(BOARD_SIZE), strict=True))
     out: list[dict[str, Any]] = []
     for m, mount in enumerate(mounts):
         size: dict[str, float] = {}
-        if mount.tolerance > 0 and len(estimate.state.sizes):  # the papers' methods estimate none
-            value, deviation = next(sizes)
-            size = {"size": 1 + mount.tolerance * value, "sigma_size": mount.tolerance * deviation}
+        if mount.tolerance > 0 and (estimated := next(sizes, None)):
+            size = {"size": 1 + estimated[0], "sigma_size": estimated[1]}
         body = "platform" if estimate.state.on_platform[m] else "base"
         reference_values = _sigma_where_identified(estimate, estimate.mount_covariance[m])
         out.append(
@@ -386,8 +386,8 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
     return [
         {
             "file": files[c],
-            "edge_shift": estimate.state.edge_shift[c] * pixels[c],
-            "sigma": estimate.edge_shift_sigma[c] * pixels[c],
+            "edge_shift": estimate.state.columns[EDGE_SHIFT][c] * pixels[c],
+            "sigma": estimate.column_sigma(EDGE_SHIFT)[c] * pixels[c],
             **_refined(calibration, files[c]),
             **({"upside_down": True} if files[c] in turned else {}),
         }

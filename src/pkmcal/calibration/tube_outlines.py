@@ -1,4 +1,4 @@
-"""Tubes whose outlines are not those of the drawing: a sleeve, a ring, a cable along a leg.
+"""Tubes whose outlines differ from the nominal model: a sleeve, a ring, a cable along a leg.
 
 Each side of a tube has a shift of its own at each station, for light shifts outlines (shading), and
 a tube has a radius with its tolerance. Shifts have Student's distribution: most are small, and a
@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.identify.assembly import lines
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.line_shading import SHADING_FREEDOM
-from pkmcal.identify.score import Score
-from pkmcal.measurements import Effect, Measurements, ModelViolation
+from pkmcal.identify.score import FALSE_ALARM, Score
+from pkmcal.measurements import Column, Measurements
+from pkmcal.measurements.effects import EDGE_SHIFT, lines
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.session.load import Session
 
 DISTANCE_SAMPLE_EDGES = 4000
-"""Edges, spread over all, by which it is told how far away each line is."""
+"""Edges, evenly of all, from which the distance of each line is computed."""
 OF_MEDIAN = 1.25
-"""Deviation of a median in that of a mean, of normal numbers."""
+"""Standard deviation of a median, over that of a mean, of normal numbers."""
 OF_MIDDLE = 1.48
 """Standard deviation of normal numbers in the median of their distances from the middle."""
 
@@ -36,18 +36,14 @@ class Outline(NamedTuple):
     lines tells, m, of which some may be other than the rest; sigma : its standard deviation.
     """
 
-    violation: ModelViolation
+    column: Column
     score: Score
     value: float
     sigma: float
 
 
-def outlines(
-    session: Session, measurements: Measurements, estimate: Estimate, level: float
-) -> Iterator[Outline]:
-    """Tubes of another radius than drawn, then single lines that are off, the surest first, at a
-    level of chance of all together.
-    """
+def outlines(session: Session, measurements: Measurements, estimate: Estimate) -> Iterator[Outline]:
+    """Tubes of another radius than drawn, then single lines that are off, the surest first."""
     from scipy.special import ndtr, stdtr
 
     keys, number = lines(measurements)
@@ -60,7 +56,7 @@ def outlines(
     grown = estimate.machine.values - table.drawing
     station, leg, tube = keys[:, :3].T
     tubes = np.unique(keys[:, 1:3], axis=0)
-    edge = float(np.max(estimate.edge_shift_sigma, initial=0.0))
+    edge = float(np.max(estimate.column_sigma(EDGE_SHIFT), initial=0.0))
     results: list[tuple[Score, Integers, float, float]] = []
     for j, t in tubes.tolist():
         mine = np.flatnonzero((leg == j) & (tube == t))
@@ -77,28 +73,30 @@ def outlines(
         # as told: lines of one tube can be as unlike as its light and what covers it
         spread = OF_MEDIAN * OF_MIDDLE * np.median(np.abs(each - value)) / np.sqrt(len(mine))
         results.append((score, mine, value, float(max(scale, spread))))
-    thick = sorted((one for one in results if one[0].adjusted < level), key=lambda x: x[0].chance)
+    thick = sorted(
+        (one for one in results if one[0].adjusted < FALSE_ALARM), key=lambda x: x[0].chance
+    )
     outlined: list[int] = []
     for score, mine, value, scale in thick:
         outlined += mine.tolist()
         j, t = keys[mine[0], 1:3].tolist()
-        by = _effect(measurements, number, mine, size)
-        name = f"legs[{j + 1}].tubes[{t + 1}]"
-        violation = ModelViolation("tube.radius", name, _tube(j, t, file=file), by)
-        yield Outline(violation, score, value, scale)
+        own, by = _edges_of_lines(measurements, number, mine, size)
+        name, facts = f"legs[{j + 1}].tubes[{t + 1}]", _tube(j, t, file=file)
+        column = Column("tube.radius", name, "tube radius", edges=by, edge_rows=own, facts=facts)
+        yield Outline(column, score, value, scale)
     z = np.abs(shift) / sigma
     chance = np.where(np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(SHADING_FREEDOM, -z))
     for k in np.argsort(chance, kind="stable").tolist():
         adjusted = 2 * len(keys) * float(chance[k])
-        if adjusted > level:
+        if adjusted > FALSE_ALARM:
             break
         score = Score(float(z[k] ** 2), 1, float(chance[k]), adjusted)
         j, t, of = int(leg[k]), int(tube[k]), session.station_names[station[k]]
-        by = _effect(measurements, number, np.array([k]), size)
-        name = f"legs[{j + 1}].tubes[{t + 1}], {of}"
-        violation = ModelViolation("tube.edge", name, _tube(j, t, station=of), by)
+        own, by = _edges_of_lines(measurements, number, np.array([k]), size)
+        name, facts = f"legs[{j + 1}].tubes[{t + 1}], {of}", _tube(j, t, station=of)
+        column = Column("tube.edge", name, "tube edge", edges=by, edge_rows=own, facts=facts)
         information = estimate.line_shift_sigma[k]
-        yield Outline(violation, score, float(shift[k] * size[k]), float(information * size[k]))
+        yield Outline(column, score, float(shift[k] * size[k]), float(information * size[k]))
 
 
 def _tube(leg: int, tube: int, **more: str) -> Callable[[Array, Array], dict[str, Any]]:
@@ -108,13 +106,14 @@ def _tube(leg: int, tube: int, **more: str) -> Callable[[Array, Array], dict[str
     }  # fmt: skip
 
 
-def _effect(measurements: Measurements, number: Integers, mine: Integers, size: Array) -> Effect:
-    """Of a tube that is larger by a metre at some of its lines: its edges should have been seen
-    farther in.
+def _edges_of_lines(
+    measurements: Measurements, number: Integers, mine: Integers, size: Array
+) -> tuple[Integers, Array]:
+    """Edges (n,) of some lines of a tube, and derivatives (n, 2, 1) by metres that it is larger
+    there: they should have been seen farther in.
     """
-    which = np.isin(number, mine)
-    away = np.where(which, 1 / size[np.maximum(number, 0)], 0.0)
-    return Effect(edges=(-away[:, None] * measurements.edges.shift)[..., None])
+    own = np.flatnonzero(np.isin(number, mine))
+    return own, (-measurements.edges.shift[own] / size[number[own], None])[..., None]
 
 
 def _metres(measurements: Measurements, estimate: Estimate, number: Integers, count: int) -> Array:

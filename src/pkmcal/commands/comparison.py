@@ -83,7 +83,6 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
         theta=truth.machine.values,
         T_camera_base=truth.T_camera_base,
         T_base_platform=truth.T_base_platform,
-        edge_shift=np.zeros_like(estimate.state.edge_shift),
     )
     nominal = calibration.session.machine
     true_in_gauge, table = in_gauge(nominal, true, default_gauge(nominal)), nominal.parameters

@@ -1,7 +1,8 @@
-"""From a machine and its measurements to the least-squares problem, and back."""
+"""Assembly of the least-squares problem from a machine and its measurements."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,27 +15,28 @@ from pkmcal.identify.link_rows import LinkBlocks, LinkData
 from pkmcal.identify.places import Places
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, TUBE_CORRELATION, Measurements
+from pkmcal.measurements import SHADING_SIGMA, Column, Measurements
 from pkmcal.measurements.edges import EdgeBlocks, EdgeData
+from pkmcal.measurements.effects import SHADING, columns_of_effects, lines
 from pkmcal.measurements.line_cells import LineCells
 from pkmcal.measurements.poses import PoseBlocks, PoseData
+from pkmcal.measurements.readings import ReadingColumns
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 
-SHIFT_SIGMA = 0.3
-"""Standard deviation (px) of a camera's constant edge shift before any data: errata, B."""
 LEVEL_SIGMA = 1e-6
-"""rad, of a bed that is level by definition: a tenth of a micrometre over a printer's bed."""
+"""Standard deviation, rad, of a bed that is level by definition: a tenth of a micrometre over a
+printer's bed."""
 
 
 @dataclass(frozen=True)
 class Assembled:
-    """A problem and where its rows come from.
+    """A problem and the origin of its rows.
 
     observed : (K,) configurations with at least one edge, link, or pose of a board on the platform,
-    or all without a station; only they are in the problem. places : where each kind's measurements
-    stand among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
-    shading, breathing, size, mount, level or gauge.
+    or all without a station; only these are in the problem. places : positions of the measurements
+    of each kind among the observed configurations. priors : names of the kinds of the prior rows,
+    (c,): drawing, the code of an effect, mount, level or gauge.
     """
 
     problem: Problem
@@ -59,15 +61,15 @@ def assemble(
     shading: float | Array = SHADING_SIGMA,
     share: float = 1.0,
 ) -> Assembled:
-    """The joint problem of one session (B = 1), every edge a block of its own.
+    """The joint problem of one session (B = 1), with every edge in its own block.
 
-    shading : px, standard deviation of the lines' shading, of all or of each (n,), where an
-    estimate has told it. share : of the configurations how many are to count together in the end,
-    where these are candidates, for the edges that share their shading.
+    shading : px, standard deviation of the lines' shading, for all or for each (n,), from an
+    earlier estimate. share : of candidate configurations, the part that will be measured, by which
+    edges that share their shading are counted.
     """
     _check(machine, measurements)
-    observed, (keys, line) = observed_configurations(measurements), lines(measurements)
-    side = np.unique(keys[:, [0, 1, 3]], axis=0, return_inverse=True)[1].reshape(-1)
+    observed = observed_configurations(measurements)
+    columns = _unknown_columns(measurements)
     edges = _places(measurements.edges.configuration, observed, measurements.edges.leg)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     one = np.zeros(len(measurements.poses), dtype=int)
@@ -76,30 +78,21 @@ def assemble(
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
-        n_cameras=measurements.n_cameras,
-        n_optics=1 + measurements.intrinsics_factor.shape[-1],
-        n_lines=int(line.max(initial=-1)) + 1,
+        codes=_codes(columns),
         n_mounts=len(measurements.mounts),
-        n_breathing=len(measurements.breathing_at),
-        n_sizes=sum(mount.tolerance > 0 for mount in measurements.mounts),
         n_linked=len(link_blocks.linked) * machine.layout.own_motion.shape[1],
     )
     prior, target, kinds = prior_rows(
         machine,
         gauge,
         unknowns,
+        columns,
         use_drawing=use_drawing,
         on_platform=measurements.on_platform,
         level=measurements.level,
-        side=side,
     )
-    if measurements.intrinsics_at.size:
-        camera = np.array([kind == "camera" for kind in kinds])
-        target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
-    target[[kind == "breathing" for kind in kinds]] = -measurements.breathing_at
-    blocks, data = _edges(machine, measurements, edges, line, side, observed, share)
-    data = replace(data, shading=np.atleast_2d(shading).astype(float))
-    pose_blocks, pose_data = _poses(measurements, poses)
+    blocks, data = _edges(machine, measurements, columns, edges, observed, share)
+    pose_blocks, pose_data = _poses(measurements, columns, poses)
     problem = Problem(
         layout=machine.layout,
         drawing=machine.parameters.drawing,
@@ -115,13 +108,17 @@ def assemble(
         pose_data=pose_data,
         link_blocks=link_blocks,
         link_data=link_data,
+        reading_columns=_readings(columns, observed),
     )
+    if unknowns.codes:
+        n_lines = unknowns.columns(SHADING).size
+        problem = problem.shaded(np.broadcast_to(shading, (1, n_lines)).astype(float))
     return Assembled(problem, observed, Kinds(edges, poses, link_blocks.at), kinds)
 
 
 def observed_configurations(measurements: Measurements) -> Booleans:
-    """(K,) configurations of which something was seen that depends on the platform's pose; all
-    where nothing but readings was measured, which then stand against each other.
+    """(K,) configurations with a measurement that depends on the platform's pose; all where only
+    readings were measured.
     """
     poses, n = measurements.poses, len(measurements.joints)
     if not measurements.n_stations:
@@ -166,8 +163,8 @@ def _check(machine: Machine, measurements: Measurements) -> None:
 
 
 def _places(configuration: Integers, visible: Booleans, kind: Integers) -> Places:
-    """Measurements of one configuration after the other in a row of its own, where each kind (N,)
-    of them has as many places as every other, side by side.
+    """Positions of measurements: one row for each visible configuration, in which each kind (N,)
+    has the same number of consecutive positions.
     """
     row = np.maximum(np.cumsum(visible) - 1, 0)[configuration]
     kinds, number = np.unique(kind, return_inverse=True)
@@ -180,50 +177,86 @@ def _places(configuration: Integers, visible: Booleans, kind: Integers) -> Place
     return Places(row, each * number + place, (int(visible.sum()), each * len(kinds)))
 
 
-def lines(measurements: Measurements) -> tuple[Integers, Integers]:
-    """Each line's station, leg, tube and side (n, 4), and the number (N,) of each edge's line; none
-    if nothing is shaded, and -1 at stations of one photograph, where each edge is a line of its
-    own.
+def _unknown_columns(measurements: Measurements) -> list[Column]:
+    """The columns that have a prior."""
+    columns = [one for one in columns_of_effects(measurements) if one.prior is not None]
+    for one in columns:
+        if one.motion is not None or one.station is not None:
+            raise InputError(
+                what=f"the effect {one.code} cannot have a prior: motions of stations are linear"
+                " about a solution only",
+                next_step="state what it does to edges, poses or readings, or leave its prior out",
+            )
+    return columns
+
+
+def _codes(columns: Sequence[Column]) -> tuple[tuple[str, int], ...]:
+    """Codes of columns, and how many numbers each has."""
+    number = dict.fromkeys((one.code for one in columns), 0)
+    for one in columns:
+        number[one.code] += one.count
+    return tuple(number.items())
+
+
+def _by_measurement(
+    count: int,
+    numbers_each: int,
+    columns: Sequence[Column],
+    parts: Sequence[tuple[Array | None, Integers | None]],
+) -> tuple[Integers, Array]:
+    """Numbers (N, w) of the columns that move each of N measurements, -1 for none, and the
+    derivatives (N, d, w) by these; numbers_each : d. parts : each column's derivatives (n, d, k),
+    and measurements (n,).
     """
-    e = measurements.edges
-    if not measurements.shaded or not len(e):
-        return np.zeros((0, 4), dtype=int), np.zeros(0, dtype=int)
-    number = np.full(len(e), -1)
-    many = ~_alone(measurements)
-    keys = np.stack([e.station, e.leg, e.tube, e.side], axis=1)[many]
-    keys, own = np.unique(keys, axis=0, return_inverse=True)
-    number[many] = own.reshape(-1)
-    return keys, number
+    of, number, by = list[Integers](), list[Integers](), list[Array]()
+    first = 0
+    for column, (values, rows) in zip(columns, parts, strict=True):
+        numbers = first + np.arange(column.count)
+        first += column.count
+        if values is not None and values.size:
+            rows = np.arange(count) if rows is None else rows
+            of.append(np.repeat(rows, len(numbers)))
+            number.append(np.tile(numbers, len(rows)))
+            by.append(values.swapaxes(1, 2).reshape(-1, values.shape[1]))
+    if not by:
+        return np.zeros((count, 0), int), np.zeros((count, numbers_each, 0))
+    of, number, by = np.concatenate(of), np.concatenate(number), np.concatenate(by)
+    used = np.flatnonzero(np.any(by != 0, axis=1))
+    order = used[np.lexsort((number[used], of[used]))]
+    of, number, by = of[order], number[order], by[order]
+    slot = np.arange(len(of)) - np.searchsorted(of, of)
+    width = int(slot.max(initial=-1)) + 1
+    column, derivative = np.full((count, width), -1), np.zeros((count, by.shape[1], width))
+    column[of, slot], derivative[of, :, slot] = number, by
+    return column, derivative
 
 
-def _alone(measurements: Measurements) -> Booleans:
-    """(N,) edges of stations that saw one configuration alone, as photographs by hand do."""
-    pair = np.unique(
-        np.stack([measurements.edges.station, measurements.edges.configuration], axis=1), axis=0
-    )
-    count = np.bincount(pair[:, 0], minlength=measurements.n_stations)
-    return count[measurements.edges.station] == 1
+def _readings(columns: Sequence[Column], visible: Booleans) -> ReadingColumns:
+    """The columns that change the readings."""
+    ends = np.cumsum([0, *(one.count for one in columns)]).tolist()
+    parts = [(k, one.readings) for k, one in enumerate(columns) if one.readings is not None]
+    number = [np.arange(*ends[k : k + 2]) for k, _ in parts]
+    by = [part[visible] for _, part in parts]
+    if not by:
+        return ReadingColumns(np.zeros((int(visible.sum()), 0, 0)), np.zeros(0, dtype=int))
+    return ReadingColumns(np.concatenate(by, axis=-1), np.concatenate(number))
 
 
 def _edges(
     machine: Machine,
     measurements: Measurements,
+    columns: Sequence[Column],
     at: Places,
-    line: Integers,
-    side: Integers,
     visible: Booleans,
     share: float,
 ) -> tuple[EdgeBlocks, EdgeData]:
-    """The edges at their places, and the readings of the seen configurations."""
-    edges, factor = measurements.edges, measurements.intrinsics_factor
+    """The edges at their positions, and the readings of the observed configurations."""
+    edges, (keys, line) = measurements.edges, lines(measurements)
     radius = machine.layout.radius_of(edges.leg, edges.tube)
-    camera = np.asarray(measurements.camera_of_station)[edges.station]
-    optics = np.zeros((len(edges), 2, 1 + factor.shape[-1]))
-    optics[..., 0] = edges.shift
-    if factor.shape[-1] and len(edges):
-        # the measured normals move with the intrinsics; residuals are predicted less measured
-        optics[..., 1:] = -edges.by_intrinsics @ factor[camera]
-    own, crowded = np.zeros((2, len(edges)))
+    parts = [(one.edges, one.edge_rows) for one in columns]
+    column, by_columns = _by_measurement(len(edges), 2, columns, parts)
+    side = np.unique(keys[:, [0, 1, 3]], axis=0, return_inverse=True)[1].reshape(-1)
+    own, alone, crowded = np.zeros((3, len(edges)))
     cells = LineCells.of(edges.normal, line if len(line) else np.full(len(edges), -1), side)
     if len(line):
         # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
@@ -236,12 +269,12 @@ def _edges(
     blocks = EdgeBlocks(
         leg=leg[None],
         station=at.filled(edges.station),
-        camera=at.filled(camera),
         # padding needs any existing radius; its weight is zero
         radius=np.where(at.present, at.filled(radius), first),
         side=at.filled(edges.side)[..., None],
         present=at.present,
-        line=at.filled(line) if len(line) else np.zeros((0, 0), dtype=int),
+        column=np.where(at.present[..., None], at.filled(column), -1),
+        alone=at.filled(alone),
         tube=at.filled(edges.tube),
         n_effective=at.filled(crowded),
         cell=np.where(at.present, at.filled(cells.cell), -1),
@@ -250,43 +283,39 @@ def _edges(
     data = EdgeData(
         basis=at.filled(edges.basis)[None, :, :, None],
         white=at.filled(np.linalg.inv(np.linalg.cholesky(edges.covariance)))[None],
-        optics=at.filled(optics)[None],
+        shift=at.filled(edges.shift)[None],
         joints=measurements.joints[None, visible],
         weight=at.present[None].astype(float),
+        # residuals are predicted less measured
+        columns=-at.filled(by_columns)[None],
+        unit=np.ones((1, sum(one.count for one in columns))),
     )
-    if len(measurements.breathing_at):
-        breathing = at.filled(-BREATHING_SIGMA * edges.by_focal[..., None])[None]
-        data = replace(data, breathing=breathing)
     return blocks, replace(data, own=at.filled(own)[None]) if len(line) else data
 
 
-def _poses(measurements: Measurements, at: Places) -> tuple[PoseBlocks, PoseData]:
-    """The boards' poses at their places."""
-    poses, factor = measurements.poses, measurements.intrinsics_factor
-    camera = np.asarray(measurements.camera_of_station)[poses.station]
-    n = poses.by_intrinsics.shape[-1]
-    optics = np.zeros((len(poses), 6, 1 + factor.shape[-1]))  # an edge shift moves no corner
-    if factor.shape[-1] and n:
-        optics[..., 1:] = -poses.by_intrinsics @ factor[camera, :n]
+def _poses(
+    measurements: Measurements, columns: Sequence[Column], at: Places
+) -> tuple[PoseBlocks, PoseData]:
+    """The poses at their positions."""
+    poses = measurements.poses
+    parts = [(one.poses, one.pose_rows) for one in columns]
+    column, by_columns = _by_measurement(len(poses), 6, columns, parts)
     blocks = PoseBlocks(
         station=at.filled(poses.station),
         mount=at.filled(poses.mount),
         present=at.present,
         on_platform=measurements.on_platform,
-        camera=at.filled(camera),
-        tolerance=np.array([mount.tolerance for mount in measurements.mounts], dtype=float),
+        column=np.where(at.present[..., None], at.filled(column), -1),
     )
     target = at.filled(poses.T_station_target)
     target[~at.present] = np.eye(4)
     whiten, weight = at.filled(poses.whiten), at.present.astype(float)
-    breathing = at.filled(-BREATHING_SIGMA * poses.by_focal[..., None])[None]
-    return blocks, PoseData(
-        target[None], whiten[None], weight[None], at.filled(optics)[None], breathing
-    )
+    by_columns = -at.filled(by_columns)[None]
+    return blocks, PoseData(target[None], whiten[None], weight[None], by_columns)
 
 
 def _links(measurements: Measurements, visible: Booleans) -> tuple[LinkBlocks, LinkData]:
-    """The links, each among the rows of its second configuration."""
+    """The links; each is among the rows of its second configuration."""
     rows = np.cumsum(visible) - 1  # of each configuration among the seen ones
     ends = [np.zeros((0, 2), dtype=int), *(one.configuration for one in measurements.links)]
     ends = np.concatenate(ends)
@@ -307,63 +336,64 @@ def prior_rows(
     machine: Machine,
     gauge: Gauge,
     unknowns: Unknowns,
+    columns: Sequence[Column],
     *,
     use_drawing: bool,
     on_platform: Booleans,
     level: Booleans,
-    side: Integers,
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
+    """Prior rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
-    Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
-    can be met exactly, hence fix the frames and pull on nothing else. Intrinsics, shading,
-    breathing and sizes stand in units of their prior. on_platform : (M,) mounts. level : (S,)
-    stations that do not tilt against the base. side : (n,) number of the leg's side at a station
-    that each line is on: what shades two tubes there is alike by TUBE_CORRELATION.
+    Without the nominal model's priors the frames are free, so the constraints of the gauge are
+    rows: they can be met exactly, hence fix the frames and affect nothing else. columns : the
+    effects, each with the square root of its prior covariance. on_platform : (M,) mounts. level :
+    (S,) stations that do not tilt against the base.
 
-    What is on a platform is as near its start as the machine is large. Where a platform turns about
-    one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
-    seems to, and would carry the board off by metres.
+    The prior sigma of the position of a mount on the platform is the size of the machine. Where a
+    platform rotates about one axis, no measurement determines the height of the board along it, and
+    a tilt by a tenth of a degree would seem to, by metres.
     """
     table, u = machine.parameters, unknowns
     first, tolerance = table.first_of_free(), table.tolerances_free()
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
     held = np.flatnonzero(radius | use_drawing)
-    optics = np.tile([SHIFT_SIGMA] + [1.0] * (u.n_optics - 1), u.n_cameras)
-    shaded = np.where(side[:, None] == side, TUBE_CORRELATION, 0.0) + (
-        1 - TUBE_CORRELATION
-    ) * np.eye(len(side))
     moving = np.flatnonzero(on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
     upright = np.flatnonzero(level)
     tilts = (u.stations.start + 6 * upright[:, None] + [0, 1]).ravel()
-    reference_values = (
-        ("drawing", held, tolerance[held]),
-        ("camera", u.columns("optics"), optics),
-        ("shading", u.columns("shading"), np.linalg.cholesky(shaded)),
-        ("breathing", u.columns("breathing"), np.ones(u.n_breathing)),
-        ("size", u.columns("sizes"), np.ones(u.n_sizes)),
-        ("mount", places, np.full(len(places), machine_size(machine) if len(places) else 1.0)),
-        ("level", tilts, np.full(len(tilts), LEVEL_SIGMA)),
-    )
     rows: list[Array] = []
+    targets: list[Array] = []
     kinds: list[str] = []
-    for kind, columns, sigma in reference_values:
-        part = np.zeros((len(columns), u.count))
-        part[:, columns] = np.diag(1 / sigma) if sigma.ndim == 1 else np.linalg.inv(sigma)
+
+    def add(kind: str, where: Integers, root: Array, at: Array | None = None) -> None:
+        """Rows on the unknowns at ``where`` with the covariance root root^T about ``-at``."""
+        part = np.zeros((len(where), u.count))
+        inverse_root = np.diag(1 / root) if root.ndim == 1 else np.linalg.inv(root)
+        part[:, where] = inverse_root
         rows.append(part)
-        kinds += [kind] * len(part)
+        targets.append(np.zeros(len(part)) if at is None else -inverse_root @ at)
+        kinds.extend([kind] * len(part))
+
+    add("drawing", held, tolerance[held])
+    first_column = u.effects.start
+    roots = [one.prior for one in columns if one.prior is not None]
+    for column, root in zip(columns, roots, strict=True):
+        add(column.code, first_column + np.arange(column.count), root, column.at)
+        first_column += column.count
+    size = machine_size(machine) if len(places) else 1.0
+    add("mount", places, np.full(len(places), size))
+    add("level", tilts, np.full(len(tilts), LEVEL_SIGMA))
     if not use_drawing and freedoms(machine).shape[1]:
         c = frame_rows(machine, gauge) @ table.free_matrix() / float(np.mean(tolerance[~radius]))
         rows.append(np.pad(c, ((0, 0), (0, u.count - u.n_free))))
+        targets.append(np.zeros(len(c)))
         kinds += ["gauge"] * len(c)
-    prior = np.concatenate(rows)
-    return prior, np.zeros(len(prior)), tuple(kinds)
+    return np.concatenate(rows), np.concatenate(targets), tuple(kinds)
 
 
 def machine_size(machine: Machine) -> float:
-    """How large a machine is, m: from the platform to the farthest joint on the base, and from the
-    tool to the farthest on the platform.
+    """Size of a machine, m: the distance from the platform to the farthest joint on the base, plus
+    that from the tool to the farthest joint on the platform.
     """
     base = np.linalg.norm(machine.base_centers() - machine.home()[:3, 3], axis=-1)
     platform = np.linalg.norm(machine.platform_centers(), axis=-1)
@@ -371,14 +401,14 @@ def machine_size(machine: Machine) -> float:
 
 
 def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState:
-    """A state as a batch of one, free parameters only."""
+    """A state as a batch of one run, with its free parameters only."""
     u = assembled.problem.unknowns
-    optics = np.zeros((len(state.edge_shift), u.n_optics))
-    optics[:, 0] = state.edge_shift
-    if state.intrinsics.shape[-1] == u.n_optics - 1:
-        optics[: len(state.intrinsics), 1:] = state.intrinsics
-    breathing = state.breathing if len(state.breathing) else np.zeros(u.n_breathing)
-    sizes = state.sizes if len(state.sizes) == u.n_sizes else np.zeros(u.n_sizes)
+    columns = np.zeros((1, u.effects.stop - u.effects.start))
+    for code, count in u.codes:
+        number = state.columns.get(code)
+        if number is not None and len(number) == count:
+            first = u.of_code(code).start - u.effects.start
+            columns[0, first : first + count] = number
     internal = np.zeros((len(state.T_base_platform), machine.layout.n_internal))
     if state.internal.shape == internal.shape:
         internal = state.internal
@@ -386,17 +416,19 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
         machine.parameters.to_free(state.theta)[None],
         state.T_camera_base[None],
         state.T_base_platform[assembled.observed][None],
-        optics[None],
+        columns,
         state.T_mount[None],
         internal[assembled.observed][None],
-        np.zeros((1, u.n_lines)),
-        breathing[None],
-        sizes[None],
     )
 
 
 def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
-    """The first run of a batch as a state; unseen configurations keep the start's pose."""
+    """The first run of a batch as a state. Unobserved configurations keep the pose of ``start``;
+    the lines' shading is left out, for its unit changes from estimate to estimate.
+    """
+    u = assembled.problem.unknowns
+    parts = {code: u.of_code(code) for code, _ in u.codes if code != SHADING}
+    first = u.effects.start
     poses = start.T_base_platform.copy()
     poses[assembled.observed] = batch.T_base_platform[0]
     internal = np.zeros((len(poses), batch.internal.shape[-1]))
@@ -407,11 +439,8 @@ def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
         assembled.problem.theta(batch)[0],
         batch.T_camera_base[0],
         poses,
-        batch.optics[0, :, 0],
-        batch.optics[0, :, 1:],
+        {c: batch.columns[0, x.start - first : x.stop - first] for c, x in parts.items()},
         batch.T_mount[0],
         assembled.problem.pose_blocks.on_platform,
         internal,
-        batch.breathing[0],
-        batch.sizes[0],
     )

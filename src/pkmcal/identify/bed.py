@@ -9,6 +9,7 @@ covariance what they leave open.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +18,9 @@ from pkmcal.arrays import Array
 from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import RandomEffects, columns_of, eliminated_beside
+from pkmcal.identify.score import columns_of, eliminated_beside, prior_root
 from pkmcal.identify.tool import pose_by_parameters
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import Column, Measurements
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.solver.elimination import divisions, rows_on_shared
 from pkmcal.solver.ranks import column_space
@@ -83,7 +84,7 @@ def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
     return poses, by, _less(by[:, 2] - np.einsum("i,nip->np", slope, by[:, :2]), plane)
 
 
-def bed_of(measurements: Measurements, estimate: Estimate, uneven: RandomEffects) -> Bed:
+def bed_of(measurements: Measurements, estimate: Estimate, uneven: Sequence[Column]) -> Bed:
     """The bed of an estimate from heights alone; uneven : the model discrepancy found."""
     machine = estimate.machine
     poses, by, height = _bent(estimate)
@@ -155,7 +156,7 @@ def _drawing_root(machine: Machine, by: Array) -> Array:
 
 
 def _wider(
-    measurements: Measurements, estimate: Estimate, drawing: Array, uneven: RandomEffects
+    measurements: Measurements, estimate: Estimate, drawing: Array, uneven: Sequence[Column]
 ) -> tuple[Array, Array]:
     """Of the parameters in the model in which all vary that the drawing R (P, m) lets vary, and the
     bed as ``uneven``: how far the best values are from the estimate's (P,), and a root (P, m) of
@@ -177,7 +178,7 @@ def _wider(
 
 
 def _rows_beside(
-    measurements: Measurements, estimate: Estimate, uneven: RandomEffects
+    measurements: Measurements, estimate: Estimate, uneven: Sequence[Column]
 ) -> tuple[Array, Array]:
     """What the heights say of all parameters and of the l random effects, these in their prior
     deviations: rows (r, P + l) and residuals (r,). Poses, the bed's place and all other unknowns
@@ -185,18 +186,19 @@ def _rows_beside(
     """
     assembled, info = linearize_at_solution(measurements, estimate)
     problem, state = info.problem.opened(info.state)
-    columns = columns_of(replace(assembled, problem=problem), state, uneven.effects)
+    columns = columns_of(replace(assembled, problem=problem), state, uneven)
+    root = prior_root(uneven)
     machine, count = problem.unknowns.columns("machine"), problem.unknowns.count
     parts: list[tuple[Array, Array]] = []
     for cut, piece in zip(
         divisions(*problem.extent), Information(problem, state).pieces(), strict=True
     ):
         linear = piece.linear
-        own, value = eliminated_beside(linear, columns(cut, linear) @ uneven.root)
+        own, value = eliminated_beside(linear, columns(cut, linear) @ root)
         parts.append((own.reshape(-1, own.shape[-1]), value.ravel()))
         reference = ~linear.shared_by[:, machine].any(axis=1)
         if not cut.start:
-            prior = np.pad(linear.shared_by[reference], ((0, 0), (0, uneven.root.shape[1])))
+            prior = np.pad(linear.shared_by[reference], ((0, 0), (0, root.shape[1])))
             parts.append((prior, linear.shared_value[0][reference]))
     rows, remaining = (np.concatenate(part) for part in zip(*parts, strict=True))
     used = np.append(machine, np.arange(count, rows.shape[1]))

@@ -13,7 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
-from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
+from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Information,
     covariance_by_noise,
@@ -46,8 +46,9 @@ from pkmcal.identify.noise import (
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
 from pkmcal.identify.scatter import EdgeScatter
-from pkmcal.identify.unknowns import BatchState, own_blocks
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.effects import SHADING, SHIFT_SIGMA
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import rank_of_normal
@@ -149,10 +150,10 @@ def solve_batch(
     every = Kinds(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
     # Begun with as much as a whole camera's shift may be: a prior that is too narrow would make
     # outliers of the edges that speak against it.
-    estimates_shading = scale_noise and problem.unknowns.n_lines > 0
-    least = LEAST_SHADING_SHARE * problem.data.shading[:, :1]
-    if estimates_shading:
-        problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
+    n_lines = problem.shading.shape[1]
+    least = LEAST_SHADING_SHARE * problem.shading[:, :1]
+    if scale_noise and n_lines:
+        problem = problem.shaded(np.full((n_runs, n_lines), SHIFT_SIGMA))
     state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)
     if robust:
         value = robust_start(problem, start, scaled=scale_noise)
@@ -185,7 +186,7 @@ def _settle(
     by_data : (B,) runs whose readings' noise is as the data show it, not as stated. least : px, of
     the lines' shading.
     """
-    estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
+    estimates_shading = scale_noise and fit.info.problem.shading.size > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.n_effective.any())
     previous_factor = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
     nearly = False
@@ -203,12 +204,12 @@ def _settle(
             edges = _edges(fit, by_tube, number)
             problem = replace(problem, data=edges.applied(problem.blocks, problem.data))
             previous_factor, made = _readings_step(fit, by_data, previous_factor, made)
-        shading = problem.data.shading
+        shading = problem.shading
         if estimates_shading:
             shading = _shading_of(fit, least)
         if number >= FIRST_PACED_ROUND:
             shading = np.maximum(
-                problem.data.shading * (shading / problem.data.shading) ** SCATTER_PACE, least
+                problem.shading * (shading / problem.shading) ** SCATTER_PACE, least
             )
         if robust:
             rows = problem.unweighted(state)
@@ -217,8 +218,8 @@ def _settle(
             weight = settled_weights(distance._replace(poses=poses), scale)
             if by_tube:
                 irls_weight = edges.irls_weight(problem.blocks, np.sum(rows.edges**2, axis=-1))
-        change = (shading - problem.data.shading) / np.maximum(problem.data.shading, SHADING_SIGMA)
-        shading_free = np.abs(change).max() < SHADING_CHANGE
+        change = (shading - problem.shading) / np.maximum(problem.shading, SHADING_SIGMA)
+        shading_free = np.abs(change).max(initial=0.0) < SHADING_CHANGE
         readings = problem.joint_noise
         if by_data.any():
             readings = problem.joint_noise_times(np.where(by_data, np.exp(made), 1.0), state)
@@ -228,8 +229,7 @@ def _settle(
         if all_free and _settled(scale, fit.scale, weight, fit.weight):
             break
         if estimates_shading:
-            units = problem.data.shading / shading  # the same shifts in other units
-            state = replace(state, shading=state.shading * units)
+            state = problem.with_shading_units(state, shading)
             problem = problem.shaded(shading)
         problem = replace(problem, joint_noise=readings)
         steps = fit.solution.steps
@@ -359,13 +359,14 @@ def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
 
 def _shading_of(fit: BatchResult, least: Array) -> Array:
     """The fit's :func:`common_shading`."""
-    problem, unit = fit.info.problem, fit.info.problem.data.shading
-    lines = problem.unknowns.shading
+    problem, unit = fit.info.problem, fit.info.problem.shading
+    lines = problem.unknowns.of_code(SHADING)
     half = unit[..., None] * fit.info.root[:, lines]
     covariance = half @ half.mT
     prior = problem.prior[:, lines]
     correlation = np.linalg.inv(prior.T @ prior)
-    return common_shading(unit * fit.info.state.shading, covariance, correlation, unit, least)
+    shift = unit * problem.lines_of(fit.info.state)
+    return common_shading(shift, covariance, correlation, unit, least)
 
 
 @dataclass(frozen=True)
@@ -498,8 +499,9 @@ def _estimate(
     state = in_gauge(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
-    optics, variance = own_blocks(shared, u.optics, u.n_optics), np.diagonal(shared)
-    factor = measurements.intrinsics_factor
+    parts = {code: u.of_code(code) for code, _ in u.codes}
+    covariance = {code: shared[part, part] for code, part in parts.items()}
+    line_sigma = np.sqrt(np.diagonal(shared)[u.of_code(SHADING)])
     edges, poses, links = problem.unweighted(solution)
     residuals = Kinds(
         assembled.places.edges.taken(edges[0]),
@@ -516,7 +518,7 @@ def _estimate(
         machine=identified,
         state=_with_unseen_poses(identified, measurements, assembled, state),
         joint_covariance=full,
-        edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
+        column_covariance={c: x for c, x in covariance.items() if c != SHADING},
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
         edge_noise=result.edges.of_run(0),
@@ -526,16 +528,13 @@ def _estimate(
         configurations=assembled.observed,
         statistics=_statistics(result, assembled, value, measurements.imputation_covariance),
         gauge=gauge.name,
-        intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
         link_residuals=residuals.links[:, 0],
         link_weights=weights.links,
-        line_shading=problem.data.shading[0],
-        line_shift=(problem.data.shading * solution.shading)[0],
-        line_shift_sigma=problem.data.shading[0] * np.sqrt(variance[u.shading]),
-        breathing_sigma=np.sqrt(variance[u.breathing]),
-        size_sigma=np.sqrt(variance[u.sizes]),
+        line_shading=problem.shading[0],
+        line_shift=(problem.shading * problem.lines_of(solution))[0],
+        line_shift_sigma=problem.shading[0] * line_sigma,
     )
 
 
@@ -602,7 +601,7 @@ def _statistics(
         link_scale=float(result.scale.links[0]),
         dof_links=freedom[LINK_ROWS_KIND],
         link_range=_range(noise_shares(result.info, LINK_ROWS_KIND), result.scale.links),
-        shading=float(np.median(problem.data.shading[0])),
+        shading=float(np.median(problem.shading[0])) if problem.shading.size else SHADING_SIGMA,
         look_scatter=float(np.sqrt(imputation_covariance)),
     )
 

@@ -29,7 +29,7 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.unknowns import BatchState, Name
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.solver.elimination import (
     Linear,
@@ -156,7 +156,7 @@ def covariance_by_noise(info: Information) -> Array:
 
 
 def reduced_rows(
-    info: Information, keep: tuple[Name, ...], silent: tuple[Name, ...] | None = None
+    info: Information, keep: tuple[str, ...], silent: tuple[str, ...] | None = None
 ) -> tuple[Array, Array]:
     """What the data say of some unknowns whatever the others are: rows A (n, m) by the named ones,
     in the order of their columns, and residuals y (n,); the problem's first run. They are few, with

@@ -53,20 +53,19 @@ from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.score import (
-    NO_RANDOM_EFFECTS,
-    RandomEffects,
+    FALSE_ALARM,
     columns_of,
     eliminated_beside,
     shared_basis,
 )
-from pkmcal.measurements import Effect
+from pkmcal.measurements import Column
 from pkmcal.solver.elimination import divisions
 
 NAMED = "named."
-"""Begins the codes of violations that have names elsewhere."""
+"""Prefix of the codes of named violations."""
 COLUMNS_BY_UNKNOWNS = 4
-"""Columns of all components in times of the unknowns': rows are gone through in so much smaller
-pieces, which take no more memory."""
+"""Columns of all components, over those of the unknowns: the rows are processed in pieces smaller
+by this factor, in the same memory."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class DiscrepancyOptions:
     """Constants of the search."""
 
     # chance at which any component is found in a session that has none
-    false_alarm: float = 0.005
+    false_alarm: float = FALSE_ALARM
     # factor on a stated noise from which the discrepancy may be what enlarged it
     enlarged: float = 1.2
     # factors tried then, from what was stated to what is in use
@@ -103,22 +102,26 @@ class DiscrepancyOptions:
 class Component:
     """A family of functions with one scale.
 
-    code : for programs. effect : what the k functions do to the measurements. roots : the L (k, l)
+    column : what the k functions do to the measurements. roots : the L (k, l)
     to choose from, of functions with a mean square of one over the session's configurations.
     inflates : kinds of rows whose noise such an error enlarges, as READING_ROWS_KIND. lengths : of
     the same number as roots, m, the correlation length of each; empty where there is none.
     """
 
-    code: str
-    effect: Effect
+    column: Column
     roots: tuple[Array, ...]
     inflates: tuple[int, ...] = ()
     lengths: tuple[float, ...] = ()
 
+    @property
+    def code(self) -> str:
+        """For programs."""
+        return self.column.code
+
 
 @dataclass(frozen=True)
 class ComponentScale:
-    """A component that the data show. scale : s, in the unit of its functions. ratio : twice the
+    """A detected component. scale : s, in the unit of its functions. ratio : twice the
     logarithm of the likelihood ratio against no such component. length : correlation length of the
     likeliest root, m; None where the component has none.
     """
@@ -132,17 +135,17 @@ class ComponentScale:
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What the data show of the components.
+    """Estimated model discrepancy.
 
     scales : of those, the surest first. shared : (na, na) what is added to the covariance of the
-    shared unknowns. random : their effects, with the root (c, l) of their prior covariance. mean,
-    covariance : (l,) and (l, l) of the coefficients of that root's columns given the data. sure :
+    shared unknowns. random : their columns, with the priors that the data show. mean,
+    covariance : (l,) and (l, l) of the coefficients of these priors' roots, given the data. sure :
     whether they explain the data better than larger noise alone does.
     """
 
     scales: tuple[ComponentScale, ...]
     shared: Array
-    random: RandomEffects
+    random: tuple[Column, ...]
     mean: Array
     covariance: Array
     sure: bool = False
@@ -163,40 +166,41 @@ class _Products:
 
 
 def no_discrepancy(info: Information) -> Discrepancy:
-    """None at all."""
+    """A discrepancy without components."""
     na = info.problem.unknowns.count
-    return Discrepancy((), np.zeros((na, na)), NO_RANDOM_EFFECTS, np.zeros(0), np.zeros((0, 0)))
+    return Discrepancy((), np.zeros((na, na)), (), np.zeros(0), np.zeros((0, 0)))
 
 
 def discrepancy_of(
     assembled: Assembled,
     info: Information,
     components: Sequence[Component],
-    named: Sequence[Effect] = (),
+    named: Sequence[Column] = (),
     enlarged: tuple[float, float] = (1.0, 1.0),
     heights: bool = False,
     options: DiscrepancyOptions = DiscrepancyOptions(),
 ) -> Discrepancy:
     """The discrepancy at a solution; the problem's first run.
 
-    named : effects of the model violations that were found otherwise, which take part with a scale
+    named : columns of the model violations that were found otherwise, which take part with a scale
     each: what they explain better is theirs, and not in the result. enlarged : factors in use on
     the stated noise of the readings and of the poses. heights : whether nothing else was measured.
     """
     rivals = [
-        Component(f"{NAMED}{k}", effect, (np.eye(effect.count),)) for k, effect in enumerate(named)
+        Component(replace(column, code=f"{NAMED}{k}"), (np.eye(column.count),))
+        for k, column in enumerate(named)
     ]
     every = [*components, *rivals]
-    effects = [one.effect for one in every]
-    ends = np.cumsum([0, *(effect.count for effect in effects)]).tolist()
+    columns = [one.column for one in every]
+    ends = np.cumsum([0, *(column.count for column in columns)]).tolist()
     parts = [slice(*ends[k : k + 2]) for k in range(len(every))]
-    at_solution = _products(assembled, info, effects)
+    at_solution = _products(assembled, info, columns)
     kind = (READING_ROWS_KIND, POSE_ROWS_KIND)[int(np.argmax(enlarged))]
     inflated = kind if max(enlarged) > options.enlarged else None
     noises = [at_solution]
     for shares in _noise_shares(enlarged, heights, options):
         other = _with_noise(assembled, shares)
-        noises.append(_products(other, Information(other.problem, info.state), effects))
+        noises.append(_products(other, Information(other.problem, info.state), columns))
     smooth_end = len(components)
     best, smooth, named_only, noise_alone = (
         max(
@@ -228,12 +232,13 @@ def discrepancy_of(
     mean, covariance = best.coefficients
     mean, covariance = mean[unnamed], covariance[np.ix_(unnamed, unnamed)]
     spread = gain @ (np.outer(mean, mean) + covariance) @ gain.T
-    random = RandomEffects(tuple(effects[:smooth_end]), root)
+    by_code = {one.code: one.column for one in components}
+    random = tuple(replace(by_code[one.code], prior=one.scale * one.root) for one in scales)
     return Discrepancy(scales, spread, random, mean, covariance, sure)
 
 
 class _Search:
-    """Components taken up one after the other.
+    """Forward selection of components.
 
     root : (c, l) prior root of all columns that are taken up. gain : of the log likelihood.
     """
@@ -246,7 +251,7 @@ class _Search:
         options: DiscrepancyOptions,
         enlarged: int | None,
     ) -> None:
-        """Take up what the data show; enlarged : kind of rows whose noise is, if any is."""
+        """Select components; enlarged : kind of rows with enlarged noise, None for none."""
         self.products, self.components, self.parts = products, components, parts
         self.options = options
         self.scales: list[ComponentScale] = []
@@ -281,7 +286,7 @@ class _Search:
             self.root = np.concatenate([self.root, more], axis=1)
 
     def _remainder(self) -> tuple[Array, Array]:
-        """M and h of all columns beside the noise that the taken ones are."""
+        """M and h of all columns beside the selected components as noise."""
         n = len(self.root)
         squared, value = self.products.squared[:n, :n], self.products.value[:n]
         across = squared @ self.root
@@ -292,14 +297,16 @@ class _Search:
 
     @property
     def _posterior(self) -> Array:
-        """(l, l) covariance of the taken coefficients, in their prior deviations."""
+        """Posterior covariance (l, l) of the selected coefficients, in prior standard
+        deviations.
+        """
         n = len(self.root)
         information = self.root.T @ self.products.squared[:n, :n] @ self.root
         return np.linalg.inv(np.eye(len(information)) + information)
 
     @property
     def likelihood(self) -> float:
-        """Logarithm of the restricted likelihood with all that are taken up."""
+        """Logarithm of the restricted likelihood with the selected components."""
         return self.products.likelihood + self.gain
 
     @property
@@ -311,7 +318,7 @@ class _Search:
         return -covariance @ (self.root.T @ self.products.value[: len(self.root)]), covariance
 
     def _scale(self, squared: Array, value: Array, whole: Array) -> tuple[float, float]:
-        """The likeliest scale, 0 for none, and twice its log likelihood ratio."""
+        """Maximum-likelihood scale, 0 for none, and twice its log likelihood ratio."""
         m, vectors = np.linalg.eigh((squared + squared.T) / 2)
         visible = m > self.options.rank * float(np.trace(whole))
         m, z = m[visible], vectors[:, visible].T @ value
@@ -345,18 +352,18 @@ def _noise_shares(
 
 
 def _with_noise(assembled: Assembled, factors: tuple[float, float]) -> Assembled:
-    """The problem with the noise of readings, and of poses, times a factor each."""
+    """The problem with the noise of readings, and of poses, multiplied by a factor each."""
     problem = assembled.problem
     poses = replace(problem.pose_data, weight=problem.pose_data.weight / factors[1] ** 2)
     problem = replace(problem, joint_noise=problem.joint_noise * factors[0], pose_data=poses)
     return replace(assembled, problem=problem)
 
 
-def _products(assembled: Assembled, info: Information, effects: Sequence[Effect]) -> _Products:
-    """Products of the effects' columns, and the restricted likelihood without them."""
+def _products(assembled: Assembled, info: Information, listed: Sequence[Column]) -> _Products:
+    """Products of the columns, and the restricted likelihood without them."""
     problem, basis = assembled.problem, shared_basis(info)
-    columns = columns_of(assembled, info.state, [_as_motion(assembled, x) for x in effects])
-    n, count = sum(effect.count for effect in effects), problem.unknowns.count
+    columns = columns_of(assembled, info.state, [_as_motion(assembled, one) for one in listed])
+    n, count = sum(one.count for one in listed), problem.unknowns.count
     squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
     in_basis, remainder, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
     configurations, n_rows = problem.extent
@@ -408,11 +415,11 @@ def _log_noise(assembled: Assembled) -> float:
     return out - float(np.sum(0.5 * kind.count[used] * np.log(kind.weight[0][used])))
 
 
-def _as_motion(assembled: Assembled, effect: Effect) -> Effect:
-    """A station that stands elsewhere from some configuration on, as a motion by configuration."""
-    if effect.station is None:
-        return effect
+def _as_motion(assembled: Assembled, column: Column) -> Column:
+    """A moved station as a motion by configuration."""
+    if column.station is None:
+        return column
     unknowns = assembled.problem.unknowns
     motion = np.zeros((unknowns.n_stations, len(assembled.observed), 6, 6))
-    motion[effect.station, effect.since :] = np.eye(6)
-    return Effect(motion=motion)
+    motion[column.station, column.since :] = np.eye(6)
+    return Column(column.code, motion=motion)

@@ -1,7 +1,8 @@
-"""What goes into an identification and what comes out of it: plain, frozen, saveable."""
+"""State and result of an estimate: plain, frozen data."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,42 +16,34 @@ from pkmcal.mechanisms import Machine
 
 @dataclass(frozen=True)
 class State:
-    """One value of every unknown.
+    """Values of all unknowns.
 
     theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
-    edge_shift : (C,) px outward, per camera. intrinsics : (C, r) change of each camera's from
-    ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
-    T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
-    T_platform_board by ``on_platform`` (M,). internal : (K, n) hinges of an articulated platform.
-    breathing : (S,) change of the stations' focal lengths from ``Measurements.breathing_at``, in
-    the same units; empty where none breathes. sizes : (n,) excess of the boards' sizes over what
-    their files say, of those of unsure size, in their tolerances.
+    columns : numbers (n,) of the effects on measurements by their code, change from where the
+    measurements were made; zero where a code is missing. T_mount : (M, 4, 4) boards in the frame of
+    what they are fixed to, T_base_board or T_platform_board by ``on_platform`` (M,). internal :
+    (K, n) hinges of an articulated platform.
     """
 
     theta: Array
     T_camera_base: Array
     T_base_platform: Array
-    edge_shift: Array
-    intrinsics: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    columns: Mapping[str, Array] = field(default_factory=dict)
     T_mount: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    breathing: Array = field(default_factory=lambda: np.zeros(0))
-    sizes: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = short_repr
 
 
 def estimated_unknowns(state: State) -> Unknowns:
-    """The unknowns that results are told of: all parameters, stations and mounts."""
-    return Unknowns(
-        state.theta.size, len(state.T_camera_base), n_cameras=0, n_mounts=len(state.T_mount)
-    )
+    """Unknowns of results: all parameters, stations and mounts."""
+    return Unknowns(state.theta.size, len(state.T_camera_base), n_mounts=len(state.T_mount))
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """How well the model explains the data.
+    """Goodness of fit and noise of an estimate.
 
     chi2, dof : of all residuals in use (robust weights count as fractions of a datum).
     chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
@@ -98,10 +91,10 @@ class Statistics:
 
     @property
     def chi2_as_stated(self) -> float:
-        """Chi-square per degree of freedom of the noise as it was stated, NaN without freedoms.
+        """Chi-square per degree of freedom with the stated noise, NaN without degrees of freedom.
 
-        With the noise as found it is 1 or so for any model, however wrong: its factors were chosen
-        for that.
+        With the estimated noise it is about 1 for any model, however wrong, for the factors on the
+        noise are chosen so.
         """
         chi2 = self.chi2_edges * self.noise_scale**2 + self.chi2_poses * self.pose_scale**2
         chi2 += self.chi2_joints * self.reading_scale**2 + self.chi2_drawing
@@ -111,14 +104,13 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Estimate:
-    """An identification's result, in the frames that ``gauge`` names.
+    """Result of an estimate, in the frames that ``gauge`` names.
 
     machine : with the identified values. state : all unknowns.
     joint_covariance : (n, n) of the machine's parameters, the stations and the mounts together, in
         that gauge, n = P + 6 S + 6 M; zero rows where fixed. Poses by (omega, tau), left
         perturbation of T_camera_base and T_mount.
-    edge_shift_sigma : (C,) px. intrinsics_covariance : (C, n, n) of the cameras' intrinsics
-    after refinement; n = 0 where they were held.
+    column_covariance : (n, n) of ``state.columns`` of each code.
     edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1. edge_noise : of each
     tube of a leg; edge_trust : (N,) by how much more or less than on average each edge counts for
     its tails, see :mod:`pkmcal.identify.edge_noise`.
@@ -130,9 +122,7 @@ class Estimate:
     kind after the other.
     line_shading : (n,) px, standard deviation of each tube's side's shading at each station;
         line_shift : (n,) px outward, what it came to, and line_shift_sigma : (n,) how well that is
-        known. Lines are numbered by :func:`~pkmcal.identify.assembly.lines`.
-    breathing_sigma : (S,) standard deviations of ``state.breathing``, in the same units.
-    size_sigma : (n,) the same of ``state.sizes``.
+        known. Lines are numbered by :func:`~pkmcal.measurements.effects.lines`.
     configurations : (K,) True where the configuration was seen and its pose estimated.
     gauge : its name for people.
     """
@@ -140,7 +130,7 @@ class Estimate:
     machine: Machine
     state: State
     joint_covariance: Array
-    edge_shift_sigma: Array
+    column_covariance: Mapping[str, Array]
     edge_residuals: Array
     edge_weights: Array
     edge_noise: EdgeScatter
@@ -150,7 +140,6 @@ class Estimate:
     configurations: Booleans
     statistics: Statistics
     gauge: str
-    intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
     link_residuals: Array = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -158,14 +147,12 @@ class Estimate:
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
     line_shift: Array = field(default_factory=lambda: np.zeros(0))
     line_shift_sigma: Array = field(default_factory=lambda: np.zeros(0))
-    breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
-    size_sigma: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = short_repr
 
     def stated_edge_noise(self, measurements: Measurements) -> Measurements:
-        """Measurements of the estimate, all or some, with the noise of readings and edges as the
-        data show it; what each edge counts besides is ``edge_trust``.
+        """Measurements of the estimate, all or some, with the estimated noise of readings and
+        edges; ``edge_trust`` is a further factor on the weight of each edge.
         """
         scale, edges = self.statistics.reading_scale, measurements.edges
         value = self.edge_noise
@@ -174,20 +161,24 @@ class Estimate:
         noise = measurements.joint_noise * scale
         return replace(measurements, edges=edges, joint_noise=noise)
 
+    def column_sigma(self, code: str) -> Array:
+        """Standard deviations (n,) of ``state.columns`` of a code; none where it has none."""
+        return np.sqrt(np.diag(self.column_covariance.get(code, np.zeros((0, 0)))))
+
     @property
     def covariance(self) -> Array:
-        """(P, P) of the machine's parameters."""
+        """Covariance (P, P) of the machine's parameters."""
         at = self._estimated_unknowns.machine
         return self.joint_covariance[at, at]
 
     @property
     def station_covariance(self) -> Array:
-        """(S, 6, 6) of each station's own place, left perturbation of T_camera_base."""
+        """Covariance (S, 6, 6) of each station's pose, left perturbation of T_camera_base."""
         return own_blocks(self.joint_covariance, self._estimated_unknowns.stations, 6)
 
     @property
     def mount_covariance(self) -> Array:
-        """(M, 6, 6) of each mount's own place, left perturbation of T_mount."""
+        """Covariance (M, 6, 6) of each mount's pose, left perturbation of T_mount."""
         return own_blocks(self.joint_covariance, self._estimated_unknowns.mounts, 6)
 
     @property

@@ -1,4 +1,4 @@
-"""How far light moves lines: the deviation of what all edges of a side of a tube have in common.
+"""Standard deviation of the lines' shading: the common shift of all edges of a side of a tube.
 
 A camera's edge shift is what all its lines have in common, and a tube's radius takes up what both
 its sides have, at every station. What is left of the lines' shifts to tell their deviation s is
@@ -12,11 +12,11 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.assembly import SHIFT_SIGMA
+from pkmcal.measurements.effects import SHIFT_SIGMA
 
 SHADING_FREEDOM = 4.0
-"""Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
-some five deviations off, and costs clean ones little."""
+"""Degrees of freedom of Student's distribution of the lines' shading: with four, a line that is
+some five standard deviations off loses its weight, and clean lines lose little."""
 SHADING_WEIGHINGS = 2
 """Rounds of weights and their common deviation, before the next solution."""
 SHADINGS_TRIED = np.geomspace(1.0, 1000.0, 72)
@@ -26,7 +26,7 @@ SHADINGS_TRIED = np.geomspace(1.0, 1000.0, 72)
 def common_shading(
     shift: Array, covariance: Array, correlation: Array, sigma: Array, least: Array | float
 ) -> Array:
-    """Standard deviation (B, n) px of each line's shading, as the data have it.
+    """Standard deviation (B, n) px of each line's shading, estimated from the data.
 
     shift : (B, n) px, as estimated with the deviations sigma (B, n) px and the correlations alike
     (n, n); covariance : (B, n, n) of that. least : (B or 1, 1) what all have at least.

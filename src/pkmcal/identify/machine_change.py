@@ -115,7 +115,7 @@ def machine_change(
 
 def _state(theta: Array) -> State:
     none = np.zeros((0, 4, 4))
-    return State(theta, none, none, np.zeros(0))
+    return State(theta, none, none)
 
 
 def _spread(

@@ -1,20 +1,28 @@
-"""The joint estimation as one least-squares problem: all unknowns, all rows, and a step.
+"""The joint estimate as one least-squares problem: unknowns, residuals, Jacobian and retraction.
 
-Rows of a configuration are its edges, then its limbs' closures, then its boards' poses
-(:mod:`pkmcal.measurements`), then what links it to another configuration, if its name stands
-second there (:mod:`pkmcal.identify.link_rows`). Of J the Jacobian, in blocks::
+The linear system
+-----------------
+Rows of a configuration are its edges, the closures of its limbs, its boards' poses
+(:mod:`pkmcal.measurements`) and the links of which it is the second configuration
+(:mod:`pkmcal.identify.link_rows`). Columns are the unknowns (:mod:`pkmcal.identify.unknowns`).
+Nonzero blocks of the Jacobian::
 
-                            machine, stations,          own unknowns of
-                            cameras, boards    linked   configurations 1  2  3
-    configuration 1              x                                     x
-    configuration 2              x                                        x
-    3, linked to 4               x               x
-    4, linked to 3               x               x
-    known beforehand             x
+                         machine stations effects mounts linked | own unknowns of 1  2
+    1  edges                x       x       x                   |                 x
+       closures             x               x                   |                 x
+       poses                        x       x       x           |                 x
+    2  edges                x       x       x                   |                    x
+       closures             x               x                   |                    x
+    3  edges                x       x       x              x    |
+       closures             x               x              x    |
+    4  closures             x               x              x    |
+       link 3 to 4                                  x      x    |
+    priors                  x       x       x       x           |
 
-The own unknowns of linked configurations are shared, so that all others can be eliminated one
-configuration after the other. Rows on shared unknowns: ``(theta - drawing) / tolerance``, what is
-known beforehand of cameras, shading and mounts, the gauge (:mod:`pkmcal.identify.assembly`).
+The own unknowns of linked configurations are shared, so that the own unknowns of all others are
+eliminated configuration by configuration (Schur complement). The prior rows are
+``(theta - nominal) / sigma``, the priors of effects, level stations and mounts, and the gauge
+(:mod:`pkmcal.identify.assembly`).
 """
 
 from __future__ import annotations
@@ -50,8 +58,15 @@ from pkmcal.measurements.edges import (
     edge_rows,
     rows_at_blocks,
 )
+from pkmcal.measurements.effects import SHADING
 from pkmcal.measurements.poses import PoseBlocks, PoseData, PoseRows, pose_rows
-from pkmcal.measurements.readings import by_noise, joint_rows, least_joint_noise
+from pkmcal.measurements.readings import (
+    ReadingColumns,
+    by_noise,
+    closures_by_readings,
+    joint_rows,
+    least_joint_noise,
+)
 from pkmcal.measurements.rows import Kinds, RowsOfKind
 from pkmcal.mechanisms.closure import (
     Closure,
@@ -68,11 +83,11 @@ from pkmcal.solver.search import Values, of_runs
 from pkmcal.solver.strips import Compact, Strips
 
 CLOSING_NEWTON_STEPS = 2
-"""Newton steps back onto the closures; each squares what is left."""
+"""Newton steps back onto the closures; each squares the remainder."""
 
 
 class _Evaluated(NamedTuple):
-    """Residuals at a point, and what they were found from."""
+    """Residuals at a state, and their intermediate values."""
 
     value: Array
     of_edges: Array
@@ -87,14 +102,14 @@ class _Evaluated(NamedTuple):
 class Problem:
     """The joint estimation of B runs; a :class:`~pkmcal.solver.search.Divisible`.
 
-    layout, drawing (P,), free (P, nz) : the machine. unknowns : which there are, and their columns.
+    layout, drawing (P,) nominal values, free (P, nz) : the machine. unknowns : and their columns.
     blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
-    prior : (c, na) rows on the shared unknowns and prior_target : (c,).
-    frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
-    pose_blocks, pose_data : of boards. link_blocks, link_data : of links. slopes : (B, K, E)
-    closures by their readings, which tell their noise, where they are held; None where they are the
-    state's own. structure_cache : the :attr:`structure`, which problems of the same measurements
-    share.
+    prior : (c, na) rows on the shared unknowns and prior_target : (c,). frames : (12 + n, g)
+    changes of frames and of the hinges' origins that no measurement determines. pose_blocks,
+    pose_data : of boards. link_blocks, link_data : of links. reading_columns : effects on the
+    readings. slopes : (B, K, E) closures by their readings, which tell their noise, where they are
+    held; None where they are the state's own. structure_cache : the :attr:`structure`, which
+    problems of the same measurements share.
     """
 
     layout: LimbLayout
@@ -111,11 +126,12 @@ class Problem:
     pose_data: PoseData
     link_blocks: LinkBlocks
     link_data: LinkData
+    reading_columns: ReadingColumns
     slopes: Array | None = None
     structure_cache: Structure | None = None
 
     def __post_init__(self) -> None:
-        """The structure of a problem of the same measurements stays."""
+        """Keep the structure of a problem of the same measurements."""
         parts = (
             self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames,
             self.link_blocks,
@@ -125,12 +141,12 @@ class Problem:
 
     @property
     def structure(self) -> Structure:
-        """Where everything stands."""
+        """Structure of the problem."""
         return cast(Structure, self.structure_cache)
 
     @cached_property
     def kinds(self) -> Kinds[RowsOfKind]:
-        """The kinds of measurement: edges' rows come first in a configuration, links' last."""
+        """Rows of each kind of measurement; edges come first in a configuration, links last."""
         edges, poses, links = self.data, self.pose_data, self.link_data
         closures = self.closure_rows
         last = closures.stop + 6 * self.pose_blocks.present.shape[1]
@@ -144,12 +160,12 @@ class Problem:
 
     @property
     def closure_rows(self) -> slice:
-        """Rows of a configuration that are the closure's."""
+        """Rows of the closures in a configuration."""
         n_edge_rows = self.data.white.shape[2] * self.data.white.shape[3]
         return slice(n_edge_rows, n_edge_rows + self.layout.n_equations)
 
     def select(self, runs: Integers) -> Problem:
-        """The problem of some runs only."""
+        """The problem of some runs."""
         return replace(
             self,
             data=of_runs(self.data, runs),
@@ -160,7 +176,7 @@ class Problem:
         )
 
     def among(self, configurations: slice) -> Problem:
-        """The problem of some configurations only; of all it is this itself, with what it knows."""
+        """The problem of some configurations; of all it is ``self``, with its cache."""
         if configurations == slice(0, len(self.blocks.present)):
             return self
         structure = self.structure.among(configurations)
@@ -173,11 +189,12 @@ class Problem:
             pose_data=self.pose_data.among(configurations),
             link_blocks=structure.link_blocks,
             link_data=self.link_data.among(configurations),
+            reading_columns=self.reading_columns.among(configurations),
             slopes=None if self.slopes is None else self.slopes[:, configurations],
         )
 
     def state_among(self, state: BatchState, configurations: slice) -> BatchState:
-        """What that problem needs of a state."""
+        """The part of a state that :meth:`among` needs."""
         return replace(
             state,
             T_base_platform=state.T_base_platform[:, configurations],
@@ -192,7 +209,7 @@ class Problem:
         return state.T_base_platform[:, self.link_blocks.linked]
 
     def weighted(self, weight: Kinds[Array]) -> Problem:
-        """The same problem with other weights (B, K, G) of each kind's measurements."""
+        """The problem with other weights (B, K, G) of the measurements of each kind."""
         return replace(
             self,
             data=replace(self.data, weight=weight.edges),
@@ -201,24 +218,47 @@ class Problem:
         )
 
     def as_noisy_as_at(self, state: BatchState) -> Problem:
-        """The same problem with closures whose noise is that of a state from which a search begins.
+        """The problem with the closures' noise fixed to that at the start of a search.
 
-        A crank moves its closure by its reading as far as the state says. Were its noise the
-        state's own throughout, the cost would have a slope that no row tells, the noise's own,
-        and near the end, with thousands of configurations, no step would keep what it promises.
+        The derivative of a crank's closure by its reading depends on the state. If the noise
+        followed the state, the cost would have a gradient that no row contains, that of the noise,
+        and with thousands of configurations no step near the minimum would reduce it as predicted.
         """
         if self.layout.reads_lengths:
             return self
         return replace(self, slopes=self.closure(state).by_reading)
 
     def shaded(self, sigma: Array) -> Problem:
-        """The same problem with other standard deviations (B, n) px of the lines' shading."""
-        return replace(self, data=replace(self.data, shading=sigma))
+        """The problem with other standard deviations (B, n) px of the lines' shading."""
+        unit = np.repeat(self.data.unit, max(len(sigma) // len(self.data.unit), 1), axis=0)
+        unit[:, self._lines] = sigma
+        return replace(self, data=replace(self.data, unit=unit))
+
+    @property
+    def shading(self) -> Array:
+        """Standard deviations (B or 1, n) px of the lines' shading."""
+        return self.data.unit[:, self._lines]
+
+    def lines_of(self, state: BatchState) -> Array:
+        """Shifts (B, n) of the lines, in their standard deviations."""
+        return state.columns[:, self._lines]
+
+    @property
+    def _lines(self) -> slice:
+        """Columns of the lines' shading among those of the effects."""
+        lines, first = self.unknowns.of_code(SHADING), self.unknowns.effects.start
+        return slice(lines.start - first, lines.stop - first)
+
+    def with_shading_units(self, state: BatchState, sigma: Array) -> BatchState:
+        """The state in the units of other standard deviations (B, n) px of the lines' shading."""
+        columns = state.columns.copy()
+        columns[:, self._lines] *= self.shading / sigma
+        return replace(state, columns=columns)
 
     def opened(self, state: BatchState) -> tuple[Problem, BatchState]:
-        """The same problem and state with every parameter of the machine an unknown of its own.
+        """The problem and state with every parameter of the machine as an unknown.
 
-        For derivatives by parameters that were held; z is then ``theta - drawing``.
+        For derivatives by parameters that are fixed; z is then ``theta - nominal``.
         """
         n, machine = self.drawing.size, self.unknowns.machine
         prior = [self.prior[:, machine] @ self.structure.to_free, self.prior[:, machine.stop :]]
@@ -238,7 +278,8 @@ class Problem:
         """The closure of all runs and configurations, (B, K, E)."""
         theta = self.theta(state)[:, None, :]
         internal = state.internal if self.layout.n_internal else None
-        return closure(self.layout, theta, self.data.joints, state.T_base_platform, internal)
+        joints = self.reading_columns.corrected(self.data.joints, state.columns)
+        return closure(self.layout, theta, joints, state.T_base_platform, internal)
 
     def residuals(self, state: BatchState) -> Values:
         """Residuals; NaN where a leg passes through the camera."""
@@ -250,13 +291,13 @@ class Problem:
         return self.compact(state).linear()
 
     def compact(self, state: BatchState) -> Compact:
-        """The same with the edges of each view as a strip."""
+        """Residuals and Jacobian with the edges of each view as a strip."""
         return self._rows(self._evaluated(state))
 
     def _evaluated(self, state: BatchState) -> _Evaluated:
         c = self.closure(state)
         edges, poses, links = self._edges(state, c), self._poses(state), self._links(state)
-        of_edges = edges.value(state.optics, state.shading, state.breathing)
+        of_edges = edges.value(state.columns)
         parts = (
             _in_rows(rows_at_blocks(self.blocks, of_edges)[..., None]),
             self._by_noise(c, c.rows.value[..., None]),
@@ -268,7 +309,7 @@ class Problem:
         return _Evaluated(value, of_edges, shared_value, c, edges, poses, links)
 
     def _rows(self, evaluated: _Evaluated) -> Compact:
-        """The rows at a point, from what was needed of it for its residuals."""
+        """The rows at a state, from its residuals."""
         usable = np.isfinite(evaluated.value) & self._in_use
         by_closures, by_pose = self._of_closures(evaluated.closure)
         by_boards, by_board = self._of_boards(evaluated.poses)
@@ -277,6 +318,11 @@ class Problem:
         by_own = np.concatenate([by_pose, by_board, no_own], axis=2)
         by_own = np.where(np.isfinite(by_own.sum(axis=-1, keepdims=True)), by_own, 0.0)
         rest = self._of_rest(by_closures, np.concatenate([by_boards, by_links], axis=2))
+        if len(self.reading_columns.column):
+            by_readings = self.by_readings(evaluated.closure, self.reading_columns.by)
+            columns = self.unknowns.effects.start + self.reading_columns.column
+            equations = np.arange(by_readings.shape[2])[:, None]
+            rest[:, :, equations, columns] += np.nan_to_num(by_readings)
         for k, columns in zip(*self.structure.strips.linked_places, strict=True):
             rest[:, k, :, columns] += np.moveaxis(by_own[:, k], -1, 0)
             by_own[:, k] = 0.0
@@ -291,26 +337,22 @@ class Problem:
         )
 
     def _of_edges(self, edges: EdgeRows, value: Array) -> Array:
-        """The strips' numbers (B, d + w + 1, N, n) from the values (B, N, n) of the views' n rows:
-        by own unknowns, by the structure's ``strip_parameters``, and the residuals. Zero where they
-        are lost.
+        """Numbers of the strips (B, d + w + 1, N, n) from the residuals (B, N, n) of the views' n
+        rows: derivatives by own unknowns and by the structure's ``strip_parameters``, and the
+        residuals. Zero where they are not finite.
         """
-        data, u, ends_by = edges.data, self.unknowns, edges.ends_by(self.layout.freedoms)
-        tube, line = self.structure.own_columns
-        breathes = int(u.n_breathing > 0)  # a view's own station alone
-        widths = (ends_by.shape[-1], len(tube), u.n_optics, len(line), breathes, 1)
+        by_columns, ends_by = edges.data.by_columns, edges.ends_by(self.layout.freedoms)
+        tube = self.structure.own_radii
+        widths = (ends_by.shape[-1], len(tube), len(by_columns), 1)
         numbers = np.empty((len(value), sum(widths), *value.shape[1:]))
-        of_ends, of_radius, of_optics, of_line, of_breathing, _ = (
+        of_ends, of_radius, of_columns, _ = (
             numbers[:, stop - width : stop]
             for width, stop in zip(widths, accumulate(widths), strict=True)
         )
         by_ends = edges.by_ends().transpose(1, 2, 0, 3)
         np.matmul(ends_by.mT, by_ends, out=of_ends.swapaxes(1, 2))
         np.multiply(edges.by_radius()[:, None], tube, out=of_radius)
-        of_optics[...] = data.by_optics.swapaxes(0, 1)
-        if u.n_lines:
-            np.multiply(data.by_line[:, None], line, out=of_line)
-        of_breathing[...] = data.by_breathing.swapaxes(0, 1)
+        of_columns[...] = by_columns.swapaxes(0, 1)
         numbers[:, -1] = value
         lost = ~np.isfinite(value)
         if lost.any():
@@ -353,8 +395,8 @@ class Problem:
         return len(self.blocks.present), self.n_rows
 
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
-        """The closures' derivatives (B, K, E, n) by the structure's ``closure_index``, and by the
-        own unknowns; zero where they are lost.
+        """Derivatives of the closures (B, K, E, n) by the structure's ``closure_index``, and by the
+        own unknowns; zero where they are not finite.
         """
         by_theta = dense(c, self.drawing.size) if self.layout.shares_motors else c.by_theta
         out = self._by_noise(c, by_theta)
@@ -364,24 +406,21 @@ class Problem:
         return out, self._by_noise(c, by_own(self.layout, c.rows))
 
     def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
-        """The same of the boards' poses by all shared unknowns, (B, K, 6 G, na)."""
+        """Derivatives of the poses by all shared unknowns, (B, K, 6 G, na), and by the own ones."""
         u, boards = self.unknowns, self.pose_blocks
         if not boards.present.size:
             none = (*poses.value.shape[:2], 0)
             return np.zeros((*none, u.count)), np.zeros((*none, self.layout.own_motion.shape[1]))
+        effects = np.where(boards.column < 0, u.count, u.effects.start + boards.column)
         parts = [
             (numbered_columns(u.stations, boards.station, 6), poses.by_station),
-            (numbered_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
+            (effects, poses.by_columns),
             (numbered_columns(u.mounts, boards.mount, 6), poses.by_mount),
         ]
-        if u.n_breathing:
-            parts.append((numbered_columns(u.breathing, boards.station, 1), poses.by_breathing))
-        if u.n_sizes:  # an exact size's rows are zero, whatever column they are written to
-            number = np.maximum(boards.size[boards.mount], 0)
-            parts.append((numbered_columns(u.sizes, number, 1), poses.by_size))
-        out = np.zeros((*poses.value.shape, u.count))
+        out = np.zeros((*poses.value.shape, u.count + 1))  # the last column is none's
         for columns, values in parts:
             np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
+        out = out[..., :-1]
         own = np.zeros((*poses.value.shape, self.layout.own_motion.shape[1]))
         by_pose = poses.by_platform[..., self.layout.freedoms]
         own[..., : by_pose.shape[-1]] = by_pose
@@ -389,7 +428,7 @@ class Problem:
         return _in_rows(out), _in_rows(own)
 
     def _of_links(self, links: LinkRows) -> Array:
-        """Derivatives (B, K, G, na) of the links by all shared unknowns: the own unknowns of both
+        """Derivatives (B, K, G, na) of the links by the shared unknowns: the own unknowns of both
         configurations, which are shared, and the mount.
         """
         u, blocks, freedoms = self.unknowns, self.link_blocks, self.layout.freedoms
@@ -408,8 +447,8 @@ class Problem:
         return link_rows(self.link_blocks, self.link_data, self._linked_poses(state), state.T_mount)
 
     def unweighted(self, state: BatchState) -> Kinds[Array]:
-        """Residuals of each kind, (B, K, G, n), in the deviations that each measurement has by
-        itself: without weights, and without what edges that are shaded alike count for together.
+        """Residuals of each kind, (B, K, G, n), in the standard deviation of each measurement
+        alone: without weights, and without the reduction for edges with correlated shading.
         """
         count, n_rows = self.extent
         cuts = divisions(count, len(state.z) * n_rows)
@@ -420,7 +459,7 @@ class Problem:
         n_effective = np.where(self.blocks.n_effective > 0, self.blocks.n_effective, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(n_effective)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
-        rows = edges.value(state.optics, state.shading, state.breathing)
+        rows = edges.value(state.columns)
         rows = rows_at_blocks(self.blocks, rows)
         links = plain._links(state).value[..., None]  # noqa: SLF001
         return Kinds(rows, plain._poses(state).value, links)  # noqa: SLF001
@@ -430,14 +469,11 @@ class Problem:
         return joint_rows(self.layout, self.closure(state).by_reading, c_rows)
 
     def prior_values(self, state: BatchState) -> Array:
-        """What the prior's rows (B, c) come to, before their targets are taken off."""
+        """Values of the prior rows (B, c), before their targets are subtracted."""
         u = self.unknowns
         x = np.zeros((len(state.z), u.count))
         x[:, u.machine] = state.z
-        x[:, u.optics] = state.optics.reshape(len(x), -1)
-        x[:, u.shading] = state.shading
-        x[:, u.breathing] = state.breathing
-        x[:, u.sizes] = state.sizes
+        x[:, u.effects] = state.columns
         mounts = x[:, u.mounts].reshape(len(x), -1, 6)  # of which only places are known
         mounts[..., 3:] = state.T_mount[..., :3, 3]
         # of stations only that they are level: where the base's z axis points, that turns them
@@ -450,7 +486,7 @@ class Problem:
 
     @cached_property
     def _view_data(self) -> ViewData:
-        return ViewData.of(self.blocks, self.data, breathe=self.unknowns.n_breathing > 0)
+        return ViewData.of(self.blocks, self.data)
 
     def _poses(self, state: BatchState) -> PoseRows:
         return pose_rows(
@@ -459,24 +495,28 @@ class Problem:
             state.T_camera_base,
             state.T_base_platform,
             state.T_mount,
-            state.optics,
-            state.breathing,
-            state.sizes,
+            state.columns,
         )
 
     def joint_noise_times(self, factor: Array, state: BatchState) -> Array:
-        """The readings' noise (B,) times a factor, but not less than their closures can tell."""
+        """Noise of the readings (B,) times a factor, at least what their closures resolve."""
         least = least_joint_noise(self.layout, self.closure(state).by_reading)
         return np.maximum(factor * self.joint_noise, np.minimum(least, self.joint_noise))
 
+    def by_readings(self, c: Closure, by: Array) -> Array:
+        """Rows (B, K, E, k) of the closures, in standard deviations, where the readings change by
+        ``by`` (K, m, k).
+        """
+        return self._by_noise(c, closures_by_readings(self.layout, c.by_reading, by))
+
     def _by_noise(self, c: Closure, rows: Array) -> Array:
-        """Rows (B, K, E, n) of the closure in standard deviations."""
+        """Rows (B, K, E, n) of the closures in standard deviations."""
         slopes = c.by_reading if self.slopes is None else self.slopes
         return by_noise(self.layout, self.joint_noise[:, None, None], slopes, rows)
 
     @cached_property
     def _in_use(self) -> Booleans:
-        """Rows that are not padding and not weighted away, (B or 1, K, r)."""
+        """Rows that are neither padding nor rejected, (B or 1, K, r)."""
         edges, poses, links = (
             np.repeat(kind.weight > 0, kind.whiten.shape[-1], axis=-1) for kind in self.kinds
         )
@@ -486,11 +526,11 @@ class Problem:
         return np.concatenate(parts, axis=-1)
 
     def retract(self, state: BatchState, shared: Array, own: Array) -> BatchState:
-        """The state after a step (B, na) and (B, K, d), taken along what bends.
+        """Retract the state along a step (B, na) and (B, K, d).
 
-        The part of the step that only turns or shifts the frames is made as an exact frame
-        change. Added up it would bend the sharp closures and edges at second order, and the
-        drawing's soft hold on the frames would be found along a curved valley.
+        The part of the step that only rotates or shifts the frames is made as an exact frame
+        change. Added linearly it would change the sharp closures and edges at second order, and
+        the minimum of the weak prior on the frames would lie along a curved valley.
         """
         u, layout = self.unknowns, self.layout
         if len(self.link_blocks.linked):
@@ -522,18 +562,15 @@ class Problem:
             state.z + z - by_moves[..., 0] @ self.structure.to_free.T,
             poses[:, :first_pose],
             poses[:, first_pose:first_mount],
-            state.optics + shared[:, u.optics].reshape(state.optics.shape),
+            state.columns + shared[:, u.effects],
             poses[:, first_mount:-2],
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
-            state.shading + shared[:, u.shading],
-            state.breathing + shared[:, u.breathing],
-            state.sizes + shared[:, u.sizes],
         )
         inner = self._in_frames(inner, poses[:, -2:], slides)
         return self._closed(state, inner, shared, own)
 
     def _in_frames(self, state: BatchState, frames: Array, slides: Array) -> BatchState:
-        """The state after exact changes of both frames, E and F (B, 2, 4, 4), and others (B, n)."""
+        """The state after exact changes E and F of both frames (B, 2, 4, 4), and others (B, n)."""
         layout, (e, f), back = self.layout, frames.swapaxes(0, 1), inverse(frames)
         theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
         theta = on_tangents(layout, theta, self.drawing)
@@ -549,8 +586,8 @@ class Problem:
     def _closed(
         self, state: BatchState, trial: BatchState, shared: Array, own: Array
     ) -> BatchState:
-        """The trial with its poses moved to where the closures are what the step meant them to be,
-        where they bend over it by more than they may be wrong: there the search would creep.
+        """The trial state with poses at which the closures have the values that the step predicts,
+        where their curvature exceeds their noise; without it the search would be slow there.
         """
         layout = self.layout
         if layout.n_equations != layout.own_motion.shape[1]:
@@ -579,7 +616,7 @@ class Problem:
         return trial
 
     def _bent(self, state: BatchState, trial: BatchState) -> Booleans:
-        """Configurations (B, K) whose closures bend over a step by more than they may be wrong.
+        """Configurations (B, K) whose closures are curved over a step by more than their noise.
 
         Readings of cranks and sliders are far sharper than a board's poses, and equations of
         joints' axes as good as exact, so theirs always do. A leg of length l that is read becomes
@@ -600,5 +637,5 @@ class Problem:
 
 
 def _in_rows(parts: Array) -> Array:
-    """Rows (B, K, G, n, w) of G places one after the other, (B, K, G n, w)."""
+    """Rows (B, K, G, n, w) of G positions as one axis, (B, K, G n, w)."""
     return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])

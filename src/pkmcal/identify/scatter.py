@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, short_repr
-from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
+from pkmcal.measurements import OWN_SHADING
 from pkmcal.measurements.edges import EdgeBlocks, EdgeData
 
 NUMBERS_AN_EDGE = 2
@@ -88,8 +88,7 @@ class EdgeScatter:
 
     def applied(self, blocks: EdgeBlocks, data: EdgeData) -> EdgeData:
         """The edges with this noise."""
-        alone = np.where(blocks.line < 0, SHADING_SIGMA, 0.0) if blocks.line.size else 0.0
-        own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.n_effective), alone)
+        own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.n_effective), blocks.alone)
         return replace(data, scale=self.scale[:, blocks.tube], own=own)
 
 

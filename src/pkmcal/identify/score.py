@@ -1,31 +1,38 @@
-"""What would be gained if something were free that the model takes for granted: score tests.
+"""Score tests of model violations.
 
-A *departure* is a change of what was measured, k numbers of it, that the model does not have: an
-encoder's scale, a lens that is another, a camera that was pushed half-way. With J the Jacobian of
-the estimate at its minimum, r its residuals and G the derivatives of the rows by a departure, all
-in standard deviations, what J leaves of G is ``H = (I - J J^+) G``, and
+One-step update
+---------------
+A *model violation* is a column (:mod:`pkmcal.measurements.columns`) of k numbers that the model
+lacks: the scale of an encoder, another lens, a camera that was moved. With J the Jacobian of the
+estimate at its minimum, r its residuals and G the derivatives of the rows by the violation, all in
+standard deviations, the part of G that J does not explain is ``H = (I - J J^+) G``, and
 
     value = -(H^T H)^-1 H^T r,    chi2 = r^T H (H^T H)^-1 H^T r,    moved = -J^+ G value
 
-are what a further estimate with the departure free would find to first order (Rao 1948), without
-making it: the value that fits, the gain in chi2, and what it does to the unknowns. Under the model
-chi2 has as many degrees of freedom as the data see of the departure.
+are, to first order, the results of a further estimate with the violation as an unknown (Rao 1948):
+its value, the decrease of chi2, and the change of the unknowns. Under the model chi2 has as many
+degrees of freedom as there are numbers that the data determine.
 
-Rows of one configuration may be wrong together: edges in a photograph by hand that light moves, or
-that were found where the photograph's own pose had them. So a departure counts by what its products
-with the residuals really scatter by over the configurations where that is more than they should,
+Correlated rows
+---------------
+Rows of one configuration may have correlated errors: edges of a hand-held image that light moves,
+or that were measured near the image's own pose. So chi2 is divided by the ratio of the scatter of
+the products with the residuals over the configurations to its expectation, where that is larger
+than one,
 
     f = max(1, K / (K - 1) tr((H^T H)^-1 sum over K configurations c of u_c u_c^T) / k),
     u_c = H_c^T (r + H value)_c,
 
-(Liang and Zeger 1986), and chi2 is divided by it. That is asked only of those that are about to be
-named, and not of single readings, which are one configuration's.
+(Liang and Zeger 1986). f is computed only for violations that would be named, and not for single
+readings, which belong to one configuration.
 
-The rows are gone through twice, some configurations at a time: for an orthonormal basis of what the
-shared unknowns can do, then for the products of all columns with each other, with the basis and
-with r. These few numbers are all that is kept, however many configurations there are, and
-``H^T H = G^T G - (Q^T G)^T (Q^T G)`` has some fourteen digits, of which OBSERVABLE_SQUARE_SHARE
-asks for ten.
+Memory
+------
+Two passes over the rows, some configurations at a time: for an orthonormal basis Q of the range of
+the shared unknowns, then for the products of all columns with each other, with the basis and with
+r. Only these products are stored, whatever the number of configurations, and
+``H^T H = G^T G - (Q^T G)^T (Q^T G)`` keeps some fourteen digits, of which OBSERVABLE_SQUARE_SHARE
+requires ten.
 """
 
 from __future__ import annotations
@@ -40,29 +47,26 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.measurements import Effect
-from pkmcal.measurements.readings import by_noise
+from pkmcal.measurements import Column
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
 
 OBSERVABLE_SQUARE_SHARE = 1e-10
-"""Part of a departure's squared rows that has to be left beside all unknowns for the data to see
-it; less is rounding. Of what a reading tells of a pose, a hundred times sharper than the edges,
-a ten-thousandth is left."""
+"""Smallest share of a violation's squared rows, after projection, that counts as observable; less
+is rounding. A ten-thousandth is left of a reading, a hundred times sharper than the edges."""
 ROUNDING_LENGTH_SHARE = 1e-9
-"""Length of a departure's column, as a share of its longest one, below which it is rounding: what a
-tracker that feels heights is shifted by along the bed, say."""
+"""Length of a violation's column, as a share of its longest one, below which it is rounding, as for
+a shift of a height probe along the bed."""
 UNTOLD_HIDDEN_SHARE = 0.01
-"""Part of a number that lies in directions which the data do not see, from which it is not told."""
+"""Share of a number in unobservable directions from which its value is not given."""
 MOST_VIOLATIONS_SOUGHT = 4
-"""Departures that are looked for one after the other; more are a session with other troubles."""
+"""Most violations that are named; a session with more has another fault."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """What one departure would gain: chi2 by dof numbers, chance of as much by chance alone in this
-    test, and ``adjusted``, in any of all tests that were made, families counting alike; NaN where
-    it stands alone.
+    """Result of a score test: decrease of chi2 by dof numbers; chance : p-value of this test;
+    adjusted : that among all tests, with equal shares for the families, NaN for a test alone.
     """
 
     chi2: float
@@ -73,8 +77,8 @@ class Score:
 
 @dataclass(frozen=True)
 class OneStepUpdate:
-    """A departure as the data tell it: value, sigma (k,), and moved (P,), what taking it up does to
-    the machine's parameters, m and rad. What the data do not see is NaN, its sigma infinite.
+    """First-order estimate of a violation: value, sigma (k,), and by_data (P,), the change of the
+    machine's parameters, m and rad. Unobservable numbers are NaN, with infinite sigma.
     """
 
     value: Array
@@ -82,44 +86,36 @@ class OneStepUpdate:
     by_data: Array
 
 
-class RandomEffects(NamedTuple):
-    """Effects whose k coefficients together have the covariance ``root root^T``, root (k, l)."""
-
-    effects: tuple[Effect, ...]
-    root: Array
-
-
-NO_RANDOM_EFFECTS = RandomEffects((), np.zeros((0, 0)))
+FALSE_ALARM = 0.005
+"""The false-alarm level of a session: the chance at which a session that agrees with its model
+shows any named violation, any discrepancy, or any measured pose that disagrees with all others."""
 
 
 class ScoreTests:
-    """Score tests beside an estimate's own unknowns, at its minimum (the problem's first run), of
-    which ``info`` tells.
+    """Score tests at the minimum of an estimate; the first run of the problem of ``info``.
 
-    Departures are numbered: the listed ones in their order, then, with ``singles``, every reading
-    of every configuration in the problem by itself, one configuration after the other.
+    Violations are numbered: the listed ones in their order, then, with ``singles``, every reading
+    of every configuration in the problem by itself, configuration by configuration.
     """
 
     def __init__(
         self,
         assembled: Assembled,
         info: Information,
-        listed: Sequence[Effect],
+        listed: Sequence[Column],
         families: Sequence[int] | None = None,
         *,
         singles: bool = False,
-        beside: RandomEffects | None = None,
+        beside: Sequence[Column] = (),
         variance: float = 1.0,
     ) -> None:
-        """As the module says.
+        """Evaluate the products of all columns.
 
-        families : of which each listed one is; among many departures of one kind the single one
-        has to gain more, and those of other kinds do not pay for it. One family if absent; single
-        readings are one of their own. beside : what counts as further unknowns, known beforehand
-        to be small. variance : factor on that of all residuals, for what else they are known to be
-        wrong by.
+        families : number of each listed violation's family. The level is shared equally among the
+        families, and within a family among its tests. One family if absent; single readings are a
+        family of their own. beside : columns with a prior, which count as further unknowns.
+        variance : factor on the variance of all residuals, for further errors.
         """
-        beside = beside or NO_RANDOM_EFFECTS
         self._variance, self._scatter = variance, dict[int, float]()
         basis = _basis_beside(assembled, info, beside)
         self._problem = assembled, info, listed, basis, beside
@@ -130,7 +126,9 @@ class ScoreTests:
         self._moves = -(info.problem.free @ basis[info.problem.unknowns.machine])
 
     def scores(self, freed: Sequence[int] = ()) -> list[Score]:
-        """Of all departures, in their order, with some of them free already: these gain nothing."""
+        """Scores of all violations in their order, beside those that are ``freed``, whose gain is
+        zero.
+        """
         from scipy.special import chdtrc
 
         made, chi2, dof = self._made, np.zeros(len(self._family)), np.zeros(len(self._family))
@@ -157,9 +155,8 @@ class ScoreTests:
         return [Score(*one) for one in every]
 
     def tests_beyond(self, alpha: float, freed: Sequence[int] = ()) -> list[tuple[int, Score]]:
-        """Those that the data show at a level ``alpha`` of all tests together (Bonferroni), one
-        after the other, the least by chance first, by their numbers; each beside those before it,
-        and beside those that are free already.
+        """Violations, by number, beyond a level ``alpha`` of all tests together (Bonferroni), the
+        smallest p-value first; each is tested beside those before it and beside the ``freed``.
         """
         out: list[tuple[int, Score]] = []
         while len(out) < min(MOST_VIOLATIONS_SOUGHT, len(self._family)):
@@ -175,7 +172,7 @@ class ScoreTests:
         return out
 
     def fitted(self, freed: Sequence[int]) -> list[OneStepUpdate]:
-        """What some departures come to, all free together."""
+        """One-step updates of some violations, all estimated together."""
         made, free = self._made, _ProjectedColumns.of(self._made, freed)
         value, sigma = -free.inverse @ free.value, np.sqrt(np.diag(free.inverse))
         factors = [self._variance * self._scatter.get(k, 1.0) for k in freed]
@@ -190,11 +187,11 @@ class ScoreTests:
         ]
 
     def _scattered(self, k: int, freed: Sequence[int]) -> float:
-        """The factor f of a listed departure beside those that are free already."""
-        assembled, info, listed, basis, effects = self._problem
+        """Factor f of a listed violation beside those that are ``freed``."""
+        assembled, info, listed, basis, random = self._problem
         made, problem = self._made, info.problem
-        beside = [f for f in freed if f < len(made.listed)]  # single readings stay as they are
-        every = [*beside, k]
+        # single readings stay as they are
+        every = [*(f for f in freed if f < len(made.listed)), k]
         of_basis = np.concatenate([made.with_basis(f) for f in every]).T
         free = _ProjectedColumns.of(made, every)
         value, n = -free.inverse @ free.value, made.count(k)
@@ -204,13 +201,13 @@ class ScoreTests:
         part = np.concatenate([-gain, np.eye(n)])
         throughout = [listed[f] for f in every if listed[f].station is None]
         columns = columns_of(assembled, info.state, throughout)
-        random = columns_of(assembled, info.state, effects.effects)
+        by_random, root = columns_of(assembled, info.state, random), prior_root(random)
         scatter, clusters = np.zeros((n, n)), 0
         for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
             linear = piece.linear
-            further = [random(cut, linear) @ effects.root, columns(cut, linear)]
+            further = [by_random(cut, linear) @ root, columns(cut, linear)]
             rows, remainder = eliminated_beside(linear, np.concatenate(further, axis=-1))
-            count = taken = problem.unknowns.count + effects.root.shape[1]
+            count = taken = problem.unknowns.count + root.shape[1]
             wide: list[Array] = []
             for f in every:
                 number = listed[f].count
@@ -241,7 +238,7 @@ class ScoreTests:
 
 
 class _Listed(NamedTuple):
-    """A listed departure's columns, and from which configuration in the problem on."""
+    """Columns of a listed violation, and the first configuration of the problem that it affects."""
 
     columns: Integers
     since: int
@@ -251,7 +248,7 @@ class _Listed(NamedTuple):
 class _Products:
     """Products of all columns with each other, their configurations' own unknowns eliminated.
 
-    n : columns of the stations and of the listed departures, which come first; then the basis, then
+    n : columns of the stations and of the listed violations, which come first; then the basis, then
     the residuals, w in all. after : by first configuration, products (n, w) of these columns with
     all from it on. single : (K', m, w) of the single readings' columns with all, among : (K', m, m)
     with each other. by_basis : (nb,) of the basis with the residuals, rows of the prior included.
@@ -265,11 +262,11 @@ class _Products:
     by_basis: Array
 
     def count(self, k: int) -> int:
-        """Numbers of a departure."""
+        """Number of numbers of a violation."""
         return len(self.listed[k].columns) if k < len(self.listed) else 1
 
     def with_all(self, k: int) -> Array:
-        """Products of a departure's columns with all, (k, w)."""
+        """Products of a violation's columns with all, (k, w)."""
         if k < len(self.listed):
             columns, since = self.listed[k]
             return self.after[since][columns]
@@ -277,17 +274,17 @@ class _Products:
         return self.single[row, motor : motor + 1]
 
     def with_basis(self, k: int) -> Array:
-        """The same with the basis, (k, nb)."""
+        """Products with the basis, (k, nb)."""
         return self.with_all(k)[:, self.n : -1]
 
     def with_residuals(self, freed: Sequence[int]) -> Array:
-        """Of the columns of some, as the basis leaves them, with the residuals."""
+        """Products of some violations' projected columns with the residuals."""
         parts = [np.zeros(0)]
         parts += [self.with_all(k)[:, -1] - self.with_basis(k) @ self.by_basis for k in freed]
         return np.concatenate(parts)
 
     def between(self, k: int, other: int) -> Array:
-        """Products of the columns of two departures, (k, k')."""
+        """Products of the columns of two violations, (k, k')."""
         if k >= len(self.listed):
             row, motor = divmod(k - len(self.listed), self.single.shape[1])
             return self.singles_with(other)[row, motor : motor + 1]
@@ -297,13 +294,13 @@ class _Products:
         return self.after[max(one.since, two.since)][np.ix_(one.columns, two.columns)]
 
     def across(self, k: int, freed: Sequence[int]) -> Array:
-        """The same with all of some, of what the basis leaves of both."""
+        """Products of a violation's projected columns with those of the ``freed`` ones."""
         parts = [np.zeros((self.count(k), 0))]
         parts += [self.between(k, f) - self.with_basis(k) @ self.with_basis(f).T for f in freed]
         return np.concatenate(parts, axis=1)
 
     def singles_with(self, other: int) -> Array:
-        """Products of the single readings' columns with a departure's, (K', m, k)."""
+        """Products of the single readings' columns with those of a violation, (K', m, k)."""
         if other < len(self.listed):
             columns, since = self.listed[other]
             out = self.single[..., columns].copy()
@@ -317,8 +314,8 @@ class _Products:
     def gains_of_singles(
         self, freed: Sequence[int], free: _ProjectedColumns
     ) -> tuple[Array, Array]:
-        """What each single reading gains beside those that are free, and whether it is seen,
-        (K' m,) each.
+        """Gain of each single reading beside those that are ``freed``, and whether it is
+        observable, (K' m,) each.
         """
         basis, squared = self.single[..., self.n : -1], np.einsum("kmm->km", self.among)
         residual = squared - np.sum(basis**2, axis=-1)
@@ -336,8 +333,8 @@ class _Products:
 
 @dataclass(frozen=True)
 class _ProjectedColumns:
-    """What all else leaves of some columns: scale (c,) their lengths before, infinite where they
-    are rounding, squared (c, c) products with each other, value (c,) with the residuals.
+    """Columns projected orthogonally to all unknowns: scale (c,) their lengths before, infinite
+    where they are rounding, squared (c, c) products with each other, value (c,) with the residuals.
     """
 
     scale: Array
@@ -346,7 +343,7 @@ class _ProjectedColumns:
 
     @classmethod
     def of(cls, made: _Products, freed: Sequence[int]) -> _ProjectedColumns:
-        """What the basis leaves of some departures."""
+        """Projection of the columns of some violations."""
         lengths = [np.zeros(0)]
         for k in freed:
             length = np.sqrt(np.maximum(np.diag(made.between(k, k)), 0.0))
@@ -356,12 +353,12 @@ class _ProjectedColumns:
         return cls(np.concatenate(lengths), np.concatenate(squared), made.with_residuals(freed))
 
     def _directions(self) -> tuple[Array, Array]:
-        """Parts of the squared columns that are left in each direction, and the directions."""
+        """Shares of the squared columns that are left in each direction, and the directions."""
         return np.linalg.eigh(self.squared / self.scale[:, None] / self.scale)
 
     @property
     def inverse(self) -> Array:
-        """Of the products (c, c), in the directions that are seen."""
+        """Pseudoinverse of the products (c, c), in the observable directions."""
         part, ways = self._directions()
         observable = part > OBSERVABLE_SQUARE_SHARE
         back = ways[:, observable] / np.sqrt(part[observable]) / self.scale[:, None]
@@ -369,13 +366,13 @@ class _ProjectedColumns:
 
     @property
     def gain(self) -> tuple[float, int]:
-        """chi2 that they gain together, and by how many numbers."""
+        """Joint decrease of chi2, and its degrees of freedom."""
         observable = self._directions()[0] > OBSERVABLE_SQUARE_SHARE
         return float(self.value @ self.inverse @ self.value), int(observable.sum())
 
     @property
     def hidden(self) -> Array:
-        """(c,) part of each that lies in directions which are not seen."""
+        """(c,) share of each number in unobservable directions."""
         part, ways = self._directions()
         return np.sum(ways[:, part <= OBSERVABLE_SQUARE_SHARE] ** 2, axis=1)
 
@@ -386,21 +383,22 @@ def shared_basis(info: Information) -> Array:
     return half[:, np.any(half != 0, axis=0)]
 
 
-def _basis_beside(assembled: Assembled, info: Information, beside: RandomEffects) -> Array:
+def _basis_beside(assembled: Assembled, info: Information, beside: Sequence[Column]) -> Array:
     """B (na + l, nb + l): the rows by the shared unknowns and by random effects, in their own
     standard deviations, times it are orthonormal; those that say so of the effects are among them.
 
     With Q = J B0 the orthonormal rows of the unknowns alone and D the effects' columns, the further
     ones are ``(D - Q Q^T D) L^-T`` with ``L L^T = 1 + D^T D - (Q^T D)^T Q^T D``.
     """
-    basis, count = shared_basis(info), beside.root.shape[1]
+    basis, root = shared_basis(info), prior_root(beside)
+    count = root.shape[1]
     if not count:
         return basis
-    columns = columns_of(assembled, info.state, beside.effects)
+    columns = columns_of(assembled, info.state, beside)
     across, squared = np.zeros((basis.shape[1], count)), np.eye(count)
     na = len(basis)
     for cut, piece in zip(divisions(*assembled.problem.extent), info.pieces(), strict=True):
-        rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ beside.root)
+        rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ root)
         flat = rows.reshape(-1, na + count)
         across += (flat[:, :na] @ basis).T @ flat[:, na:]
         squared += flat[:, na:].T @ flat[:, na:]
@@ -413,12 +411,12 @@ def _basis_beside(assembled: Assembled, info: Information, beside: RandomEffects
 def _products(
     assembled: Assembled,
     info: Information,
-    listed: Sequence[Effect],
+    listed: Sequence[Column],
     basis: Array,
     singles: bool,
-    beside: RandomEffects,
+    beside: Sequence[Column],
 ) -> _Products:
-    """Of the departures' columns; basis : of the unknowns and the random effects beside them."""
+    """Products of the violations' columns; basis : of the unknowns and of ``beside``."""
     problem, observed = assembled.problem, assembled.observed
     stations, motors = problem.unknowns.stations, problem.layout.n_readings if singles else 0
     parts: list[_Listed] = []
@@ -440,15 +438,15 @@ def _products(
     )
     throughout = [effect for effect in listed if effect.station is None]
     columns = columns_of(assembled, info.state, throughout, singles=singles)
-    random, n_random = columns_of(assembled, info.state, beside.effects), beside.root.shape[1]
+    random, root = columns_of(assembled, info.state, beside), prior_root(beside)
     for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
         linear = piece.linear
-        further = [random(cut, linear) @ beside.root, columns(cut, linear)]
+        further = [random(cut, linear) @ root, columns(cut, linear)]
         rows, value = eliminated_beside(linear, np.concatenate(further, axis=-1))
         count = problem.unknowns.count
         if not cut.start:
             reference_values = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
-        first, split = count + n_random, rows.shape[-1] - motors
+        first, split = count + root.shape[1], rows.shape[-1] - motors
         own = [rows[..., stations], rows[..., first:split], rows[..., :first] @ basis]
         wide = np.concatenate([*own, value[..., None]], axis=-1)
         for begin in begins:
@@ -469,10 +467,17 @@ def _products(
     )
 
 
+def prior_root(columns: Sequence[Column]) -> Array:
+    """Root (k, l) of the covariance of all numbers of columns with a prior."""
+    from scipy.linalg import block_diag
+
+    return np.array(block_diag(np.zeros((0, 0)), *(one.prior for one in columns)))
+
+
 def eliminated_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
     """Rows (K', r, na + k) with columns (K', r, k) beside the unknowns' and residuals (K', r), of
-    which the configurations' own unknowns are eliminated. Rows that are weighted away or hold
-    nothing say nothing of departures either.
+    which the configurations' own unknowns are eliminated. Columns are zero in rows that are
+    rejected or padding.
     """
     extra = np.where(linear.usable[0][..., None], columns, 0.0)
     wide = linear._replace(
@@ -484,10 +489,10 @@ def eliminated_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
 
 
 def columns_of(
-    assembled: Assembled, state: BatchState, listed: Sequence[Effect], *, singles: bool = False
+    assembled: Assembled, state: BatchState, listed: Sequence[Column], *, singles: bool = False
 ) -> Callable[[slice, Linear], Array]:
-    """Gives the columns (K', r, k) of some configurations, of which the problem's rows are given,
-    by effects throughout, in their order, then by the single readings.
+    """Function that returns the columns (K', r, k) of some configurations from the problem's rows
+    there: of the listed columns in their order, then of the single readings.
     """
     problem, places = assembled.problem, assembled.places
     counts = [effect.count for effect in listed]
@@ -500,21 +505,20 @@ def columns_of(
         where = slice(end - effect.count, end)
         if effect.readings is not None:
             readings[..., where] = effect.readings[assembled.observed]
-        edges = None if effect.edges is None else places.edges.filled(effect.edges)
-        poses = None if effect.poses is None else places.poses.filled(effect.poses)
+        parts = effect.edges_of(len(places.edges.row)), effect.poses_of(len(places.poses.row))
+        edges, poses = (
+            None if part is None else at.filled(part)
+            for at, part in zip(places, parts, strict=False)
+        )
         placed.append((where, edges, poses))
         if effect.motion is not None:
             moving.append((where, effect.motion[:, assembled.observed]))
 
     def columns(cut: slice, linear: Linear) -> Array:
         part = problem.among(cut)
-        c, layout = part.closure(part.state_among(state, cut)), part.layout
+        c = part.closure(part.state_among(state, cut))
         out = np.zeros((len(part.blocks.present), part.n_rows, readings.shape[-1]))
-        row = np.where(layout.row_motor >= 0, layout.row_motor, 0)
-        by = np.where(layout.row_motor >= 0, c.by_reading[0], 0.0)[..., None]
-        by = by * readings[cut][:, row]
-        noise = part.joint_noise[:1, None, None]
-        out[:, part.closure_rows] = by_noise(layout, noise, c.by_reading, by[None])[0]
+        out[:, part.closure_rows] = part.by_readings(c, readings[cut])[0]
         of_edges = part.data.weighed[0]
         of_poses = (np.sqrt(part.pose_data.weight)[..., None, None] * part.pose_data.whiten)[0]
         before, after = (out[:, kind.rows] for kind in part.kinds[:2])

@@ -1,4 +1,4 @@
-"""Where the joint estimate starts: from the readings and what the photographs say."""
+"""Initial state of the joint estimate, from the readings and the measured poses."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pkmcal.mechanisms import Machine
 
 MEDIAN_TURN_STEPS = 15
 EQUAL_TURNS_ANGLE = 1e-4
-"""rad, about; turns that differ by less are one."""
+"""rad, about; rotations that differ by less are equal."""
 
 
 def start_state(machine: Machine, measurements: Measurements, T_camera_base_guess: Array) -> State:
-    """A start: the machine's present values, poses by forward kinematics from the readings.
+    """Initial state: the machine's present values, and poses by forward kinematics of the readings.
 
     Readings, not seen directions: the latter lead into local minima (errata, B).
     T_camera_base_guess : (S, 4, 4).
@@ -31,7 +31,6 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
         machine.values,
         stations,
         poses,
-        np.zeros(measurements.n_cameras),
         T_mount=start_mounts(measurements, stations, poses),
         on_platform=measurements.on_platform,
         internal=fk.internal,
@@ -39,7 +38,7 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
 
 
 def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array) -> Array:
-    """T_mount (M, 4, 4) from the measured poses, the stations' and the platform's.
+    """Initial T_mount (M, 4, 4) from the measured poses, the stations' and the platform's.
 
     T_camera_base : (S, 4, 4). poses : T_base_platform (K, 4, 4).
     """
@@ -54,7 +53,7 @@ def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array)
 
 
 def middle_pose(poses: Array) -> Array:
-    """The pose (4, 4) nearest to poses (n, 4, 4), a few wrong ones forgiven; the identity of none.
+    """Robust mean (4, 4) of poses (n, 4, 4); the identity of none.
 
     The turn with the least sum of distances, as the median has it of numbers (Weiszfeld).
     """
@@ -70,7 +69,7 @@ def middle_pose(poses: Array) -> Array:
 
 
 def edge_misfit(machine: Machine, measurements: Measurements, state: State) -> float:
-    """Median Mahalanobis distance of the edges from their prediction; infinite where none is."""
+    """Median Mahalanobis distance of the edges from their prediction; infinite without edges."""
     assembled = assemble(machine, measurements, default_gauge(machine))
     rows = assembled.problem.unweighted(batch_of(machine, assembled, state))
     distance = norms(assembled.problem, rows).edges

@@ -1,4 +1,4 @@
-"""Where everything stands in a problem: what neither weights nor noise nor a state change."""
+"""Structure of a problem: the part that does not depend on weights, noise or state."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from pkmcal.solver.strips import StripLayout
 
 
 class _Turn(NamedTuple):
-    """From a strip's columns, which are parameters, to the unknowns' where these differ.
+    """Map from the columns of strips, which are parameters, to unknowns, where these differ.
 
-    by : (groups, w, w') of the strips with the same columns. columns : (groups, w') which of the
-    shared unknowns they are.
+    by : (groups, w, w') for the strips with the same columns. columns : (groups, w') numbers of the
+    shared unknowns.
     """
 
     by: Array
@@ -30,7 +30,9 @@ class _Turn(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Integers, turn: Array) -> _Turn:
-        """Of strips with these columns (groups, w); turn (width, na) from all columns."""
+        """Map for strips with columns ``parameters`` (groups, w); turn : (width, na) of all
+        columns.
+        """
         used = [np.flatnonzero(np.any(turn[own] != 0, axis=0)) for own in parameters]
         most = max((len(own) for own in used), default=0)
         columns = np.full((len(used), most), turn.shape[1])
@@ -43,8 +45,8 @@ class _Turn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Of a problem with these parts (:class:`~pkmcal.identify.problem.Problem`); made when it is
-    asked for, and once for all problems of the same measurements.
+    """Structure of a problem with these parts (:class:`~pkmcal.identify.problem.Problem`),
+    evaluated lazily and shared by all problems of the same measurements.
     """
 
     layout: LimbLayout
@@ -56,7 +58,7 @@ class Structure:
     link_blocks: LinkBlocks
 
     def made_of(self, *parts: object) -> bool:
-        """Whether it is made of these, in their order."""
+        """Whether its parts are these objects, in their order."""
         own = (
             self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames,
             self.link_blocks,
@@ -65,11 +67,11 @@ class Structure:
 
     @cached_property
     def _parts(self) -> dict[tuple[int, int], Structure]:
-        """Those of some configurations that were asked for."""
+        """Cache of the structures of some configurations."""
         return {}
 
     def among(self, configurations: slice) -> Structure:
-        """That of some configurations only."""
+        """Structure of some configurations."""
         key = configurations.start, configurations.stop
         if key not in self._parts:
             self._parts[key] = replace(
@@ -81,25 +83,25 @@ class Structure:
 
     @cached_property
     def to_free(self) -> Array:
-        """(nz, P), from changes of the parameters to those of z."""
+        """(nz, P) map from changes of the parameters to changes of z."""
         return np.linalg.pinv(self.free)
 
     @cached_property
     def choice(self) -> Integers | None:
-        """The parameter of each free unknown where each moves one parameter alone."""
+        """Parameter of each free unknown, where each changes one parameter only; else None."""
         alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
         return np.argmax(self.free, axis=0) if alone else None
 
     @cached_property
     def width(self) -> int:
-        """Columns of an edge's row while it is written: the shared unknowns', where parameters are
-        tied or are axes one for each parameter besides, and one for what is no unknown.
+        """Columns of an edge's row while it is written: the shared unknowns, one for each parameter
+        where parameters are tied or are axes, and one for padding.
         """
         return self.unknowns.count + 1 + (0 if self.choice is not None else self.drawing.size)
 
     @cached_property
     def column(self) -> Integers:
-        """Where each parameter's derivatives are written, (P + 1,); the last is no parameter's."""
+        """Column of each parameter's derivatives, (P + 1,); the last is for padding."""
         if self.choice is None:
             return self.unknowns.count + np.arange(self.drawing.size + 1)
         out = np.full(self.drawing.size + 1, self.unknowns.count)
@@ -108,21 +110,21 @@ class Structure:
 
     @cached_property
     def moves_of(self) -> Array:
-        """Frame changes and others (12 + n, nz) that a step of z makes, as far as they can, by
-        least squares at the drawing: what they leave to be added up is small in any case.
+        """Frame changes and others (12 + n, nz) that explain most of a step of z, by least squares
+        at the nominal model; the remainder is small and added linearly.
         """
         by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
         return self.frames @ np.linalg.pinv(by_moves @ self.frames)
 
     @cached_property
     def reach(self) -> float:
-        """How far from the platform's origin the farthest of its joints is drawn, m."""
+        """Largest nominal distance of a joint from the platform's origin, m."""
         ends = platform_ends(self.layout, self.drawing, np.eye(4))
         return float(np.linalg.norm(ends.b, axis=-1).max())
 
     @cached_property
     def strips(self) -> StripLayout:
-        """The views as strips."""
+        """Layout of the views as strips."""
         views, columns = self.blocks.views, self.strip_parameters
         n_rows = 2 * self.blocks.side.shape[-1]
         place = n_rows * (views.place % max(self.blocks.present.shape[1], 1))
@@ -140,62 +142,39 @@ class Structure:
 
     @cached_property
     def linked_columns(self) -> Integers:
-        """(K, d) the shared columns of each configuration's own unknowns; -1 where it is not
-        linked.
-        """
+        """(K, d) shared columns of each configuration's own unknowns; -1 where it is not linked."""
         d, number = self.layout.own_motion.shape[1], self.link_blocks.number
         columns = self.unknowns.linked.start + d * number[:, None] + np.arange(d)
         return np.where(number[:, None] < 0, -1, columns)
 
     @cached_property
     def strip_parameters(self) -> Integers:
-        """Of each group of views the columns (groups, w) that its edges' derivatives are by: the
-        parameters of both ends, the station, the radii, its camera's, its lines' and its breathing.
+        """Columns (groups, w) on which the edges of each group of views depend: the parameters of
+        both ends, the station, the radii, the effects.
         """
         u, layout, views = self.unknowns, self.layout, self.blocks.views
         first = np.array([cut.start for cut in views.groups], dtype=int)
-        leg, station, camera = views.leg[first], views.station[first], views.camera[first]
-        none = self.width - 1
-        radii = np.full((len(first), len(self.own_columns[0])), none)
+        leg, none = views.leg[first], self.width - 1
+        radii = np.full((len(first), len(self.own_radii)), none)
         for k, one in enumerate(leg):
             radii[k, : len(layout.radius[one])] = self.column[layout.radius[one]]
-        lines = np.full((len(first), len(self.own_columns[1])), none)
-        for own, item in zip(lines, self._lines, strict=True):
-            own[: len(item)] = u.shading.start + item
+        effects = self.blocks.view_columns.of_groups
         parts = [self.column[layout.b_index[leg]], self.column[layout.a_index[leg]]]
-        parts += [numbered_columns(u.stations, station, 6), radii]
-        parts += [numbered_columns(u.optics, camera, u.n_optics), lines]
-        if u.n_breathing:
-            parts.append(numbered_columns(u.breathing, station, 1))
+        parts += [numbered_columns(u.stations, views.station[first], 6), radii]
+        parts += [np.where(effects < 0, none, u.effects.start + effects)]
         return np.concatenate(parts, axis=1)
 
     @cached_property
-    def _lines(self) -> list[Integers]:
-        """The lines that each group of views sees."""
-        views = self.blocks.views
-        if not self.unknowns.n_lines:
-            return [np.zeros(0, dtype=int) for _ in views.groups]
-        line = np.where(views.present, views.taken(self.blocks.line), -1)
-        return [np.unique(line[cut][line[cut] >= 0]) for cut in views.groups]
-
-    @cached_property
-    def own_columns(self) -> tuple[Array, Array]:
-        """Which of its leg's radii and of its group's lines each row depends on: ones in
-        (radii, N, n) and (lines, N, n).
-        """
-        blocks, views, n_rows = self.blocks, self.blocks.views, 2 * self.blocks.side.shape[-1]
+    def own_radii(self) -> Array:
+        """Indicator (radii, N, n) of the radius of its leg on which each row depends."""
+        views, n_rows = self.blocks.views, 2 * self.blocks.side.shape[-1]
         radii = max((len(self.layout.radius[leg]) for leg in np.unique(views.leg)), default=0)
-        used = views.taken(blocks.tube) == np.arange(radii)[:, None, None]
-        number = np.zeros((max((len(own) for own in self._lines), default=0), *views.place.shape))
-        for cut, own in zip(views.groups, self._lines, strict=True):
-            if own.size:
-                line = views.taken(blocks.line)[cut]
-                number[: len(own), cut] = line == own[:, None, None]
-        return np.repeat(used.astype(float), n_rows, -1), np.repeat(number, n_rows, -1)
+        used = views.taken(self.blocks.tube) == np.arange(radii)[:, None, None]
+        return np.repeat(used.astype(float), n_rows, -1)
 
     @cached_property
     def turn(self) -> _Turn | None:
-        """How strips' columns become unknowns, where parameters are tied or are axes."""
+        """Map from columns of strips to unknowns, where parameters are tied or are axes."""
         if self.choice is not None:
             return None
         turn = np.eye(self.width, self.unknowns.count)
@@ -204,8 +183,8 @@ class Structure:
 
     @cached_property
     def closure_index(self) -> Integers:
-        """Parameters (E, n) that the closures' derivatives are by; rods on one motor share their
-        noise, so each has those of all.
+        """Parameters (E, n) on which the closures depend; rods on one motor share their noise, so
+        each depends on the parameters of all.
         """
         if self.layout.shares_motors:
             return np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
@@ -213,10 +192,12 @@ class Structure:
 
     @cached_property
     def closure_turn(self) -> Array:
-        """(E, n, nz) from the closures' derivatives by those to the ones by the free unknowns."""
+        """(E, n, nz) map from derivatives by ``closure_index`` to derivatives by the free
+        unknowns.
+        """
         return np.pad(self.free, ((0, 1), (0, 0)))[self.closure_index]
 
 
 def numbered_columns(part: slice, number: Integers, width: int) -> Integers:
-    """Columns (K, G, width) of unknowns ``width`` wide each, by which one it is, (K, G)."""
+    """Columns (K, G, width) of unknowns with ``width`` columns each, by their number (K, G)."""
     return part.start + width * number[..., None] + np.arange(width)

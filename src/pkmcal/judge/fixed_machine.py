@@ -28,8 +28,9 @@ from pkmcal.identify.covariance import Information, reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.unknowns import BatchState, Name
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.effects import INTRINSICS
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import column_space, nonzero
@@ -110,7 +111,7 @@ class Held:
     observed: Booleans
     problem: Problem
     state: BatchState
-    unknowns: tuple[Name, ...]
+    unknowns: tuple[str, ...]
 
     def residuals(self) -> Array:
         """Root mean squares (K,) of each configuration's residuals in standard deviations.
@@ -192,8 +193,12 @@ def hold(
     # The same solution in a problem with magnifications, which are zero there.
     opened = assemble(still, magnified, default_gauge(still), shading=data_weights.shading)
     problem = opened.trusting(data_weights.weights)
-    state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
-    return Held(still, assembled.observed, problem, state, ("machine", "intrinsics"))
+    u = problem.unknowns
+    new = u.columns(INTRINSICS)
+    columns = np.zeros((len(state.columns), u.effects.stop - u.effects.start))
+    columns[:, np.delete(np.arange(columns.shape[1]), new - u.effects.start)] = state.columns
+    state = replace(state, columns=columns)
+    return Held(still, assembled.observed, problem, state, ("machine", INTRINSICS))
 
 
 def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:

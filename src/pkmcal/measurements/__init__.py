@@ -1,14 +1,12 @@
 """What was measured: one contract, one file a kind of measurement; sets of measurements."""
 
+from pkmcal.measurements.columns import Column
 from pkmcal.measurements.edges import OWN_SHADING, SHADING_SIGMA, EdgeSet, Rejection
 from pkmcal.measurements.line_cells import SHADING_CORRELATION_ANGLE, TUBE_CORRELATION
 from pkmcal.measurements.links import LinkRows, LinkSet
 from pkmcal.measurements.poses import PoseSet
 from pkmcal.measurements.sets import (
-    BREATHING_SIGMA,
-    Effect,
     Measurements,
-    ModelViolation,
     Mount,
     Observation,
     Set,
@@ -17,17 +15,15 @@ from pkmcal.measurements.sets import (
 )
 
 __all__ = [
-    "BREATHING_SIGMA",
     "OWN_SHADING",
     "SHADING_CORRELATION_ANGLE",
     "SHADING_SIGMA",
     "TUBE_CORRELATION",
+    "Column",
     "EdgeSet",
-    "Effect",
     "LinkRows",
     "LinkSet",
     "Measurements",
-    "ModelViolation",
     "Mount",
     "Observation",
     "PoseSet",

@@ -1,8 +1,10 @@
 """Silhouette edges of legs in images: the kind, its measurements and their rows.
 
-Two rows an edge, ``L^-1 (basis^T n_predicted + shift * s)`` with L the Cholesky factor of the
-edge's covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all
-edge points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
+Two rows an edge, ``L^-1 (basis^T n_predicted - C x)`` with L the Cholesky factor of the edge's
+covariance and C its derivatives by the numbers x of the columns
+(:mod:`pkmcal.measurements.columns`). ``basis^T n_measured = 0``. When all points of an edge lie s
+px outward, the measured normal is the true one plus ``basis @ (shift * s)``, so the derivative of
+an edge shift is ``C = -shift``.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import ClassVar, TypeVar, final
+from typing import ClassVar, NamedTuple, TypeVar, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,13 +26,13 @@ from pkmcal.measurements.rows import among
 from pkmcal.mechanisms.closure import Closure
 
 SHADING_SIGMA = 0.03
-"""Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
-where light is even; hard light and polished metal show ten times as much, so data may enlarge it.
-Path-traced photographs of matt machines show 0.02, our own renderer's 0.05."""
+"""Standard deviation (px) of the shift by shading of all edges of one side of a tube at one
+station, under even light. Hard light and polished metal cause ten times as much, so the data may
+enlarge it. 0.02 in path-traced images of matt machines, 0.05 in those of our own renderer."""
 
 OWN_SHADING = 0.015
-"""Standard deviation (px) of what shading adds to one edge beside what all of its line have in
-common, where light is even; highlights and what metal mirrors add ten times as much."""
+"""Standard deviation (px) of the shift by shading of one edge beside the common shift of its line,
+under even light; highlights and mirror images in metal cause ten times as much."""
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -49,9 +51,9 @@ class Edges(ImageKind):
 
 @dataclass(frozen=True)
 class EdgeSet:
-    """Silhouette edges of legs in photographs; N edges, flat arrays, all indices from 0.
+    """Silhouette edges of legs in images; N edges, flat arrays, all indices from 0.
 
-    station, configuration, leg, tube, side : (N,) where the edge was seen; side as in
+    station, configuration, leg, tube, side : (N,) where the edge was measured; side as in
         :mod:`pkmcal.geometry.cylinders` (0 or 1).
     normal : (N, 3) unit normal of the plane of edge and camera centre, camera frame,
         pointing away from the leg's axis.
@@ -59,16 +61,16 @@ class EdgeSet:
     covariance : (N, 2, 2) of the normal in that basis, rad^2.
     shift : (N, 2) change of the normal, in that basis, when every point of the edge moves
         outward by one pixel (rad/px).
-    span : (N, 2) first and last seen place along the leg, m from A.
+    span : (N, 2) first and last visible position along the leg, m from A.
     by_intrinsics : (N, 2, n) change of the normal, in that basis, by the camera's parameters with
-        the edge's pixels held; n = 0 where nobody asked.
-    by_focal : (N, 2) the same by the relative excess of the focal lengths, where these breathe from
-        photograph to photograph; else zero.
-    shading : (N,) px, standard deviation of what shading adds to each edge beside what it adds to
-        all of its line; edges of a line share it as far as their normals agree, see
-        :mod:`~pkmcal.measurements.line_cells`. It counts where measurements are ``shaded``.
-    coarse : (N,) whether it is where a whole machine's silhouettes lie on picture edges
-        (:mod:`pkmcal.observe.silhouettes`), and not measured by itself.
+        the edge's pixels fixed; n = 0 where it is not needed.
+    by_focal : (N, 2) the same by the relative excess of the focal lengths, where these differ from
+        image to image; else zero.
+    shading : (N,) px, standard deviation of each edge's shift by shading beside the common shift of
+        its line; correlated between edges of a line with near normals
+        (:mod:`~pkmcal.measurements.line_cells`). It counts where measurements are ``shaded``.
+    coarse : (N,) whether the edge follows from the fit of a whole machine's silhouettes to image
+        edges (:mod:`pkmcal.observe.silhouettes`) and was not measured by itself.
     """
 
     station: Integers
@@ -89,7 +91,7 @@ class EdgeSet:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """What is not given is empty, zero or the usual, so that all edges select alike."""
+        """Set absent fields to empty, zero or usual values of the right length."""
         if len(self.coarse) != len(self.station):
             object.__setattr__(self, "coarse", np.zeros(len(self.station), dtype=bool))
         if len(self.by_intrinsics) != len(self.station):
@@ -101,7 +103,7 @@ class EdgeSet:
 
     @classmethod
     def empty(cls) -> EdgeSet:
-        """No edge, for sessions of boards alone."""
+        """A set without edges, for sessions of boards alone."""
         none = np.zeros(0, dtype=int)
         each = [np.zeros((0, *shape)) for shape in ((3,), (3, 2), (2, 2), (2,), (2,))]
         normal, basis, covariance, shift, span = each
@@ -111,12 +113,12 @@ class EdgeSet:
         return len(self.station)
 
     def select(self, keep: Booleans | Integers) -> EdgeSet:
-        """The edges at a mask or at positions."""
+        """The edges selected by a mask or by positions."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
     def same_as(self, other: EdgeSet) -> tuple[Integers, Integers]:
-        """Positions in this set and in another of the edges that are in both: of one station's
-        photograph of a configuration, and one side of a leg's tube. Each is in a set once.
+        """Positions, in this set and in another, of the edges in both: of the same station,
+        configuration, leg, tube and side. Each edge is in a set once.
         """
         each = [
             np.stack([of.station, of.configuration, of.leg, of.tube, of.side], axis=1)
@@ -127,11 +129,11 @@ class EdgeSet:
         return np.intersect1d(own, others, return_indices=True)[1:]
 
     def scaled(self, factor: float) -> EdgeSet:
-        """The same, that scatter by a factor more."""
+        """The edges with standard deviations larger by a factor."""
         return replace(self, covariance=self.covariance * factor**2)
 
     def rejection(self, k: int, reason: str) -> Rejection:
-        """The edge at k, left out for a reason."""
+        """Rejection of the edge at position k, with a reason."""
         return Rejection(
             station=int(self.station[k]),
             configuration=int(self.configuration[k]),
@@ -144,9 +146,9 @@ class EdgeSet:
 
 @dataclass(frozen=True)
 class Rejection:
-    """Something that was seen but left out, or looked for and not found, and why.
+    """A measurement that was rejected, or not found, and the reason.
 
-    tube and side are -1 where the whole leg, leg -1 where the whole photograph is meant.
+    tube and side are -1 for a whole leg, leg is -1 for a whole image.
     """
 
     station: int
@@ -159,40 +161,41 @@ class Rejection:
 
 @dataclass(frozen=True)
 class EdgeBlocks:
-    """Where the edges are: K configurations of G blocks, padded; the same for all runs. A leg has
-    as many places as every other, side by side, in all configurations.
+    """Positions of the edges: K configurations of G blocks, padded; the same for all runs. Each leg
+    has the same number of consecutive positions in all configurations.
 
     Edges that share their noise are whitened together: a *block* is g edges (g = 1 for edges
-    fitted in photographs, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
+    measured in images, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
     of one tube at one station, with one 2g x 2g whitening matrix and one robust weight.
 
-    leg : (1, G). station, camera, radius : (K, G) station, camera, position of the tube's radius.
-    side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
-    its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
-    empty where nothing is shaded. tube : (K, G) number of the tube on its leg. n_effective : (K, G)
-    how many of its line share an edge's own shading, see :mod:`~pkmcal.measurements.line_cells`,
-    zero where nothing is shaded. cell : (K, G) which of the ``cells`` each is in, -1 for none.
+    leg : (1, G). station, radius : (K, G) station, position of the tube's radius. side : (K, G, g).
+    present : (K, G) False for padding. column : (K, G, w) which of the estimate's columns move each
+    edge, -1 for none. alone : (K, G) px, standard deviation of the shading of edges that are a line
+    of their own, zero for all others. tube : (K, G) number of the tube on its leg. n_effective :
+    (K, G) how many of its line share an edge's own shading, see
+    :mod:`~pkmcal.measurements.line_cells`, zero where nothing is shaded. cell : (K, G) which of the
+    ``cells`` each is in, -1 for none.
     """
 
     leg: Integers
     station: Integers
-    camera: Integers
     radius: Integers
     side: Integers
     present: Booleans
+    column: Integers
+    alone: Array
     tube: Integers
     n_effective: Array
     cell: Integers
     cells: LineCells
-    line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
 
     def among(self, configurations: slice) -> EdgeBlocks:
-        """Those of some configurations."""
+        """The blocks of some configurations."""
         return among(self, configurations, 0)
 
     @cached_property
     def views(self) -> EdgeViews:
-        """The same by views, padding left out."""
+        """The blocks by views, without padding."""
         configuration, number = np.nonzero(self.present)
         leg, station = self.leg[0, number], self.station[configuration, number]
         order = np.lexsort((number, configuration, station, leg))
@@ -207,30 +210,55 @@ class EdgeBlocks:
         place[view, slot] = (keys[2] * self.present.shape[1]) + number[order]
         present = np.zeros(place.shape, dtype=bool)
         present[view, slot] = True
-        camera = self.camera.ravel()[place[:, 0]] if place.size else station
-        return EdgeViews(configuration, leg, station, camera, place, present)
+        return EdgeViews(configuration, leg, station, place, present)
+
+    @cached_property
+    def view_columns(self) -> ViewColumns:
+        """The columns that move the edges of each view."""
+        views = self.views
+        group = np.repeat(np.arange(len(views.groups)), [c.stop - c.start for c in views.groups])
+        column = views.taken(self.column)
+        used, base = column >= 0, int(self.column.max(initial=0)) + 1
+        keys, inverse = np.unique((group[:, None, None] * base + column)[used], return_inverse=True)
+        of_group, number = np.divmod(keys, base)
+        slot = np.arange(len(keys)) - np.searchsorted(of_group, of_group)
+        of_groups = np.full((len(views.groups), int(slot.max(initial=-1)) + 1), -1)
+        of_groups[of_group, slot] = number
+        slots = np.full(column.shape, -1)
+        slots[used] = slot[inverse.reshape(-1)]
+        return ViewColumns(of_groups, of_groups[group], slots)
 
     @cached_property
     def number(self) -> Integers:
-        """(K, G) which each is of the views' blocks, (N m); any for padding."""
+        """(K, G) number of each block among those of the views, (N m); any for padding."""
         views, out = self.views, np.zeros(self.present.size, dtype=int)
         out[views.place[views.present]] = np.flatnonzero(views.present)
         return out.reshape(self.present.shape)
 
 
+class ViewColumns(NamedTuple):
+    """Columns that move the edges of views: of_groups (groups, W) of each group, in increasing
+    order, -1 where there are fewer; of_views (N, W) the same by view; slots (N, m, w) which of
+    these each block's own columns are, -1 for none.
+    """
+
+    of_groups: Integers
+    of_views: Integers
+    slots: Integers
+
+
 @dataclass(frozen=True)
 class EdgeViews:
-    """What is seen of one leg in one photograph, N times: up to m blocks, whose edges are those of
-    one line. Views of one leg from one station stand side by side.
+    """N views, each of one leg in one image: up to m blocks, whose edges are those of one axis.
+    Views of one leg from one station are contiguous.
 
-    configuration, leg, station, camera : (N,). place : (N, m) where each block is among those of
-    all configurations, (K G). present : (N, m) False for padding, which has another block's place.
+    configuration, leg, station : (N,). place : (N, m) position of each block among those of all
+    configurations, (K G). present : (N, m) False for padding, which has another block's position.
     """
 
     configuration: Integers
     leg: Integers
     station: Integers
-    camera: Integers
     place: Integers
     present: Booleans
 
@@ -241,12 +269,12 @@ class EdgeViews:
         return flat.take(self.place, axis=axis)
 
     def limbs(self, n_legs: int) -> Integers:
-        """Which each one's limb is, of those of all configurations, (K L)."""
+        """Number of each view's limb among those of all configurations, (K L)."""
         return self.configuration * n_legs + self.leg
 
     @cached_property
     def groups(self) -> list[slice]:
-        """Views of one leg from one station."""
+        """Slices of the views of one leg from one station."""
         changes = (np.diff(self.leg) != 0) | (np.diff(self.station) != 0)
         cuts = [0, *(np.flatnonzero(changes) + 1).tolist(), len(self.leg)]
         return [slice(*cut) for cut in pairwise(cuts) if cut[0] < cut[1]]
@@ -254,44 +282,42 @@ class EdgeViews:
 
 @dataclass(frozen=True)
 class EdgeData:
-    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
+    """Measured values of each run; leading axis B, or 1 where all runs share them.
 
     basis : (B, K, G, g, 3, 2). white : (B, K, G, 2g, 2g) whitening of each block's noise as it was
-    stated, shading left out. optics : (B, K, G, 2g, w) change of
-    the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
-    shift (px), then its intrinsics where they are refined (in units of their prior).
-    joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
-    shading : (B, n) px by which one unit of each line's shading moves its edges, its standard
-    deviation; n = 1 where all have the same. breathing : (B, K, G, 2g, 1) the same change as optics
-    by a unit of their station's focal breathing; zero numbers where nothing breathes. scale :
-    (B, K, G) factor on the stated noise. own : (B, K, G) px, standard deviation of the shading of
-    each edge beside its line's, that of all who share it counted.
+    stated, shading left out. shift : (B, K, G, 2g) change of the measured normals by a pixel
+    outward. joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale
+    squared. columns : (B, K, G, 2g, w) derivatives of the rows, before they are whitened, by the
+    blocks' ``column``. unit : (B or 1, n) by what the n columns of the estimate are multiplied:
+    standard deviations, px, of the lines' shading, one of all others. scale : (B, K, G) factor on
+    the stated noise. own : (B, K, G) px, standard deviation of the shading of each edge beside its
+    line's, that of all who share it counted.
     """
 
     basis: Array
     white: Array
-    optics: Array
+    shift: Array
     joints: Array
     weight: Array
-    shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
-    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
+    columns: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 0)))
+    unit: Array = field(default_factory=lambda: np.ones((1, 0)))
     scale: Array = field(default_factory=lambda: np.ones((1, 1, 1)))
     own: Array = field(default_factory=lambda: np.zeros((1, 1, 1)))
 
     def among(self, configurations: slice) -> EdgeData:
-        """Those of some configurations."""
-        return replace(among(self, configurations, 1), shading=self.shading)
+        """The data of some configurations."""
+        return replace(among(self, configurations, 1), unit=self.unit)
 
     @cached_property
     def by_shift(self) -> Array:
         """Rows by a pixel of shift, in the noise as it was stated, (B or 1, K, G, 2g)."""
-        return (self.white @ self.optics[..., :1])[..., 0]
+        return (self.white @ self.shift[..., None])[..., 0]
 
     @cached_property
     def whiten(self) -> Array:
-        """The whitening, (B or 1, K, G, 2g, 2g), with the noise's scale and the edges' own shading:
-        in the stated noise's units the covariance is ``scale^2 + own^2 v v^T``, v the
-        :attr:`by_shift`, and its inverse root turns only what lies along v.
+        """Whitening (B or 1, K, G, 2g, 2g) of the noise with its scale and the edges' own shading:
+        in units of the stated noise the covariance is ``scale^2 + own^2 v v^T`` with v the
+        :attr:`by_shift`; its inverse root differs from the identity along v only.
         """
         if not self.own.any():
             return self.white / self.scale[..., None, None]
@@ -309,28 +335,23 @@ class EdgeData:
 
 @dataclass(frozen=True)
 class ViewData:
-    """The edges' numbers by view, whitened and weighted: of each view (B or 1, N) its n rows, which
-    are 2g of each of its m blocks. With the rows last NumPy runs along those of all views, and a
-    number costs a nanosecond an operation.
+    """The edges' derivatives by view, whitened and weighted: n rows of each view (B or 1, N), 2g
+    for each of its m blocks. The rows are the last axis, so that NumPy's inner loops run over all
+    views: a nanosecond a number and operation.
 
-    of_normals : (g, ..., 3, n) rows by changes of the normals, camera frame. by_optics : (w, ...,
-    n) by the unknowns of their camera. by_breathing : (1, ..., n) by their station's focal
-    breathing, none where nothing breathes. by_line : (..., n) by their line's shading, which moves
-    them as the camera's shift moves all; edges that are their station's only one of a line have
-    theirs among their noise. counts : (..., n) whether the block is there and has a weight. sign :
-    (g, N, n) of the edges' sides.
+    of_normals : (g, ..., 3, n) rows by changes of the normals, camera frame. by_columns : (W, ...,
+    n) by the columns of their group (:class:`ViewColumns`). counts : (..., n) whether the
+    block is there and has a weight. sign : (g, N, n) of the edges' sides.
     """
 
     of_normals: Array
-    by_optics: Array
-    by_breathing: Array
-    by_line: Array
+    by_columns: Array
     counts: Booleans
     sign: Array
 
     @classmethod
-    def of(cls, blocks: EdgeBlocks, data: EdgeData, *, breathe: bool) -> ViewData:
-        """The numbers of all edges that are there; breathe : whether focal lengths do."""
+    def of(cls, blocks: EdgeBlocks, data: EdgeData) -> ViewData:
+        """The data of all edges that are present."""
         views = blocks.views
         counts = (views.taken(data.weight, 1) > 0) & views.present
         white = np.where(counts[..., None, None], views.taken(data.weighed, 1), 0.0)
@@ -341,24 +362,22 @@ class ViewData:
             """Numbers (..., m, 2g) of blocks."""
             return numbers.reshape(*numbers.shape[:-2], numbers.shape[-2] * each)
 
-        def rows(by_unknowns: Array) -> Array:
-            return by_row(np.einsum("...krq,...kqw->w...kr", white, by_unknowns, order="C"))
-
-        by_optics = rows(views.taken(data.optics, 1))
-        by_line, by_breathing = by_optics[0], by_optics[:0]
-        if blocks.line.size:
-            line, sigma = views.taken(blocks.line), data.shading
-            own = sigma[:, line] if sigma.shape[1] > 1 else sigma[..., None]
-            by_line = by_line * np.repeat(np.where(line < 0, 0.0, own), each, axis=-1)
-        if breathe:
-            by_breathing = rows(views.taken(data.breathing, 1))
+        by_column = np.einsum(
+            "...krq,...kqw->w...kr", white, views.taken(data.columns, 1), order="C"
+        )
+        if np.any(data.unit != 1):
+            unit = data.unit[:, views.taken(blocks.column)]
+            by_column = by_column * np.moveaxis(unit, -1, 0)[..., None]
+        to = blocks.view_columns
+        by_columns = np.zeros((to.of_groups.shape[1], *by_row(by_column).shape[1:]))
+        for by, slot in zip(by_row(by_column), np.moveaxis(to.slots, -1, 0), strict=True):
+            for k in np.unique(slot[slot >= 0]).tolist():
+                by_columns[k] += np.where(np.repeat(slot == k, each, axis=-1), by, 0.0)
         of_normals = split.swapaxes(-3, -2) @ views.taken(data.basis, 1).mT  # (..., m, g, 2g, 3)
         side = np.moveaxis(views.taken(blocks.side), -1, 0)
         return cls(
             by_row(np.moveaxis(of_normals, (-3, -1), (0, -3))),
-            by_optics,
-            by_breathing,
-            by_line,
+            by_columns,
             np.repeat(counts, each, axis=-1),
             np.repeat(SIDE_SIGNS[side], each, axis=-1),
         )
@@ -366,8 +385,8 @@ class ViewData:
 
 @dataclass(frozen=True)
 class EdgeRows:
-    """The edges' rows at a state, and how they answer to the two ends of their line; the ends
-    answer to all else. Arrays have the views (B, N), or their rows (B, N, n), last.
+    """The edges' rows at a state, with their derivatives by the two ends of their axis; all other
+    derivatives follow by the chain rule. Last axes are the views (B, N), or their rows (B, N, n).
 
     T_camera_base : (B, S, 4, 4). lines : camera frame. frame : (B, N, 3, 3) their u, m and w.
     sine (...) and cosine (g, ...) : of :func:`~pkmcal.geometry.cylinders.edge_planes`, NaN where a
@@ -385,45 +404,35 @@ class EdgeRows:
     cosine: Array
     by_frame: Array
 
-    def value(self, optics: Array, shading: Array, breathing: Array) -> Array:
-        """Rows (B, N, n), zero where they do not count, with the cameras' unknowns (B, C, w), the
-        lines' shading (B, n) and the stations' focal breathing (B, S), none where there is none.
-        """
-        data, views = self.data, self.blocks.views
+    def value(self, columns: Array) -> Array:
+        """Rows (B, N, n), zero where they do not count, at numbers (B, n) of the columns."""
+        data, (_, of_views, _) = self.data, self.blocks.view_columns
         (_, along_m, along_w), *others = self.by_frame
         rows = self.cosine[0] * along_m - self.sine * along_w
         for cosine, (_, along_m, along_w) in zip(self.cosine[1:], others, strict=True):
             rows += cosine * along_m - self.sine * along_w
-        for by_unknown, unknown in zip(data.by_optics, optics.transpose(2, 0, 1), strict=True):
-            rows += by_unknown * unknown[:, views.camera, None]
-        if shading.shape[-1]:
-            shift = shading[:, views.taken(self.blocks.line)]
-            rows += data.by_line * self._of_blocks(shift)
-        if breathing.shape[-1]:
-            rows += data.by_breathing[0] * breathing[:, views.station, None]
+        numbers = np.pad(columns, ((0, 0), (0, 1)))  # the last is none's
+        for by, column in zip(data.by_columns, of_views.T, strict=True):
+            rows += by * numbers[:, column, None]
         return np.where(data.counts, rows, 0.0)
 
-    def _of_blocks(self, numbers: Array) -> Array:
-        """Numbers of blocks (..., m) for each of their rows, (..., n)."""
-        return np.repeat(numbers, 2 * len(self.cosine), axis=-1)
-
     def _of_views(self, numbers: Array) -> Array:
-        """Numbers of views (...) for each of their rows, (..., n)."""
+        """Values of views (...) repeated for each of their rows, (..., n)."""
         n_rows = self.sine.shape[-1]
         return np.repeat(numbers, n_rows, axis=-1).reshape(*numbers.shape, n_rows)
 
     @cached_property
     def _turns(self) -> Array:
-        """Rows by a shift of the whole line towards the camera, (g, ...): as much as by the radius;
-        see :meth:`~pkmcal.geometry.cylinders.LineSilhouettes.edges`.
+        """Derivative of the rows by a shift of the whole axis towards the camera, (g, ...): equal
+        to that by the radius; see :meth:`~pkmcal.geometry.cylinders.LineSilhouettes.edges`.
         """
         along_m, along_w = self.by_frame[:, 1], self.by_frame[:, 2]
         turn = along_w + (self.sine / self.cosine) * along_m
         return turn / self._of_views(self.lines.distance)
 
     def by_ends(self) -> Array:
-        """By what both ends do along m and along w, a before b, (4, B, N, n): nothing that they do
-        along u is seen, and all derivatives are multiples of these.
+        """Derivatives by both ends along m and along w, a before b, (4, B, N, n). Motions along u
+        do not change an edge; all other derivatives are multiples of these.
         """
         line, out = self.lines, np.empty((4, *self.sine.shape))
         shift = self.by_frame[:, 0] / self._of_views(line.length)
@@ -438,14 +447,14 @@ class EdgeRows:
         return out
 
     def by_radius(self) -> Array:
-        """By their tube's radius, (B, N, n)."""
+        """Derivatives by the radius of their tube, (B, N, n)."""
         return -np.sum(self._turns, axis=0)
 
     def ends_by(self, freedoms: slice) -> Array:
-        """How both ends, a before b, answer along m and along w, (B, N, 4, d + n_b + n_a + 6): to
-        the configuration's own unknowns, to the parameters of b and of a, and to their station,
-        whose (omega, tau) moves them by ``omega x (p - t) + tau``, with t the base's origin, camera
-        frame.
+        """Derivatives of both ends, a before b, along m and along w, (B, N, 4, d + n_b + n_a + 6):
+        by the configuration's own unknowns, by the parameters of b and of a, and by their station,
+        whose (omega, tau) moves them by ``omega x (p - t) + tau``, with t the base's origin in the
+        camera frame.
         """
         c, views, line = self.closure, self.blocks.views, self.lines
         rot, origin = self.T_camera_base[..., :3, :3], self.T_camera_base[..., :3, 3]
@@ -483,7 +492,7 @@ def _side_by_side(parts: tuple[Array, ...], limbs: tuple[int, ...]) -> Array:
 
 
 def rows_at_blocks(blocks: EdgeBlocks, rows: Array) -> Array:
-    """Rows (B, N, n) of views at the places of their blocks, (B, K, G, 2g); zero elsewhere."""
+    """Rows (B, N, n) of views at the positions of their blocks, (B, K, G, 2g); zero elsewhere."""
     views, (n_runs, n, _), each = blocks.views, rows.shape, 2 * blocks.side.shape[-1]
     if not n:
         return np.zeros((n_runs, *blocks.present.shape, each))

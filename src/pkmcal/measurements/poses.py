@@ -1,4 +1,4 @@
-"""Poses of boards and targets: measurements of all kinds that have them, and their rows.
+"""Poses of boards and targets: the measurements of all such kinds, and their rows.
 
 Six rows each, of which a kind may measure a part: predicted as ``T_camera_base T_base_platform
 T_platform_board``, or ``T_camera_base T_base_board`` for a board fixed to the base ([A] 3.3). The
@@ -26,11 +26,12 @@ class PoseSet:
     mount : (N,) what the target is fixed to.
     T_station_target : (N, 4, 4) target to station (camera or tracker) coordinates, m.
     whiten : (N, 6, 6) for the left perturbation (omega, tau) of T_station_target, rad and m:
-        whiten @ error has unit covariance. Rows of what is not measured (a point's turn) are zero.
+        whiten @ error has unit covariance. Rows of numbers that are not measured (the rotation of a
+        point) are zero.
     by_intrinsics : (N, 6, n) that perturbation by the camera's parameters, with the corners'
-        pixels held; n = 0 where nobody asked.
-    by_focal : (N, 6) the same by the relative excess of the focal lengths, where these breathe from
-        photograph to photograph; else zero.
+        pixels fixed; n = 0 where it is not needed.
+    by_focal : (N, 6) the same by the relative excess of the focal lengths, where these differ from
+        image to image; else zero.
     """
 
     station: Integers
@@ -44,7 +45,7 @@ class PoseSet:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Poses without derivatives by intrinsics get empty ones, so that all select alike."""
+        """Set absent derivatives to empty or zero ones of the right length."""
         if len(self.by_intrinsics) != len(self.station):
             object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 6, 0)))
         if len(self.by_focal) != len(self.station):
@@ -52,7 +53,7 @@ class PoseSet:
 
     @classmethod
     def empty(cls) -> PoseSet:
-        """No pose."""
+        """A set without poses."""
         none = np.zeros(0, dtype=int)
         return cls(none, none, none, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
 
@@ -61,17 +62,17 @@ class PoseSet:
 
     @property
     def rows(self) -> Integers:
-        """(N,) how many of its six numbers each measurement has."""
+        """(N,) how many of the six numbers each measurement has."""
         return np.any(self.whiten != 0, axis=-1).sum(axis=-1)
 
     def select(self, mask: Booleans | Integers) -> PoseSet:
-        """The poses that a mask or an index picks."""
+        """The poses selected by a mask or by positions."""
         return PoseSet(*(getattr(self, f.name)[mask] for f in fields(self)))
 
     def transform(self, change: Array) -> PoseSet:
-        """The poses as cameras with other parameters see them; change : (S, n), by station.
+        """The poses by cameras with other parameters; change : (S, n), by station.
 
-        To first order: a camera's calibration is good to a thousandth, so what is left out is a
+        To first order: a camera's calibration is good to a thousandth, so the remainder is a
         millionth.
         """
         n = self.by_intrinsics.shape[-1]
@@ -81,65 +82,51 @@ class PoseSet:
 
 @dataclass(frozen=True)
 class PoseBlocks:
-    """Where the poses are: K configurations of G poses, padded; the same for all runs.
+    """Positions of the poses: K configurations of G poses, padded; the same for all runs.
 
-    station, mount, camera : (K, G). present : (K, G) False for padding. on_platform : (M,) of the
-    mounts. tolerance : (M,) of the sizes of boards, relative; those that have one are unknowns, in
-    their order.
+    station, mount : (K, G). present : (K, G) False for padding. on_platform : (M,) of the mounts.
+    column : (K, G, w) which of the estimate's columns move each pose, -1 for none.
     """
 
     station: Integers
     mount: Integers
     present: Booleans
     on_platform: Booleans
-    camera: Integers
-    tolerance: Array
-
-    @property
-    def size(self) -> Integers:
-        """(M,) number of each mount's size among those that are unknown; -1 for an exact one."""
-        unsure = self.tolerance > 0
-        return np.where(unsure, np.cumsum(unsure) - 1, -1)
+    column: Integers
 
     def among(self, configurations: slice) -> PoseBlocks:
-        """Those of some configurations."""
-        whole = among(self, configurations, 0)
-        return replace(whole, on_platform=self.on_platform, tolerance=self.tolerance)
+        """The blocks of some configurations."""
+        return replace(among(self, configurations, 0), on_platform=self.on_platform)
 
 
 @dataclass(frozen=True)
 class PoseData:
-    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
+    """Measured values of each run; leading axis B, or 1 where all runs share them.
 
-    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
-    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
-    breathing : (B, K, G, 6, 1) by their station's focal breathing.
+    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). columns :
+    (B, K, G, 6, w) derivatives of the error, before it is whitened, by the poses' ``column``.
     """
 
     T_station_target: Array
     whiten: Array
     weight: Array
-    optics: Array
-    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 6, 0)))
+    columns: Array
 
     def among(self, configurations: slice) -> PoseData:
-        """Those of some configurations."""
+        """The data of some configurations."""
         return among(self, configurations, 1)
 
 
 class PoseRows(NamedTuple):
     """Rows (B, K, G, 6) and their derivatives, (B, K, G, 6, 6) each: by their station, by the
-    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w), by their
-    station's focal breathing and by their board's size (B, K, G, 6, 1).
+    platform's pose and by their mount; by their columns (B, K, G, 6, w).
     """
 
     value: Array
     by_station: Array
     by_platform: Array
     by_mount: Array
-    by_optics: Array
-    by_breathing: Array
-    by_size: Array
+    by_columns: Array
 
 
 def pose_rows(
@@ -148,20 +135,16 @@ def pose_rows(
     T_camera_base: Array,
     poses: Array,
     T_mount: Array,
-    optics: Array,
-    breathing: Array,
-    sizes: Array,
+    columns: Array,
 ) -> PoseRows:
     """Whitened errors of the predicted poses.
 
-    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
-    (B, C, w), breathing (B, S) or (B, 0), sizes (B, n). A board that is larger by a share s stands
-    farther from the camera by the same share.
+    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), columns
+    (B, n).
     """
     if not blocks.present.size:
         none = np.zeros((*poses.shape[:2], 0, 6, 6))
-        optics = np.zeros((*none.shape[:-1], optics.shape[-1]))
-        return PoseRows(none[..., 0], none, none, none, optics, none[..., :1], none[..., :1])
+        return PoseRows(none[..., 0], none, none, none, none[..., :0])
     moving = blocks.on_platform[blocks.mount][..., None, None]
     camera = T_camera_base[:, blocks.station]
     body = np.where(moving, poses[:, :, None], np.eye(4))
@@ -175,33 +158,26 @@ def pose_rows(
     turn = turn_jacobian(error[..., :3])
 
     def rows(by_turn: Array, by_shift_turn: Array, by_shift: Array) -> Array:
-        """Derivative by (omega, tau) from those of the pose's turn and place."""
+        """Derivative by (omega, tau) from those of the rotation and the translation."""
         out = np.zeros((*np.broadcast_shapes(by_turn.shape, place.shape)[:-2], 6, 6))
         out[..., :3, :3], out[..., 3:, :3] = turn @ by_turn, by_shift_turn
         out[..., 3:, 3:] = by_shift
         return weigh @ out
 
-    eye, by_optics, by_breathing = np.eye(3), weigh @ data.optics, weigh @ data.breathing
-    value = (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0]
-    if breathing.shape[-1]:
-        value = value + by_breathing[..., 0] * breathing[:, blocks.station, None]
-    away = -blocks.tolerance[blocks.mount][..., None] * data.T_station_target[..., :3, 3]
-    by_size = weigh @ np.concatenate([np.zeros_like(away), away], axis=-1)[..., None]
-    if sizes.shape[-1]:
-        value = value + by_size[..., 0] * sizes[:, blocks.size[blocks.mount], None]
+    eye, by_columns = np.eye(3), weigh @ data.columns
+    numbers = np.pad(columns, ((0, 0), (0, 1)))[:, blocks.column]  # the last is none's
+    value = (weigh @ error[..., None] + by_columns @ numbers[..., None])[..., 0]
     return PoseRows(
         value,
         rows(eye, -skew(place[..., 0]), eye),
         np.where(moving, rows(rot_c, -rot_c @ skew(arm[..., 0]), rot_c), 0.0),
         rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
-        by_optics,
-        by_breathing,
-        by_size,
+        by_columns,
     )
 
 
 def turn_jacobian(phi: Array) -> Array:
-    """Change of a rotation vector (..., 3) by a further turn from the left, (..., 3, 3).
+    """Derivative of a rotation vector (..., 3) by a further rotation from the left, (..., 3, 3).
 
     The inverse left Jacobian of SO(3), with its series near zero.
     """

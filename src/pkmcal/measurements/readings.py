@@ -1,27 +1,28 @@
-"""Readings of the motors: the kind, and the rows of the closures with their noise.
+"""Joint readings: the kind, its rows (the closures of the limbs) and their noise.
 
-One row a limb, ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened; what no reading enters
-(rods of constant length, joints' axes) is taken as perfect and held to PERFECT_CLOSURE_SIGMA.
+One row a limb, ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened. Closures without a reading
+(rods of constant length, axes of joints) count as exact, to PERFECT_CLOSURE_SIGMA.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import ClassVar, final
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.measurements.contract import MotorKind
 from pkmcal.mechanisms.layout import LimbLayout
 
 PERFECT_CLOSURE_SIGMA = 1e-6
-"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of
-a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
+"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of a
+good encoder's noise, which loses no information, and large enough to keep digits."""
 
 
 @final
 class Readings(MotorKind):
-    """Lengths, places of sliders and angles of cranks, as the motors read them."""
+    """Lengths, positions of sliders and angles of cranks, as the motors read them."""
 
     code: ClassVar = "readings"
     one: ClassVar = "reading"
@@ -29,6 +30,33 @@ class Readings(MotorKind):
     unit: ClassVar = "m or rad"
     numbers: ClassVar = 1
     key: ClassVar = "joints"
+
+
+@dataclass(frozen=True)
+class ReadingColumns:
+    """Columns that change the readings: by (K, m, c), and which of the estimate's each is, (c,)."""
+
+    by: Array
+    column: Integers
+
+    def among(self, configurations: slice) -> ReadingColumns:
+        """The columns of some configurations."""
+        return replace(self, by=self.by[configurations])
+
+    def corrected(self, joints: Array, columns: Array) -> Array:
+        """Readings (B, K, m) as they should have been at numbers (B, n) of the columns."""
+        if not len(self.column):
+            return joints
+        return joints + np.einsum("kmc,bc->bkm", self.by, columns[:, self.column])
+
+
+def closures_by_readings(layout: LimbLayout, by_reading: Array, by: Array) -> Array:
+    """Derivatives (B, K, E, k) of the closures, with slopes (B, K, E), where the readings change by
+    ``by`` (K, m, k).
+    """
+    driven = layout.row_motor >= 0
+    slope = np.where(driven, by_reading, 0.0)[..., None]
+    return slope * by[:, np.where(driven, layout.row_motor, 0)]
 
 
 def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:

@@ -1,36 +1,32 @@
-"""What was measured, of all kinds together: plain and frozen."""
+"""Measurements of all kinds together: plain, frozen data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.measurements.columns import Column
 from pkmcal.measurements.edges import EdgeSet, Rejection
 from pkmcal.measurements.links import LinkSet
 from pkmcal.measurements.poses import PoseSet
 
-BREATHING_SIGMA = 1.5e-3
-"""Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
-focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
-mm) changes by 0.3 % from 3 m to 1 m, as one walks about a machine, so half of that to each side."""
-
 
 @dataclass(frozen=True)
 class Observation:
-    """What the photographs of a session gave.
+    """Measurements from the images of a session.
 
-    edges : the measurements.
-    rejected : what was left out, with its reason.
-    points, point_edge : (M, 2) sub-pixel edge points (px) and the edge that each supports,
-        for pictures and residuals.
-    T_camera_base : (S, 4, 4) poses of the stations as the search left them.
+    edges : silhouette edges.
+    rejected : measurements that were rejected, with their reasons.
+    points, point_edge : (M, 2) sub-pixel edge points (px), and the edge that each supports, for
+        pictures and residuals.
+    T_camera_base : (S, 4, 4) poses of the stations after the search.
     poses : of boards, and of trackers' targets.
-    binning : (S,) pixels of each station's photographs across, and down, that were one where edges
-        were looked for: what of an edge is in pixels, is in these.
+    binning : (S,) pixels of each station's images, across and down, that were averaged to one for
+        the measurement of edges; pixel values of edges refer to these.
     """
 
     edges: EdgeSet
@@ -44,16 +40,18 @@ class Observation:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Where nothing is said of binning, there is none."""
+        """Default to no binning."""
         if not len(self.binning):
             object.__setattr__(self, "binning", np.ones(len(self.T_camera_base), dtype=int))
 
 
 Set = TypeVar("Set", PoseSet, EdgeSet)
+Effect = Callable[["Measurements"], Iterable[Column]]
+"""An effect on measurements: its columns."""
 
 
 def concatenate(sets: Sequence[Set]) -> Set:
-    """One set or more as one; cameras with fewer parameters get zeros for the rest."""
+    """Concatenation of sets; derivatives by the intrinsics are padded with zeros to the widest."""
     widest = max(s.by_intrinsics.shape[-1] for s in sets)
     padded = [
         np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
@@ -69,16 +67,16 @@ def concatenate(sets: Sequence[Set]) -> Set:
 
 
 def of_stations(edges: Mapping[int, EdgeSet]) -> EdgeSet:
-    """Edges by the number of their station, whatever number it had, as one set."""
+    """Concatenation of edges, numbered by the stations that are the keys."""
     return concatenate([replace(e, station=np.full(len(e), k)) for k, e in edges.items()])
 
 
 @dataclass(frozen=True)
 class Mount:
-    """What a board or a tracker's target is fixed to; its place there is estimated.
+    """The body to which a board or a tracker's target is fixed; its pose there is estimated.
 
-    tolerance : standard deviation of a board's size, relative: its squares are all larger or
-    smaller by one factor, which is estimated where the data tell it.
+    tolerance : prior sigma of a board's size, relative: all squares are larger or smaller by one
+    factor, which is estimated.
     """
 
     name: str
@@ -88,7 +86,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class Measurements:
-    """Everything that was measured, nothing that was assumed.
+    """All measurements of a session, with their stated noise.
 
     edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
     standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
@@ -97,8 +95,9 @@ class Measurements:
     refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
     those units from the calibration's values. poses : of boards or targets, each on one of the
     ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
-    gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
-    they were measured, in BREATHING_SIGMA; empty where none breathes. links : measurements that
+    gives edges in photographs. focal_at : (S,) relative excess of the stations' focal lengths at
+    which they were measured; empty where none is held by hand. effects : further effects beside
+    those that every estimate counts (:mod:`pkmcal.measurements.effects`). links : measurements that
     link two configurations, one set for each kind. level : (S,) stations whose z
     axis is the base's, exactly; empty where there is none. imputation_covariance : by what part of
     its variance by noise a result varies besides, with where its edges were looked for.
@@ -114,10 +113,11 @@ class Measurements:
     poses: PoseSet = field(default_factory=PoseSet.empty)
     mounts: tuple[Mount, ...] = ()
     shaded: bool = False
-    breathing_at: Array = field(default_factory=lambda: np.zeros(0))
+    focal_at: Array = field(default_factory=lambda: np.zeros(0))
     level: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
     imputation_covariance: float = 0.0
     links: tuple[LinkSet, ...] = ()
+    effects: tuple[Effect, ...] = ()
 
     __repr__ = short_repr
 
@@ -133,7 +133,7 @@ class Measurements:
         return np.concatenate([none, *(links.configuration for links in self.links)])
 
     def link_at(self, number: int) -> tuple[LinkSet, int]:
-        """The set of a link, by its number among all, and its number there."""
+        """Set of a link, from its number among all links, and its number in the set."""
         for links in self.links:
             if number < len(links):
                 return links, number
@@ -141,12 +141,12 @@ class Measurements:
         raise IndexError(number)
 
     def links_among(self, keep: Booleans) -> Booleans:
-        """(n,) links of which both configurations are among those to keep, (K,)."""
+        """(n,) links whose configurations are both to be kept; keep : (K,)."""
         first, second = self.link_ends.T
         return keep[first] & keep[second]
 
     def with_links(self, keep: Booleans) -> Measurements:
-        """The same with some of the links, (n,)."""
+        """The measurements with some of the links; keep : (n,)."""
         ends = np.cumsum([len(links) for links in self.links]).tolist()
         parts = [
             links.select(keep[end - len(links) : end])
@@ -161,47 +161,5 @@ class Measurements:
 
     @property
     def on_platform(self) -> Booleans:
-        """(M,) which of the mounts move with the platform."""
+        """(M,) whether each mount moves with the platform."""
         return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)
-
-
-@dataclass(frozen=True)
-class Effect:
-    """What k numbers do to what was measured, to first order: from what was measured to what should
-    have been.
-
-    edges : (N, 2, k) turn of the normals, in their bases. readings : (K, m, k). poses : (N', 6, k)
-    left perturbation of T_station_target. motion : (S, K, 6, k) left perturbation (omega, tau) of
-    the stations' poses, by configuration. Absent: none. Or, where ``station`` is given, the camera
-    or tracker of that number stands elsewhere from configuration ``since`` on, by (omega, tau).
-    """
-
-    edges: Array | None = None
-    readings: Array | None = None
-    poses: Array | None = None
-    motion: Array | None = None
-    station: int | None = None
-    since: int = 0
-
-    @property
-    def count(self) -> int:
-        """How many numbers, k."""
-        if self.station is not None:
-            return 6
-        parts = (self.edges, self.readings, self.poses, self.motion)
-        return max((part.shape[-1] for part in parts if part is not None), default=0)
-
-
-@dataclass(frozen=True)
-class ModelViolation:
-    """Something that a session takes for granted and that may be otherwise.
-
-    code : of its finding. of : what departs, by name. facts : of its finding, from the estimates
-    and their standard deviations (k,). effect : what it does to what was measured; empty
-    for a single reading, see :class:`pkmcal.identify.score.ScoreTests`.
-    """
-
-    code: str
-    of: str
-    facts: Callable[[Array, Array], dict[str, Any]]
-    effect: Effect = field(default_factory=Effect)

@@ -168,7 +168,6 @@ def with_boards(
         theta,
         T_camera_base,
         T_base_platform,
-        np.zeros(measurements.n_cameras),
         T_mount=mounts,
         on_platform=measurements.on_platform,
     )

@@ -91,14 +91,14 @@ class PairProblem:
     def linearize(self, state: Pair) -> Linear:
         """Residuals and exact Jacobian: six columns of the camera, six of the mount."""
         one = np.zeros((self.body.shape[1], 1), dtype=int)
-        blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), one, np.zeros(1))
+        none = np.zeros((*one.shape, 0), dtype=int)
+        blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), none)
         data = PoseData(
             self.observed[:, :, None], np.diag(1 / self._sigma), self.weight[:, :, None],
             np.zeros((1, 1, 1, 6, 0)),
         )  # fmt: skip
         camera, mount = state.T_camera_base[:, None], state.T_mount[:, None]
-        none = np.zeros((1, 0))
-        rows = pose_rows(blocks, data, camera, self.body, mount, none[:, None], none, none)
+        rows = pose_rows(blocks, data, camera, self.body, mount, np.zeros((1, 0)))
         value = rows.value[:, :, 0]
         return Linear(
             value,
@@ -258,7 +258,6 @@ def start_from_poses(
         machine.values,
         stations,
         fk.T_base_platform,
-        np.zeros(measurements.n_cameras),
         T_mount=np.where(np.isnan(mounts), np.eye(4), mounts),
         on_platform=measurements.on_platform,
         internal=fk.internal,

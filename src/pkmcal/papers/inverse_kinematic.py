@@ -27,7 +27,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
-from pkmcal.identify.unknowns import Name, Unknowns
+from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine, kinematics
@@ -119,7 +119,7 @@ class ImplicitProblem:
     def unknowns(self) -> Unknowns:
         """Columns of the unknowns, na in all."""
         n_free = self.free.shape[1]
-        return Unknowns(n_free, self.n_stations, n_cameras=0, n_mounts=self.n_mounts)
+        return Unknowns(n_free, self.n_stations, n_mounts=self.n_mounts)
 
     def theta(self, state: ImplicitState) -> Array:
         """Machine parameters (B, P)."""
@@ -428,7 +428,7 @@ def estimable_unknowns(
     if not whitened:
         # the axis of rotation determines rotations that the machine itself cannot make: of the
         # mounts, and of the camera for one axis and one camera
-        names: tuple[Name, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
+        names: tuple[str, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
         bodies = problem.unknowns.columns(*names).reshape(-1, 6)
         keep[bodies[:, :3][:, ~problem.layout.motion[:3].any(axis=1)]] = False
     loose = _loose(jac[:, keep], sizes[keep])[1]

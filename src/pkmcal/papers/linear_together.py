@@ -31,13 +31,13 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import cross, dot, perturb, register
-from pkmcal.identify.assembly import SHIFT_SIGMA
 from pkmcal.identify.bundle import SHADING_CHANGE
 from pkmcal.identify.gauge import centre_index
 from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE, LEAST_SCALE, clean_norm
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
+from pkmcal.measurements.effects import EDGE_SHIFT, SHADING, SHIFT_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import linear
 from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
@@ -90,7 +90,7 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
     now = system.start
     weight = final_weights(_distance(system, now) * ONE_RESIDUAL_FACTOR) * system.used
     scale = LEAST_SCALE
-    shading = np.full(system.unknowns.n_lines, SHIFT_SIGMA)
+    shading = np.full(system.unknowns.columns(SHADING).size, SHIFT_SIGMA)
     for _ in range(MOST_VARIANCE_ROUNDS):
         now, half = _solved(system, now, weight, scale, shading)
         residual, jac = _rows(system, now)
@@ -102,9 +102,9 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
             scale = max(scale, LEAST_SCALE)
         # standard deviation of the lines' shading
         if shading.size:
-            lines = system.unknowns.shading
+            lines = system.unknowns.of_code(SHADING)
             covariance = half[lines] @ half[lines].T
-            shift = now.shifts[system.unknowns.n_cameras :]
+            shift = now.shifts[measurements.n_cameras :]
             given = shift[None], covariance[None], np.eye(len(shift)), shading[None]
             shading = common_shading(*given, SHADING_SIGMA)[0]
         # weights at the new scale, and convergence of scale, shading and weights
@@ -121,8 +121,8 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
         spread=np.concatenate(
             [machine.parameters.free_matrix() @ half[u.machine], half[u.stations]]
         ),
-        edge_shift=now.shifts[: u.n_cameras],
-        edge_shift_sigma=np.sqrt(np.sum(half[u.optics] ** 2, axis=1)),
+        edge_shift=now.shifts[: measurements.n_cameras],
+        edge_shift_sigma=np.sqrt(np.sum(half[u.of_code(EDGE_SHIFT)] ** 2, axis=1)),
         shading=shading,
         weights=weight,
         scale=scale,
@@ -143,7 +143,7 @@ class _State(NamedTuple):
     def retract(self, step: Array, u: Unknowns) -> _State:
         """Retract the state along a step (na,) of all unknowns."""
         turns = step[u.stations].reshape(-1, 6)
-        shifts = self.shifts + step[u.optics.start : u.shading.stop]
+        shifts = self.shifts + step[u.effects]
         return _State(self.z + step[u.machine], perturb(self.T_camera_base, turns), shifts)
 
 
@@ -176,11 +176,11 @@ class _System:
     @property
     def believed(self) -> Integers:
         """Columns (c,) of the unknowns with a prior."""
-        return np.r_[self.unknowns.machine, self.unknowns.optics, self.unknowns.shading]
+        return np.r_[self.unknowns.machine, self.unknowns.effects]
 
     def prior(self, shading: Array) -> Array:
         """Prior sigmas (c,) of these unknowns; shading : (n,) px of the lines."""
-        shift = np.full(self.unknowns.n_cameras, SHIFT_SIGMA)
+        shift = np.full(self.unknowns.columns(EDGE_SHIFT).size, SHIFT_SIGMA)
         return np.concatenate([self.machine.parameters.tolerances_free(), shift, shading])
 
 
@@ -219,7 +219,9 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
     system = _System(
         machine=machine,
         unknowns=Unknowns(
-            n_free, measurements.n_stations, n_cameras, n_lines=max(n_shifts - n_cameras, 0)
+            n_free,
+            measurements.n_stations,
+            ((EDGE_SHIFT, n_cameras), (SHADING, max(n_shifts - n_cameras, 0))),
         ),
         edges=edges,
         centre=centre_index(machine.layout)[0][edges.leg],
@@ -272,7 +274,8 @@ def _distance(system: _System, state: _State) -> Array:
     possible shifts.
     """
     residual, jac = _rows(system, state)
-    prior = np.square(system.prior(np.full(system.unknowns.n_lines, SHIFT_SIGMA)))
+    lines = system.unknowns.columns(SHADING)
+    prior = np.square(system.prior(np.full(lines.size, SHIFT_SIGMA)))
     return np.abs(residual) / np.sqrt(1 + jac[:, system.believed] ** 2 @ prior)
 
 
@@ -302,7 +305,7 @@ def _rows(system: _System, state: _State) -> tuple[Array, Array]:
     columns = u.stations.start + 6 * edges.station[:, None] + np.arange(6)
     # derivative of A by the station: omega x arm + tau
     by[at[:, None], columns] = np.concatenate([cross(arm, by_a), by_a], axis=1)
-    by[at[:, None], u.optics.start + system.shifts] = (-dot(system.by_shift, a) / sigma)[:, None]
+    by[at[:, None], u.effects.start + system.shifts] = (-dot(system.by_shift, a) / sigma)[:, None]
     return value, by
 
 

@@ -21,6 +21,7 @@ from pkmcal.identify.estimate import Estimate, State, Statistics, estimated_unkn
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.measurements import OWN_SHADING, Measurements
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import PaperMethod
 from pkmcal.papers.four_step import four_step
@@ -97,7 +98,7 @@ def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
     base = base_together(machine, measurements)
     poses = machine.with_values(base.theta).forward_result(measurements.joints, machine.home())
     state = with_boards(measurements, base.theta, base.T_camera_base, poses.T_base_platform)
-    state = replace(state, edge_shift=base.edge_shift)
+    state = replace(state, columns={EDGE_SHIFT: base.edge_shift})
     gauge, estimated = default_gauge(machine), estimated_unknowns(state)
     spread = np.zeros((estimated.count, base.spread.shape[1]))
     spread[: len(base.spread)] = base.spread
@@ -112,7 +113,7 @@ def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
             full,
             (base.weights, base.scale),
         ),
-        edge_shift_sigma=base.edge_shift_sigma,
+        column_covariance={EDGE_SHIFT: np.diag(base.edge_shift_sigma**2)},
         line_shading=base.shading,
     )
 
@@ -171,9 +172,11 @@ def _estimate(
     joints = machine.inverse(state.T_base_platform) - measurements.joints
     return Estimate(
         machine=machine,
-        state=state,
+        state=replace(
+            state, columns={EDGE_SHIFT: np.zeros(measurements.n_cameras), **state.columns}
+        ),
         joint_covariance=joint,
-        edge_shift_sigma=np.zeros(len(state.edge_shift)),
+        column_covariance={EDGE_SHIFT: np.zeros((measurements.n_cameras,) * 2)},
         edge_residuals=edges / scale,
         pose_residuals=poses / pose_scale,
         pose_weights=np.ones(len(poses)),

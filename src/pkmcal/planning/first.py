@@ -21,6 +21,7 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import Photographs, placed_at
@@ -170,7 +171,7 @@ def first_edges(
     fine = measurements(concatenate([one.edges for one in passes]))
     held = refinement_of(session, refine=False)
     fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
-    start = replace(state, intrinsics=np.zeros_like(held.at))
+    start = replace(state, columns={EDGE_SHIFT: state.columns[EDGE_SHIFT]})
     estimate = bundle(machine, fine, start)
     return _edge_information(images, rows, estimate, fine.edges)
 

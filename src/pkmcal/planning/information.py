@@ -264,7 +264,7 @@ def tool_by_free(rig: Rig, problem: Problem, joints: Array, poses: Array) -> Arr
     At poses (M, 4, 4) and given readings (M, m), with the frames registered as for a result.
     """
     machine, n = rig.machine, len(rig.machine.values)
-    state = State(machine.values, rig.T_station_base, poses, np.zeros(1))
+    state = State(machine.values, rig.T_station_base, poses)
     free = transformation(machine, state, BestFit())[:n, :n] @ problem.free
     by = pose_by_parameters(machine, joints, poses)
     legs_observed = any(isinstance(one, LegsFrom) for one in rig.instruments)

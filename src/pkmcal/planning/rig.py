@@ -241,7 +241,6 @@ class Rig:
             machine.values,
             self.T_station_base,
             T_base_platform,
-            np.zeros(measurements.n_cameras),
             T_mount=np.zeros((0, 4, 4)) if self.T_mount is None else self.T_mount,
             on_platform=measurements.on_platform,
         )

@@ -10,6 +10,7 @@ from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.views import ONLY_BOARD_MOUNT, Boards
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.session.load import Session
 
 
@@ -53,7 +54,7 @@ def board_corners(session: Session, boards: Boards, estimate: Estimate) -> Board
         BoardCorners(none, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), none.astype(bool))
     ]
     state = estimate.state
-    size = 1 + boards.tolerance * float(state.sizes[0]) if len(state.sizes) else 1.0
+    size = 1 + float(state.columns.get(BOARD_SIZE, np.zeros(1))[0]) if boards.tolerance else 1.0
     for s, station in boards.stations.items():
         views, moves = station.views, boards.body == "platform"
         usable = dict(zip(views.numbers.tolist(), views.usable.tolist(), strict=True))

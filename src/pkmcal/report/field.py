@@ -15,6 +15,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Observation
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import page
@@ -153,7 +154,7 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
         machine, state.T_camera_base[s], state.T_base_platform[rows], session.joints[rows]
     )
     own = own_edges(machine, legs, photograph, some)
-    outward = state.edge_shift[session.camera_of_station[s]]
+    outward = state.columns[EDGE_SHIFT][session.camera_of_station[s]]
     normal = own.normal + outward * (some.basis @ some.shift[..., None])[..., 0]
     normal /= np.sqrt(dot(normal, normal))[..., None]
     shifted = replace(own, normal=normal)

@@ -16,6 +16,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.contract import measurement_kinds
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
 from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
@@ -81,8 +82,8 @@ def stations(
             photographs = f"{used[s]} of {photographs} in use"
         # edge shifts are estimated in binned pixels
         pixels = int(observation.binning[s])
-        shift = float(estimate.state.edge_shift[camera[s]]) * pixels
-        sigma = float(estimate.edge_shift_sigma[camera[s]]) * pixels
+        shift = float(estimate.state.columns[EDGE_SHIFT][camera[s]]) * pixels
+        sigma = float(estimate.column_sigma(EDGE_SHIFT)[camera[s]]) * pixels
         if pixels > 1:
             photographs += f", {pixels} × {pixels} pixels as one"
         places = decimals(sigma)

@@ -11,6 +11,7 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
+from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import charts
@@ -84,7 +85,7 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
     # measured minus predicted normal in the tangent basis of the measured one
     normal = edge_normal_jacobians(legs.a[rows, j], legs.b[rows, j], radius, edges.side).n
     error = -np.einsum("nij,ni->nj", edges.basis, normal)
-    error -= edges.shift * state.edge_shift[camera[edges.station]][:, None]
+    error -= edges.shift * state.columns[EDGE_SHIFT][camera[edges.station]][:, None]
     weighted = np.linalg.solve(edges.covariance, edges.shift[..., None])[..., 0]
     return dot(weighted, error) / dot(weighted, edges.shift)
 

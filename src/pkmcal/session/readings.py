@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import pi
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
-from pkmcal.measurements import Effect, ModelViolation
+from pkmcal.measurements import Column
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
@@ -235,42 +235,41 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
     )
 
 
-def reading_violations(
-    joints: Array, columns: Sequence[str], units: Sequence[str], present: Array
-) -> tuple[list[ModelViolation], list[ModelViolation]]:
-    """Model violations of readings (K, m): for each joint a scale beyond its prior sigma, and a
-    play (backlash) that depends on the motor's last direction of motion in the order of the table.
+def scale_columns(joints: Array, columns: Sequence[str], present: Array) -> Iterator[Column]:
+    """Scale of each of the readings (K, m), beyond its prior sigma, in the order of the table.
 
-    units : (m,).
     present : (m,) estimated scales relative to the nominal model.
 
     A score-tested scale has no prior, so its estimate is the full difference from the nominal
     scale, expressed relative to the present scale; the fact ``value`` is relative to the nominal
     one.
     """
-    direction = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
-    scales: list[ModelViolation] = []
-    plays: list[ModelViolation] = []
-    for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
-        one = np.eye(len(columns))[m]
+    for m, name in enumerate(columns):
 
-        def scale(
+        def facts(
             value: Array, sigma: Array, name: str = name, own: float = float(present[m])
         ) -> dict[str, Any]:
             change = own * value[0]
             return {"column": name, "value": change, "sigma": sigma[0], "factor": 1 + change}
 
-        def play(value: Array, sigma: Array, name: str = name, unit: str = unit) -> dict[str, Any]:
+        by = (joints * np.eye(len(columns))[m])[..., None]
+        yield Column("readings.scale", name, "reading scale", readings=by, facts=facts)
+
+
+def play_columns(joints: Array, columns: Sequence[str], units: Sequence[str]) -> Iterator[Column]:
+    """Play of each motor: its reading (K, m) differs with the direction in which it came."""
+    direction = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
+    for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
+
+        def facts(value: Array, sigma: Array, name: str = name, unit: str = unit) -> dict[str, Any]:
             return {"column": name, "value": value[0], "sigma": sigma[0], "unit": unit}
 
-        by_scale, by_path = ((x * one)[..., None] for x in (joints, direction))
-        scales.append(ModelViolation("readings.scale", name, scale, Effect(readings=by_scale)))
-        plays.append(ModelViolation("readings.play", name, play, Effect(readings=by_path)))
-    return scales, plays
+        by = (direction * np.eye(len(columns))[m])[..., None]
+        yield Column("readings.play", name, "backlash", readings=by, facts=facts)
 
 
-def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
-    """Model violation of one reading; its column is added by the caller."""
+def wrong_reading(column: str, unit: str, configuration: str, by: Array | None = None) -> Column:
+    """Column of one wrong reading; by : (K, m, 1), one at that reading."""
 
     def facts(value: Array, sigma: Array) -> dict[str, Any]:
         return {
@@ -281,7 +280,8 @@ def wrong_reading(column: str, unit: str, configuration: str) -> ModelViolation:
             "unit": unit,
         }
 
-    return ModelViolation("readings.single", f"{column}, {configuration}", facts)
+    name = f"{column}, {configuration}"
+    return Column("readings.single", name, "reading", readings=by, facts=facts)
 
 
 def _check_movement(table: CsvTable, noise: float) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""Model violations of stations that moved during the measurement."""
+"""Cameras and trackers that did not stand still while they measured."""
 
 from __future__ import annotations
 
@@ -8,25 +8,22 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.measurements import Effect, ModelViolation
+from pkmcal.measurements import Column
 from pkmcal.wording import amount
 
 FEWEST_BESIDE_MOVEMENT = 3
-"""Fewest configurations before and after a movement; fewer are treated as outliers."""
+"""Configurations on either side of a movement: fewer are outliers."""
 MOVEMENT_MOMENTS_TRIED = 12
-"""Most moments of movement tested for each station, spread over its configurations."""
+"""Times at most, spread over a station's configurations, at which it may have moved."""
 
 
-def movement_violations(
+def movement_columns(
     station: int, name: str, used: Integers, configurations: Sequence[str], what: str = "camera"
-) -> Iterator[ModelViolation]:
-    """Model violations: the station has another pose from some configuration on, one for each
-    moment tested.
+) -> Iterator[Column]:
+    """That a station stands elsewhere from some configuration on.
 
-    station, name : number and name of the station.
-    used : rows of the configurations that the station measured, in order.
-    configurations : names of all configurations.
-    what : camera, or another noun for messages.
+    station, name : its number and name. used : configurations of which it measured something, in
+    their order. what : stands there.
     """
     few = FEWEST_BESIDE_MOVEMENT
     times = min(MOVEMENT_MOMENTS_TRIED, len(used) - 2 * few + 1)
@@ -43,14 +40,20 @@ def movement_violations(
                 },
             }  # fmt: skip
 
-        effect = Effect(station=station, since=int(used[k]))
-        yield ModelViolation("station.moved", name, facts, effect)
+        yield Column(
+            "station.moved",
+            name,
+            "station moved",
+            station=station,
+            since=int(used[k]),
+            facts=facts,
+        )
 
 
 def how_far(change: Array) -> str:
-    """Size of a pose change as the end of a sentence.
+    """How far a pose moved, as the end of a sentence.
 
-    change : (6,) omega and tau, rad and m; NaN for components that the data do not determine.
+    change : (omega, tau), rad and m; NaN where the data do not determine it.
     """
     turn, shift = change[:3], change[3:]
     sizes = [

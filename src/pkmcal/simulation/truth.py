@@ -20,7 +20,7 @@ from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
-from pkmcal.measurements import BREATHING_SIGMA
+from pkmcal.measurements.effects import FOCAL_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
@@ -97,7 +97,7 @@ class Settings:
     light: Light = "usual"
     as_built: bool = False
     handheld: bool = False
-    breathing: float = BREATHING_SIGMA
+    breathing: float = FOCAL_SIGMA
     asked: RequestedConfigurations | None = None
 
     @property

@@ -27,7 +27,7 @@ from pkmcal.geometry.cylinders import (
     tangent_basis,
 )
 from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference, skew
-from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, state_of
+from pkmcal.identify.assembly import Assembled, assemble, state_of
 from pkmcal.identify.bundle import BatchResult, counts, solve_batch
 from pkmcal.identify.covariance import machine_covariance
 from pkmcal.identify.estimate import State
@@ -47,6 +47,7 @@ from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
 from pkmcal.measurements import OWN_SHADING, SHADING_CORRELATION_ANGLE, SHADING_SIGMA
 from pkmcal.measurements.edges import EdgeData
+from pkmcal.measurements.effects import SHIFT_SIGMA, lines
 from pkmcal.measurements.poses import PoseData
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
@@ -321,7 +322,6 @@ def _truth(data: SimulatedSessions, run: int) -> State:
         data.theta[run],
         capture.T_camera_base,
         data.poses[run],
-        np.zeros(len(set(map(id, capture.cameras)))),
         T_mount=np.zeros((0, 4, 4)) if capture.T_platform_board is None
         else capture.T_platform_board[None],
         on_platform=np.ones(int(capture.T_platform_board is not None), dtype=bool),
@@ -409,15 +409,14 @@ def _measured_edges(
         by_tilt[:, own] = tilt.reshape(runs, -1, 2)
     # Errors in px: independent noise, the camera's edge shift, and the shading of the tube's side.
     error = design.edge_noise * rng.standard_normal((2, runs, n))
-    camera = blocks.camera[at.row, at.place]
-    outward = (
-        SHIFT_SIGMA * rng.standard_normal((runs, template.problem.unknowns.n_cameras))[:, camera]
-    )
-    line = blocks.line[at.row, at.place]
-    lines = rng.standard_normal((runs, int(line.max(initial=0)) + 1))
+    measured = capture.measurements(design.reading_noise)
+    camera = np.asarray(measured.camera_of_station)[edges.station]
+    outward = SHIFT_SIGMA * rng.standard_normal((runs, measured.n_cameras))[:, camera]
+    line = lines(measured)[1]
+    of_lines = rng.standard_normal((runs, int(line.max(initial=0)) + 1))
     alone = rng.standard_normal((runs, n))
     own = OWN_SHADING / SHADING_SIGMA * _own_shading(line, normal[0], rng, runs)
-    shaded = design.shading * (np.where(line < 0, alone, lines[:, line]) + own)
+    shaded = design.shading * (np.where(line < 0, alone, of_lines[:, line]) + own)
     turn = by_shift * (error[0] + outward + shaded)[..., None] + by_tilt * error[1][..., None]
     normal = normal + (basis @ turn[..., None])[..., 0]
     normal = normal / np.sqrt(dot(normal, normal))[..., None]
@@ -433,7 +432,9 @@ def _measured_edges(
         template.problem.data,
         basis=placed(basis)[:, :, :, None],
         white=placed(whiten),
-        optics=placed(by_shift[..., None]),
+        shift=placed(by_shift),
+        # all columns of edges are shifts, of their camera and of their line
+        columns=placed(by_shift)[..., None] * (blocks.column[:, :, None] >= 0),
     )
 
 
@@ -516,8 +517,7 @@ def _start(
         np.zeros((runs, u.n_free)),
         T_camera_base,
         fk.T_base_platform[:, observed],
-        np.zeros((runs, u.n_cameras, u.n_optics)),
+        np.zeros((runs, u.effects.stop - u.effects.start)),
         mounts,
         fk.internal[:, observed],
-        np.zeros((runs, u.n_lines)),
     )

@@ -418,7 +418,7 @@ def joint_from_readings(data: SimulatedRuns, start: Start) -> Fitted:
     home = np.broadcast_to(machine.home(), (1, 1, 4, 4))
     poses = forward(machine.layout, start.theta[:, None], data.joints, home).T_base_platform
     z = machine.parameters.to_free(start.theta)
-    state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
+    state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1)))
     solution = joint(problem, state)
     theta, nz = problem.theta(solution.solution.state), z.shape[1]
     # The gauge fixes 12 of the nz free parameters; each station has 6 unknowns.
@@ -456,7 +456,7 @@ def root_of_bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Ar
     z = machine.parameters.to_free(data.theta)
     n, nz = z.shape
     T = np.broadcast_to(data.view.T_camera_base, (n, PAPER_A_STATIONS, 4, 4))
-    state = BatchState(z, T, data.T_base_platform, np.zeros((n, 1, 1)))
+    state = BatchState(z, T, data.T_base_platform, np.zeros((n, 1)))
     covariance = Information(problem, state).covariance[:, :nz, :nz]
     eigenvalues, eigenvectors = np.linalg.eigh(covariance)
     root = eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, None]

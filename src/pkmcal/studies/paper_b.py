@@ -297,6 +297,6 @@ def jointly_estimated_centres(one: MeasuredHexapod, start: Array) -> Array:
     machine, measured = one.machine, one.measurements
     T = register(machine.base_centers(), start)
     poses = machine.forward_result(measured.joints).T_base_platform
-    state = State(machine.values, T[None], poses, np.zeros(1))
+    state = State(machine.values, T[None], poses)
     fit = bundle(machine, measured, state)
     return apply(fit.state.T_camera_base[0], fit.machine.base_centers())

@@ -249,7 +249,6 @@ def start(machine: Machine, data: SimulatedRuns) -> State:
         nominal,
         pair.T_camera_base[:, None],
         fk.T_base_platform,
-        np.zeros(1),
         T_mount=pair.T_mount[:, None],
         on_platform=np.ones(1, dtype=bool),
         internal=fk.internal,
@@ -293,7 +292,7 @@ def joint_from_pose_fit(
     state = begin.solution.state
     poses = begin.problem.platform_poses(state)
     first = BatchState(
-        state.z, state.T_camera_base, poses, np.zeros((len(poses), 1, 1)), state.T_mount,
+        state.z, state.T_camera_base, poses, np.zeros((len(poses), 1)), state.T_mount,
         state.internal,
     )  # fmt: skip
     solution = joint(problem, first)
@@ -315,7 +314,7 @@ def estimate_at_bound(machine: Machine, data: SimulatedRuns, rng: np.random.Gene
         z,
         np.broadcast_to(PAPER_C_CAMERA_POSE, (runs, 1, 4, 4)),
         data.T_base_platform[:, :n],
-        np.zeros((runs, 1, 1)),
+        np.zeros((runs, 1)),
         np.broadcast_to(PAPER_C_BOARD_POSE, (runs, 1, 4, 4)),
         np.zeros((runs, n, machine.layout.n_internal)),
     )
