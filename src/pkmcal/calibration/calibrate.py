@@ -19,7 +19,6 @@ from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.chance_matches import by_chance, chance_match_reason
 from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
 from pkmcal.calibration.faults import (
-    check_poses,
     lens_notes,
     model_at_fault,
     noise_fault,
@@ -43,6 +42,7 @@ from pkmcal.calibration.localization import (
 )
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
+from pkmcal.calibration.pose_hypotheses import check_frozen, check_poses
 from pkmcal.calibration.refinement import (
     RefinementResult,
     identify_poses,
@@ -305,6 +305,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
 
     case : of the session. Raises `InputError` or `ResultError` where it cannot.
     """
+    check_frozen(session, case.boards)
     turns = _identify(case, refine_camera, seed, clock)
     turned = upside_down(case.session, turns)
     if sure := {one.file: one.camera for one in turned if one.sure}:

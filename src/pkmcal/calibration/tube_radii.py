@@ -16,7 +16,6 @@ import numpy as np
 
 from pkmcal.calibration.camera_refinement import refinement_of
 from pkmcal.calibration.case import Case
-from pkmcal.calibration.faults import CURED_MISFIT_SHARE
 from pkmcal.calibration.handheld import localize_case
 from pkmcal.calibration.refinement import refine_alternating
 from pkmcal.errors import PkmcalError
@@ -27,6 +26,10 @@ from pkmcal.mechanisms.document import Leg
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.observe.hypotheses import diameters
 from pkmcal.outcome.finding import Finding, note
+
+SUSPECT_NOISE_SHARE = 0.5
+"""Part of TOO_NOISY by which edges have to scatter for other radii to be tried, and below which
+these explain the edges."""
 
 
 def check_radii(
@@ -40,7 +43,7 @@ def check_radii(
     have offered its edges, which then agree with anything. refine_camera : whether it estimated the
     cameras. seed : of the search for the stations.
     """
-    agree = CURED_MISFIT_SHARE * TOO_NOISY
+    agree = SUSPECT_NOISE_SHARE * TOO_NOISY
     bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
     if not bad or not case.photographs:
         return ()
