@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -303,21 +303,27 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
     """All that decides whether a session can be calibrated: `calibrate` goes on from it, and
     `check` ends with it.
 
-    case : of the session. Raises `InputError` or `ResultError` where it cannot.
+    Repairs change the case, so after each one the machine is estimated and every hypothesis weighed
+    again, until none calls for another repair. Then mistakes that a user has to correct are
+    compared. case : of the session. Raises `InputError` or `ResultError` where it cannot.
     """
     check_frozen(session, case.boards)
-    turns = _identify(case, refine_camera, seed, clock)
-    turned = upside_down(case.session, turns)
-    if sure := {one.file: one.camera for one in turned if one.sure}:
-        session = turned_round(session, sure)
-        case = _observe(session, seed, clock)
+    repaired: dict[str, UpsideDown] = {}
+    while True:
         turns = _identify(case, refine_camera, seed, clock)
-    # without one that was in a wrong place, another may show itself to be
-    while wrong := by_chance(case.session, turns) or inconsistent_poses(
-        case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
-    ):
+        turned = [one for one in upside_down(case.session, turns) if one.file not in repaired]
+        if sure := [one for one in turned if one.sure]:
+            repaired |= {one.file: one for one in sure}
+            # of the whole session: a station that was left out before may have been upside down
+            cameras = {file: one.camera for file, one in repaired.items()}
+            case = _observe(turned_round(session, cameras), seed, clock)
+            continue
+        wrong = by_chance(case.session, turns) or inconsistent_poses(
+            case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
+        )
+        if not wrong:
+            break
         case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
-        turns = _identify(case, refine_camera, seed, clock)
     clock.progress("Looking for mistakes that explain the data", 0.86)
     machine = case.session.machine
     stated = refit_fixed_noise(machine, turns.measurements, turns.estimate)
@@ -332,7 +338,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
         *check_poses(case.session, turns.measurements, stated, richer),
         *check_radii(case, turns.estimate, bool(chance_match_reason(turns)), refine_camera, seed),
     )
-    return Settled(case, turns, stated, richer, turned, untested)
+    return Settled(case, turns, stated, richer, (*repaired.values(), *turned), untested)
 
 
 def _finished(
@@ -446,80 +452,48 @@ def _judge(
     seed: int,
     clock: Clock,
 ) -> Calibration:
-    """What the data tell, what they leave open, and whether the result may be used."""
-    session = case.session
+    """Verdict on an estimate: model violations, identifiability and all findings.
+
+    turned : cameras whose images are upside down, or may be. untested : notes on hypotheses that
+    could not be tested.
+    """
     clock.progress("Judging", 0.95)
-    if value.turns.cameras.active:  # the edges are where these cameras see them
-        cameras = value.turns.cameras
-        refined = [
-            replace(station, camera=cameras.at_station(k))
-            for k, station in enumerate(session.stations)
-        ]
-        session = replace(session, stations=tuple(refined))
-    if sure := overruled(value.turns.responses):
-        notes = [
-            replace(station, response=sure[station.entry], response_given=True)
-            if station.entry in sure
-            else station
-            for station in session.stations
-        ]
-        session = replace(session, stations=tuple(notes))
-    ended = linearize_at_solution(value.turns.measurements, value.estimate)
+    session, turns = _as_measured(case.session, value.turns), value.turns
+    ended = linearize_at_solution(turns.measurements, value.estimate)
     detections: tuple[DetectedViolation, ...] = ()
     errors: tuple[ModelError, ...] = ()
     uneven = NO_RANDOM_EFFECTS
     without = value.estimate
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
-        turns = value.turns
         detections, errors, estimate, uneven = model_violations(
             session, turns.observation, turns.measurements, value.estimate, ended
         )
         value = value._replace(estimate=estimate)
-    findings = _findings(value.turns.measurements, without, ended[1], uneven)
-    uneven_bed = explains_heights(errors)
-    named, images = bool(detections or any(one.sure for one in errors)), value.turns.responses
+    findings = _findings(turns.measurements, without, ended[1], uneven)
     others = (
-        *scale_fault(session, value.estimate),
-        *(() if uneven_bed else noise_fault(session, value.estimate)),
-        *value.turns.reasons,
-        *chance_match_reason(value.turns),
-        *unused_configurations(session, value.estimate, value.out.region.rows if value.out else ()),
-        *rejection_findings(
-            session,
-            value.turns.measurements,
-            value.estimate,
-            findings,
-            at_minimum=method == "bundle",
-        ),
-        *(one.finding for one in detections),
-        *discrepancy_findings(errors),
-        *outlier_explanations(session, value.turns.measurements, value.estimate),
-        *noise_notes(session, value.estimate, named, explained=uneven_bed),
-        *lens_notes(value.turns.cameras),
-        *size_notes(session, value.turns.measurements, value.estimate),
-        *scale_notes(session, value.estimate, tuple(x.of for x in detections)),
+        *_findings_of_estimate(session, value, findings, detections, errors, method == "bundle"),
         *numbering_note(session),
-        *(one.finding for one in (*turned, *images)),
+        *(one.finding for one in (*turned, *turns.responses)),
         *untested,
     )
     verdict = judge(
-        value.turns.observation,
+        turns.observation,
         value.estimate,
         findings,
         method,
         richer=value.richer,
-        explained=uneven_bed,
+        explained=explains_heights(errors),
         others=others,
     )
     clock.lap("identify")
     return Calibration(
         session=session,
-        observation=value.turns.observation,
-        measurements=value.turns.measurements,
+        observation=turns.observation,
+        measurements=turns.measurements,
         estimate=value.estimate,
         verdict=verdict,
         findings=findings,
-        cameras=value.turns.cameras,
+        cameras=turns.cameras,
         method=method,
         seed=seed,
         timings=clock.laps,
@@ -530,6 +504,57 @@ def _judge(
         upside_down=tuple(one for one in turned if one.sure),
         photographs={one.station: one.images for one in case.photographs},
     )
+
+
+def _as_measured(session: Session, turns: RefinementResult) -> Session:
+    """The session with the cameras and responses by which its images were measured in the end."""
+    stations = session.stations
+    if turns.cameras.active:  # the edges are where these cameras see them
+        stations = tuple(
+            replace(station, camera=turns.cameras.at_station(k))
+            for k, station in enumerate(stations)
+        )
+    if sure := overruled(turns.responses):
+        stations = tuple(
+            replace(station, response=sure[station.entry], response_given=True)
+            if station.entry in sure
+            else station
+            for station in stations
+        )
+    return session if stations is session.stations else replace(session, stations=stations)
+
+
+def _findings_of_estimate(
+    session: Session,
+    value: _Identified,
+    findings: Findings,
+    detections: tuple[DetectedViolation, ...],
+    errors: tuple[ModelError, ...],
+    at_minimum: bool,
+) -> Iterator[Finding]:
+    """Findings about an estimate beside those of the verdict.
+
+    detections, errors : model violations, and smooth model errors without a name. at_minimum :
+    whether the estimate is the minimum of the joint problem.
+    """
+    turns, estimate, measurements = value.turns, value.estimate, value.turns.measurements
+    uneven_bed = explains_heights(errors)
+    named = bool(detections or any(one.sure for one in errors))
+    out = value.out.region.rows if value.out else ()
+    yield from scale_fault(session, estimate)
+    if not uneven_bed:
+        yield from noise_fault(session, estimate)
+    yield from turns.reasons
+    yield from chance_match_reason(turns)
+    yield from unused_configurations(session, estimate, out)
+    yield from rejection_findings(session, measurements, estimate, findings, at_minimum=at_minimum)
+    yield from (one.finding for one in detections)
+    yield from discrepancy_findings(errors)
+    yield from outlier_explanations(session, measurements, estimate)
+    yield from noise_notes(session, estimate, named, explained=uneven_bed)
+    yield from lens_notes(turns.cameras)
+    yield from size_notes(session, measurements, estimate)
+    yield from scale_notes(session, estimate, tuple(one.of for one in detections))
 
 
 def _findings(

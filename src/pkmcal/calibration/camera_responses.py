@@ -25,6 +25,7 @@ from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import EdgeSet, Effect, Measurements, concatenate
 from pkmcal.observe.image_batches import Photographs
 from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.outcome.hypotheses import OPTIONS
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
@@ -36,9 +37,6 @@ LEAST_RESPONSE_GAIN, MOST_TURN_DEVIATION = 2.7, 0.1
 from which some do not tell."""
 LEAST_EDGE_SHARE = 0.5
 """Share of the edges that a response has to find, of those by the usual one, to be right."""
-ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
-"""Odds from which the edges overrule what is usual for files of a kind; and from which what is
-usual needs no caution."""
 _Camera = tuple[str, Response]
 """A camera's file, and what is usual for the photographs' kind."""
 
@@ -58,9 +56,14 @@ class ResponseEstimate:
     failure: str = ""
 
     @property
+    def log_odds(self) -> float:
+        """For the other response, nats; NaN where the test failed."""
+        return self.gain / 2
+
+    @property
     def sure(self) -> bool:
-        """Whether the other response is right."""
-        return self.gain > 2 * np.log(ODDS_FOR_OTHER_RESPONSE)
+        """Whether the images are measured by the other response, against what is usual."""
+        return self.log_odds > OPTIONS.act
 
     @property
     def response(self) -> Response:
@@ -74,13 +77,13 @@ class ResponseEstimate:
             "usual": self.usual,
             "other": OTHER_RESPONSE[self.usual],
             "stations": self.entries,
-            "log_odds": self.gain / 2,
+            "log_odds": self.log_odds,
         }
         where = listed(self.entries)
         if self.failure:
             return note("image.response_untested", where, **facts, why=self.failure)
         if self.sure:
-            return note("image.response", where, **facts, odds=ODDS_FOR_OTHER_RESPONSE)
+            return note("image.response", where, **facts, odds=round(np.exp(OPTIONS.act)))
         return doubtful("image.response_unknown", where, **facts)
 
 
@@ -142,7 +145,7 @@ def responses_by_edges(
         )
         for camera in every
     ]
-    return tuple(one for one in rows if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
+    return tuple(one for one in rows if one.log_odds > -OPTIONS.report)
 
 
 def _entries(session: Session, photographs: Sequence[Photographs]) -> tuple[str, ...]:

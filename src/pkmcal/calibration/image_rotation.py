@@ -24,15 +24,9 @@ from pkmcal.cameras.files import written_camera
 from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.score import ScoreTests
 from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.outcome.hypotheses import OPTIONS
 from pkmcal.session.load import Session
 
-ODDS_FOR_UPSIDE_DOWN = 1000.0
-"""Odds from which the edges overrule the file."""
-ODDS_FOR_UPRIGHT = 20.0
-"""Odds from which the photographs of one of session.yaml's stations are upright, so that those of
-the same camera are not taken to be turned alike."""
-ODDS_TO_REPORT = 20.0
-"""Odds from which photographs that may be upside down are said to be so."""
 FURTHER_THAN_TURNED = 1.5
 """Times the way, from which what fits is neither camera, though one is nearer."""
 USUAL_CENTRE_ERROR = 1.5
@@ -54,8 +48,8 @@ class UpsideDown:
 
     @property
     def sure(self) -> bool:
-        """Whether they are measured so."""
-        return self.log_odds > np.log(ODDS_FOR_UPSIDE_DOWN)
+        """Whether the images are measured by the camera turned by half."""
+        return self.log_odds > OPTIONS.act
 
     @property
     def finding(self) -> Finding:
@@ -70,7 +64,7 @@ class UpsideDown:
             "image.upside_down",
             self.file,
             **facts,
-            odds=ODDS_FOR_UPSIDE_DOWN,
+            odds=round(np.exp(OPTIONS.act)),
             centre_x=x,
             centre_y=y,
             written=written_camera(self.file),
@@ -100,7 +94,7 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, 
         reference_values = _file_sigma(camera)
         alone = [_log_odds(value[[k]], sigma[[k]], reference_values) for k in range(len(own))]
         odds = _log_odds(value, sigma, reference_values)
-        if odds > np.log(ODDS_TO_REPORT) and min(alone) > -np.log(ODDS_FOR_UPRIGHT):
+        if odds > OPTIONS.report and min(alone) > -OPTIONS.report:
             names = tuple(list(cameras)[k] for k in own)
             out.append(UpsideDown(file, names, camera.turned_by_half(), odds))
     return tuple(out)

@@ -136,6 +136,7 @@ def _check_columns(session: Session, bad: list[str]) -> None:
                 found=f"readings that the machine cannot take in configuration {listed(bad)}",
                 expected="the other sign of this column, with which its legs meet the platform",
                 next_step="Turn the sign of this column round, or the axis in the mechanism file",
+                code="readings.sign",
             )
 
 
@@ -284,6 +285,9 @@ def mistake_in(
     says: the usual mix-ups are tried. A reading that never moved is named before all others, for it
     may look like any of them.
     """
+    still = frozen_in(session)
+    if still is not None and not recognition.complete:  # an error in any case, and cheaper
+        return still
     stations = [session.stations[p.station] for p in photographs]
     error = mistake(
         [
@@ -305,7 +309,7 @@ def mistake_in(
         ],
         rng,
     )
-    return error and (frozen_in(session) or error)
+    return error and (still or error)
 
 
 def frozen_in(session: Session) -> InputError | None:
