@@ -1,4 +1,4 @@
-"""What is known of a session before its edges are measured: where everything stands."""
+"""A session with its images and boards, and the scene from which its estimate starts."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from pkmcal.session.load import Session
 
 
 class PriorScene(NamedTuple):
-    """The machine, T_camera_base (S, 4, 4) of the stations, NaN where one is not known, and
-    T_base_platform (K, 4, 4) of the configurations.
+    """What an estimate starts from: machine, stations and platform poses.
 
-    Of photographs by hand that have told the machine: edges, the silhouettes found in each, by its
-    station; told, what they and the drawing know of the machine together; scatter, by how much more
-    or less these edges scatter than each says. findings : notes on places that could not be tested.
+    T_camera_base : (S, 4, 4), NaN for stations without a pose. T_base_platform : (K, 4, 4). After
+    hand-held images have been placed: edges, the silhouettes measured in each, by station; prior,
+    the information of these images and the nominal model on the machine, all else marginalized;
+    scatter, ratio of these edges' scatter to their stated noise. findings : notes on poses that
+    could not be tested.
     """
 
     machine: Machine
@@ -35,13 +36,13 @@ class PriorScene(NamedTuple):
 
     @classmethod
     def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> PriorScene:
-        """A drawing; of platforms the nearest poses, where it does not quite close."""
+        """The scene of the nominal model; nearest platform poses where loops do not quite close."""
         return cls(machine, T_camera_base, machine.forward_result(joints).T_base_platform)
 
 
 class Case(NamedTuple):
-    """A session, the photographs of its stations that observe legs, the boards in all, and what is
-    known of machine, stations and platforms.
+    """A session, the images of its stations that observe legs, the boards in all images, and the
+    prior scene.
     """
 
     session: Session

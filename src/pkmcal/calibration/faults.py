@@ -27,24 +27,25 @@ from pkmcal.wording import listed
 RICHER_MODEL_SHARE = 0.5
 """Factor on the poses' misfit by which a richer model has to fit better to be what is missing."""
 UNTOLD_BOARD_SIZE_SIGMA = 0.7
-"""Part of its tolerance from which a board's size is known from its file: the data say less."""
+"""Part of its prior sigma from which a board's size is determined by its file rather than by the
+data."""
 BOARD_SIZE_DISAGREEMENT = 2.0
-"""Standard deviations between a board's size by its file and by all else from which a hint says so:
-one of these in twenty is chance."""
+"""Standard deviations between a board's size by its file and by all other data from which a note
+names them: by chance one session of twenty."""
 WRONG_SCALE_DEVIATIONS = 3.0
-"""Standard deviations by which a reading's scale is told to be another than the drawing's."""
+"""Standard deviations from the nominal scale of a reading from which a note names it."""
 COMMON_FACTOR_CHI2 = 60.0
-"""Chi2 by which the drawing has to speak for a common factor on all lengths."""
+"""Gain of the nominal model's chi2 by a common factor on all lengths from which it is named."""
 WRONG_MODEL_READING_SCALE = 100.0
-"""Factor on the readings' stated noise from which it is no noise: between a data sheet's figure and
-what a mounted encoder does lies a factor of ten or thirty."""
+"""Factor on the readings' stated noise from which the scatter is no noise: mounted encoders are
+ten or thirty times as noisy as their data sheets."""
 FEWEST_POSES = 4
 """Whole poses of one station from which the platform's turning is tested."""
 
 
 def wrong_scale(estimate: Estimate) -> float:
-    """How much larger all lengths came out than the drawing's, 1 where no common factor explains
-    it: a board whose squares are larger than written makes the whole machine larger.
+    """Common factor of all estimated lengths to the nominal ones; 1 where no common factor explains
+    their difference. A board whose squares are larger than stated makes the whole machine larger.
     """
     machine = estimate.machine
     table = machine.parameters
@@ -62,8 +63,8 @@ def wrong_scale(estimate: Estimate) -> float:
 
 
 def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
-    """The estimate with the readings' noise as it is stated, by which mistakes are looked for: a
-    wrong sign, or a model that is too poor, would be taken for noise.
+    """The estimate with the readings' noise as stated, for the comparison of hypotheses: otherwise
+    a wrong sign, or a model that is too poor, would be taken for noise.
     """
     if estimate.statistics.reading_scale <= 1 or not len(measurements.poses):
         return estimate
@@ -71,14 +72,14 @@ def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Es
 
 
 def model_at_fault(richer: tuple[RicherModel, ...], estimate: Estimate) -> bool:
-    """Whether a richer model fits what the estimate's, with noise as stated, does not."""
+    """Whether a richer model fits where the estimate, with noise as stated, does not."""
     best = min((model.scale for model in richer), default=np.inf)
     return best < max(POOR_MODEL_POSE_SCALE, RICHER_MODEL_SHARE * estimate.statistics.pose_scale)
 
 
 def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """A reason where readings scatter by more than the nominal model is off, and so determine
-    nothing, or by so much more than is stated that it is no noise.
+    """A reason against the result where readings scatter by more than the nominal model's prior
+    sigma, so that they determine nothing, or by too much more than stated to be noise.
     """
     s, tolerance = estimate.statistics, session.machine.document.tolerance
     units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
@@ -99,7 +100,7 @@ def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
 def richer_models(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[RicherModel, ...]:
-    """How well the mechanism file's richer models fit, where this one is too poor for the poses."""
+    """Fits of the mechanism file's richer models, where this one is too poor for the poses."""
     if estimate.statistics.pose_scale < POOR_MODEL_POSE_SCALE:
         return ()
     machine = session.machine
@@ -125,7 +126,7 @@ def richer_models(
 
 
 def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """A reason where the whole machine came out larger or smaller than drawn."""
+    """A reason against the result where all lengths have a common factor."""
     scale = wrong_scale(estimate)
     if scale != 1.0 and estimate.pose_weights.size:
         cause = "board" if session.board else "table"
@@ -135,10 +136,10 @@ def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
 def noise_notes(
     session: Session, estimate: Estimate, detections: bool = False, *, explained: bool = False
 ) -> Iterator[Finding]:
-    """Warnings where the data do not allow a noise that session.yaml states.
+    """Warnings where the data contradict the noise that session.yaml states.
 
-    detections : whether something was found that makes readings scatter. explained : whether an
-    uneven bed is what makes heights scatter, and not their noise.
+    detections : whether a model violation makes readings scatter. explained : whether heights
+    scatter because the bed is uneven.
     """
     if explained:
         return
@@ -178,7 +179,7 @@ def lens_notes(cameras: CameraRefinement) -> Iterator[Finding]:
 def size_notes(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> Iterator[Finding]:
-    """A note on how large the board is, where that is not known exactly."""
+    """Notes on the size of a board that is not stated to be exact."""
     tolerances = [mount.tolerance for mount in measurements.mounts if mount.tolerance > 0]
     for tolerance, value, sigma in zip(
         tolerances, estimate.state.sizes, estimate.size_sigma, strict=False
@@ -203,8 +204,8 @@ def size_notes(
 
 
 def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) -> Iterator[Finding]:
-    """A note on readings whose scale is surely not the nominal one, beside those that are named
-    already.
+    """A note on readings whose scale differs significantly from the nominal one, besides those
+    ``named`` already.
     """
     layout, table = session.machine.layout, session.machine.parameters
     results: dict[str, tuple[float, float]] = {}
@@ -238,7 +239,7 @@ def _within(value: float, limits: tuple[float, float | None]) -> bool:
 
 
 def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Finding]:
-    """Whether the platform turns as the mechanism file says, by every station that saw it whole.
+    """Whether the platform turns as the mechanism file states, by each station's whole poses.
 
     on_platform : (M,) of the mounts.
     """

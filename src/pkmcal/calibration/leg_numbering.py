@@ -1,8 +1,8 @@
-"""Numberings of the legs that photographs and readings cannot tell apart.
+"""Numberings of the legs that images and readings cannot distinguish.
 
-A machine whose drawing looks the same after a turn fits as well with its readings' columns counted
-from another leg: all that differs is the base frame, turned by as much. So of such a machine only a
-camera's pose by hand tells whether the readings' first leg is the drawing's.
+A machine whose nominal model is symmetric under a rotation fits equally well with the columns of
+its readings counted from another leg; only the base frame differs, by that rotation. For such a
+machine only the pose by hand of a camera determines which leg of the model the first column is.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from pkmcal.session.load import Session
 from pkmcal.wording import in_full
 
 NUMBERING_CONFIGURATIONS = 5
-"""Configurations at which numberings are compared: unlike machines differ at any."""
+"""Configurations at which numberings are compared: machines without the symmetry differ at any."""
 LAST_DIGIT = 1e-6
-"""m; by as much equal drawings differ that were written with few digits."""
+"""Difference (m) of equal nominal models that are written with few digits."""
 
 
 def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
-    """Columns (m,) that the legs' readings can be taken from instead, counted from another leg, so
-    that within its tolerances the drawing is the same machine, turned.
+    """Orders (m,) of columns, counted from another leg, with which the nominal model is the same
+    machine up to a rotation, within its prior sigmas.
 
-    joints : (K, m) readings at which that is tried. Empty of a machine with legs without a reading
-    of their own.
+    joints : (K, m) readings at which numberings are compared. Empty for a machine with legs that
+    have no reading of their own.
     """
     layout, m = machine.layout, machine.n_joints
     if machine.n_legs != m or sorted(layout.actuated.tolist()) != list(range(m)):
@@ -42,8 +42,8 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
 
 
 def _equivalent(machine: Machine, readings: Array, order: Integers) -> bool:
-    """Whether legs that take the readings (n, m) of other columns stand as those columns' legs do,
-    up to one turn and shift of the whole.
+    """Whether legs with the readings (n, m) of other columns are, up to one rigid motion of the
+    whole, where the legs of those columns are.
     """
     layout, table = machine.layout, machine.parameters
     column = layout.actuated
@@ -69,9 +69,8 @@ def _equivalent(machine: Machine, readings: Array, order: Integers) -> bool:
 
 
 def numbering_note(session: Session) -> Iterator[Finding]:
-    """A note where nothing in a session determines which leg of the drawing is the readings' first.
-
-    A station's pose by hand does.
+    """A note where nothing in a session, such as a station's pose by hand, determines which leg of
+    the nominal model the first column of the readings is.
     """
     if not legs_stations(session) or any(
         station.T_camera_base is not None for station in session.stations

@@ -1,9 +1,9 @@
-"""Measured poses that the estimate let go, and what explains them: a reading, or a wrong name.
+"""Explanations of rejected poses: a wrong reading, or the name of another configuration.
 
-A pose that was measured tells what all motors should have read, whatever they did read. Where a
-configuration disagrees and all of its readings but one agree, that reading is wrong; where its pose
-agrees with the readings of another configuration, names were mixed up. Either is outvoted by the
-other configurations, so the result is right; but whoever took the photographs wants to know.
+A measured pose determines by inverse kinematics what all motors should have read. Where a
+configuration disagrees in one reading only, that reading is wrong; where its pose agrees with the
+readings of another configuration, names were exchanged. The other configurations outweigh either,
+so the result is right, but the user should correct the session.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from pkmcal.session.readings import wrong_reading
 from pkmcal.wording import listed
 
 FALSE_OUTVOTED_CHANCE = 0.005
-"""Chance at which any configuration of a right session disagrees."""
+"""False-alarm level for a session: probability that any configuration of a right one disagrees."""
 UNLIKELY_EXPLANATION_CHANCE = 1e-4
-"""Chance below which one reading, or another configuration's, is no explanation; so small because
-the machine's own uncertainty, about as large as that of a pose, is not counted."""
+"""p-value below which one reading, or another configuration, is no explanation; so small because
+the uncertainty of the machine, about as large as that of a pose, is not included."""
 MOST_USUAL_MISFIT = 100.0
-"""Times its noise that the better half of a session may be off: with more, nothing fits, and no
-configuration stands out."""
+"""Factor on the noise by which the better half of the poses may disagree: beyond, nothing fits, and
+no configuration stands out."""
 
 
 def outlier_explanations(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> Iterator[Finding]:
-    """A warning for each configuration that stands against the others and is explained."""
+    """A warning for each rejected configuration that one of the two mistakes explains."""
     whole = (measurements.poses.rows == 6) & measurements.on_platform[measurements.poses.mount]
     which = np.flatnonzero(whole)
     if not which.size:
@@ -111,8 +111,8 @@ def _misnamed(session: Session, name: str, other: str, both: bool) -> Finding:
 def _platforms(
     measurements: Measurements, estimate: Estimate, which: Integers
 ) -> tuple[Array, Array]:
-    """Where measured poses say that the platform was, T_base_platform (n, 4, 4), and the covariance
-    (n, m, m) of the readings that follow from it; NaN where the machine cannot take it.
+    """Platform poses T_base_platform (n, 4, 4) by measured poses, and covariances (n, m, m) of the
+    readings that follow by inverse kinematics; NaN where the machine cannot take the pose.
     """
     poses, state = measurements.poses.select(which), estimate.state
     T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]
@@ -138,7 +138,7 @@ def _platforms(
 
 
 def _chi2(off: Array, noise: Array) -> Array:
-    """Squares (...) of deviations (..., m) in units of their covariance (..., m, m)."""
+    """Squared Mahalanobis norms (...) of deviations (..., m) with covariances (..., m, m)."""
     return np.sum(off * np.linalg.solve(noise, off[..., None])[..., 0], axis=-1)
 
 

@@ -1,10 +1,9 @@
-"""How much the edges of photographs speak for the machine at a place, and the descent to the most.
+"""Log-likelihood ratio of a camera pose by the edges of images, and its maximization.
 
-Places descend by damped steps on the distances of predicted silhouettes from picture edges
-(:mod:`pkmcal.observe.distance_tables`). A point of a predicted silhouette has either a picture edge
-of the machine near by, or what chance has put there: a mixture, whose two numbers each place may
-choose for itself. Its likelihood against chance alone is the evidence, counted by the length of the
-silhouettes.
+Poses are refined by damped steps on the distances of predicted silhouettes from image edges
+(:mod:`pkmcal.observe.distance_tables`). A point of a predicted silhouette has either an edge of the
+machine near by, or one by chance: a mixture with two parameters, which are estimated for each pose.
+The log-likelihood ratio is against chance alone, and is weighted by the length of the silhouettes.
 """
 
 from __future__ import annotations
@@ -34,32 +33,31 @@ from pkmcal.observe.predict import (
 )
 
 FIRST_DAMPING = 1e-3
-"""Of a step, relative to the normal equations' diagonal."""
+"""First damping of a step, relative to the diagonal of the normal equations."""
 DISTANCE_OUTSIDE_IMAGE = 1e4
-"""Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
+"""Distance (reduced px) of points outside the image: no edge is near."""
 LEAST_LOG_LIKELIHOOD_GAIN = 0.1
-"""Evidence that a step has to gain for another one to follow; a measurement is tens of it."""
+"""Gain of a step's log-likelihood below which no other follows; one measurement has tens."""
 SILHOUETTE_PLACES_AT_ONCE = 30_000
-"""Places on silhouettes that are looked up together, so that what is worked out of them stays in
-the processor's cache."""
+"""Points on silhouettes that are looked up together, so that intermediate arrays stay in the
+processor's cache."""
 LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
-"""Other readings for each photograph, which tell what evidence chance gives."""
+"""Number of other readings for each image, which give the likelihoods by chance."""
 ELSEWHERE_TURN_AND_SHIFT = np.repeat([0.2, 0.1], 3)
 """Turn (rad) and shift (in distances of base and platform) of a platform that is elsewhere."""
 SILHOUETTES_APART = 8.0
-"""Reduced pixels between two hypotheses' silhouettes from which they are not the same place."""
+"""Reduced pixels between the silhouettes of two poses from which they are not the same pose."""
 
 
 @dataclass(frozen=True)
 class StationView:
-    """What the search looks at: one station's photographs and what should be in them.
+    """One station's images and the machine that should be in them.
 
     configuration : (K,) rows of the session's readings. all_joints : (M, m) these readings.
-    all_poses : T_base_platform (M, 4, 4) by the drawing. guessed : where the legs would be in the
-    photographs by hypotheses, (H, K, L), one for each place that is asked for; none where they are
-    as the readings say.
+    all_poses : T_base_platform (M, 4, 4) by the nominal model. guessed : legs in the images under
+    hypotheses, (H, K, L), one for each candidate pose; None where the legs are as read.
     """
 
     machine: Machine
@@ -77,12 +75,12 @@ class StationView:
 
     @property
     def joints(self) -> Array:
-        """Readings (K, m) of the photographs."""
+        """Readings (K, m) of the images."""
         return self.all_joints[self.configuration]
 
     @property
     def poses(self) -> Array:
-        """Poses (K, 4, 4) of the platform in the photographs."""
+        """Poses (K, 4, 4) of the platform in the images."""
         return self.all_poses[self.configuration]
 
     @cached_property
@@ -95,28 +93,28 @@ class StationView:
         return legs_in_camera(self.machine, np.eye(4), poses, joints).single()
 
     def legs(self, photographs: Integers) -> LegsInCamera:
-        """Of some photographs (n,): (n, L), or (H, n, L) where they are guessed."""
+        """Legs in some images (n,): (n, L), or (H, n, L) under hypotheses."""
         if self.guessed is not None:
             return self.guessed[:, photographs]
         return self.all_legs[self.configuration[photographs]]
 
     def guess(self, which: slice | Integers) -> StationView:
-        """The same for some of the hypotheses that are guessed, if there are as many as places."""
+        """The same view with some of the hypotheses, if there is one for each candidate pose."""
         if self.guessed is None or len(self.guessed) == 1:
             return self
         return replace(self, guessed=self.guessed[which])
 
     def few(self, count: int) -> Integers:
-        """Numbers of up to ``count`` photographs, spread over all."""
+        """Indices of up to ``count`` images, spread over all."""
         return evenly(len(self.configuration), count)
 
     def with_joints(self, joints: Array) -> StationView:
-        """The same photographs with other readings (M, m)."""
+        """The same images with other readings (M, m)."""
         fk = self.machine.forward_result(joints).T_base_platform
         return replace(self, all_joints=joints, all_poses=fk)
 
     def select(self, photographs: Integers) -> StationView:
-        """Some of the photographs alone."""
+        """The view of some of the images."""
         return replace(
             self,
             configuration=self.configuration[photographs],
@@ -125,9 +123,8 @@ class StationView:
         )
 
     def rivals(self, rng: np.random.Generator) -> LegsInCamera:
-        """Where legs would be at readings that are not the photographs' own, (R, K, L): each time
-        those of the configurations that follow by so many; where the session has few, on platforms
-        elsewhere too.
+        """Legs (R, K, L) at readings of other configurations than the images': each time those so
+        many rows later; where the session has few, with displaced platforms too.
         """
         count, own = len(self.all_joints), self.configuration
         steps = np.unique(np.linspace(1, max(count - 1, 1), MOST_RIVALS).astype(int))
@@ -142,7 +139,7 @@ class StationView:
 
 
 def distinct_silhouettes(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
-    """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
+    """Indices of candidates (H, 4, 4), best first, that are not the same pose as a better one."""
     if len(candidates) < 2:
         return list(range(len(candidates)))
     legs = view.legs(photographs).under(candidates)
@@ -192,16 +189,16 @@ def score(
 
 
 class _Mixture(NamedTuple):
-    """What a hypothesis says of the distances found, (H,): the share that chance has put there, and
-    the standard deviation (reduced px) of the rest.
+    """Mixture of distances for each pose, (H,): share of chance matches, and standard deviation
+    (reduced px) of the others.
     """
 
     share: Array
     sigma: Array
 
     def likelier(self, at: Distances) -> Array:
-        """Density (H, E, n) of the distances found on the machine's edges, times the share that is
-        on these, by the density that chance gives.
+        """Density (H, E, n) of distances of the machine's edges, times their share, relative to the
+        density by chance.
         """
         share, sigma = (v.astype(np.float32)[:, None, None] for v in self)
         near = np.exp(at.distance**2 * (-0.5 / sigma**2))
@@ -209,11 +206,11 @@ class _Mixture(NamedTuple):
 
 
 class Distances(NamedTuple):
-    """Distances found in the picture under predicted edges, of all photographs in a row, (H, E, n).
+    """Distances of image edges from points on predicted edges, of all images in a row, (H, E, n).
 
-    distance : reduced pixels, DISTANCE_OUTSIDE_IMAGE outside the image. rare : one by the density
-    of such distances by chance. length : reduced pixels of silhouette for which each place stands,
-    none outside the image.
+    distance : reduced pixels, DISTANCE_OUTSIDE_IMAGE outside the image. rare : reciprocal of the
+    density of such distances by chance. length : reduced pixels of silhouette that each point
+    stands for, 0 outside the image.
     """
 
     distance: Array
@@ -221,7 +218,7 @@ class Distances(NamedTuple):
     length: Array
 
     def mixture(self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH) -> _Mixture:
-        """The likeliest mixture, from another on (expectation and maximisation)."""
+        """The likeliest mixture, from a first one (expectation maximization)."""
         total = np.maximum(_summed(self.length), 1e-9)
         for _ in range(rounds):
             own = self.length * self.own(mixture)
@@ -232,20 +229,22 @@ class Distances(NamedTuple):
         return mixture
 
     def own(self, mixture: _Mixture) -> Array:
-        """Probability (H, E, n) of each place's edge being the machine's."""
+        """Posterior probability (H, E, n) that the edge of each point is the machine's."""
         own = mixture.likelier(self)
         return own / (own + mixture.share.astype(np.float32)[:, None, None])
 
     def log_likelihood(self, mixture: _Mixture) -> Array:
-        """Log likelihood (H, E, n) of each place against chance."""
+        """Log-likelihood ratio (H, E, n) of each point against chance."""
         share = mixture.share.astype(np.float32)[:, None, None]
         return self.length * np.log(mixture.likelier(self) + share)
 
 
 class _Linearization(NamedTuple):
-    """What a place may descend by. slope : (H, E, n) of the distances found, by metres that the
-    edge moves outward. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the camera frame
-    does to an edge, in metres outward: at its first place, and how much more its turn at the last.
+    """Distances with their derivatives.
+
+    slope : (H, E, n) derivative of the distances by the edge's outward motion (m). begins, grows :
+    (H, 6, E) and (H, 3, E) outward motion of an edge by a motion of the camera frame: at its first
+    point, and how much more a turn moves the last.
     """
 
     distances: Distances
@@ -254,16 +253,16 @@ class _Linearization(NamedTuple):
     grows: Array
 
     def weight(self, reach: float) -> Array:
-        """Geman-McClure: what is further than the reach is another edge."""
+        """Geman-McClure weights: distances beyond the reach are of another edge."""
         return (1 + (self.distances.distance * (1 / reach)) ** 2) ** -2
 
     def cost(self, reach: float) -> Array:
-        """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
+        """Cost (H,) that the weights minimize: mean over points of 0 to 1, 1 outside the image."""
         part = (self.distances.distance * (1 / reach)) ** 2
         return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
 
     def where(self, better: Booleans, other: _Linearization) -> _Linearization:
-        """Take some of the hypotheses from here, the rest from the other look."""
+        """Some of the runs from here, the others from ``other``."""
         if better.all():
             return self
 
@@ -281,7 +280,7 @@ class _Linearization(NamedTuple):
 
 
 def _summed(values: Array) -> Array:
-    """Sums (H,) over all places (H, E, n)."""
+    """Sums (H,) over all points (H, E, n)."""
     return values.reshape(len(values), -1).sum(axis=-1, dtype=float)
 
 
@@ -292,9 +291,9 @@ def refine_lm(
     samples: int,
     reaches: tuple[float, ...],
 ) -> Array:
-    """Levenberg-Marquardt on the distances, candidates (H, 4, 4) side by side, a step a reach.
+    """Levenberg-Marquardt on the distances, candidates (H, 4, 4) in one batch, a step a reach.
 
-    Upright legs hardly say where their camera stands; undamped, steps there go astray.
+    Parallel legs hardly determine the camera's pose; undamped, steps diverge there.
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
@@ -316,10 +315,10 @@ def refine_ml(
     steps: int,
     widest: float = LAST_REACH,
 ) -> tuple[Array, Array]:
-    """The same to the most evidence: how far edges scatter, up to ``widest`` reduced pixels, is
-    learnt on the way.
+    """Maximize the log-likelihood ratio; the edges' scatter, up to ``widest`` reduced pixels, is
+    estimated on the way.
 
-    Returns the places (H, 4, 4) and their evidence (H,).
+    Returns poses (H, 4, 4) and their log-likelihood ratios (H,).
     """
     linearization = linearize_distances(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
@@ -350,29 +349,29 @@ def refine_ml(
 
 
 def first_mixture(count: int) -> _Mixture:
-    """Where each of so many places begins: half edges, half chance."""
+    """First mixture of ``count`` poses: half edges, half chance."""
     return _Mixture(np.full(count, 0.5), np.full(count, LAST_REACH / 2))
 
 
 def log_likelihood_of(
     view: StationView, candidates: Array, photographs: Integers, samples: int
 ) -> Array:
-    """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
+    """Log-likelihood ratios (H, K) of candidates (H, 4, 4) in each image."""
     count = distances_under(view, candidates, photographs, samples)
     mixture = count.mixture(first_mixture(len(candidates)), rounds=10)
     return by_photograph(count.log_likelihood(mixture), len(photographs))
 
 
 def by_photograph(log_likelihood_ratio: Array, count: int) -> Array:
-    """Sums (H, K) over each photograph's places, or each name's, (H, E, n) of all in a row."""
+    """Sums (H, K) over the points of each image, or of each name, (H, E, n) of all in a row."""
     return log_likelihood_ratio.reshape(len(log_likelihood_ratio), count, -1).sum(
         axis=-1, dtype=float
     )
 
 
 def log_likelihood_by_name(view: StationView, T_camera_base: Array, names: Integers) -> Array:
-    """Evidence (K, n) of a pose (4, 4) in each photograph under each of the names (n,), rows of the
-    readings; edges scatter as they do under the names that the view has.
+    """Log-likelihood ratios (K, n) of a pose (4, 4) in each image under each of the names (n,),
+    rows of the readings; with the mixture of the names that the view has.
     """
     every = view.few(len(view.configuration))
     own = distances_under(view, T_camera_base[None], every, 8)
@@ -391,24 +390,24 @@ def log_likelihood_by_name(view: StationView, T_camera_base: Array, names: Integ
 
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
-    """The pose (4, 4) with the most evidence near another."""
+    """The likeliest pose (4, 4) near another."""
     every = view.few(len(view.configuration))
     return refine_ml(view, T_camera_base[None], every, 8, 8)[0][0]
 
 
 def likelihood_from(view: StationView, places: Array) -> float:
-    """The most evidence, of all photographs, to which any of the places (H, 4, 4) settles.
+    """Largest log-likelihood ratio of all images to which any of the poses (H, 4, 4) is refined.
 
-    Searches end up to fifty measurements apart, whatever they look for; so explanations of the same
-    photographs are compared from the same places.
+    Searches for one explanation end up to fifty measurements apart; so explanations of the same
+    images are compared from the same poses.
     """
     every = view.few(len(view.configuration))
     return float(refine_ml(view, places, every, 8, 8)[1].max())
 
 
 def correlation_length(view: StationView, T_camera_base: Array) -> float:
-    """Reduced pixels of half a predicted edge: what moves an edge moves its places together, so
-    each half counts as one measurement.
+    """Mean length (reduced px) of half a predicted edge: errors of the points of an edge are
+    correlated, so each half counts as one measurement.
     """
     every = view.few(len(view.configuration))
     length = distances_under(view, T_camera_base[None], every, 2).length[0]
@@ -418,8 +417,8 @@ def correlation_length(view: StationView, T_camera_base: Array) -> float:
 
 
 def _parts(view: StationView, count: int, places: int) -> list[slice]:
-    """Of so many hypotheses, or photographs, those that are looked at together, at so many places
-    of each edge.
+    """Slices of ``count`` poses, or images, that are evaluated together, at ``places`` points of
+    each edge.
     """
     each = max(places * len(view.tubes), 1)
     parts = max(min(round(count * each / SILHOUETTE_PLACES_AT_ONCE), count), 1)
@@ -443,7 +442,7 @@ def distances_under(
 def linearize_distances(
     view: StationView, candidates: Array, photographs: Integers, samples: int
 ) -> _Linearization:
-    """The same, and what places may descend by."""
+    """Distances under predicted edges, with derivatives by the poses."""
     parts = _parts(view, len(candidates), len(photographs) * samples)
     if len(parts) > 1:
         passes = [
@@ -471,7 +470,7 @@ def linearize_distances(
 def _edges_under(
     view: StationView, candidates: Array, photographs: Integers, samples: int
 ) -> tuple[EdgePoints, Integers, Integers]:
-    """Predicted edges (H, K, E, n), their directions, and the photographs' numbers (K, 1, 1)."""
+    """Predicted edges (H, K, E, n), their directions, and the images' indices (K, 1, 1)."""
     number = np.arange(len(view.configuration))[photographs][:, None, None]
     legs = view.legs(photographs).under(candidates)
     points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
@@ -481,8 +480,8 @@ def _edges_under(
 def _distances(
     view: StationView, points: EdgePoints, direction: Integers, values: Array, inside: Booleans
 ) -> Distances:
-    """Distances that were ``values`` (H, K, E, n) at predicted points, and where these are
-    ``inside``, of all photographs in a row.
+    """Distances with ``values`` (H, K, E, n) at predicted points, which are in the image where
+    ``inside``, of all images in a row.
     """
     shape = (len(values), -1, values.shape[-1])
     inside = np.broadcast_to(inside, values.shape)
@@ -497,7 +496,7 @@ def _distances(
 
 
 def _stacked(vectors: tuple[Array, ...], visible: Booleans) -> Array:
-    """Components (H, 3 n, E) of n vectors (H, K, E, 3) of all edges in a row, 0 where not seen."""
+    """Components (H, 3 n, E) of n vectors (H, K, E, 3) of all edges in a row, 0 where hidden."""
     out = np.zeros((len(visible), 3 * len(vectors), visible[0].size), np.float32)
     for k, vector in enumerate(vectors):
         for c in range(3):
@@ -509,7 +508,7 @@ def _stacked(vectors: tuple[Array, ...], visible: Booleans) -> Array:
 def _step(candidates: Array, station_edges: _Linearization, weight: Array, damping: Array) -> Array:
     """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4).
 
-    weight : (H, E, n) of the places. damping : (H,).
+    weight : (H, E, n) of the points. damping : (H,).
     """
     # the places of an edge lie evenly between its first and its last
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)

@@ -1,12 +1,11 @@
-"""Repeated photographs of a configuration: one edge of several, with the noise that they show.
+"""Mean edges of repeated images of a configuration, with the noise that the repeats show.
 
-[A] 4.2 measures the noise by repeats. A photograph's own profiles tell how well an edge agrees
-with its model; what differs from one photograph to the next (sensor noise, vibration, air, light)
-only repeats tell. What they have in common, such as shading, does not average out. So with n
-repeats, of which each has the stated covariance C and scatters with the covariance S about their
-mean,
+[A] 4.2 measures the noise by repeats. The profiles of one image show how well an edge agrees with
+its model; errors that differ from one image to the next (sensor noise, vibration, air, light) show
+in repeats only. Errors that repeats have in common, such as shading, do not average out. With n
+repeats, each with the stated covariance C and with the sample covariance S about their mean,
 
-    covariance of the mean = (the part of C that repeats have in common) + S / n.
+    covariance of the mean = (the common part of C) + S / n.
 """
 
 from __future__ import annotations
@@ -22,15 +21,16 @@ from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe.legs import StationEdges
 
 SCATTER_PRIOR_FREEDOM = 10.0
-"""Degrees of freedom that the wider group's scatter counts for in a narrower one's: an edge of few
-repeats has the scatter of its leg's, a leg of few configurations its station's."""
+"""Degrees of freedom with which the scatter of a wider group is the prior of a narrower one: an
+edge with few repeats takes the scatter of its leg, a leg with few configurations that of its
+station."""
 FAR_REPEAT_DEVIATIONS = 5.0
-"""Standard deviations of a repeat from the others beyond which it is not one of them."""
+"""Standard deviations from the other repeats beyond which a repeat is an outlier."""
 HARMLESS_REPEAT_DEVIATIONS = 1.0
-"""Stated standard deviations within which a repeat stays, however well the others agree."""
+"""Stated standard deviations within which a repeat is an inlier, however well the others agree."""
 MAJORITY_OF_REPEATS = 0.5
-"""Share of a configuration's repeats of which more must show an edge: those that show now and then
-are faint, and lie a pixel off as easily as not."""
+"""Share of a configuration's repeats that an edge has to exceed: edges that are measured only now
+and then are faint, and a pixel off as often as not."""
 _RARE = "seen in only {} of {} repeats"
 _OUT = "a repeat lies {:.1f} standard deviations from the others, which are used without it"
 _DISPUTED = "its repeats lie up to {:.1f} standard deviations off, and no majority agrees"
@@ -38,9 +38,9 @@ _DISPUTED = "its repeats lie up to {:.1f} standard deviations off, and no majori
 
 @dataclass(frozen=True)
 class Groups:
-    """N things in G groups.
+    """Partition of N items into G groups.
 
-    first : (G,) one thing of each. member : (N,) the group of each thing. count : (G,) their size.
+    first : (G,) index of one item of each. member : (N,) group of each item. count : (G,) sizes.
     """
 
     first: Integers
@@ -66,7 +66,7 @@ class Groups:
         return (ordered[low] + ordered[high]) / 2
 
     def exchanged(self, rng: np.random.Generator) -> Integers:
-        """Positions (N,) of the things with those of each group exchanged at random."""
+        """Permutation (N,) of the items, random within each group."""
         inside = np.argsort(self.member, kind="stable")
         out = np.empty_like(inside)
         out[inside] = np.lexsort((rng.random(len(inside)), self.member))
@@ -74,7 +74,7 @@ class Groups:
 
 
 def groups_of(*keys: Integers) -> Groups:
-    """Groups of things whose keys, each (N,), are the same."""
+    """Groups of items with equal keys, each (N,)."""
     _, first, member, count = np.unique(
         np.stack(keys, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
     )
@@ -82,12 +82,12 @@ def groups_of(*keys: Integers) -> Groups:
 
 
 def same_edges(edges: EdgeSet) -> Groups:
-    """Repeats of one edge: the same station, configuration, leg, tube and side."""
+    """Groups of repeats of one edge: equal station, configuration, leg, tube and side."""
     return groups_of(edges.station, edges.configuration, edges.leg, edges.tube, edges.side)
 
 
 def combined(station_edges: StationEdges) -> StationEdges:
-    """One edge for all repeats of it, at their mean; a look without repeats as it is."""
+    """Mean edges of a measurement pass, one for all repeats of each; unchanged without repeats."""
     groups = same_edges(station_edges.edges)
     if len(groups.first) == len(station_edges.edges):
         return station_edges
@@ -109,7 +109,7 @@ def combined(station_edges: StationEdges) -> StationEdges:
 
 
 def mean_edges(edges: EdgeSet, groups: Groups) -> EdgeSet:
-    """The mean edge (G,) of each group of repeats, with the noise that the repeats show."""
+    """Mean edge of each of G groups of repeats, with :func:`mean_covariance`."""
     normal = groups.mean(edges.normal)
     normal /= np.sqrt(dot(normal, normal))[:, None]
     stated = groups.mean(edges.covariance)
@@ -128,10 +128,10 @@ def mean_edges(edges: EdgeSet, groups: Groups) -> EdgeSet:
 def mean_covariance(stated: Array, scatter: Array, count: Integers) -> Array:
     """Covariance (G, 2, 2) of the mean of ``count`` (G,) repeats, from those of a single one.
 
-    Along each principal axis of the scatter S in units of the stated C, S = s C: sensor noise is
-    in C, for it roughens profiles as well, and 1 - s of C remains common; where s > 1, C cannot
-    have held it (a shaken camera leaves crisp profiles), and all of C remains. Between, where it
-    may be either, s of C remains, so that a half is the least.
+    Along each principal axis of the scatter S in units of the stated C, S = s C. Sensor noise is
+    part of C, for it roughens profiles as well, so 1 - s of C is common. Where s > 1, C cannot
+    contain the scatter (a shaken camera leaves crisp profiles), and all of C is common. In between
+    either may hold, and the larger of s and 1 - s is common, a half at least.
     """
     root = np.linalg.cholesky(stated)
     back = np.linalg.inv(root)
@@ -150,9 +150,10 @@ def turns_from_first(edges: EdgeSet, groups: Groups) -> Array:
 
 
 def pixel_units(edges: EdgeSet) -> Array:
-    """Turns (N, 2), rad, of a shift by a pixel, and of a tilt by as much over the edge's length.
+    """Turns (N, 2), rad, by a shift of a pixel, and by a tilt of a pixel over the edge's length.
 
-    The tilt up to a factor, the leg's distance. So edges scatter alike whatever their length.
+    The tilt is up to a factor, the leg's distance. In these units edges of all lengths have equal
+    scatter.
     """
     pixel = np.sqrt(dot(edges.shift, edges.shift))
     length = np.maximum(edges.span[:, 1] - edges.span[:, 0], 1e-3)
@@ -162,8 +163,8 @@ def pixel_units(edges: EdgeSet) -> Array:
 def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
     """Covariance (G, 2, 2), rad^2, of a single repeat of each edge, from the repeats alone.
 
-    An edge's own scatter, drawn towards that of its leg's same edge in all configurations, and
-    that towards its station's, by their degrees of freedom.
+    The scatter of an edge is shrunk towards that of the same edge of its leg in all configurations,
+    and that towards the scatter of its station, by their degrees of freedom.
     """
     unit = groups.mean(pixel_units(edges))
     turn = turns_from_first(edges, groups)
@@ -186,11 +187,11 @@ def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
 
 @dataclass(frozen=True)
 class OddOnes:
-    """Repeats that are left out, all (N,).
+    """Rejected repeats, all (N,).
 
-    off : stated standard deviations from the middle of the repeats. out : far from a majority that
-    agrees. disputed : one of repeats without such a majority. rare : of an edge that shows in few
-    of the repeats, of which ``most`` show others.
+    off : stated standard deviations from the median of the repeats. out : far from a majority that
+    agrees. disputed : of repeats without such a majority. rare : of an edge that few of the repeats
+    show, while ``most`` of them show others.
     """
 
     off: Array
@@ -201,12 +202,12 @@ class OddOnes:
 
     @property
     def any(self) -> Booleans:
-        """Whether a repeat is left out, for whatever reason."""
+        """Whether a repeat is rejected, for any reason."""
         return self.out | self.disputed | self.rare
 
 
 def odd_ones(edges: EdgeSet, groups: Groups) -> OddOnes:
-    """Repeats of one station that lie further from the median of theirs than noise explains."""
+    """Repeats that are further from their median than noise explains."""
     turn, unit = turns_from_first(edges, groups), pixel_units(edges)
     away = np.abs(turn - groups.median(turn)[groups.member])
     stated = np.sqrt(edges.covariance[:, [0, 1], [0, 1]])
@@ -229,9 +230,8 @@ def odd_ones(edges: EdgeSet, groups: Groups) -> OddOnes:
 
 
 def _typical_spread(turn: Array, groups: Groups) -> Array:
-    """Standard deviation (2,) of a repeat of a typical edge, not moved by a few bad ones.
-
-    The median over edges of their variances, which lies below the mean (Wilson-Hilferty).
+    """Robust standard deviation (2,) of a repeat: by the median over edges of their variances,
+    corrected for the median of a chi-squared variable (Wilson and Hilferty, 1931).
     """
     several = groups.count > 1
     freedom = np.maximum(groups.count - 1.0, 1.0)[:, None]
@@ -243,7 +243,7 @@ def _typical_spread(turn: Array, groups: Groups) -> Array:
 
 
 def _rejections(edges: EdgeSet, odd: OddOnes) -> list[Rejection]:
-    """What was left out and why: each repeat that is out, each other edge once."""
+    """Rejections with their reasons: each outlying repeat, and each disputed or rare edge once."""
     out = [edges.rejection(k, _OUT.format(odd.off[k])) for k in np.flatnonzero(odd.out).tolist()]
     for kind in (odd.disputed, odd.rare):
         rows = np.flatnonzero(kind)

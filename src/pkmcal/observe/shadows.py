@@ -1,10 +1,11 @@
-"""A machine's shadow, which may look as much like the machine as it does itself.
+"""Rejection of camera poses that explain the machine's shadow.
 
-Legs that move in a plane throw shadows on a parallel one that are their exact image elsewhere, with
-edges often clearer than their own. But a shadow darkens what it falls on, always. So of two places
-of the machine, turned alike, one of which lies on what has become darker and the other on what has
-become brighter than in the other photographs, the darker one is the other's shadow; for what is
-bright could not be explained by a machine in the dark. Of dark machines nothing can be said so.
+Legs that move in a plane throw shadows on a parallel plane that are their exact image elsewhere,
+with edges often clearer than their own. A shadow always darkens the surface that it falls on. So of
+two camera poses with nearly the same orientation, one with its legs on pixels that are darker and
+the other on pixels that are brighter than in the other images, the darker one is the shadow of the
+other: a machine at the darker pose would leave the bright pixels unexplained. The test does not
+apply to dark machines.
 """
 
 from __future__ import annotations
@@ -18,18 +19,19 @@ from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
 
 PLACES_ALONG_TUBE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Places along the middle of a tube's visible part that are looked at."""
+"""Positions along the axis of a tube's visible part at which its brightness is sampled."""
 MOSTLY_CHANGED_SHARE = 0.5
-"""Share of these, in all photographs, that have become darker, or brighter, than elsewhere."""
+"""Share of these samples, over all images, that are darker, or brighter, than in the others."""
 SHADOW_TURN = np.radians(20.0)
-"""Turn within which a place can be the other's shadow: its planes are nearly parallel."""
+"""Largest angle between two poses of which one is the shadow of the other: planes of legs and
+shadow are nearly parallel."""
 
 
 def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: DistanceTables) -> Array:
-    """How much of the legs' middles is brighter than there in the median of all photographs, less
-    what is darker, (H,), -1 to 1.
+    """Share of samples on the legs' axes that are brighter than the median of all images, less the
+    share of darker ones, (H,), -1 to 1.
 
-    legs : camera frame, (H, K, L), of the K photographs of ``tables``.
+    legs : camera frame, (H, K, L), of the K images of ``tables``.
     """
     a, b, u = of_edges(legs, tubes)
     first, last = visible_stretch(a, b, tubes)
@@ -42,8 +44,9 @@ def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: Dista
 
 
 def without_shadows(places: Array, light: Array) -> Integers:
-    """Numbers of those places (H, 4, 4) that are no other one's shadow; light : (H,) as `lightness`
-    says.
+    """Indices of the poses (H, 4, 4) that are not the shadow of another.
+
+    light : (H,) as of :func:`lightness`.
     """
     casts = (light > MOSTLY_CHANGED_SHARE) & (angle_between(places[:, None], places) < SHADOW_TURN)
     return np.flatnonzero((light > -MOSTLY_CHANGED_SHARE) | ~casts.any(axis=1))

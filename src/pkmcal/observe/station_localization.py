@@ -1,14 +1,13 @@
-"""Where a station's camera stands: a coarse search for the machine in its photographs.
+"""Localization of a station: the camera's pose by a coarse search for the machine in its images.
 
-About a rough pose many are tried at random, first a few as near as the right one most often is; of
-a station without one, places all round the machine (:mod:`pkmcal.observe.pose_candidates`). The
-best descend (:mod:`pkmcal.observe.pose_likelihood`) on more and more photographs, with distances
-cut off ever nearer.
+Candidate poses are drawn at random about a rough pose, first a few as near as the right one is as a
+rule; for a station without a pose they are all round the machine
+(:mod:`pkmcal.observe.pose_candidates`). The best are refined on more and more images, with ever
+smaller distances at which residuals are cut off (:mod:`pkmcal.observe.pose_likelihood`).
 
-What was found is weighed. The most evidence is found in any picture, machine or not. So the place
-is searched in some of the photographs, and the others are asked: at that place, do their own
-readings fit better than those that other photographs of the session bear? Without the machine they
-do not.
+The result is tested. Some pose has the largest likelihood in any image, with or without a machine.
+So the pose is searched in some of the images, and the others confirm it: at that pose, do their own
+readings fit better than those of other images of the session? Without the machine they do not.
 """
 
 from __future__ import annotations
@@ -39,9 +38,11 @@ from pkmcal.observe.shadows import lightness, without_shadows
 
 
 class _SearchRadius(NamedTuple):
-    """How far about a pose by hand is searched: the spread (6,) of rad and m by which the poses
-    are drawn that are tried, how many these are, and how many of them descend. enough : probability
-    by chance, of some of the photographs, from which the others need not be searched.
+    """Extent of the search about a pose by hand.
+
+    spread : (6,) standard deviations, rad and m, of the poses that are drawn; tried : their number;
+    descending : number of them that are refined. enough : p-value of some of the images from which
+    the others need not be searched.
     """
 
     spread: Array
@@ -50,8 +51,8 @@ class _SearchRadius(NamedTuple):
     enough: float
 
     def reaches(self, T_camera_base: Array, other: Array) -> bool:
-        """Whether another pose is no further from one, (4, 4) both, than those drawn are on
-        average, turn and shift together.
+        """Whether two poses (4, 4) are no further apart than those drawn are on average, turn and
+        shift together.
         """
         turn, shift = angle_between(T_camera_base, other), T_camera_base @ inverse(other)
         square = (turn / self.spread[0]) ** 2 + np.sum((shift[:3, 3] / self.spread[3:]) ** 2)
@@ -60,58 +61,57 @@ class _SearchRadius(NamedTuple):
 
 FAR = _SearchRadius(np.repeat([np.radians(15.0), 0.15], 3), 3200, 48, 1e-6)
 """The spread's norm over three axes is 26 degrees and 26 cm; of poses that are 30 degrees and 30 cm
-off, 97 of 100 lead to the right place. A place that fits about a pose that is wrong by more than
-was searched is not known from the right one: before clutter its photographs confirm it to one in
-ten thousand."""
+off, 97 of 100 lead to the right pose. Where the pose by hand is wrong by more than was searched, a
+wrong pose that fits cannot be distinguished: before clutter its images confirm it to one in ten
+thousand."""
 NEAR = _SearchRadius(FAR.spread / 3, 160, 8, 1e-3)
-"""Asked first, and where one of thirty hypotheses is looked at. Where a pose is wrong by more, a
-search does not end so near to it by chance."""
+"""Searched first, and for each of many hypotheses. Where a pose is wrong by more, a search does not
+end so near to it by chance."""
 
 
 class _PosePrior(NamedTuple):
-    """A rough pose (4, 4), and how far about it is searched."""
+    """A rough pose (4, 4), and the extent of the search about it."""
 
     T_camera_base: Array
     nearness: _SearchRadius
 
 
 POSES_FOR_RESCORING = 8
-"""One in so many of the poses tried is looked at closer: two photographs tell as much of them."""
+"""One in so many of the poses tried is scored again: two images are enough to drop the others."""
 GLOBAL_CANDIDATES_REFINED, GLOBAL_CANDIDATES_RETAINED = 1200, 300
-"""Poses from all round the machine that descend, and how many of them go on: before a descent the
-pictures hardly tell which is near, least of all of three legs that are alike."""
+"""Poses from all round the machine that are refined, and how many of them go on: before refinement
+their scores hardly show which is near, least of all with three equal legs."""
 SHAKEN_SPREAD = np.repeat([np.radians(2.0), 0.02], 3)
 PERTURBED_POSES_TRIED, PERTURBED_POSES_RETAINED = 48, 16
-"""Poses beside the best ones that are tried before the last descent, how far (rad and m) from
-these, and of how many two steps have shown that they may be the best."""
+"""Poses beside the best ones that are tried before the last refinement, their spread (rad and m),
+and the number that is retained after two steps."""
 LIKELIEST_PLACES_SETTLED = 4
-"""Of the likeliest places, where all are one, those that are settled without a look beside them."""
+"""Number of the likeliest poses, where all are one pose, that are refined without others beside."""
 FEW_GLOBAL_CANDIDATES, FEW_CANDIDATES_RETAINED = 160, 16
-"""Where one of thirty hypotheses is looked at."""
+"""The same for each of many hypotheses."""
 NEARBY_PLACES_SETTLED, HYPOTHESES_SETTLED = 8, 8
-"""Places of each of thirty hypotheses that are settled, and of how many beside the first: three are
-searched in full."""
+"""Poses of each of many hypotheses that are refined to the largest likelihood, and the number of
+such hypotheses beside the first."""
 FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_WITH_PRIOR = 7, 5, 4
-"""Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
-each in its turn. About a known pose two are enough to be searched."""
+"""Images from which half of them, or a third, are held out of the search for confirmation; with
+fewer, each in turn. About a known pose two are enough for the search."""
 EARLY_DECISION = 1e-4
-"""Probability by chance, of some of the photographs, from which the others need not be searched
-where nothing is told of the pose."""
+"""p-value of some of the images from which the others need not be searched, without a pose."""
 BY_CHANCE, BY_CHANCE_WITH_PRIOR = 1e-3, 1e-2
-"""Probability of as much evidence by chance, below which the machine is recognised: anywhere, and
-where it was looked for about a pose by hand, which says much the same already."""
+"""p-value below which the machine is recognised: anywhere, and about a pose by hand, which is
+evidence by itself."""
 RIVAL_POSE_PROBABILITY = 0.05
-"""Probability of a second place being as good above which neither is believed."""
+"""Posterior probability of a second pose above which neither is accepted."""
 
 
 @dataclass(frozen=True)
 class LocalizedPose:
-    """A found pose T_camera_base (4, 4) and its score: 0 perfect, 1 nothing fits.
+    """A localized pose T_camera_base (4, 4) and its score: 0 perfect, 1 nothing fits.
 
-    log_likelihood_ratio : log likelihood against chance, by reduced pixels of silhouette. by_chance
-    : probability of as much without the machine. second : probability that another place is as
-    good. has_prior : whether it was looked for about a pose that is known. correlation_length :
-    reduced pixels of silhouette that count as one measurement.
+    log_likelihood_ratio : against chance, in reduced pixels of silhouette. by_chance : p-value of
+    the confirmation by held-out images. second : posterior probability of another pose. has_prior :
+    whether the search was about a known pose. correlation_length : reduced pixels of silhouette
+    that count as one measurement.
     """
 
     T_camera_base: Array
@@ -123,22 +123,22 @@ class LocalizedPose:
     correlation_length: float = 1.0
 
     def likelier(self, other: LocalizedPose) -> float:
-        """Log odds of this explanation of the photographs against another one of the same."""
+        """Log-likelihood ratio (nats) of this pose against another one for the same images."""
         return (self.log_likelihood_ratio - other.log_likelihood_ratio) / self.correlation_length
 
     @property
     def limit(self) -> float:
-        """What ``by_chance`` must stay below."""
+        """Limit of ``by_chance``."""
         return BY_CHANCE_WITH_PRIOR if self.has_prior else BY_CHANCE
 
     @property
     def good(self) -> bool:
-        """Whether the machine was recognised, and at one place only."""
+        """Whether the machine was recognised, and at one pose only."""
         return self.by_chance < self.limit and self.second < RIVAL_POSE_PROBABILITY
 
     @property
     def sure(self) -> bool:
-        """Whether it was recognised without what is said of the pose."""
+        """Whether it was recognised without the pose by hand as evidence."""
         return self.by_chance < BY_CHANCE and self.second < RIVAL_POSE_PROBABILITY
 
 
@@ -148,11 +148,13 @@ def find_station(
     rng: np.random.Generator,
     near_prior: bool = False,
 ) -> LocalizedPose:
-    """The pose near a rough one, or anywhere, from half of the photographs, or all but one or two
-    of few; what the others say of it decides, each in its turn. Then every photograph takes part.
+    """Localize a station near a rough pose, or anywhere.
 
-    near_prior : look beside the likeliest places though they are one, as is done of searches from
-    nothing, and be as sure as a wide search has to be, for evidence that is to be compared.
+    The pose is searched in half of the images, or all but one or two of few, and the others decide
+    on it, each part in turn. Then all images take part.
+
+    near_prior : try poses beside the likeliest ones even where all are one pose, and require the
+    p-value of a wide search, for likelihoods that are to be compared.
     """
     if T_camera_base is None:
         return _localize(view, None, rng, near_prior)
@@ -166,7 +168,7 @@ def find_station(
 def _localize(
     view: StationView, prior: _PosePrior | None, rng: np.random.Generator, near_prior: bool
 ) -> LocalizedPose:
-    """What one search finds: about a pose by hand, as far as is told with it, or anywhere."""
+    """One search: about a pose by hand, as far as its extent, or anywhere."""
     count = len(view.configuration)
     number = np.arange(count)
     halves = FEWEST_FOR_HALVES_WITH_PRIOR if prior else FEWEST_FOR_HALVES
@@ -217,7 +219,7 @@ def _localize(
 def _search(
     view: StationView, prior: _PosePrior | None, rng: np.random.Generator, near_prior: bool
 ) -> Array:
-    """Up to three places (H, 4, 4), the one with the most evidence first."""
+    """Up to three poses (H, 4, 4), the likeliest first."""
     few, more = view.few(4), view.few(8)
     if prior is None:
         each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
@@ -245,7 +247,7 @@ def _search(
 def _best_about(
     view: StationView, candidates: Array, photographs: Integers, rng: np.random.Generator
 ) -> Array:
-    """The likeliest places (H, 4, 4) that candidates descend to, and beside these."""
+    """The likeliest poses (H, 4, 4) to which candidates, and poses beside the best, are refined."""
     candidates = refine_lm(view, candidates, photographs, 5, (5, 4, 4, 3))
     candidates = _best(view, candidates, photographs, reach=3, keep=24)
     candidates = candidates[distinct_silhouettes(view, candidates, photographs)[:4]]
@@ -307,11 +309,12 @@ def likelihood_nearby(
     few: Integers,
     rng: np.random.Generator,
 ) -> Array:
-    """What a short search from poses (S, 4, 4) finds in some photographs, ``few``, with each of
-    several readings (N, K, m) of all, (N,); from none, anywhere. Of many, those that are far from
-    the best, and not the first, find nothing (minus infinity).
+    """Log-likelihood ratios (N,) by a short search in ``few`` of the images under each of several
+    readings (N, K, m).
 
-    wide : look about the starts first, as about a pose by hand.
+    starts : (S, 4, 4) poses from which to search; anywhere, if S = 0. Of many readings, those far
+    from the best have minus infinity, except the first. wide : search about the starts first, as
+    about a pose by hand.
     """
     few_readings = readings if not len(starts) else readings[:, few]
     fk = view.machine.forward_result(
@@ -340,8 +343,8 @@ def likelihood_nearby(
 
 
 def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Generator) -> Array:
-    """Places (H, 4, 4) that are worth a descent, about poses (S, 4, 4), or anywhere, by one
-    guess.
+    """Candidate poses (H, 4, 4) about poses (S, 4, 4), or anywhere, under one hypothesis of the
+    legs.
     """
     if not len(starts):
         places = _anywhere(view, few, FEW_GLOBAL_CANDIDATES)
@@ -356,11 +359,11 @@ def _z_scores(
     other: Integers,
     rng: np.random.Generator,
 ) -> Array:
-    """How surely each of some photographs shows the machine at a pose (4, 4) that was found from
-    others, ``searched``: standard normal (K,) where it does not.
+    """z-scores (K,) of some images at a pose (4, 4) that was searched in others, standard normal
+    where they do not show the machine there.
 
-    Without the machine, a photograph's own readings fit it no better than others do; by how much
-    they do, in units of the others' scatter, has Student's distribution.
+    Without the machine, the readings of an image fit it no better than those of others; the
+    difference, in units of the scatter of the others, has Student's distribution.
     """
     from scipy.special import ndtri, stdtr
 
@@ -378,8 +381,8 @@ def _z_scores(
 
 
 def _second(log_likelihood_ratio: Array, correlation_length: float) -> float:
-    """Probability that the second of places is the machine's and not the first, by their evidence
-    (H,).
+    """Posterior probability of the second of two poses, by log-likelihood ratios (H,) of all, the
+    likeliest first.
     """
     if len(log_likelihood_ratio) < 2:
         return 0.0
@@ -438,7 +441,7 @@ def _second_search(
 
 
 def _by_chance(parts: list[Array]) -> float:
-    """Probability of so sure photographs, (K,) of each part, taken together, by chance."""
+    """p-value of z-scores, (K,) of each part, taken together."""
     if not parts:
         return 1.0
     surely = np.concatenate(parts)

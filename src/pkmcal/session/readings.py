@@ -1,4 +1,4 @@
-"""Joint readings against their machine: columns, units, ranges, and whether the machine moved."""
+"""Checks of joint readings against their machine: columns, units, signs, ranges, movement."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _UNITS = {
 def check_readings(
     table: CsvTable, ranges: Array, noise: float, units: Sequence[str]
 ) -> list[Finding]:
-    """Raise `InputError` for readings that cannot be this machine's; return warnings.
+    """Raise `InputError` for readings that this machine cannot have; return warnings.
 
     ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN where not known.
     noise : standard deviation of a reading, m or rad. units : ``m`` or ``rad`` of each joint.
@@ -86,7 +86,7 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
 
 
 def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Most readings out of range, and in range once scaled: another unit, not so many mistakes."""
+    """Raise `InputError` where most readings are out of range, and in range in another unit."""
     for kind, (factor, unit, expected, next_step) in _UNITS.items():
         finite = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
         if not finite.any() or _inside(table.values, ranges)[:, finite].mean() > 0.5:
@@ -105,7 +105,7 @@ def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
 
 
 def _check_signs(table: CsvTable, ranges: Array) -> None:
-    """A joint whose readings are out of range, and in range with the other sign."""
+    """Raise `InputError` for joints that are out of range, and in range with the other sign."""
     here, there = _inside(table.values, ranges), _inside(-table.values, ranges)
     wrong = np.flatnonzero((here.mean(axis=0) < 0.5) & there.all(axis=0))
     if not wrong.size:
@@ -125,8 +125,8 @@ def _check_signs(table: CsvTable, ranges: Array) -> None:
 
 
 def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Most readings of all joints, or of some, out of range, and all in it after one constant
-    shift: counted from another place, not so many mistakes.
+    """Raise `InputError` where most readings of all joints, or of some, are out of range, and all
+    in range after a constant shift: they count from another zero.
     """
     inside, loosely = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
     if loosely.all():
@@ -149,7 +149,7 @@ def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
 def _shifted(
     table: CsvTable, ranges: Array, which: Booleans, shift: tuple[float, float], unit: str
 ) -> InputError:
-    """The error about joints ``which`` (m,) whose readings a shift puts into their ranges."""
+    """Error about joints ``which`` (m,) whose readings a shift puts into their ranges."""
     column = int(np.flatnonzero(which)[0])
     low, high = ranges[column]
     scale, name = DISPLAY_UNITS[unit]
@@ -202,12 +202,12 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[Finding]:
 
 
 def unmoved_readings(joints: Array, noise: float) -> Booleans:
-    """(m,) which of the readings (K, m) never move by more than their noise."""
+    """Mask (m,) of the readings (K, m) that never move by more than their noise."""
     return np.ptp(joints, axis=0) <= _SAME_SIGMAS * noise
 
 
 def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> InputError | None:
-    """The error about readings that never moved, where the data contradict the readings."""
+    """Error about readings that never move, for data that contradict the readings; None without."""
     still = np.flatnonzero(unmoved_readings(joints, noise)).tolist() if len(joints) else []
     if not still:
         return None
@@ -288,8 +288,8 @@ def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
 
 
 def same_pose(joints: Array, noise: float) -> Integers:
-    """(K,) of each of the readings (K, m) the first row whose readings differ from its own by no
-    more than noise explains: rows of one pose share it.
+    """For each of the readings (K, m) the first row (K,) that differs by no more than noise: rows
+    of one pose share it.
     """
     owner = np.full(len(joints), -1)
     # by the reading that spreads most, so that each row is held against few others
@@ -307,12 +307,13 @@ def same_pose(joints: Array, noise: float) -> Integers:
 
 
 def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Finding]]:
-    """The table with rows of one pose made one, at their mean, and a sentence about them.
+    """The table with rows of one pose merged into their mean, and a warning about them.
 
-    For readings that are calibrated by themselves. What the model leaves out, a belt that sags or a
-    hook that is no point, is alike in all repeats of a pose; as so many measurements they would
-    promise too much. Rows are of one pose where no reading differs by more than noise explains.
-    Over so small a step the closures are straight, so a mean of rows is what the mean pose reads.
+    For readings that are calibrated by themselves. Errors that the model leaves out, such as a belt
+    that sags or a hook that is no point, are equal in all repeats of a pose, so repeats are no
+    independent measurements. Rows are of one pose where no reading differs by more than noise. Over
+    so small a step the closure equations are linear, so the mean of the rows is the reading of the
+    mean pose.
     """
     first, group = np.unique(same_pose(table.values, noise), return_inverse=True)
     if len(first) == len(group):
@@ -330,7 +331,7 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Findi
 
 
 def _inside(values: Array, ranges: Array, margin: float = _MARGIN) -> np.ndarray:
-    """(K, m) True where a reading lies in its range widened by `margin` of it, or has none."""
+    """Mask (K, m) of readings in their range, widened by `margin` of it, or without a range."""
     low, high = ranges[:, 0], ranges[:, 1]
     slack = margin * (high - low)
     # Negated, so that NaN, a range that is not known, counts as inside.
