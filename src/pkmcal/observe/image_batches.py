@@ -1,8 +1,8 @@
-"""The photographs of stations, and how they are passed through: so many at a time as fit.
+"""Image batches: the images of stations, processed in windows of bounded memory.
 
-What is worked out of one photograph takes some megabytes, so those that are looked at are held a
-window at a time. Photographs of several stations are looked at together where one camera took them
-alike: what is done to six in one set of arrays takes a third as long as to one after the other.
+Intermediate arrays of one image take some megabytes, so images are processed a window at a time.
+Images of several stations share a window where they have the same camera: six in one set of arrays
+take a third of the time of six one after the other.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from pkmcal.cameras.response import Response
 from pkmcal.observe.images import Selected, binned, fitting
 
 PHOTOGRAPHS_A_WINDOW = 32
-"""Photographs that are looked at together: their profiles take some 20 MB."""
+"""Images in a window: their profiles take some 20 MB."""
 WINDOW_BYTES = 96 * 2**20
-"""Bytes that these take as grey levels at most; one may take more."""
+"""Most bytes of a window's grey levels; a single image may take more."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """One station's photographs.
+    """The images of one station.
 
     station : its number. configuration : (K,) rows of the session's joints. joints : (K, m).
-    images : K grey-level arrays (height, width), decoded or when they are looked at. response : how
-    their levels code light. binning : count of their pixels across, and down, that are one where
-    edges are looked for (:meth:`binned`).
+    images : K grey-level arrays (height, width), decoded now or on access. response : curve from
+    light to grey levels. binning : factor by which pixels are binned, across and down, before edges
+    are measured (:meth:`binned`).
     """
 
     station: int
@@ -43,7 +43,7 @@ class Photographs:
     binning: int = 1
 
     def select(self, numbers: Integers) -> Photographs:
-        """Some of the photographs."""
+        """Some of the images."""
         return replace(
             self,
             configuration=self.configuration[numbers],
@@ -52,29 +52,29 @@ class Photographs:
         )
 
     def spread(self, most: int) -> Integers:
-        """Numbers of up to ``most`` photographs, evenly over all."""
+        """Indices of up to ``most`` images, evenly over all."""
         return evenly(len(self.images), most)
 
     @property
     def window(self) -> int:
-        """How many photographs are looked at together."""
+        """Number of images in a window."""
         return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), PHOTOGRAPHS_A_WINDOW)
 
     def decoded(self) -> Photographs:
-        """The same with every photograph decoded; for no more than a window of them."""
+        """The batch with every image decoded; for a window at most."""
         return replace(self, images=list(self.images))
 
     def binned(self) -> Photographs:
-        """The same as edges are looked for in them, decoded; for no more than a window of them.
+        """The batch binned as for the measurement of edges, and decoded; for a window at most.
 
-        Levels are averaged, not the light that they code: over the pixels of one bin, in which a
-        blurred edge rises by a third, the code bends by half a level.
+        Grey levels are averaged, not light: over the pixels of one bin, in which a blurred edge
+        rises by a third, the response is linear to half a level.
         """
         images = [binned(image, self.binning) for image in self.images]
         return replace(self, camera=self.camera.binned(self.binning), images=images, binning=1)
 
     def same_camera(self, other: Photographs) -> bool:
-        """Whether others were taken, and are looked at, as these: by one camera."""
+        """Whether another batch has the same camera, response and binning."""
         one, its = self.camera, other.camera
         return (
             type(one) is type(its)
@@ -85,8 +85,8 @@ class Photographs:
 
 
 class Placed(NamedTuple):
-    """A station's photographs, where its camera stands, T_camera_base (4, 4), and where the
-    platform is in each, T_base_platform (K, 4, 4).
+    """The images of a station with the camera's pose T_camera_base (4, 4) and the platform's pose
+    in each image, T_base_platform (K, 4, 4).
     """
 
     photographs: Photographs
@@ -94,24 +94,24 @@ class Placed(NamedTuple):
     poses: Array
 
     def select(self, numbers: Integers) -> Placed:
-        """Some of the photographs."""
+        """Some of the images."""
         return Placed(self.photographs.select(numbers), self.T_camera_base, self.poses[numbers])
 
 
 def placed_at(
     photographs: Sequence[Photographs], T_camera_base: Array, poses: Array
 ) -> list[Placed]:
-    """Those of stations among all, (S, 4, 4), at poses of all configurations, (N, 4, 4)."""
+    """Batches with stations' poses out of (S, 4, 4) and platform poses out of (N, 4, 4)."""
     return [Placed(p, T_camera_base[p.station], poses[p.configuration]) for p in photographs]
 
 
 @dataclass(frozen=True)
 class PhotographWindow:
-    """Photographs that are looked at together, as edges are looked for in them, decoded.
+    """Images of a window, binned and decoded for the measurement of edges.
 
-    camera, response : of all. binning : how many pixels became one. station, configuration : (K,)
-    of each, station after station. joints : (K, m). images : K arrays (height, width).
-    T_camera_base, poses : (K, 4, 4) where each was taken, and T_base_platform.
+    camera, response : of all. binning : factor of their binning. station, configuration : (K,), in
+    the order of stations. joints : (K, m). images : K arrays (height, width). T_camera_base, poses
+    : (K, 4, 4) poses of camera and platform (T_base_platform).
     """
 
     camera: Camera
@@ -126,7 +126,7 @@ class PhotographWindow:
 
     @classmethod
     def of(cls, placed: Sequence[Placed]) -> PhotographWindow:
-        """Of stations whose photographs are alike, no more than a window in all."""
+        """The window of stations with the same camera, whose images fit into one."""
         count = [len(one.photographs.images) for one in placed]
         in_view = [one.photographs.binned() for one in placed]
         return cls(
@@ -143,8 +143,8 @@ class PhotographWindow:
 
 
 def windows(placed: Sequence[Placed]) -> Iterator[PhotographWindow]:
-    """All photographs of stations, whose numbers differ, in their order; such as follow one another
-    and are alike share a window, as far as they fit.
+    """Windows over all images of stations, in order. Consecutive stations with the same camera
+    share windows as far as they fit.
     """
     together: list[Placed] = []
     for one in placed:

@@ -1,15 +1,14 @@
-"""Where a camera could stand of which nothing is said: places all round the machine, all turns.
+"""Candidate poses of a camera without a prior: positions all round the machine, all turns.
 
-A central camera sees rays. From a place, the parts of the machine that its joints move spread over
-a part of the sphere about the camera: its middle tells where the camera must look, its width how
-far away it stands. Both are seen in photographs of several configurations without knowing what
-moves there. So of six unknowns four are tried, place by place on a sphere about the machine and
-turn by turn about the line of sight, and two nearly follow. A camera in the midst of the legs is
-the same case: there the sphere is small.
+A central camera measures rays. From a position, the moving parts of the machine cover a part of the
+sphere about the camera: its middle gives the line of sight, its angular width the distance. Both
+are measured in images of several configurations without knowing what moves there. So four of the
+six unknowns are enumerated, positions on a sphere about the machine and turns about the line of
+sight, and two nearly follow. A camera amid the legs is the same case, with a small sphere.
 
-All that is compared on a chart: angles from the middle of what moves, in units of its width. Turns
-are turns of the chart and a wrong line of sight a shift of it, whatever the lens or mirror, so a
-million hypotheses are looked up in a table of some ten thousand cells.
+Predictions and images are compared on a chart: angles from the middle of the moving parts, in units
+of their width. A turn of the camera is a turn of the chart and a wrong line of sight a shift of it,
+for any lens or mirror, so a million candidates are looked up in a table of ten thousand cells.
 """
 
 from __future__ import annotations
@@ -35,30 +34,30 @@ CAMERA_DIRECTIONS = 642
 SIGHT_LINE_TURNS = 24
 """Turns about the line of sight: 15 degrees apart."""
 NEAREST_DISTANCE_TRIED, FURTHEST_DISTANCE_TRIED = 0.05, 30.0
-"""Distances from the machine's middle that are tried, in its own sizes."""
+"""Distances of candidates from the machine's middle, in sizes of the machine."""
 DISTANCES_TRIED = 28
 SPREAD_POINTS = 160
-"""Points of the legs, in all configurations, whose spread is looked at."""
+"""Points of the legs, in all configurations, by which their angular extent is computed."""
 WIDER_THAN_LEGS = (0.9, 1.2, 1.6)
-"""How much wider what moves may look than the legs do: shadows and cables move too."""
+"""Ratios of the width of all moving parts to that of the legs: shadows and cables move too."""
 CHART_HALF_CELLS = 40
 """Cells of the chart from its middle to its border."""
 CHART_HALF_WIDTHS = 3.0
-"""Widths of what moves from the chart's middle to its border."""
+"""Widths of the moving parts from the chart's middle to its border."""
 CHART_DISTANCE_CUT = 10
 """Cells at which distances on the chart are cut off."""
 CHART_BORDER_CELLS = CHART_DISTANCE_CUT
-"""Cells about the chart in which nothing is near."""
+"""Cells about the chart without edges."""
 SIGHT_LINE_SHIFTS = np.stack(np.meshgrid(*[np.arange(-8, 9, 4)] * 2), axis=-1).reshape(-1, 2)
 """Cells by which the line of sight may be off."""
 CHORD_ENDS_ALONG_LEG = np.array([0.05, 0.35, 0.65, 0.95])
-"""Places along a leg's visible part between which its chords lie."""
+"""Positions along the visible part of a leg between which its chords are."""
 LONGEST_CHORD = CHART_HALF_WIDTHS * CHART_HALF_CELLS
-"""Cells that a chord counts for at most: from near by, a leg fills the sphere."""
+"""Largest weight of a chord, in cells: from near by, a leg fills the sphere."""
 
 
 class AngularExtent(NamedTuple):
-    """What moves, on the sphere about the camera: unit middle (..., 3) and width (...), rad."""
+    """Moving parts on the sphere about the camera: unit middle (..., 3), width (...) in rad."""
 
     middle: Array
     width: Array
@@ -73,10 +72,10 @@ def global_candidates(
     photographs: Integers,
     keep: int,
 ) -> Array:
-    """The likeliest poses T_camera_base (keep, 4, 4), best first, with nothing known of any.
+    """The best candidate poses T_camera_base (keep, 4, 4), best first, without a prior.
 
     legs : of all configurations in the base frame, (K, L). radius : (E,) m of the tubes. tables :
-    of the same K photographs, of which ``photographs`` are looked at.
+    of the same K images, of which ``photographs`` (indices) are compared.
     """
     in_view = _direction_spread(camera, tables)
     frame = frame_of(in_view.middle)
@@ -96,7 +95,7 @@ def global_candidates(
 
 
 def _direction_spread(camera: Camera, tables: DistanceTables) -> AngularExtent:
-    """What moves in the photographs."""
+    """Angular extent of the moving parts in the images."""
     y, x = np.nonzero(tables.moving)
     corner = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
     pixel = (np.stack([x, y], axis=-1)[:, None] + corner + 0.5) * tables.scale - 0.5
@@ -109,7 +108,7 @@ def _direction_spread(camera: Camera, tables: DistanceTables) -> AngularExtent:
 
 
 def _spread(total: Array, weight: Array) -> AngularExtent:
-    """Of unit rays whose weighted sum is (..., 3), and that of their weights (...)."""
+    """Angular extent of unit rays with the weighted sum (..., 3) and the sum of weights (...)."""
     mean = total / np.maximum(weight, 1e-300)[..., None]
     length = np.sqrt(dot(mean, mean))
     middle = np.where(length[..., None] > 0, mean, [0.0, 0.0, 1.0])  # nothing moves: anywhere
@@ -120,8 +119,8 @@ def _spread(total: Array, weight: Array) -> AngularExtent:
 def _places(
     tubes: TubeList, radius: Array, legs: LegsInCamera, width: float
 ) -> tuple[Array, AngularExtent]:
-    """Places (P, 3) in the base frame from which what moves looks about as wide as it is seen, and
-    how it looks from there.
+    """Positions (P, 3) in the base frame from which the moving parts are about as wide as in the
+    images, and their extent from there.
     """
     one = np.flatnonzero(tubes.side == 0)
     a, b, u = (v[:, tubes.leg] for v in (legs.a, legs.b, legs.u))
@@ -165,7 +164,7 @@ def _places(
 
 
 def sphere(count: int) -> Array:
-    """Unit directions (count, 3), evenly about the sphere: Fibonacci's lattice."""
+    """Unit directions (count, 3), evenly over the sphere: Fibonacci lattice."""
     k = np.arange(count) + 0.5
     z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
     flat = np.sqrt(1 - z * z)
@@ -173,7 +172,7 @@ def sphere(count: int) -> Array:
 
 
 def frame_of(middle: Array) -> Array:
-    """Rotations (..., 3, 3) from the frame of unit vectors (..., 3) to one whose z they are."""
+    """Rotations (..., 3, 3) to frames with unit vectors (..., 3) as their z axes."""
     other = np.where(np.abs(middle[..., 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     x = np.cross(other, middle)
     x /= np.sqrt(dot(x, x))[..., None]
@@ -181,7 +180,7 @@ def frame_of(middle: Array) -> Array:
 
 
 def _on_chart(rays: Array, width: float) -> Array:
-    """Cells (..., 2) of unit rays (..., 3) in the chart's frame, from its middle."""
+    """Cells (..., 2), from the chart's middle, of unit rays (..., 3) in its frame."""
     away = np.sqrt(rays[..., 0] ** 2 + rays[..., 1] ** 2)
     angle = np.arctan2(away, rays[..., 2])
     cells = CHART_HALF_CELLS / CHART_HALF_WIDTHS / width
@@ -191,7 +190,7 @@ def _on_chart(rays: Array, width: float) -> Array:
 def _chart_tables(
     camera: Camera, tables: DistanceTables, photographs: Integers, frame: Array, width: float
 ) -> Integers:
-    """Distance tables (K, EDGE_DIRECTIONS, n, n) uint8 on the chart, of some photographs."""
+    """Distance tables (K, EDGE_DIRECTIONS, n, n) uint8 of some images on the chart."""
     n = 2 * CHART_HALF_CELLS + 1
     out = np.empty((len(photographs), EDGE_DIRECTIONS, n, n), dtype=np.float32)
     for row, k in enumerate(photographs):
@@ -219,8 +218,8 @@ def _scores(
     photographs: Integers,
     width: float,
 ) -> Array:
-    """Mean distance (P, SIGHT_LINE_TURNS, SIGHT_LINE_SHIFTS), in cells, of all legs' chords from
-    edges so directed.
+    """Mean distances (P, SIGHT_LINE_TURNS, SIGHT_LINE_SHIFTS), in cells, of all legs' chords from
+    image edges of their direction.
     """
     leg = np.unique(tubes.leg)
     a, b, u = (v[photographs][:, leg] for v in (legs.a, legs.b, legs.u))
@@ -262,8 +261,8 @@ def _scores(
 
 
 def _shifted(chart: Integers) -> Array:
-    """Distances (cells, SIGHT_LINE_SHIFTS) by every line of sight, at each cell of charts (K,
-    EDGE_DIRECTIONS, n, n) with a border: what is looked up together lies together.
+    """Distances (cells, SIGHT_LINE_SHIFTS) for every line of sight at each cell of charts (K,
+    EDGE_DIRECTIONS, n, n) with a border: values that are looked up together are adjacent.
     """
     border = (CHART_BORDER_CELLS, CHART_BORDER_CELLS)
     around = ((0, 0), (0, 0), border, border)

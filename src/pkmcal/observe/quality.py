@@ -1,4 +1,4 @@
-"""What photographs are like where it counts: on the legs, once the machine was recognised."""
+"""Quality of images on the legs of a localized machine: exposure, blur, contrast, occlusion."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
 from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
 
 BLACK_GREY_LEVEL = 8
-"""Grey level up to which a sample is taken as black: shading and edges drown in the noise."""
+"""Grey level up to which a sample is black: shading and edges are below the noise."""
 DEPTHS_INSIDE_EDGE = np.array([0.25, 0.6, 1.0])
-"""Depths inside an edge, in half widths of the leg, at which its grey levels are looked at."""
+"""Depths inside an edge, in half widths of the leg, at which grey levels are sampled."""
 BLUR_PROFILE_REACH, BLUR_PROFILE_PITCH = 8.0, 0.5
-"""Pixels to each side of an edge, and between samples, of the profiles that tell the blur."""
+"""Reach to each side of an edge and pitch (px) of the profiles by which blur is estimated."""
 EDGE_FLANK_WIDTH = 6.0
-"""Pixels from the steepest place within which a blurred edge has its whole contrast."""
+"""Distance (px) from the steepest point within which a blurred edge has its full contrast."""
 LEAST_BLUR_CONTRAST = 30.0
-"""Grey levels that an edge needs to tell the blur in spite of noise."""
+"""Least contrast (grey levels) of an edge by which blur is estimated in spite of noise."""
 LENS_WIDTH_PERCENTILE = 25.0
-"""Percentile of the edges' widths that is the lens's: shading makes the others wider."""
+"""Percentile of the edges' widths that is the blur of the lens: shading widens the others."""
 BESIDE_EDGE_RANGE = (1.5, 4.0)
-"""Pixels to each side of an edge between which its two levels are looked at: beyond the blur, and
-before what lies next."""
+"""Range of distances (px) to each side of an edge in which its two levels are sampled: beyond the
+blur, before the next object."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """By photograph (K,) of one station.
+    """Quality of each image (K,) of one station.
 
-    legs : (K, L) True where a leg was found; all False where the machine was not recognised.
-    saturated, black : share of the legs' pixels that are so; of all pixels where there are no
-    legs. blur : standard deviation of the sharper edges, px; NaN where no edge tells.
-    hidden : (K, L) share of a leg's edges behind other legs or outside the photograph, NaN of legs
-    without tubes. level, behind : (K, E) grey levels beside each edge, on the leg and on what lies
-    behind it, in the order of ``tubes_of``; NaN where nothing of it is seen. half_width : (K, E)
-    px of the tube there.
+    legs : (K, L) whether a leg was measured; all False where the machine was not recognised.
+    saturated, black : share of such pixels among the legs', or among all where there are no legs.
+    blur : standard deviation of the sharper edges, px; NaN where no edge determines it.
+    hidden : (K, L) share of a leg's edges behind other legs or outside the image, NaN of legs
+    without tubes. level, behind : (K, E) grey levels beside each edge, on the leg and on the
+    background, in the order of ``tubes_of``; NaN where all of it is hidden. half_width : (K, E) px
+    of the tube there.
     """
 
     legs: Booleans
@@ -55,14 +55,14 @@ class Quality:
 
     @property
     def contrast(self) -> Array:
-        """Grey levels (K, E) by which each leg stands out at its edges."""
+        """Contrast (K, E), in grey levels, of each leg at its edges."""
         return np.abs(self.level - self.behind)
 
 
 def quality(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
 ) -> Quality:
-    """Quality on the legs; poses : T_base_platform (K, 4, 4) of the photographs."""
+    """Quality on the legs; poses : T_base_platform (K, 4, 4) in the images."""
     placed = Placed(photographs, T_camera_base, poses)
     parts = [_quality(window, machine) for window in windows([placed])]
     each = (f.name for f in fields(Quality))
@@ -75,7 +75,7 @@ def quality(
 
 
 def _quality(window: PhotographWindow, machine: Machine) -> Quality:
-    """The same of one window."""
+    """Quality of the images of one window."""
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear)
     edge = places.outward(points, clear, tubes)[..., None]
@@ -109,7 +109,7 @@ def _quality(window: PhotographWindow, machine: Machine) -> Quality:
 
 
 def unrecognised_quality(images: Sequence[Integers], n_legs: int) -> Quality:
-    """Quality of photographs in which the machine was not found: of the whole pictures."""
+    """Quality of images in which the machine was not localized, over whole images."""
     count = len(images)
     shares = np.array(
         [
@@ -135,7 +135,7 @@ def _middle(values: Array, clear: Booleans) -> Array:
 
 
 def _share(is_so: Booleans, clear: Booleans) -> Array:
-    """Share of the samples (K, E, n, depths) that are so, of those at clear edge points, (K,)."""
+    """Share (K,) of the samples at clear edge points for which ``is_so`` (K, E, n, depths)."""
     count = np.maximum(clear.sum(axis=(1, 2)), 1) * is_so.shape[-1]
     return np.sum(is_so & clear[..., None], axis=(1, 2, 3)) / count
 

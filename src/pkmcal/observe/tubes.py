@@ -1,13 +1,14 @@
-"""Where tubes could lie in one photograph: two parallel edges at a tube's width, and how rare.
+"""Detection of tubes in one image: pairs of parallel edges at a tube's width, and their surprisal.
 
-Nothing moves in a single photograph, so nothing tells the machine from what stands about it but its
-looks: a leg shows two straight edges side by side, the one from dark to bright, the other back. For
-each of a few widths and directions a map tells how well a place is the middle of such a pair, along
-a stretch of some widths. A shelf shows many pairs upright and level, and few oblique: so what a
-place is worth is how rarely its width and direction are found so clear in this photograph.
+Nothing moves in a single image, so only appearance distinguishes the machine from its surroundings:
+a leg has two straight parallel edges, one from dark to bright, the other back. For each of a few
+widths and directions a map has the support of each point as the middle of such a pair, along a
+stretch of some widths. A shelf has many upright and level pairs, and few oblique ones: so the worth
+of a point is its surprisal, by how rarely a pair of its width and direction is as clear in this
+image.
 
-All that is on a chart of angles from the middle of the picture, the same for any lens, on which a
-turn of the camera is nearly a shift.
+The maps are on a chart of angles from the image's middle, equal for any lens, on which a turn of
+the camera is nearly a shift.
 """
 
 from __future__ import annotations
@@ -21,36 +22,36 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
 
 FINE_CHART_CELLS = 384
-"""Cells of the fine chart along the longer side of the picture: a leg that is a fiftieth of the
-picture wide, as where a machine fills it, has its edges eight cells apart."""
+"""Cells of the fine chart along the longer side of the image: the edges of a leg that is a fiftieth
+of the image wide, as where a machine fills it, are eight cells apart."""
 MAP_CELL_SIZE = 6
-"""Fine cells that are one cell of the maps, which are looked up 15 degrees and 8 degrees apart."""
+"""Fine cells in one cell of the maps; these are looked up at steps of 15 and of 8 degrees."""
 SUPPORT_SPACING = 2
-"""Fine cells between the places whose support is worked out."""
+"""Pitch, in fine cells, of the points whose support is computed."""
 PAIR_DIRECTIONS = 24
 """Directions of a pair: 7.5 degrees apart."""
 PAIR_WIDTHS = 3.2 * np.sqrt(2.0) ** np.arange(6)
-"""Widths (fine cells) of a pair: nearer, its edges run together."""
+"""Widths (fine cells) of a pair: narrower ones have edges that merge."""
 SUPPORT_LENGTH_WIDTHS = 4.0
 """Length, in widths, along which a pair's support is averaged: tubes are longer."""
 SHORTEST_SUPPORT_LENGTH = 12.0
-"""Fine cells along which it is averaged at least."""
+"""Shortest length, in fine cells, along which support is averaged."""
 HALF_STRENGTH_SLOPE = 2.5
-"""Levels a fine cell at which an edge counts half of a strong one: levels are roots (255 stays),
-whose noise is even and half a level at most, so five times that."""
+"""Slope (levels a fine cell) at which an edge has half of the full strength. Levels are square
+roots (255 stays), with uniform noise of half a level at most; the slope is five times that."""
 SLOPE_ALONG_WEIGHT = 2.0
-"""Times that a slope along a pair counts against one across it: directions within 27 degrees."""
+"""Weight of a slope along a pair against one across it: directions within 27 degrees."""
 LEAST_PAIR_SUPPORT = 0.24
-"""Support below which a place is no pair at all: one place in four of its length."""
+"""Support below which a point is no pair: a quarter of its length."""
 GREATEST_SURPRISAL = 4.0
-"""Logarithm of rarity beyond which rarer ones count no more: one leg must not outvote six."""
+"""Largest surprisal (nats): one leg must not outweigh six."""
 SURPRISAL_STEPS = 60
-"""Steps of the maps' numbers for each factor of e in rarity."""
+"""Steps of the maps' numbers for each nat of surprisal."""
 
 
 class TubeChart(NamedTuple):
-    """surprisal : (W, D, h, w) uint8, minus the logarithm of how rare so clear a pair is, in steps.
-    scale : fine cells a radian. size : (w, h) of the fine chart.
+    """Maps of surprisal (W, D, h, w) uint8, in steps: minus the logarithm of the share of points
+    with as clear a pair. scale : fine cells a radian. size : (w, h) of the fine chart.
     """
 
     surprisal: Integers
@@ -63,19 +64,21 @@ class TubeChart(NamedTuple):
         return (np.array(self.size) - 1) / 2
 
     def width_number(self, width: Array) -> Integers:
-        """The numbers of widths (...), fine cells."""
+        """Indices of the nearest PAIR_WIDTHS to widths (...), fine cells."""
         apart = np.abs(np.log(np.maximum(width, 1e-9))[..., None] - np.log(PAIR_WIDTHS))
         return apart.argmin(axis=-1)
 
 
 def tube_chart(image: Integers, camera: Camera) -> TubeChart:
-    """Of one photograph (height, width)."""
+    """Chart of an image (height, width)."""
     grey, scale = _on_chart(image, camera)
     return TubeChart(_rarity(_support(grey)), scale, (grey.shape[1], grey.shape[0]))
 
 
 def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
-    """Levels (h, w) on the fine chart: angles from the optical axis, evenly; and its scale."""
+    """Square-root levels (h, w) on the fine chart of angles from the optical axis, with its scale
+    (cells a radian).
+    """
     import cv2
 
     height, width = image.shape
@@ -105,8 +108,8 @@ def _angle(rays: Array) -> Array:
 
 
 def _support(grey: Array) -> Array:
-    """How clear a pair lies about each place, (PAIR_WIDTHS, PAIR_DIRECTIONS, h, w), 0 to 1; places
-    lie SUPPORT_SPACING fine cells apart.
+    """Support (PAIR_WIDTHS, PAIR_DIRECTIONS, h, w), 0 to 1, of a pair about each point; points are
+    SUPPORT_SPACING fine cells apart.
     """
     import cv2
 
@@ -135,7 +138,7 @@ def _support(grey: Array) -> Array:
 
 
 def _strength(slope: Array) -> Array:
-    """Strength 0 to 1 of edges; a cell beside one counts too."""
+    """Strength of edges, 0 to 1, dilated by one cell."""
     import cv2
 
     up = np.square(np.maximum(slope, 0.0))
@@ -155,7 +158,7 @@ def _shifted(values: Array, step: Integers) -> Array:
 
 
 def _line(along: Array, length: float) -> Array:
-    """Weights that average along a line."""
+    """Kernel that averages along a line."""
     half = int(np.ceil(length / 2))
     kernel = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
     for place in np.linspace(-length / 2, length / 2, 8 * half):
@@ -165,9 +168,10 @@ def _line(along: Array, length: float) -> Array:
 
 
 def _rarity(support: Array) -> Integers:
-    """The maps of :class:`TubeChart` from supports (W, PAIR_DIRECTIONS, h, w).
+    """Maps of :class:`TubeChart` from supports (W, PAIR_DIRECTIONS, h, w).
 
-    A cell takes the best about it, and neighbouring directions, for hypotheses lie so far apart.
+    A cell has the largest support about it and in neighbouring directions, as candidates are that
+    far apart.
     """
     import cv2
 
