@@ -105,6 +105,8 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
 
     machine : nominal. estimate : of these measurements.
     """
+    if not np.any(measurements.on_platform[measurements.poses.mount]):
+        return Diagnosis(None, np.inf, np.zeros(6), ())  # poses of boards on the base alone
     n_effective = effective_sample_size(machine, measurements)
     estimates: dict[int, Estimate] = {}
     untested: list[tuple[str, str]] = []
