@@ -1,13 +1,13 @@
-"""Where all stations stand: those on a tripod as recognised, photographs by hand one by one.
+"""Localization of all stations: those on tripods by all their images, hand-held images one by one.
 
-Each photograph by hand is searched by itself (:mod:`pkmcal.observe.image_localization`), for
-nothing but the machine joins it to others, and from the places that it could show it is looked at
-more closely (:mod:`pkmcal.calibration.pose_scoring`), the clearest first. A board on the base
-places those that see it beside one that is placed. Those that are sure tell the machine better than
-its drawing, and with that the others are asked, and asked again, until none is added. What stays
-unsure is left out and told, for one photograph in a wrong place spoils the rest; so is one in which
-legs cannot be measured where they should be, or of which the joint estimate gives up most edges: it
-was in a wrong place.
+Each hand-held image is localized by itself (:mod:`pkmcal.observe.image_localization`), for only the
+machine joins it to others, and its candidate poses are scored by the joint estimate
+(:mod:`pkmcal.calibration.pose_scoring`), the clearest image first. A board on the base places the
+images that see it relative to one that is placed. Images with a sure pose determine the machine
+better than the nominal model does, and with their prior the others are scored, again and again,
+until none is added. Images without a sure pose are rejected with a reason, for one at a wrong pose
+spoils the estimate; so are those in which legs cannot be measured where they are predicted, or of
+which the joint estimate rejects most edges: their pose was wrong.
 """
 
 from __future__ import annotations
@@ -43,30 +43,30 @@ from pkmcal.session.load import Session
 from pkmcal.wording import brief, listed
 
 MISPLACED_PROBABILITY = 0.05
-"""Probability that any photograph of a session is believed to be where it is not."""
+"""Probability that any image of a session is placed at a wrong pose."""
 CANDIDATES_SCORED_AGAIN = 4
-"""Places of a photograph that are asked about again, whatever the picture says to a machine that is
-known better: one in a wrong place spoils it."""
+"""Candidate poses of an image that are scored again whatever their likelihood with a better
+machine: one image at a wrong pose spoils that machine."""
 RESCORING_GROWTH = 1.25
-"""By what factor more photographs have told a machine when the others are asked all over again."""
+"""Growth of the number of placed images from which the others are scored anew."""
 EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
 CAMERA_TURNED_REASON = "all photographs together turn its camera by more than ten degrees"
-"""Why one is left out that was found in one place and does not belong there."""
+"""Reasons for the rejection of images that were localized and have a wrong pose."""
 MOST_TURN = SAME_PLACE_TURN / 2
-"""Turn (rad) from where a photograph was placed from which on it does not belong there."""
+"""Turn (rad) of the estimate from the localized pose from which this was wrong."""
 FEWEST_LEGS, FEWEST_EDGES = 4, 4
-"""Legs of a photograph, if the machine has so many, and edges that tell its place. A pose and a
-focal length are seven numbers: each edge tells two, and each leg little more, so of three legs none
-contradicts another that was taken for something else."""
+"""Least number of legs of an image, if the machine has so many, and of edges, by which its pose is
+determined. A pose and a focal length are seven numbers; each edge gives two, and each leg little
+more, so with three legs no leg contradicts a wrong match of another."""
 
 
 @dataclass(frozen=True)
 class Localization:
-    """Where the stations of a session stand, by what their photographs show; nothing raised.
+    """Localization of a session's stations.
 
-    recognition : of the machine in the photographs on tripods, None where none was searched. places
-    : that each photograph by hand could show, by its station's number. result : what is known,
-    without the rejected photographs by hand, or why nothing is.
+    recognition : of the machine in images on tripods, None where none was searched. places : pose
+    hypotheses of each hand-held image, by its station's number. result : the case without rejected
+    hand-held images, or the error for which there is none.
     """
 
     recognition: Recognition | None
@@ -81,10 +81,10 @@ def localize_case(
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
 ) -> Case:
-    """Where all stations stand, as of :func:`localize`.
+    """The case of a session with all stations localized, as of :func:`localize`.
 
-    Raises `InputError`, or `ResultError`, where nothing tells where a station stands that is not by
-    hand, and where no photograph by hand is placed.
+    Raises `InputError`, or `ResultError`, where nothing determines the pose of a station that is
+    not hand-held, and where no hand-held image is placed.
     """
     value = localize(session, photographs, boards, rng, progress).result
     if isinstance(value, PkmcalError):
@@ -99,10 +99,10 @@ def localize(
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
 ) -> Localization:
-    """Where all stations stand; photographs by hand that are not found are rejected, with a reason.
+    """Localize all stations; hand-held images that are not placed are rejected with a reason.
 
     photographs : of all stations that observe legs. progress : called with the step in words and
-    the share done.
+    the share done. Nothing is raised.
     """
     fixed = [p for p in photographs if not session.stations[p.station].handheld]
     search = locate_stations(session, fixed, boards, rng, progress)
@@ -136,12 +136,12 @@ def search_by_hand(
     scene: PriorScene,
     progress: CalibrationProgress | None = None,
 ) -> tuple[dict[int, PoseHypotheses], PriorScene]:
-    """The places that each photograph by hand could show, by its station's number; and what is
-    known with those that are believed, T_camera_base NaN for the others.
+    """Pose hypotheses of each hand-held image, by its station's number; and the scene with those
+    that are accepted, T_camera_base NaN for the others.
 
-    photographs : of all stations that observe legs. scene : by the drawing, T_camera_base of the
-    stations that are placed already, NaN for the others. progress : called with the step in words
-    and the share done.
+    photographs : of all stations that observe legs. scene : of the nominal model, with
+    T_camera_base of the stations that are placed already, NaN for the others. progress : called
+    with the step in words and the share done.
     """
     first = np.zeros(1, dtype=int)  # of a camera on a tripod it stands for all
     at = {p.station: p.select(first) for p in photographs}
@@ -204,7 +204,7 @@ def _untested(
     answers: Mapping[int, _CachedHypotheses],
     T_camera_base: Array,
 ) -> Iterator[Finding]:
-    """Notes on what could not be tested, of the photographs that have no place in the end."""
+    """Notes on hypotheses that could not be tested, for images without a pose in the end."""
     if so_far.failure:
         yield note("image.not_taken_together", why=so_far.failure.rstrip("."))
     for k, answer in answers.items():
@@ -215,10 +215,10 @@ def _untested(
 
 
 class _LocalizationState(NamedTuple):
-    """What is known when a photograph is asked: the scene, the photographs that are placed, and
-    what they show of the room; bare : those in which too few legs can be measured from where they
-    were believed to be. failure : why the last photographs that were believed could not be taken
-    together with the others.
+    """State of the joint localization: the scene, the placed images, and their landmarks.
+
+    bare : images in which too few legs can be measured at their accepted pose. failure : why the
+    last accepted images could not be estimated together with the others.
     """
 
     scene: PriorScene
@@ -230,11 +230,11 @@ class _LocalizationState(NamedTuple):
 
 @dataclass(frozen=True)
 class _CachedHypotheses:
-    """What is known of the places of one photograph.
+    """Pose hypotheses of one image, cached.
 
-    hypotheses : by the search in it alone. places : weighed with all that is known. scores : what
-    was found out of them, None where they were not asked about. by : the machine that was known
-    then, None where it was as drawn; beside : how many photographs had told it.
+    hypotheses : by the search in this image alone. places : by all evidence. scores : by the joint
+    estimate, None where they were not scored. by : marginal prior on the machine with which they
+    were scored, None for the nominal model; beside : number of images in that prior.
     """
 
     hypotheses: PoseHypotheses
@@ -252,7 +252,7 @@ def _with_sure(
     believed: Array,
     boards: Boards,
 ) -> _LocalizationState:
-    """What is known with all photographs that are believed; the same where there are no others."""
+    """The state with all accepted images; unchanged where there are no further ones."""
     scene = so_far.scene
     sure = {k: T for k, T in enumerate(believed) if k in photographs and not np.isnan(T).any()}
     new = {k: T for k, T in sure.items() if k not in scene.edges}
@@ -284,7 +284,7 @@ def _with_sure(
 
 
 def _too_few_edges(scene: PriorScene, photograph: Photographs) -> bool:
-    """Whether too few legs can be measured in a photograph where it is."""
+    """Whether too few legs can be measured in an image at its pose."""
     p, machine = photograph, scene.machine
     T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
@@ -294,7 +294,7 @@ def _too_few_edges(scene: PriorScene, photograph: Photographs) -> bool:
 def _image_hypotheses(
     session: Session, scene: PriorScene, photograph: Photographs
 ) -> PoseHypotheses:
-    """The places of a photograph by the search in it alone."""
+    """Pose hypotheses of an image by the search in it alone."""
     p = photograph
     view = StationView(
         scene.machine, p.camera, p.configuration, session.joints, scene.T_base_platform,
@@ -310,11 +310,11 @@ def _search(
     photograph: Photographs,
     before: _CachedHypotheses,
 ) -> _CachedHypotheses:
-    """The places that a photograph could show, those of before among them, weighed by its legs and
-    by what it shares of the room with those that are placed.
+    """Pose hypotheses of an image, earlier ones among them, by its legs and by the background that
+    it shares with placed images.
 
-    As soon as photographs have told a machine, it is searched again, once, with that: later ones
-    change it by little. Places that were asked with a machine like this one are not asked again.
+    Once images determine the machine, the search is repeated with it, once: later ones change the
+    machine by little. Poses that were scored with nearly the same machine are not scored again.
     """
     p, scene, placed, k = photograph, so_far.scene, so_far.placed, photograph.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
@@ -337,7 +337,7 @@ def _search(
 def _legs(
     session: Session, photograph: Photographs, joined: PriorScene, T_camera_base: Array
 ) -> LegsInCamera:
-    """Leg axes (H, L, 3) of a photograph taken from places (H, 4, 4), or (1, L, 3) from one."""
+    """Leg axes (H, L, 3) of an image from camera poses (H, 4, 4), or (1, L, 3) from one."""
     first = photograph.configuration[:1]
     pose, readings = joined.T_base_platform[first], session.joints[first]
     return legs_in_camera(joined.machine, T_camera_base, pose, readings)
@@ -346,11 +346,11 @@ def _legs(
 def _on_board(
     hypotheses: Mapping[int, PoseHypotheses], boards: Boards
 ) -> dict[int, PoseHypotheses]:
-    """The places of the photographs that see a board on the base, weighed together: where it stands
-    on the base is one unknown, and each of their places tells it.
+    """Pose hypotheses of the images that see a board on the base, by all of them: the board's pose
+    on the base is one unknown, for which each hypothesis of each image is a vote.
 
-    A photograph's place is its own where that agrees with the board, which knows the drawing no
-    better, and the board's where none does.
+    The pose of an image is its own where that agrees with the board, and the board's where none
+    does.
     """
     T_camera_board = {
         k: visible.stood.T_camera_board
@@ -381,8 +381,8 @@ def _on_board(
 
 
 def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
-    """The photographs whose places are believed, by the station's number: of those that were found,
-    of ``count`` by hand, the surest, as many as together leave little doubt.
+    """Numbers of the stations whose hand-held images are accepted: the surest of the localized
+    ones, of ``count`` in all, as many as together have a small probability of error.
     """
     order = sorted(hypotheses, key=lambda k: hypotheses[k].rival_probability)
     together = np.cumsum([hypotheses[k].rival_probability for k in order])
@@ -396,10 +396,10 @@ def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
 def _believed(
     hypotheses: Mapping[int, PoseHypotheses], count: int, boards: Boards, prior_poses: Array
 ) -> Array:
-    """Poses T_camera_base (S, 4, 4) with those of photographs of whose place there is little
-    doubt, and those that a board on the base joins to them; NaN for the others.
+    """Poses T_camera_base (S, 4, 4) with those of accepted images, and those that a board on the
+    base joins to them; NaN for the others.
 
-    count : of all photographs by hand, some of which may not be found yet.
+    count : of all hand-held images, some of which may not be localized yet.
     """
     out = prior_poses.copy()
     for k in _sure(hypotheses, count):
@@ -412,10 +412,9 @@ def _believed(
 def inconsistent_poses(
     session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
 ) -> dict[int, str]:
-    """Why photographs by hand do not belong where they were placed, T_camera_base, by the station's
-    number: the joint estimate finds the camera looking another way, has given up most edges, or has
-    too few edges or legs to tell the place. A board that agrees with the others tells the place of
-    its photograph whatever the edges do.
+    """Reasons why poses T_camera_base of hand-held images are wrong, by the station's number: the
+    joint estimate turns the camera away, rejects most edges, or has too few edges or legs to
+    determine the pose. Images with a board that agrees with the others have their pose from it.
     """
     astray = angle_between(estimate.state.T_camera_base, T_camera_base) > MOST_TURN
     station = measurements.edges.station
@@ -441,8 +440,8 @@ def inconsistent_poses(
 def without_misplaced(
     case: Case, wrong: Mapping[int, str], edges: EdgeSet, estimate: Estimate
 ) -> Case:
-    """What is seen without these stations, each told why, and what is known by an estimate of all.
-    edges : from which it was made.
+    """The case without some stations, each rejected for its reason, and with the scene of an
+    estimate of all. edges : from which the estimate was made.
     """
     state = estimate.state
     mine = {p.station: edges.select(edges.station == p.station) for p in case.photographs}
@@ -454,7 +453,7 @@ def without_misplaced(
 
 
 def why_lost(hypotheses: PoseHypotheses) -> str:
-    """Why a photograph could not be placed, in words."""
+    """Why an image could not be placed, in words."""
     return (
         "its edges fit the legs nearly as well from another place, which with probability"
         f" {brief(hypotheses.rival_probability)} is the right one"
@@ -462,8 +461,9 @@ def why_lost(hypotheses: PoseHypotheses) -> str:
 
 
 def _without(case: Case, lost: Mapping[int, str]) -> Case:
-    """What is seen without the stations that are lost, each rejected for a reason, the others
-    numbered anew; an error where no photograph by hand is left.
+    """The case without ``lost`` stations, each rejected for its reason, the others renumbered.
+
+    Raises `InputError` where no hand-held image is left, or one configuration only.
     """
     session, scene = case.session, case.scene
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]

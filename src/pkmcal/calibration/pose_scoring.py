@@ -1,15 +1,15 @@
-"""Where a photograph by hand was taken from, asked of the joint estimate.
+"""Log-likelihoods of candidate poses of a hand-held image, by the joint estimate.
 
-A search in the picture alone knows the machine by its drawing, whose errors of millimetres are
-pixels: a machine of equal parts then fits nearly as well when it is turned by one of them. Here the
-silhouettes are looked for from each of the places that a photograph could show, and the machine is
-estimated with it there, in turns. What the drawing has wrong is explained by that, and paid for by
-the drawing's tolerances; where photographs that are placed already know the machine, by what they
-know of it. How well the machine, so changed, lies on the picture (the evidence of
-:mod:`pkmcal.observe.pose_likelihood`) less what was paid is the log likelihood of the place.
-Between places from which the machine lies on the same legs, turned onto itself, half an edge counts
-as one measurement, as it does in a station's photographs; against other places half a leg, since
-what chance puts under a leg in a picture full of edges, it puts under all of it.
+The localization of one image uses the nominal machine, whose errors of millimetres are pixels: a
+machine of equal parts then fits nearly as well when it is turned by one of them. Here silhouettes
+are measured from each candidate pose and the machine is estimated with the image at that pose, in
+turns. The estimate takes up errors of the nominal model, at a cost by its prior sigmas; where other
+images are placed already, by their marginal prior on the machine. The log-likelihood of the pose is
+the log-likelihood ratio of the image with the machine so changed
+(:mod:`pkmcal.observe.pose_likelihood`) less that cost. Between poses under which the machine lies
+on the same legs, turned onto itself, half an edge counts as one measurement, as in the images of a
+station; against other poses half a leg, for chance matches in an image full of edges are correlated
+along a leg.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
 
 CANDIDATES_RESCORED, MOST_BEHIND_BEST = 8, 12.0
-"""Most places of a photograph that are asked about, and by how many measurements of the search one
-may be behind the best: what is further behind has odds of one in a hundred thousand."""
+"""Most candidate poses of an image that are evaluated, and by how many measurements of the search
+one may be behind the best: others have odds of one in a hundred thousand."""
 CANDIDATES_REFINED_LOCALLY = 4
-"""Places about which likelier ones are looked for, once others have told the machine."""
+"""Poses about which likelier ones are searched, once other images determine the machine."""
 PASSES_FROM_NOMINAL, PASSES_FROM_PRIOR = 4, 2
-"""Looks at silhouettes, each from the estimate before: the drawing is off by pixels, a machine that
-photographs have told is not."""
+"""Measurement passes of silhouettes, each from the estimate before: the nominal model is off by
+pixels, a machine that images have determined is not."""
 SILHOUETTE_SCATTER = legs.SEARCH_SIGMA
-"""Pixels (of the finest tables) within which silhouettes scatter about the picture's edges: a whole
-leg is found to no less, and what is wrong of the drawing is explained by then. Chance offers legs
-that lie near something; it does not offer legs that lie on it."""
+"""Largest scatter (px of the finest tables) of silhouettes about image edges: a whole leg is
+measured to no less, and errors of the nominal model are taken up by then. By chance legs are near
+edges, but not on them."""
 
 ViewOf = Callable[[int, PriorScene], StationView]
-"""The view of a station's one photograph with what is known."""
+"""The view of a station's one image under a scene."""
 
 
 def register_images(
@@ -75,12 +75,11 @@ def register_images(
     places: Mapping[int, Array],
     boards: Boards,
 ) -> PriorScene:
-    """What is known together with photographs at places T_camera_base (4, 4): those that were
-    placed before are looked at again as well, for what the machine was taken for then, their edges
-    were taken for.
+    """The scene with images registered at poses T_camera_base (4, 4).
 
-    photographs : by station. boards : what they show of a board. Raises a `PkmcalError` where there
-    is nothing to be estimated.
+    Images that were placed before are measured again, for their edges depend on the machine by
+    which they were predicted. photographs : by station. boards : seen in them. Raises a
+    `PkmcalError` where there is no estimate.
     """
 
     def view(k: int, scene: PriorScene) -> StationView:
@@ -108,13 +107,12 @@ def register_images(
 def evaluate_pose(
     session: Session, scene: PriorScene, station: int, T_camera_base: Array, view: StationView
 ) -> tuple[PriorScene, float]:
-    """What one photograph would make of what is known, if it were taken from a place (4, 4); and
-    what is paid for that, half the squares by which the machine and the readings are moved.
+    """The scene with one image at a candidate pose (4, 4), and the cost of that: half the squares
+    of the changes of machine and readings, in prior sigmas.
 
-    Those that are placed say what they know of the machine once and for all, so a question costs
-    the same however many they are. Boards are left out: what a place is asked is how the legs look
-    from there. view : of the photograph. Raises a `PkmcalError` where too few legs are where they
-    should be.
+    Placed images enter by their marginal prior on the machine, so the time does not depend on their
+    number. Boards are left out: the legs alone decide on the pose. view : of the image. Raises a
+    `PkmcalError` where too few legs are near their prediction.
     """
 
     def changed(_: int, now: PriorScene) -> StationView:
@@ -130,7 +128,7 @@ def evaluate_pose(
 
 
 class _Pass(NamedTuple):
-    """What is known after a look, and the estimate that says so."""
+    """The scene after a measurement pass, and its estimate."""
 
     scene: PriorScene
     measurements: Measurements
@@ -144,8 +142,8 @@ def _measurement_pass(
     boards: Boards,
     view: ViewOf,
 ) -> _Pass:
-    """What is known once photographs were looked at from places, and nothing of others but what
-    they told of the machine.
+    """One measurement pass and estimate of images at poses; other images enter by their marginal
+    prior only.
     """
     stations = sorted(places)
 
@@ -170,9 +168,8 @@ def _measurement_pass(
 
 
 class ScoredPoses(NamedTuple):
-    """What is known of places (n, 4, 4) of one photograph: the evidence (n,) that it shows the
-    machine from there, and what was paid (n,) for the machine. failures : why further places could
-    not be tested.
+    """Candidate poses (n, 4, 4) of one image with log-likelihood ratios (n,) and costs (n,) of the
+    machine's changes. failures : why further poses could not be tested.
     """
 
     T_camera_base: Array
@@ -193,11 +190,11 @@ def rescore_poses(
     others: Array,
     scores: ScoredPoses | None = None,
 ) -> tuple[PoseHypotheses, ScoredPoses]:
-    """The places of one photograph, weighed with what is known of the machine, the likeliest first;
-    evidence is then a log likelihood against chance. And what was found out for that.
+    """Pose hypotheses of one image by the joint estimate, the likeliest first, with log-likelihood
+    ratios in nats; and the scored poses.
 
-    others : (n, 4, 4) places that are asked about beside those found in the picture. scores : what
-    was found out already with the same machine; nothing is asked about one of its places again.
+    others : (n, 4, 4) candidates besides those by the search in the image. scores : of an earlier
+    call with the same machine, whose poses are not evaluated again.
     """
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
@@ -245,7 +242,7 @@ def rescore_poses(
 
 
 def _weighed(view: StationView, scores: ScoredPoses, unit: float) -> PoseHypotheses:
-    """Places by what was found out of them, the likeliest first."""
+    """Pose hypotheses by their scores, the likeliest first."""
     at, log_likelihood_ratio, paid, _ = scores
     edge = correlation_length(view, at[np.argmax(log_likelihood_ratio)])
     by_edges, by_legs = log_likelihood_ratio / edge - paid, log_likelihood_ratio / unit - paid

@@ -1,16 +1,15 @@
-"""The machine in one photograph alone, of which nothing is known: the places that it could show.
+"""Localization of one image alone, without a prior: hypotheses of its camera pose.
 
-Places all round the machine, at distances from which it fills the picture or a third of it, turns
-about the line of sight and places in the picture are tried, by the middles of the tubes on a chart
-of what could be tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as those of a
-station do (:mod:`pkmcal.observe.pose_likelihood`), on tables that tell three times as many
-directions apart; the best of these again on twice and four times as fine a picture, where texture
-yields far less evidence and the machine more.
+Positions all round the machine, at distances from which it fills the image or a third of it, turns
+about the line of sight and shifts in the image are enumerated, and scored by the middles of the
+tubes on a chart of tube-like pairs of edges (:mod:`pkmcal.observe.tubes`). The best few thousand
+are refined as those of a station (:mod:`pkmcal.observe.pose_likelihood`), on tables with three
+times as many directions; the best of these again at two and four times the resolution, where
+texture has far less likelihood and the machine more.
 
-How surely the best is the machine, the second best tells: what is not the machine in a picture full
-of edges is rarely alone, and a machine of equal parts looks much the same from several sides. What
-the drawing has wrong moves all edges of a leg together, so each half of a leg counts as one
-measurement of that comparison.
+The second best shows how sure the best is: in an image full of edges a wrong match is rarely alone,
+and a machine of equal parts looks much the same from several sides. Errors of the nominal model are
+correlated along a leg, so each half of a leg counts as one measurement of that comparison.
 """
 
 from __future__ import annotations
@@ -38,49 +37,48 @@ from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.tubes import MAP_CELL_SIZE, PAIR_DIRECTIONS, TubeChart, tube_chart
 
 PICTURE_SHARES_FILLED = (0.3, 1.5)
-"""Share of the picture that the machine fills: from a third, to where its ends lie outside."""
+"""Share of the image that the machine fills: from a third, to where its ends are outside."""
 WIDEST_HALF_ANGLE = 1.2
-"""Half the angle (rad) under which it is seen at most."""
+"""Largest half angle (rad) that the machine subtends."""
 NEXT_DISTANCE_FACTOR = 1.18
 """Factor from one distance to the next: half of that moves a leg's end by half its width."""
 CHART_SHARE_OFF_MIDDLE = 0.2
-"""Share of the chart's size by which the machine may lie off its middle, to each side."""
+"""Largest offset of the machine from the chart's middle, to each side, as a share of its size."""
 CHART_STRIDE_CELLS = 2
-"""Cells of the chart from one place in the picture to the next."""
+"""Cells of the chart from one shift in the image to the next."""
 PICTURE_PLACES_A_TURN = 2
-"""Places in the picture that are kept for each place and turn of the camera."""
+"""Shifts in the image that are retained for each position and turn of the camera."""
 HYPOTHESES_THAT_DESCEND = 2000
-"""Hypotheses that descend: in a cluttered laboratory the machine's is among the first thousand."""
+"""Hypotheses that are refined: in a cluttered laboratory the right one is among the first 1000."""
 HYPOTHESES_ON_COARSE, HYPOTHESES_ON_FINER = 400, 120
-"""How many go on after the first descents, and to the finer picture."""
+"""Hypotheses that go on after the first refinements, and to the finer image."""
 MANY_DIRECTIONS = 24
-"""Directions of the tables: each takes its neighbours in, so edges within 11 degrees count."""
+"""Directions of the tables: each includes its neighbours, so edges within 11 degrees count."""
 FINEST_TABLES = 4 * WORKING_WIDTH, MANY_DIRECTIONS
-"""Width (px) and directions of the tables on which places are weighed."""
+"""Width (px) and directions of the tables on which pose hypotheses are compared."""
 HYPOTHESES_ON_FINEST = 40
-"""How many go on to the finest picture, and beside them the look-alikes of the first two."""
+"""Hypotheses that go on to the finest image, besides the symmetric poses of the first two."""
 SAME_PLACE_TURN = np.radians(20.0)
-"""Turn within which two places are one: look-alikes are turned by 60 degrees at least."""
+"""Turn within which two poses are one: symmetric poses differ by 60 degrees at least."""
 MACHINE_FOLDS = (2, 3, 4, 6)
 """Equal parts that a machine may have."""
 JOINT_ON_JOINT_DISTANCE = 0.2
-"""Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
-equal that they could be exchanged, and yet from a photograph they could."""
+"""Distance, in radii of the base, within which joints coincide under a turn: parts of a machine are
+never equal, but nearly enough to be exchanged in an image."""
 NEAR_ROUNDS, NEAR_STARTS, NEAR_THAT_GO_ON = 3, 32, 8
-"""How often, and from how many places at once, the likeliest place near one is looked for; how many
-of these are settled closely."""
+"""Rounds, starts in each, and retained starts of the search for the likeliest pose near another."""
 NEAR_TURN, NEAR_SHIFT = np.radians(5.0), np.array([0.005, 0.005, 0.03])
-"""How far these are turned about the machine (rad), and shifted, in the camera's distance: legs
-move by their own width then, by which the search that found the place may be off."""
+"""Spread of the starts: turns about the machine (rad), and shifts in units of the camera's
+distance. Legs move by their own width then, by which the first search may be off."""
 PLACES_IN_A_BATCH = 214
-"""Places that are looked up together: some ten megabytes."""
+"""Positions that are evaluated together: some ten megabytes."""
 
 
 class PoseHypotheses(NamedTuple):
-    """Places that a photograph could show, the one with the most evidence first.
+    """Hypotheses of an image's camera pose, the likeliest first.
 
-    T_camera_base : (H, 4, 4), none near the first. log_likelihood_ratio : (H,) as
-    :mod:`pkmcal.observe.pose_likelihood` has it. unit : evidence that counts as one measurement.
+    T_camera_base : (H, 4, 4), none near the first. log_likelihood_ratio : (H,) as of
+    :mod:`pkmcal.observe.pose_likelihood`. unit : log-likelihood that counts as one measurement.
     """
 
     T_camera_base: Array
@@ -89,7 +87,7 @@ class PoseHypotheses(NamedTuple):
 
     @property
     def rival_probability(self) -> float:
-        """Probability that the second is the machine's place and not the first."""
+        """Posterior probability of the second pose against the first."""
         second = float(self.log_likelihood_ratio[1]) if len(self.log_likelihood_ratio) > 1 else 0.0
         return 1 / (
             1 + float(np.exp(min((self.log_likelihood_ratio[0] - second) / self.unit, 500.0)))
@@ -97,7 +95,7 @@ class PoseHypotheses(NamedTuple):
 
 
 def localize_image(view: StationView, image: Integers) -> PoseHypotheses:
-    """The likeliest places of the camera of one photograph; view : of it alone."""
+    """Pose hypotheses of one image without a prior; view : of this image alone."""
     one = np.zeros(1, dtype=int)
     coarse = replace(view, tables=distance_tables([image], WORKING_WIDTH, MANY_DIRECTIONS))
     fine = replace(view, tables=distance_tables([image], 2 * WORKING_WIDTH, MANY_DIRECTIONS))
@@ -115,7 +113,7 @@ def localize_image(view: StationView, image: Integers) -> PoseHypotheses:
 
 
 def weighed_places(view: StationView, image: Integers, values: Array) -> PoseHypotheses:
-    """Places (H, 4, 4) settled on the finest tables, those that are not the same place."""
+    """Distinct poses out of (H, 4, 4), refined on the finest tables."""
     one = np.zeros(1, dtype=int)
     view = replace(view, tables=distance_tables([image], *FINEST_TABLES))
     values, log_likelihood_ratio = refine_ml(view, values, one, 16, 6)
@@ -130,7 +128,7 @@ def weighed_places(view: StationView, image: Integers, values: Array) -> PoseHyp
 
 
 def distinct(view: StationView, values: Array) -> Integers:
-    """Of places (H, 4, 4), best first, those that are not the same place as a better one."""
+    """Indices of poses (H, 4, 4), best first, that are not the same pose as a better one."""
     retained_rows = np.array(distinct_silhouettes(view, values, np.zeros(1, dtype=int)))
     # near the first lies the same place, less well settled
     return retained_rows[
@@ -141,16 +139,16 @@ def distinct(view: StationView, values: Array) -> Integers:
 def finest_view(
     machine: Machine, photograph: Photographs, joints: Array, poses: Array
 ) -> StationView:
-    """What places of one photograph are weighed on; joints, poses : of all configurations."""
+    """The view with the finest tables of one image; joints, poses : of all configurations."""
     tables = distance_tables([photograph.images[0]], *FINEST_TABLES)
     return StationView(machine, photograph.camera, photograph.configuration, joints, poses, tables)
 
 
 def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tuple[Array, float]:
-    """The place with the most evidence near one (4, 4), and its evidence: where a drawing has put
-    the camera, it may hold on to the wrong side of some legs.
+    """The likeliest pose near one (4, 4), and its log-likelihood ratio: a pose by the nominal model
+    may match the wrong side of some legs.
 
-    scatter : as :func:`refine_ml` takes it.
+    scatter : largest scatter of edges, reduced px, as in :func:`refine_ml`.
     """
     rng, one = np.random.default_rng(0), np.zeros(1, dtype=int)
     ends = view.machine.ends_at(view.joints, view.poses)
@@ -172,7 +170,7 @@ def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tup
 
 
 def _unit(view: StationView, values: Array) -> float:
-    """Reduced pixels of silhouette that count as one measurement: half a leg's."""
+    """Reduced pixels of silhouette that count as one measurement: those of half a leg."""
     edges = edge_points(
         view.machine, view.camera, legs_in_camera(view.machine, values[0], view.poses, view.joints),
         view.tubes, 2,
@@ -190,10 +188,10 @@ def _most(view: StationView, values: Array, samples: int, count: int) -> Array:
 
 
 class _Tubes(NamedTuple):
-    """Tubes of the machine in the photograph's configuration, T of them, base frame.
+    """T tubes of the machine in the image's configuration, base frame.
 
-    ends : (T, 3, 3) first, middle and last point that can be seen. radius : (T,). centre : (3,) of
-    all. size : m, from there to the furthest.
+    ends : (T, 3, 3) first, middle and last visible point. radius : (T,). centre : (3,) of all.
+    size : m, from the centre to the furthest point.
     """
 
     ends: Array
@@ -265,8 +263,8 @@ def _tubes(view: StationView) -> _Tubes:
 
 
 def _windows(surprisal: Integers, steps: Sequence[Integers]) -> Integers:
-    """The maps so that [width, direction, y, x] is a whole window of shifts, (Sy, Sx); y, x count
-    from the chart's corner less what :func:`_border` says.
+    """A view of the maps in which [width, direction, y, x] is a window of shifts, (Sy, Sx); y, x
+    count from the corner of the padded chart.
     """
     border = _border(surprisal)
     padded = np.pad(surprisal, ((0, 0), (0, 0), (border, border), (border, border)))
@@ -286,15 +284,16 @@ def _windows(surprisal: Integers, steps: Sequence[Integers]) -> Integers:
 
 
 def _border(surprisal: Integers) -> int:
-    """Cells put about the maps, on which nothing is a tube."""
+    """Cells of padding about the maps, without tubes."""
     return max(surprisal.shape[2:])
 
 
 def _scores(
     visibility: Array, radius: Array, turn: float, chart: TubeChart, windows: Integers
 ) -> Array:
-    """Mean worth (P, shifts) of the tubes' middles; visibility : (P, T, 3, 3) first, middle and
-    last points from each place. Long tubes count more.
+    """Mean surprisal (P, shifts) of the tubes' middles, weighted by the tubes' lengths.
+
+    visibility : (P, T, 3, 3) first, middle and last points from each position, camera frame.
     """
     beside = np.hypot(visibility[..., 0], visibility[..., 1])
     angle = np.arctan2(beside, visibility[..., 2])
@@ -321,8 +320,8 @@ def _scores(
 
 
 def symmetric_poses(view: StationView, values: Array) -> Array:
-    """Places (H, 4, 4) with the machine turned about its own axis onto itself, all such turns of
-    each: a machine of equal parts looks much the same from there.
+    """Poses (H, 4, 4) of the machine turned about its own axis onto itself, all such turns of each
+    pose: a machine of equal parts looks much the same.
     """
     machine = view.machine
     base = machine.base_centers()

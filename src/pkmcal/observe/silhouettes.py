@@ -1,11 +1,10 @@
-"""Edges of a whole machine in one photograph, coarse: where its silhouettes lie on picture edges.
+"""Coarse edges of a whole machine in one image, by distances of its silhouettes from image edges.
 
-A place was compared with others by how well the machine's silhouettes lie on the edges of the
-picture (:mod:`pkmcal.observe.pose_likelihood`). The same distances, each counted by the probability
-that it is the machine's own edge and not what chance has put there, say where the silhouettes
-should have been: an edge a tube's side, to a pixel. In a cluttered picture of polished legs that is
-three times as many edges as can be measured one by one, and enough to tell the machine together
-with the places.
+The log-likelihood of a pose (:mod:`pkmcal.observe.pose_likelihood`) uses distances of predicted
+silhouettes from image edges. The same distances, weighted by the posterior probability that the
+edge is the machine's and not a chance match, give a measured edge for each side of a tube, to a
+pixel. In a cluttered image of polished legs these are three times as many edges as can be measured
+one by one, enough to determine the machine together with the camera poses.
 """
 
 from __future__ import annotations
@@ -21,20 +20,21 @@ from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed
 from pkmcal.observe.profiles import edge_set, fit_edges
 
 SILHOUETTE_SAMPLES = 40
-"""Places along an edge at which the picture is asked."""
+"""Points along an edge at which distances are looked up."""
 LEAST_OWN = 0.05
-"""Probability of being the machine's from which a place counts: those that hardly are weigh little,
-and leaving out more of them makes edges come and go from look to look."""
+"""Least posterior probability of a point that is used: less likely ones have little weight, and
+with a higher limit edges come and go between measurement passes."""
 WIDEST_SCATTER = 2.0
-"""Reduced pixels within which silhouettes scatter about the picture's edges at most, where the
-machine is known to a few pixels."""
+"""Largest scatter (reduced px) of silhouettes about image edges, where the machine is predicted to
+a few pixels."""
 
 
 def silhouette_edges(
     view: StationView, T_camera_base: Array, station: int, refine_camera: bool = False
 ) -> StationEdges:
-    """Edges of one photograph, taken from near a place (4, 4). view : of it alone. refine_camera :
-    also how the edges depend on the camera's parameters.
+    """Edges of one image near a camera pose (4, 4).
+
+    view : of this image alone. refine_camera : with derivatives by the camera's parameters.
     """
     tubes = view.tubes
     linearization = linearize_distances(
