@@ -1,10 +1,10 @@
-"""Picture edges of one station's photographs, ready to be looked up: how far is the nearest?
+"""Distance transforms of the image edges of one station, by edge direction.
 
-Photographs are reduced, picture edges found, and for each of a few directions the distance to
-the nearest edge of about that direction is tabulated, as soon as one is asked for. A predicted
-silhouette then scores by the distances under its points, smooth enough to be descended from a
-hundred pixels away. Where a station took several photographs, edges that never move are left out:
-the floor and the wall do not say where the machine is.
+Images are reduced, edges are detected, and for each of a few directions the distance to the nearest
+edge of about that direction is tabulated on first use. The distances under the points of a
+predicted silhouette are its residuals, smooth enough for refinement from a hundred pixels away.
+Where a station has several images, edges that never move are dropped: floor and wall hold no
+information on the machine.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.observe.grey_levels import MOST_ROWS_INTERPOLATED, interpolated
 
 EDGE_DIRECTIONS = 8
-"""Edge directions told apart; each table takes the neighbouring directions in as well."""
+"""Number of edge directions; each table includes the neighbouring directions."""
 WORKING_WIDTH = 256
-"""Width in pixels that photographs are reduced to: fine enough for a leg's two edges to stay
-apart, coarse enough to search quickly."""
+"""Width (px) to which images are reduced: fine enough for the two edges of a leg to stay separate,
+coarse enough for a quick search."""
 STILL_LEVEL_DIFFERENCE = 5.0
-"""Levels from the station's median photograph within which a place counts as still."""
+"""Levels from the station's median image within which a pixel is still."""
 ENOUGH_TO_COMPARE = 4
-"""Photographs from which a median is a picture of the background."""
+"""Images from which their median is an image of the background."""
 CANNY_SLOPES = (20, 40)
-"""Sobel slopes from which an edge goes on and begins: five times what the noise of a level, that a
-reduced photograph has at most, makes of it; from half of that to the double, little changes."""
+"""Hysteresis thresholds of Canny's detector, Sobel slopes: five times the effect of noise of one
+level, the most in a reduced image; results hardly change from half to twice that."""
 FURTHEST_EDGE_DISTANCE = 32.0
-"""Reduced pixels beyond which distances are not told apart."""
+"""Largest distance (reduced px) that is resolved."""
 NO_EDGE_DISTANCE = 1e3
-"""Reduced pixels where a photograph has no edge of a direction."""
+"""Distance (reduced px) in an image without an edge of a direction."""
 CHANCE_DISTANCE_BIN = 0.5
-"""Reduced pixels of a bin of the distances that chance gives."""
+"""Bin width (reduced px) of the histogram of distances by chance."""
 
 
 class PictureEdges(NamedTuple):
-    """Edge points of one reduced photograph: pixel (n, 2), reduced px, and unit normal (n, 2)."""
+    """Edge points of one reduced image: pixel (n, 2), reduced px, and unit normal (n, 2)."""
 
     pixel: Array
     normal: Array
@@ -48,14 +48,14 @@ class PictureEdges(NamedTuple):
 
 @dataclass(frozen=True)
 class DirectionTables:
-    """The tables of photographs. What belongs to a direction is worked out when an edge of that
-    direction is first looked for: the silhouettes of most machines have half of them.
+    """Distance tables of images, computed for each direction on first use: the silhouettes of most
+    machines have half of the directions.
 
-    place, number : of each photograph's edge points, their pixels (n,), counted row after row, and
-    direction numbers (n,). picture : (rows, h, columns, EDGE_DIRECTIONS, w), in which the n-th
-    photograph's tables lie in row n % rows and column n // rows. chance : (EDGE_DIRECTIONS, bins)
-    of CHANCE_DISTANCE_BIN: how often a place taken anywhere has that distance. ready :
-    (EDGE_DIRECTIONS,) whether both are worked out.
+    place, number : of each image's edge points, their pixels (n,), counted row after row, and
+    direction numbers (n,). picture : (rows, h, columns, EDGE_DIRECTIONS, w), with the tables of the
+    n-th image in row n % rows and column n // rows. chance : (EDGE_DIRECTIONS, bins), density of
+    the distance of a random pixel, bins of CHANCE_DISTANCE_BIN. ready : (EDGE_DIRECTIONS,) whether
+    both are computed.
     """
 
     place: tuple[Integers, ...]
@@ -68,7 +68,7 @@ class DirectionTables:
     def of_edges(
         cls, place: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
     ) -> DirectionTables:
-        """Those of edge points, none ready. shape : EDGE_DIRECTIONS, h, w."""
+        """Tables of edge points, none computed yet. shape : EDGE_DIRECTIONS, h, w."""
         directions, height, width = shape
         rows = min(len(place), MOST_ROWS_INTERPOLATED // height)
         columns = -(-len(place) // rows)
@@ -79,7 +79,7 @@ class DirectionTables:
         return cls(tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool))
 
     def get_ready(self, direction: Integers) -> None:
-        """Work out what there is not yet of directions (...)."""
+        """Compute the tables of directions (...) that are missing."""
         if self.ready.take(direction).all():
             return
         missing = [k for k in np.unique(direction) if not self.ready[k]]
@@ -99,7 +99,7 @@ class DirectionTables:
         self.ready[direction] = True  # at last, as others may look beside
 
     def mirrored(self) -> DirectionTables:
-        """With left and right exchanged, none ready."""
+        """The tables of the mirrored images, none computed yet."""
         _, height, _, directions, width = self.picture.shape
         place = [p + width - 1 - 2 * (p % width) for p in self.place]
         # the direction a becomes pi - a
@@ -109,13 +109,12 @@ class DirectionTables:
 
 @dataclass(frozen=True)
 class DistanceTables:
-    """Distances in reduced pixels and the reduction factor.
+    """Distances in reduced pixels, with the reduction factor ``scale``.
 
-    row : (K,) each photograph's number in the tables. edges : of each photograph.
-    moving : (h, w) share of the photographs in which each place differs from the others; where a
-    single one cannot tell, where it has edges. against : (n, h, w) of each in the tables, 1 where a
-    place is brighter than in the median photograph, -1 darker, 0 much the same, or where there is
-    no median.
+    row : (K,) each image's number in the tables. edges : of each image. moving : (h, w) share of
+    the images in which each pixel differs from the others; of a single image, where it has edges.
+    against : (n, h, w) of each image in the tables, 1 where a pixel is brighter than in the median
+    image, -1 where darker, 0 where nearly equal, or without a median.
     """
 
     tables: DirectionTables
@@ -126,16 +125,16 @@ class DistanceTables:
     against: Integers
 
     def direction(self, normal: Array) -> Integers:
-        """Direction number of edges whose image normals are (..., 2)."""
+        """Direction numbers of edges with image normals (..., 2)."""
         return direction_of(normal, len(self.tables.ready))
 
     def look_up(
         self, direction: Integers, pixel: Array, photograph: Integers, between: bool = False
     ) -> tuple[Array, Booleans]:
-        """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
+        """Distances (reduced px) at full-size pixels (..., 2), and which are in the image.
 
-        direction, photograph : (...) table numbers. between : bilinear between table entries, else
-        the nearest.
+        direction, photograph : (...) table numbers. between : bilinear interpolation, else the
+        nearest entry.
         """
         import cv2
 
@@ -146,8 +145,8 @@ class DistanceTables:
     def look_along(
         self, direction: Integers, pixel: Array, outward: Array, photograph: Integers
     ) -> tuple[Array, Array, Booleans]:
-        """As :meth:`look`, bilinear between table entries; with it how much the distance grows a
-        pixel along unit vectors (..., 2), from the entries a reduced pixel to both sides.
+        """Distances as of :meth:`look_up`, bilinear; their derivatives along unit vectors (..., 2),
+        by central differences over two reduced pixels; and which pixels are in the image.
         """
         import cv2
 
@@ -159,8 +158,8 @@ class DistanceTables:
         return here, np.clip((ahead - behind) / 2, -1, 1) / np.float32(self.scale), inside
 
     def brighter(self, pixel: Array, photograph: Integers) -> tuple[Integers, Booleans]:
-        """Whether places at full-size pixels (..., 2) are brighter (1) or darker (-1) than in the
-        median photograph, 0 outside, and which lie in the photograph.
+        """Whether full-size pixels (..., 2) are brighter (1) or darker (-1) than in the median
+        image, 0 outside, and which are in the image.
         """
         height, width = self.against.shape[1:]
         x, y = ((pixel[..., i] + 0.5) / self.scale for i in (0, 1))
@@ -172,7 +171,7 @@ class DistanceTables:
     def _place(
         self, direction: Integers, pixel: Array, photograph: Integers
     ) -> tuple[Array, Array, Booleans]:
-        """Column and row (...) in the picture of all tables, and whether in the photograph."""
+        """Column and row (...) in the array of all tables, and which pixels are in the image."""
         self.tables.get_ready(direction)
         rows, height, _, count, width = self.tables.picture.shape
         x, y = ((pixel[..., i] + 0.5) / self.scale - 0.5 for i in (0, 1))
@@ -186,24 +185,24 @@ class DistanceTables:
         return x, y, inside
 
     def _interpolated(self, x: Array, y: Array, how: int) -> Array:
-        """The picture of all tables at columns and rows (...)."""
+        """Values of the array of all tables at columns and rows (...)."""
         tables = self.tables.picture
         return interpolated(tables.reshape(tables.shape[0] * tables.shape[1], -1), x, y, how)
 
     def by_chance(self, direction: Integers, values: Array) -> Array:
-        """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
+        """Density (per reduced pixel) of distances (...) of a random pixel."""
         self.tables.get_ready(direction)
         bins = self.tables.chance.shape[1]
         number = np.minimum(values / np.float32(CHANCE_DISTANCE_BIN), bins - 1).astype(np.int32)
         return self.tables.chance.take(direction * bins + number)
 
     def select(self, photographs: Integers) -> DistanceTables:
-        """Of some of the photographs; what moves and what chance gives, as all show it."""
+        """Tables of some images; ``moving`` and the densities by chance are those of all."""
         edges = tuple(self.edges[k] for k in photographs)
         return replace(self, row=self.row[photographs], edges=edges)
 
     def mirrored(self) -> DistanceTables:
-        """Of the photographs with left and right exchanged."""
+        """Tables of the mirrored images."""
         width = self.moving.shape[1]
         edges = (
             PictureEdges(e.pixel * (-1, 1) + (width - 1, 0), e.normal * (-1, 1)) for e in self.edges
@@ -219,24 +218,21 @@ class DistanceTables:
 
 
 def direction_of(normal: Array, count: int = EDGE_DIRECTIONS) -> Integers:
-    """Direction number, of ``count``, of edges whose image normals are (..., 2); the sign does not
-    matter.
-    """
+    """Direction numbers, of ``count``, of edges with image normals (..., 2) of either sign."""
     turn = np.arctan2(normal[..., 1], normal[..., 0]) * (count / np.pi)
     with np.errstate(invalid="ignore"):  # what is no number has any
         return np.floor(turn).astype(np.int32) % count
 
 
 def bin_neighbours(direction: int, count: int) -> Booleans:
-    """Which direction numbers, of ``count``, a direction's table takes in: its own and the
-    neighbours'.
+    """Mask (count,) of the direction numbers in a direction's table: its own and both neighbours.
     """
     return (np.arange(count) - (direction - 1)) % count < 3
 
 
 def write_distances(place: Integers, out: Array) -> None:
-    """Distance (h, w) of every pixel to the nearest of some, (n,), counted row after row; written
-    into ``out``, in single precision and each row in one piece.
+    """Distance transform (h, w) of some pixels (n,), counted row after row, written into ``out``,
+    in single precision with contiguous rows.
     """
     import cv2
 
@@ -254,8 +250,8 @@ def distance_tables(
     width: int = WORKING_WIDTH,
     directions: int = EDGE_DIRECTIONS,
 ) -> DistanceTables:
-    """Tables of one station's photographs, K arrays (height, width) uint8 of one size, which are
-    looked at on threads.
+    """Tables of one station's images, K arrays (height, width) uint8 of one size; computed on
+    threads.
     """
     import cv2
 
@@ -284,7 +280,7 @@ def distance_tables(
 
 
 def _against_median(small: Integers) -> Integers:
-    """Where photographs (K, h, w) are brighter (1) or darker (-1) than the median of all."""
+    """Where images (K, h, w) are brighter (1) or darker (-1) than the median of all."""
     # neighbours exchanged until all are in order: over pictures, thirty times as fast as sorting
     # the levels of one place after the other
     order = small.copy()
@@ -301,8 +297,8 @@ def _against_median(small: Integers) -> Integers:
 
 
 def _moving(small: Integers, edges: PictureEdges) -> Array:
-    """Share (h, w) of photographs too few for a median in which each place differs from the others;
-    of one alone, where it has edges.
+    """Moving pixels (h, w) of images too few for a median: where they differ; of one image, where
+    it has edges.
     """
     if len(small) > 1:
         return (np.ptp(small.astype(float), axis=0) > STILL_LEVEL_DIFFERENCE).astype(float)
@@ -313,8 +309,8 @@ def _moving(small: Integers, edges: PictureEdges) -> Array:
 
 
 def _counted(tables: Array) -> Integers:
-    """How often each distance occurs in tables (n, h, w), (bins,); at every other place of every
-    other row: from fewer, what chance gives would differ between explanations of one picture.
+    """Histogram (bins,) of the distances in tables (n, h, w), at every other pixel of every other
+    row: with fewer, the density by chance would differ between hypotheses of one image.
     """
     bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
     number = tables[:, ::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN)
@@ -323,14 +319,14 @@ def _counted(tables: Array) -> Integers:
 
 
 def _levels(image: Any) -> Integers:
-    """Grey levels (h, w) whose noise is even: a sensor's grows with the root of the light. So a
-    dark machine before a dark wall stands out as a bright one does in the sun.
+    """Square-root grey levels (h, w), which have uniform noise: a sensor's grows with the root of
+    the light. So a dark machine before a dark wall has as clear edges as a bright one in the sun.
     """
     return np.rint(np.sqrt(255.0 * image.astype(np.float32))).astype(np.uint8)
 
 
 def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
-    """Edge points of one reduced photograph, where it differs from the others (h, w)."""
+    """Edge points of one reduced image, where it differs from the others (h, w)."""
     import cv2
 
     dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)

@@ -1,8 +1,7 @@
-"""Grey levels of a photograph, or the light that they code, at places between its pixels; and what
-any picture has at places.
+"""Interpolation of images: grey levels, or light, at points between pixels.
 
-Of a photograph only the part that the places lie in is worked on: a machine fills a quarter of it,
-and what is worked out of a whole one does not stay in the processor's cache.
+Only the part of an image that contains the points is processed: a machine fills a quarter of it,
+and intermediate arrays of a whole image do not stay in the processor's cache.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ from pkmcal.arrays import Array
 from pkmcal.cameras.response import Response, light_in
 
 INTERPOLATION_MARGIN = 2
-"""Pixels about a place whose levels an interpolation takes."""
+"""Pixels about a point that an interpolation uses."""
 MOST_ROWS_INTERPOLATED = 32_000
-"""Rows, or columns, of a picture that cv2.remap takes, and of the places in it: a little fewer than
+"""Most rows, or columns, of an array for cv2.remap, and of the points in it: a little fewer than
 2**15."""
 PLACES_A_ROW = 512
-"""Places that it is given in a row: of shorter rows it takes half as much time again."""
+"""Points in a row for cv2.remap: with shorter rows it takes half as much time again."""
 PLACES_IN_ONE_ROW = 2**14
-"""Places up to which all are one row: rows are shared out among threads, and to wake these costs
-more than so few places take."""
+"""Number of points up to which all are one row: rows are distributed over threads, and waking these
+takes longer than so few points."""
 BLUR_KERNEL_END = 4.0
 """Standard deviations of a blur at which its kernel ends."""
 
@@ -37,11 +36,11 @@ def levels_at(
     blur: float = 0.0,
     response: Response = "linear",
 ) -> Array:
-    """Light (...) in a photograph (height, width) at columns and rows (...), interpolated.
+    """Light (...) in an image (height, width) at columns and rows (...), interpolated.
 
-    blur : standard deviation (px) of a Gaussian that goes over the light first. response : how the
-    levels code it; linear leaves them as they are. Places outside have the light of its border,
-    places that are no numbers any light.
+    blur : standard deviation (px) of a Gaussian by which the light is smoothed first. response :
+    curve from light to grey levels; linear leaves them unchanged. Points outside have the light of
+    the border, points with NaN any light.
     """
     import cv2
 
@@ -62,11 +61,11 @@ def levels_at(
 
 
 def interpolated(picture: Any, x: Array, y: Array, how: int) -> Array:
-    """What a picture (height, width) has at columns and rows (...), of the nearest pixel or between
-    pixels as cv2 interpolates; that of its border outside.
+    """Values of an array (height, width) at columns and rows (...), interpolated by cv2 in the way
+    ``how``; those of the border outside.
 
-    Neither side of the picture is longer than MOST_ROWS_INTERPOLATED; places are no more than so
-    many rows of PLACES_A_ROW, 16 million.
+    Neither side of the array is longer than MOST_ROWS_INTERPOLATED; points are at most so many rows
+    of PLACES_A_ROW, 16 million.
     """
     import cv2
 
@@ -82,8 +81,8 @@ def interpolated(picture: Any, x: Array, y: Array, how: int) -> Array:
 
 
 def _spanned(places: Array, around: int, size: int) -> tuple[Array, slice]:
-    """Places (...) in single precision, 0 where they are no numbers, and the pixels, of so many in
-    a row, in which they lie, with so many to both sides.
+    """Points (...) in single precision, 0 where NaN, and the slice of ``size`` pixels that contains
+    them, with a margin of ``around`` to both sides.
     """
     places = places.astype(np.float32, copy=False)
     low, high = places.min(), places.max()

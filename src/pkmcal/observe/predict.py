@@ -1,8 +1,7 @@
-"""Where the edges of every leg should lie in every photograph, from what is known so far.
+"""Predicted edges of every leg in every image.
 
-Arrays have the axes (..., E edges of a machine, n samples along an edge), with K photographs before
-them; the E edges are the same in every photograph: each visible tube of each
-leg, side 0 then side 1.
+Arrays have the axes (..., E edges of a machine, n samples along an edge), after an axis of K
+images; the E edges are the same in every image: each visible tube of each leg, side 0 then side 1.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from pkmcal.geometry.rigid import apply, cross, dot, of_components
 from pkmcal.mechanisms import Machine
 
 JOINT_MARGIN = 0.006
-"""Metres left out at both ends of a tube: collars and joint housings hide or imitate edges."""
+"""Metres omitted at both ends of a tube: collars and joint housings hide or imitate edges."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class TubeList:
 
 
 def tubes_of(machine: Machine) -> TubeList:
-    """Every edge that the drawing promises, in the order leg, tube, side."""
+    """All edges of the nominal model, in the order leg, tube, side."""
     rows = [
         (j, t, side, tube.start, tube.stop, machine.layout.radius[j][t])
         for j, leg in enumerate(machine.document.legs)
@@ -63,30 +62,31 @@ def tubes_of(machine: Machine) -> TubeList:
 
 @dataclass(frozen=True)
 class LegsInCamera:
-    """Leg axes as a station sees them: ends a, b and directions u, (..., L, 3), camera frame."""
+    """Leg axes in the camera frame: ends a, b and directions u, (..., L, 3)."""
 
     a: Array
     b: Array
     u: Array
 
     def __getitem__(self, which: Any) -> LegsInCamera:
-        """Some of them, by their leading axes."""
+        """Some of the legs, by the leading axes."""
         return LegsInCamera(self.a[which], self.b[which], self.u[which])
 
     def __len__(self) -> int:
         return len(self.a)
 
     def single(self) -> LegsInCamera:
-        """The same in single precision, which is enough for a search in reduced photographs."""
+        """In single precision, which is enough for a search in reduced images."""
         return LegsInCamera(*(v.astype(np.float32) for v in (self.a, self.b, self.u)))
 
     def joined(self, other: LegsInCamera) -> LegsInCamera:
-        """Both, along their first axis."""
+        """Concatenated with others along the first axis."""
         pairs = (self.a, other.a), (self.b, other.b), (self.u, other.u)
         return LegsInCamera(*(np.concatenate(pair) for pair in pairs))
 
     def under(self, T_camera_base: Array) -> LegsInCamera:
-        """Legs (K, L) or (H, K, L) of another frame as cameras (H, 4, 4) see them, (H, K, L)."""
+        """Legs (K, L) or (H, K, L) of the base frame in the frames of cameras (H, 4, 4), (H, K, L).
+        """
         T = T_camera_base.astype(self.a.dtype)
         shape = self.a.shape[-3:-1]
         lead = self.a.shape[:-3] or (1,)
@@ -107,13 +107,13 @@ def legs_in_camera(
 
 @dataclass(frozen=True)
 class EdgePoints:
-    """Points along predicted edges, and how the picture of each moves.
+    """Points along predicted edges, with the derivatives of their pixels.
 
-    normal : (..., E, 3) edge planes, camera frame. along : (..., E, n) place on the leg, m from
+    normal : (..., E, 3) edge planes, camera frame. along : (..., E, n) position on the leg, m from
     A. point : (..., E, n, 3) on the cylinder where the view ray grazes it, camera frame.
     pixel : (..., E, n, 2). outward : (..., E, n, 2) unit normals of the edge in the image, away
     from the leg. across : (..., E, n, 3) outward motion of the pixel (px) by the point's (m).
-    gain : (..., E, n) px per metre across the leg. valid : (..., E, n) has an image.
+    gain : (..., E, n) px per metre across the leg. valid : (..., E, n) whether there is a pixel.
     """
 
     normal: Array
@@ -142,8 +142,8 @@ class EdgePoints:
 def edge_points(
     machine: Machine, camera: Camera, legs: LegsInCamera, tubes: TubeList, samples: int
 ) -> EdgePoints:
-    """``samples`` points spaced evenly along every edge; leading axes, and the numbers' precision,
-    as ``legs`` has them.
+    """``samples`` points, evenly along every edge; leading axes and precision are those of
+    ``legs``.
     """
     radius = machine.values[tubes.radius].astype(legs.a.dtype)
     a, b, u = of_edges(legs, tubes)
@@ -166,13 +166,13 @@ def edge_points(
 
 
 def of_edges(legs: LegsInCamera, tubes: TubeList) -> Iterator[Array]:
-    """The legs' ends a, b and directions u for every edge, (..., E, 3)."""
+    """Ends a, b and directions u of the leg of every edge, (..., E, 3)."""
     for vectors in (legs.a, legs.b, legs.u):
         yield of_components(*(vectors[..., k].take(tubes.leg, axis=-1) for k in range(3)))
 
 
 def normals_of_edges(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[Array, Booleans]:
-    """Edge planes (..., E, 3) of axes given per edge, and where the leg can be seen at all."""
+    """Edge planes (..., E, 3) of axes for each edge, and where the leg has a silhouette."""
     m = cross(a, u)
     ok = has_silhouette(m, radius)
     sign = SIDE_SIGNS.astype(a.dtype)[tubes.side]
@@ -180,7 +180,7 @@ def normals_of_edges(a: Array, u: Array, radius: Array, tubes: TubeList) -> tupl
 
 
 def visible_stretch(a: Array, b: Array, tubes: TubeList) -> tuple[Array, Array]:
-    """First and last place of each tube that can be seen, m from A; (E,) and (..., E)."""
+    """First and last visible position on each tube, m from A; (E,) and (..., E)."""
     length = np.sqrt(dot(b - a, b - a))
     start, stop = (place.astype(length.dtype) for place in (tubes.start, tubes.stop))
     return start + JOINT_MARGIN, np.minimum(stop, length) - JOINT_MARGIN
@@ -194,11 +194,12 @@ def unobstructed(
     edges: EdgePoints,
     clearance: float,
 ) -> Booleans:
-    """Points in the image, not behind another leg nor within ``clearance`` px of its outline.
+    """Mask (K, E, n) of points in the image, not behind another leg nor within ``clearance`` px of
+    its outline.
 
-    The ray to the point passes another leg's axis at some distance. Nearer than that leg's
-    radius, the leg hides the point or stands behind it; a leg behind only matters where its own
-    outline spoils the point's background. (K, E, n).
+    The ray to the point passes another leg's axis at some distance. Where this is less than the
+    leg's radius, the leg hides the point or is behind it; a leg behind only matters where its own
+    outline is in the point's background.
     """
     clear = edges.valid & camera.in_image(edges.pixel, margin=4.0)
     reach = np.sqrt(dot(edges.point, edges.point))

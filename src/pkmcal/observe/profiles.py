@@ -1,4 +1,4 @@
-"""Sub-pixel edge positions from grey-level profiles, free of the shading's bias.
+"""Sub-pixel edge positions from grey-level profiles, without the bias of shading.
 
 A profile across a silhouette is not a step: a cylinder's shading changes fastest just inside its
 limb. At a depth d px inside, the surface has turned by an angle e from the limb with
@@ -27,25 +27,25 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import EdgePoints, TubeList
 
 PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE = 3.0, 3.0
-"""Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
-other features and neighbours."""
+"""Extent (px) of the modelled profile: less is ill-conditioned, more has other features of the leg
+and neighbours."""
 SAMPLED_INSIDE = 6.0
-"""Pixels inside to which profiles are sampled: beyond what is explained, a highlight ends."""
+"""Pixels inside to which profiles are sampled: highlights end beyond the modelled part."""
 MODELLED_LIMB_SHARE = 0.45
-"""Share of a leg's half width, from its limb inwards, that the model explains: highlights of bare
-metal begin further in. On slim legs this is less than PROFILE_REACH_INSIDE."""
+"""Share of a leg's half width, from its limb inwards, that is modelled: highlights of bare metal
+begin further in. On slim legs this is less than PROFILE_REACH_INSIDE."""
 LEAST_INSIDE = 1.25
-"""Pixels inside that are used in any case: less would not hold the limb's own brightness."""
+"""Least extent (px) inside: less would not contain the limb's own brightness."""
 CLEAR_OUTSIDE = 1.0
-"""Pixels outward of the predicted edge from which samples are taken for the background's level."""
+"""Distance (px) outward of the predicted edge from which samples give the background's level."""
 HIGHLIGHT_DEVIATIONS = 3.0
-"""Standard deviations by which the brightness inside has to come back to be a highlight's."""
+"""Standard deviations by which the brightness has to recede further inside, for a highlight."""
 PROFILE_STEP = 0.5
 EDGE_SHIFTS = np.arange(-1.5, 1.55, 0.1)
 """Trial positions of the edge about the predicted one, px."""
 PROFILE_MODEL_PITCH = 0.05
-"""Pixels from one place to the next at which the model is worked out: in steps and shifts it goes
-without remainder, so that all samples of all trial positions are such places."""
+"""Pitch (px) at which the model is tabulated: steps and shifts are multiples of it, so that all
+samples of all trial positions are tabulated."""
 BRIGHTNESS_UNKNOWNS = 5
 """Linear unknowns of the model: three inside the limb, two outside."""
 HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
@@ -53,54 +53,55 @@ HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
 _BETWEEN_HALF_WIDTHS = np.sqrt(HALF_WIDTHS[1:] * HALF_WIDTHS[:-1])
 """Half widths (px) from which the next one is nearer, by ratio."""
 BLURS_TRIED = np.arange(0.45, 1.5, 0.1)
-"""Blurs (px, standard deviation, lens and pixel and interpolation together) that may be tried."""
+"""Trial blurs (px, standard deviation of lens, pixel and interpolation together)."""
 USUAL_BLUR = 0.7
-"""Blur (px) that is tried first, and assumed where no profile tells it: lens 0.6, pixel 0.3."""
+"""Blur (px) that is tried first, and assumed where no profile determines it: lens 0.6, pixel 0.3.
+"""
 BLURS_BESIDE = 2
-"""Blurs to both sides of the best that are tried: the next tell its place between them, and how
-little each profile can leave; with further ones it moves by less than profiles tell it to, and of a
-hundred poor profiles the next ones alone may mistake a dent for it."""
+"""Blurs to both sides of the best that are tried: the next ones are needed for interpolation and
+for each profile's least residual. Further ones move the result by less than its standard deviation;
+of a hundred poor profiles the next ones alone may give a local minimum."""
 ENOUGH_FOR_BLUR = 500
-"""Profiles that tell the blur to a hundredth of a pixel; more only take time."""
+"""Profiles that determine the blur to a hundredth of a pixel; more only take time."""
 FEWEST_FOR_BLUR = 100
-"""Profiles without which no blur is told: where fewer are whole, as those of the one wide leg among
-slim ones, others tell it with them."""
+"""Least number of profiles for a blur: where fewer are complete, as those of one wide leg among
+slim ones, incomplete ones are used with them."""
 GREY_NOISE = 0.6
-"""Least standard deviation (grey levels) believed of a profile's samples: 8-bit rounding and
-what the model leaves out; keeps a chance perfect fit from counting for everything."""
+"""Least standard deviation (grey levels) of a profile's samples: 8-bit rounding and model errors;
+limits the weight of a fit that is perfect by chance."""
 PROFILE_MODEL_ERROR = 0.01
-"""Share of the contrast by which real profiles differ from the model; weighs the two beliefs."""
+"""Share of the contrast by which real profiles differ from the model; scales the two priors."""
 SHADING_SLOPE, SHADING_ROOT = 0.3, 1.0
-"""Believed spread (in contrasts) of the shading's linear part per pixel, and of its root part at
-a pixel's depth. Whole profiles hardly feel it; where the leg is overexposed, and only its limb's
-flank is left, it says how much shading may hide there, so the position's sigma grows honestly."""
+"""Prior sigma (in contrasts) of the shading's linear part per pixel, and of its root part at a
+pixel's depth. It hardly affects complete profiles; where the leg is overexposed, and only the flank
+of the limb remains, it bounds the shading there, so that the position's sigma contains it."""
 SATURATED_GREY_LEVEL = 250
-"""Grey level from which a sample is taken as clipped."""
+"""Grey level from which a sample is clipped."""
 MOST_CUT = -0.25
-"""Place (px) beyond which a profile must be free of saturation: its edge itself."""
+"""Position (px) beyond which a profile must not be saturated: the edge itself."""
 OWN_EDGE_WINDOW = 0.5
-"""Pixels about the place of its leg as a whole within which a profile's own edge is looked for:
-further off lie highlights, which all places of an edge may show alike."""
+"""Half width (px) of the search for a profile's edge about the position of the whole leg: further
+off are highlights, which all points of an edge may have in common."""
 FAINT_EDGE_SIGMA = 0.5
-"""Standard deviation (px) of a position above which a profile shows no edge: the window's half."""
+"""Standard deviation (px) of a position above which a profile has no edge: half of the window."""
 EDGE_SIGMA_FLOOR = 0.02
-"""Pixels below which no position is believed, however crisp the profile."""
+"""Least standard deviation (px) of a position, however sharp the profile."""
 MEASUREMENTS_AN_EDGE = 2.0
-"""Independent measurements that an edge counts as, whatever its length. Shading and paint move
-all positions along an edge together, so they do not average out: an edge is one line measured
-once at each of two halves, not three hundred points."""
+"""Effective sample size of an edge, whatever its length. Errors by shading and paint are correlated
+along an edge and do not average out: an edge is one line measured once in each of two halves, not
+three hundred points."""
 FEWEST_PLACES_FOR_TILT = 3
-"""Places along an edge without which its tilt is a guess."""
+"""Least number of points along an edge that determine its tilt."""
 
 
 BlurByStation = Mapping[int, float]
-"""Px, standard deviation, of the edges in a station's photographs."""
+"""Blur of the edges in a station's images, px, standard deviation."""
 
 
 @dataclass(frozen=True)
 class ProfileEdges:
-    """Edge positions in profiles: position (...) px outward from the predicted edge, its
-    standard deviation sigma (...) px from grey-level noise, and found (...).
+    """Edge positions in profiles: position (...) px outward from the predicted edge, its standard
+    deviation sigma (...) px by grey-level noise, and whether it is valid (...).
     """
 
     position: Array
@@ -109,18 +110,18 @@ class ProfileEdges:
 
 
 def sampled_offsets() -> Array:
-    """Places along a profile that are sampled, px outward from the predicted edge."""
+    """Positions of the samples of a profile, px outward from the predicted edge."""
     return np.arange(-SAMPLED_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
 
 
 def profile_offsets() -> Array:
-    """Places of a profile that the model explains, the outermost of those that are sampled."""
+    """Positions of the modelled samples of a profile, the outermost ones."""
     return np.arange(-PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
 
 
 @lru_cache(maxsize=512)
 def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
-    """Places x (px outward of the edge), (n,), and the five brightnesses there, blurred, (n, 5)."""
+    """Positions x (n,), px outward of the edge, and the five blurred brightnesses there, (n, 5)."""
     place = np.arange(-PROFILE_REACH_INSIDE - 8, PROFILE_REACH_OUTSIDE + 8, PROFILE_MODEL_PITCH)
     inside = (place < 0).astype(float)
     inside[np.abs(place) < PROFILE_MODEL_PITCH / 2] = 0.5
@@ -139,9 +140,9 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
     """Orthonormal bases of the model's profiles at each trial position, (samples, 5 x shifts):
     the first basis of all positions, then the second.
 
-    cut : samples at the inner end that are not used; their rows are zero.
-    The weak beliefs about the shading are rows below the samples, whose data are zero; only the
-    samples' rows are returned, which is all that a projection of such data needs.
+    cut : samples at the inner end that are not used; their rows are zero. The weak priors on the
+    shading are rows below the samples, with zero data; only the samples' rows are returned, which
+    suffice for the projection of such data.
     """
     place, model = _blurred_model(blur, half_width)
     at = profile_offsets() - EDGE_SHIFTS[:, None]
@@ -155,11 +156,11 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
 
 
 class _Kinds(NamedTuple):
-    """Profiles by kind: of each station a few dozen combinations of half width and cut.
+    """Profiles grouped by station, half width and cut: a few dozen kinds a station.
 
     scaled : (N, samples) in contrasts, less the outermost, in the order of the kinds. square : (N,)
-    sums of their squares. order : (N,) the profile that each is. parts : the first and the end of
-    each kind, and its station, half width (px) and cut.
+    sums of their squares. order : (N,) index of each profile. parts : begin and end of each kind,
+    its station, half width (px) and cut.
     """
 
     scaled: Array
@@ -172,8 +173,8 @@ class _Kinds(NamedTuple):
 class Profiles:
     """Averaged profiles across edges, N of them.
 
-    grey : (N, samples) at :func:`profile_offsets`. count : (N,) photograph profiles that each
-    averages. half_width : (N,) of the legs there, px. cut : (N,) samples at the inner end that
+    grey : (N, samples) at :func:`profile_offsets`. count : (N,) number of averaged profiles.
+    half_width : (N,) of the legs there, px. cut : (N,) samples at the inner end that
     are not used: clipped at the camera's brightest level, or too deep inside a slim leg.
     station : (N,) whose blur each has. strip, bright : (N,), see :func:`strips`.
     """
@@ -190,8 +191,8 @@ class Profiles:
     def of(
         cls, grey: Array, clipped: Booleans, count: Array, half_width: Array, station: Integers
     ) -> Profiles:
-        """From grey (N, samples) at :func:`sampled_offsets`, and whether it is clipped at
-        :func:`profile_offsets`.
+        """Profiles from grey levels (N, samples) at :func:`sampled_offsets`, and the mask of
+        clipped ones at :func:`profile_offsets`.
         """
         explained, cut = grey[:, -clipped.shape[1] :], cut_of(clipped, half_width)
         strip = strips(grey, count, half_width)
@@ -208,7 +209,7 @@ class Profiles:
 
     @cached_property
     def by_kind(self) -> _Kinds:
-        """The profiles as one projection a kind takes them."""
+        """The profiles grouped by kind, for one projection a kind."""
         # what a good fit leaves is a millionth of the profile: too little for single precision
         scaled = (self.grey - self.grey[:, -1:]).astype(float)
         scaled /= self.contrast[:, None]
@@ -230,10 +231,10 @@ class Profiles:
 
 
 def cut_of(saturated: Booleans, half_width: Array) -> Integers:
-    """Samples (N,) to leave out at the inner end of profiles.
+    """Number (N,) of samples to omit at the inner end of profiles.
 
-    Up to the outermost saturated one of ``saturated`` (N, samples), and what lies deeper than the
-    limb of a leg of ``half_width`` (N,) px.
+    Up to the outermost one of ``saturated`` (N, samples), and those deeper than the limb of a leg
+    of ``half_width`` (N,) px.
     """
     count = saturated.shape[-1]
     last = count - np.argmax(saturated[..., ::-1], axis=-1)
@@ -243,13 +244,13 @@ def cut_of(saturated: Booleans, half_width: Array) -> Integers:
 
 
 def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Booleans]:
-    """Samples (N,) of :func:`profile_offsets` inward of the middle of a strip within the limb, 0
-    where there is none, and strips that are brighter than what lies behind the leg (N,).
+    """Number (N,) of samples inward of the middle of a strip within the limb, 0 where there is
+    none, and whether the strip is brighter than the background (N,).
 
-    grey : (N, samples) at :func:`sampled_offsets`. count, half_width : (N,), as of `Profiles`.
-    A strip is where, further in, the departure from the background is less again by more than
-    diffuse light as a rule allows, whose cosine changes by MODELLED_LIMB_SHARE down to that depth,
-    and by more than noise.
+    grey : (N, samples) at :func:`sampled_offsets`. count, half_width : (N,), as of `Profiles`. A
+    strip is where the difference from the background decreases again further in, by more than noise
+    and by more than diffuse light as a rule allows, whose cosine changes by MODELLED_LIMB_SHARE
+    down to that depth.
     """
     offsets = sampled_offsets()
     background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
@@ -272,14 +273,14 @@ def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Bool
 
 
 def without_highlights(profiles: Profiles, blur: BlurByStation) -> tuple[Profiles, Booleans]:
-    """Profiles without what lies deeper than a strip's middle, and those (N,) that show a
-    highlight for the limb.
+    """Profiles without the samples deeper than a strip's middle, and mask (N,) of those with a
+    highlight in place of the limb.
 
-    A lamp's picture in polished metal, some way inside the limb, is none of the model's, and with
-    its far side in the profile its near border is the likelier edge. Between that and the limb
-    the metal is as dark as what lies behind the leg: the edge itself is not to be seen. Paint with
-    the light behind it has a bright strip as well, but one that the model explains to its usual
-    error; a highlight it does not.
+    The reflection of a lamp in polished metal, some way inside the limb, is not modelled, and with
+    its far side in the profile its near border is the likelier edge. Between that and the limb the
+    metal is as dark as the background: the edge itself is invisible. Paint lit from behind has a
+    bright strip as well, but one that the model explains to its usual error; a highlight it does
+    not.
     """
     bright, odd = np.flatnonzero(profiles.bright), np.zeros(len(profiles.cut), dtype=bool)
     if bright.size:
@@ -304,8 +305,8 @@ def residual_curves(profiles: Profiles, blur: BlurByStation) -> Array:
 
 
 def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
-    """Log likelihood (N, shifts) of every trial position, the noise's size unknown, less its
-    largest value; 0 of profiles that are clipped up to their edge.
+    """Log-likelihood (N, shifts) of every trial position with noise of unknown size, less its
+    largest value; 0 for profiles that are clipped up to their edge.
 
     curves : of :func:`residual_curves`.
     """
@@ -317,7 +318,7 @@ def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
 
 
 def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
-    """Edge positions of profiles, each within OWN_EDGE_WINDOW of where its leg is, ``about`` (N,)
+    """Edge positions of profiles, each within OWN_EDGE_WINDOW of its leg's position ``about`` (N,),
     px.
 
     curves : of :func:`residual_curves`.
@@ -349,13 +350,13 @@ def _contrast(grey: Array) -> Array:
 
 
 def _noise(contrast: Array, count: Array) -> Array:
-    """Least noise (N,) believed of a sample, in contrasts."""
+    """Least noise (N,) of a sample, in contrasts."""
     return GREY_NOISE / contrast / np.sqrt(np.maximum(count, 1))
 
 
 def _freedom(profiles: Profiles) -> Array:
-    """Degrees of freedom (N,) that the model leaves. Neighbouring samples of a profile at half a
-    pixel share their noise: two count as one.
+    """Degrees of freedom (N,) of the residuals. Neighbouring samples at half a pixel have
+    correlated noise: two count as one.
     """
     samples = profiles.grey.shape[-1] - profiles.cut
     return np.maximum(samples * PROFILE_STEP - BRIGHTNESS_UNKNOWNS, 1.0)
@@ -367,11 +368,11 @@ def _shows_its_edge(profiles: Profiles) -> Booleans:
 
 
 def estimate_blur(profiles: Profiles) -> float:
-    """The blur (px) with which the model leaves least, over the profiles of one station.
+    """Blur (px) with the least residuals over the profiles of one station.
 
-    Contrast differs by edge, so each profile's residual is taken relative to its best; the
-    median over profiles decides, so that half of them may be anything. Those of which least is
-    cut off are looked at. From the usual blur on, the next ones are tried towards the best.
+    Contrast differs by edge, so each profile's residual is relative to its least; the median over
+    profiles is minimized, so that half of them may be outliers. The most complete profiles are
+    used. The search goes from the usual blur to its neighbours, towards the minimum.
     """
     few = min(FEWEST_FOR_BLUR, len(profiles.cut))
     whole = np.flatnonzero(profiles.cut <= np.sort(profiles.cut)[few - 1]) if few else np.array([])
@@ -404,8 +405,8 @@ class EdgeFits:
     """Planes fitted to positions along edges; all (K, E, ...).
 
     turn : (2,) of the normal in ``basis`` (3, 2). covariance : (2, 2). operator : (2, n) turn by
-    the positions at the n samples, with the final weights. used : samples taken as the edge's.
-    good : enough of them.
+    the positions at the n samples, with the final weights. used : inliers. good : whether there are
+    enough.
     """
 
     turn: Array
