@@ -121,8 +121,13 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
             if value > values[best.setdefault(one.meaning, k)]:
                 best[one.meaning] = k
         # of a motor's constants the best is enough: its offset, estimated, takes up the rest
-        only = np.isin(np.arange(len(values)), list(best.values()))
-        return np.where(only, np.array(values) - null, -np.inf)
+        retained = np.isin(np.arange(len(values)), list(best.values()))
+        ratios = np.array(values) - null
+        # a mistake in the readings moves the platform by far more than nominal errors do, so
+        # closure shows it; a movement or a size may be less, and is estimated in any case
+        prior = np.array([one.log_prior for one in hypotheses])
+        readings = np.array([one.code.startswith("readings.") for one in hypotheses])
+        return np.where(retained & (~readings | (ratios + prior > 0)), ratios, -np.inf)
 
     def by_estimate(hypotheses: Sequence[PoseHypothesis]) -> Array:
         null = log_likelihood(np.array(pose_misfit(estimate)), n_effective)

@@ -225,8 +225,7 @@ def direction_of(normal: Array, count: int = EDGE_DIRECTIONS) -> Integers:
 
 
 def bin_neighbours(direction: int, count: int) -> Booleans:
-    """Mask (count,) of the direction numbers in a direction's table: its own and both neighbours.
-    """
+    """Mask (count,) of the direction numbers in a direction's table: its own, both neighbours."""
     return (np.arange(count) - (direction - 1)) % count < 3
 
 

@@ -85,8 +85,7 @@ class LegsInCamera:
         return LegsInCamera(*(np.concatenate(pair) for pair in pairs))
 
     def under(self, T_camera_base: Array) -> LegsInCamera:
-        """Legs (K, L) or (H, K, L) of the base frame in the frames of cameras (H, 4, 4), (H, K, L).
-        """
+        """Legs (K, L) or (H, K, L) of the base frame seen by cameras (H, 4, 4), (H, K, L)."""
         T = T_camera_base.astype(self.a.dtype)
         shape = self.a.shape[-3:-1]
         lead = self.a.shape[:-3] or (1,)
