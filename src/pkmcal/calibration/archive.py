@@ -1,8 +1,7 @@
-"""An earlier result is kept when a new one takes its place: beside it, under its date.
+"""Archive of an earlier result that a new one replaces: a folder beside it, under its date.
 
-The copy is made first, whole or not at all; then the new result takes the folder as it would any
-other. A run that is killed between the two leaves the earlier result twice, and the next one finds
-its copy there.
+The copy is made first, atomically; then the new result is written to the folder. A run that is
+killed between the two leaves the earlier result twice, and the next run finds its copy there.
 """
 
 from __future__ import annotations
@@ -23,13 +22,12 @@ def keep_earlier(
     document: str = CALIBRATION_DOCUMENT_FILE,
     page: str = CALIBRATION_REPORT_FILE,
 ) -> Path | None:
-    """Copy the result that ``folder`` holds into a folder beside it; returns that.
+    """Copy the result in ``folder`` to a folder beside it, and return that.
 
-    texts : the new result's by their files' names. document : the file by which a result is known;
-    page : the one that is made from it. None where there is no earlier one, or the new
-    one is the same but for how long it took: nothing needs keeping twice. The copy's name is the
-    folder's with the earlier result's date, as calibration-2026-11-23T1502; a second one of the
-    same minute ends in -2.
+    texts : the new result's, by file name. document : the file by which a result is recognised;
+    page : the file that is made from it. None where there is no earlier result, or the new one
+    differs in its timings only. The copy's name is the folder's with the earlier result's date,
+    such as calibration-2026-11-23T1502; a second one of the same minute ends in -2.
     """
     folder = resolved(folder)
     names = entries(folder)
@@ -50,7 +48,7 @@ def keep_earlier(
 
 
 def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page: str) -> bool:
-    """Whether the new result tells what the one in the folder does; pages are made from these."""
+    """Whether the new result equals the one in the folder; pages are made from these files."""
     if {*names} - {page} != {*texts} - {page} or not _regular(folder, names):
         return False
     return all(
@@ -61,7 +59,7 @@ def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page
 
 
 def _comparable(name: str, content: str | bytes) -> object:
-    """What a file says, but for how long it took to find out."""
+    """Content of a file without timings."""
     raw = content if isinstance(content, bytes) else content.encode("utf-8")
     if name != CALIBRATION_DOCUMENT_FILE:
         return raw
@@ -83,7 +81,7 @@ def _copied(folder: Path, names: list[str], place: Path) -> bool:
 
 
 def _regular(folder: Path, names: list[str]) -> bool:
-    """Whether all of these are files. What a link leads to is neither read nor copied: it may be
-    anything, in somebody else's session.
+    """Whether all of these are regular files. Targets of links are neither read nor copied: they
+    may be any file, in another user's session.
     """
     return all((folder / name).is_file() and not (folder / name).is_symlink() for name in names)

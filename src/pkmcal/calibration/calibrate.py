@@ -1,4 +1,6 @@
-"""From a session to a calibrated machine: load, observe, identify in turns, judge."""
+"""Calibration of a session: load, localize, measure and estimate in turns, compare hypotheses,
+judge.
+"""
 
 from __future__ import annotations
 
@@ -87,16 +89,15 @@ CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
 
 @dataclass(frozen=True, repr=False)
 class Calibration(CalibrationSummary):
-    """Everything that a calibration found.
+    """The result of a calibration.
 
-    boards : the calibration board, where stations observe one. findings : what the data tell of
-    the machine and what they leave open. timings : seconds by step. holdout : configurations that
-    the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
-    tells what it predicts of them. violations : what the data show that the model does not have.
-    model_errors : smooth errors of the model that have no name; the covariance contains them.
-    upside_down : cameras whose photographs are, by which they were measured.
-    photographs : of stations whose legs were observed, by their number; those that fitted into
-    memory are decoded.
+    boards : the calibration board, where stations observe one. findings : identifiability of the
+    machine's parameters. timings : seconds by step. holdout : configurations that the estimate does
+    not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them. violations :
+    detected model violations. model_errors : smooth model errors without a name, which the
+    covariance contains. upside_down : cameras, turned by half, by which upside-down images were
+    measured. photographs : images of stations whose legs were observed, by the station's number;
+    those that fitted into memory are decoded.
     """
 
     session: Session
@@ -124,7 +125,7 @@ class Calibration(CalibrationSummary):
         return self.estimate.machine
 
     def overview(self) -> Overview:
-        """What it shows of itself."""
+        """The figures of its summary."""
         session, e = self.session, self.estimate
         edges, poses = e.edge_residuals[e.edge_weights >= 0.5], e.pose_residuals
         return Overview(
@@ -158,12 +159,13 @@ def calibrate_session(
     session : a loaded session, or its folder.
     method : ``bundle`` (joint maximum likelihood), ``four-step`` ([A]), ``linear`` ([B]) or
         ``inverse-kinematic`` ([C]).
-    seed : of the random search for the stations' poses.
+    seed : for the random search for the stations' poses.
     refine_camera : estimate the cameras' intrinsics with the machine, from their calibration's
         covariance on.
-    holdout : poses, spread over the workspace, to leave out, to judge the result by them.
+    holdout : number of poses, spread over the workspace, that the estimate does not use and that
+        test the result.
     progress : called with the step in words and the share done.
-    Raises InputError where the session is at fault, ResultError where nothing can be said.
+    Raises InputError where the session is at fault, ResultError where there is no estimate.
     """
     from threadpoolctl import threadpool_limits
 
@@ -190,10 +192,10 @@ def better_refined(
     """The calibration with the cameras' intrinsics estimated, unless the one with those of the
     files is better; a warning then says so.
 
-    Intrinsics that are estimated can be led astray by photographs that are few or without a sure
-    place. A result that may be used is better, then one that keeps more photographs, then one that
-    fits what it keeps beyond chance better, which no added unknowns do by themselves. Raises the
-    error of ``refined`` where neither ends.
+    Estimated intrinsics can be wrong where images are few or without a sure pose. A usable result
+    is better, then one with more images, then one that fits its data better beyond chance, which
+    additional unknowns do not by themselves. Raises the error of ``refined`` where neither has a
+    result.
     """
     try:
         value = refined()
@@ -253,7 +255,7 @@ def calibrate_measurements(
     *,
     progress: CalibrationProgress | None = None,
 ) -> Calibration:
-    """Calibrate the machine of a session from edges that were measured already, as simulated ones.
+    """Calibrate the machine of a session from edges that are given, such as simulated ones.
 
     No image is read. observation : with the edges of ``measurements``. T_camera_base : (S, 4, 4)
     from where the estimate starts. Raises ResultError where there is no estimate.
@@ -270,7 +272,7 @@ def calibrate_measurements(
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
-    """Raise InputError for what no caller may ask."""
+    """Raise InputError for options without a meaning."""
     if method not in CALIBRATION_METHODS:
         guess = closest(str(method), CALIBRATION_METHODS)
         raise InputError(
@@ -284,11 +286,10 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
 
 
 class Settled(NamedTuple):
-    """A session whose stations all stand where their photographs say, and the estimate of it that
-    no known mistake explains better.
+    """A repaired session and its estimate, which no hypothesis explains better.
 
-    stated : the estimate with the readings' noise as it is stated. turned : cameras whose
-    photographs are upside down, or may be. findings : notes on hypotheses that could not be tested.
+    stated : the estimate with the readings' noise as stated. turned : cameras whose images are
+    upside down, or may be. findings : notes on hypotheses that could not be tested.
     """
 
     case: Case
@@ -344,7 +345,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
-    """The calibration of a settled session."""
+    """The calibration of a session after all repairs."""
     case, turns, stated, richer, turned, untested = settled
     machine = case.session.machine
     turns = imputation_variance(case, turns, np.random.default_rng(0), clock.progress)
@@ -358,9 +359,7 @@ def _finished(
 
 
 class _Identified(NamedTuple):
-    """The last turn, the estimate by the method asked for, richer models that were tried, and what
-    was left out.
-    """
+    """The refinement, the estimate by the requested method, fits of richer models, the holdout."""
 
     turns: RefinementResult
     estimate: Estimate
@@ -369,7 +368,7 @@ class _Identified(NamedTuple):
 
 
 def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> Session:
-    """The session, whole and possible."""
+    """The loaded session, checked for what this observation can use."""
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
@@ -381,8 +380,8 @@ def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> S
 
 
 def _observe(session: Session, seed: int, clock: Clock) -> Case:
-    """Where the stations stand, by what their photographs and tables show; without photographs by
-    hand that could not be placed.
+    """The case of a session with its stations localized, without hand-held images that could not be
+    placed.
     """
     clock.progress("Reading photographs", 0.0)
     photographs = read_photographs(session)
@@ -396,8 +395,8 @@ def _observe(session: Session, seed: int, clock: Clock) -> Case:
 
 
 def _identify(case: Case, refine_camera: bool, seed: int, clock: Clock) -> RefinementResult:
-    """The machine, in turns with looks at the edges; where there is none, diameters for radii may
-    be why.
+    """Refine the machine in turns with measurement passes. Where there is no estimate, diameters
+    may have been written for radii.
     """
     session, cameras = case.session, refinement_of(case.session, refine_camera)
     try:
@@ -423,9 +422,9 @@ def _estimated(
     holdout: int,
     clock: Clock,
 ) -> _Identified:
-    """The estimate without what is held out, by the paper's method if asked for.
+    """The estimate without the holdout, by a paper's method if requested.
 
-    Only now, when all is found, are configurations set aside: photographs that miss are misplaced.
+    Configurations are held out only here, after the localization, which needs all images.
     """
     out = None
     if holdout:
@@ -560,9 +559,9 @@ def _findings_of_estimate(
 def _findings(
     measurements: Measurements, estimate: Estimate, info: Information, uneven: RandomEffects
 ) -> Findings:
-    """What the data tell of the machine, in words, and the paper's conditions.
+    """Identifiability of the machine's parameters, in words, and the papers' conditions.
 
-    info : of the estimate at its end. uneven : the model discrepancy, which bends a bed.
+    info : linearized problem at the estimate. uneven : the model discrepancy, which bends a bed.
     """
     observed = observed_legs(
         measurements.edges,
@@ -583,7 +582,7 @@ def _findings(
 
 
 class Clock:
-    """Seconds by step, each of which may be lapped several times; told : what is being done."""
+    """Seconds by step, each of which may have several laps; progress : called with each step."""
 
     def __init__(self, progress: CalibrationProgress | None) -> None:
         self.progress: CalibrationProgress = progress or (lambda _text, _share: None)

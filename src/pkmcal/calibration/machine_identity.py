@@ -13,14 +13,14 @@ from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
 
 OTHER_MACHINE_TOLERANCES = 10.0
-"""Tolerances by which two drawings of one machine may differ: a corrected number, not another
-machine's."""
+"""Prior sigmas by which two nominal models of one machine may differ: a corrected number, not
+another machine."""
 
 
 def read_same_machine(
     calibration: SavedCalibration | Path | str, session: Session | Path | str
 ) -> tuple[SavedCalibration, Session]:
-    """Both, where they are not loaded. Raises InputError where the session is another machine's."""
+    """Both, loaded if necessary. Raises InputError where the session is another machine's."""
     saved = calibration if isinstance(calibration, SavedCalibration) else load(calibration)
     if not isinstance(session, Session):
         session = load_session(session)
@@ -32,8 +32,8 @@ def read_same_machine(
 def _check_machine(saved: SavedCalibration, session: Session) -> None:
     """Raise `InputError` where the session is another machine's.
 
-    Readings' scales tell no machine from another: the one may have them exact, as calibrations of
-    earlier versions have, and the other not.
+    Readings' scales do not distinguish machines: one model may have them exact, as calibrations of
+    earlier versions do, and the other not.
     """
     machine, drawn = saved.machine, session.machine
     rows, own = (np.flatnonzero(np.array(m.parameters.kinds) != "scale") for m in (machine, drawn))
@@ -82,7 +82,7 @@ def _check_joints(saved: SavedCalibration, session: Session) -> None:
 
 
 def _columns(document: Any) -> list[str]:
-    """The readings' columns by a session's document, empty where it tells none."""
+    """The readings' columns in a session's document, empty without any."""
     joints = document.get("joints") if isinstance(document, dict) else None
     columns = joints.get("columns") if isinstance(joints, dict) else None
     return [str(name) for name in columns] if isinstance(columns, list) else []

@@ -1,4 +1,4 @@
-"""A machine to be used: calibrated, drawn or built in, with the cameras that saw it."""
+"""A machine for use elsewhere: calibrated, nominal or built in, with the cameras of its session."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ SESSION_FILE = "session.yaml"
 
 @dataclass(frozen=True)
 class MachineSource:
-    """A machine to export or to control, and how far to trust it.
+    """A machine to export or to control, with its uncertainty.
 
     machine : with the values to use. sigma, covariance : (P,) and (P, P) of its parameters;
-    None for a drawing. cameras, T_base_camera : intrinsics and poses (4, 4) m by station; a
+    None for a nominal model. cameras, T_base_camera : intrinsics and poses (4, 4) m by station; a
     station's camera is missing where its file was not found.
     headline : the calibration's verdict in a sentence. usable : False for a refused one; reasons
     : why. origin : where it was read. calibrated : False for a drawing. frames : the gauge.
@@ -65,20 +65,20 @@ class MachineSource:
 
     @property
     def identity(self) -> str:
-        """Where the values are from, and their short digest: many calibrations have one name."""
+        """Origin of the values and their short digest: many calibrations have one name."""
         values = np.asarray(self.machine.values + 0.0, dtype="<f8")
         digest = blake2b(values.tobytes(), digest_size=4).hexdigest()
         parts = (self.origin, self.session, f"values {digest}", "" if self.usable else "refused")
         return ", ".join(part for part in parts if part)
 
     def sigma_of(self, name: str) -> float | None:
-        """A parameter's standard deviation, m or rad; None where it is not known."""
+        """Standard deviation of a parameter, m or rad; None where unknown."""
         if self.sigma is None or name not in self.machine.parameters.names:
             return None
         return float(self.sigma[self.machine.parameters.index(name)])
 
     def header(self, *conventions: str) -> tuple[str, ...]:
-        """Lines for the top of every file: what this is, of what, and in which conventions."""
+        """Header lines of every file: content, origin, conventions."""
         state = "" if self.usable else "REFUSED, NOT TO BE USED: "
         lines = (
             f"Machine {self.machine.name}, exported by pkmcal {version('pkmcal')}"
@@ -110,7 +110,7 @@ class MachineSource:
 def load_source(origin: Path | str, session: Path | None = None) -> MachineSource:
     """A calibration's folder, a mechanism file, or a built-in machine by its name.
 
-    session : the calibration's session, for its cameras; else it is looked for around the folder.
+    session : the calibration's session, for its cameras; else it is searched near the folder.
     Raises InputError where `origin` is none of these.
     """
     calibration = loaded(origin)
@@ -185,8 +185,8 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> MachineSou
 
 
 def _bed(saved: SavedCalibration) -> float | None:
-    """Height of the platform's origin over a bed that was felt, m, base frame, where it is 0 there;
-    None where none was felt, or none that is level.
+    """Height (z, m, base frame) of the platform's origin on a probed bed; None where no bed was
+    probed, or none that is level.
     """
     if saved.document.get("bed"):
         return saved.document["bed"].get("z")
@@ -203,7 +203,7 @@ def _bed(saved: SavedCalibration) -> float | None:
 
 
 def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | None:
-    """Where the session lies: as told, above the calibration, or beside it (as demo writes it)."""
+    """The session's folder: as given, above the calibration, or beside it (as demo writes it)."""
     if session is not None:
         if not (session / SESSION_FILE).is_file():
             raise InputError(
@@ -219,8 +219,8 @@ def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | Non
 
 
 def _camera_file(folder: Path, file: str, session: Path | None) -> Path | None:
-    """A station's camera: as refined with the machine, or as the session had it; a tracker's
-    table is none.
+    """A station's camera file: as refined with the machine, or of the session; None for a tracker's
+    table.
     """
     if Path(file).suffix == ".csv":
         return None

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 CALIBRATED_COLOUR, DRAWING_COLOUR, QUIET_COLOUR = "#2a6fb0", "#b5651d", "#888888"
 PARAMETER_ROW_HEIGHT = 0.17
-"""Inches of a parameter's line."""
+"""Height of a parameter's line, inches."""
 RESIDUAL_PLOT_REACH = 5.0
-"""Standard deviations to either side in which residuals are counted one by one."""
+"""Range of the histogram of residuals, standard deviations to either side."""
 
 
 def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
-    """The axes to draw into, made where there are none."""
+    """The axes to draw into, new ones if None."""
     if ax is not None:
         return ax
     try:
@@ -54,8 +54,8 @@ def draw_residuals(values: Array, ax: Axes | None = None) -> Axes:
 
 
 def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None = None) -> Axes:
-    """Each parameter's change from the drawing in its tolerances (P,), two deviations either way;
-    those that a frame or the file holds are left out.
+    """Change of each parameter from its nominal value in prior sigmas (P,), with two standard
+    deviations; those fixed by the gauge or the file are omitted.
     """
     rows = [k for k, row in enumerate(estimates) if row.decided_by in ("data", "drawing")]
     ax = _axes(ax, (6.0, 1.2 + PARAMETER_ROW_HEIGHT * len(rows)))
@@ -74,7 +74,7 @@ def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None 
 
 
 def tool(error: ToolError, ax: Axes | None = None) -> Axes:
-    """The drawing's error and the calibrated machine's standard deviation at each pose, mm."""
+    """Nominal error, and standard deviation as calibrated, of the tool at each pose, mm."""
     ax = _axes(ax, (6.0, 3.4))
     finite = np.flatnonzero(np.isfinite(error.position))
     order = finite[np.argsort(error.position[finite])]

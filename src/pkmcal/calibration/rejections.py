@@ -1,4 +1,4 @@
-"""Rejected heights, boards and images by name, and what the result may owe to their rejection."""
+"""Findings about rejected heights, boards and images, and the effect of their rejection."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from pkmcal.session.load import Session
 from pkmcal.wording import count, listed
 
 LEAST_CHECKED_SHARE = 0.1
-"""Degrees of freedom that a link leaves on average, below which a wrong one goes unnoticed up to
-``4.13 / sqrt(0.1)``, thirteen, of its standard deviations (Baarda 1968)."""
+"""Mean degrees of freedom of a link's residual below which an error of up to ``4.13 / sqrt(0.1)``,
+thirteen, of its standard deviations is undetected (Baarda 1968)."""
 
 
 def rejection_findings(
@@ -32,10 +32,10 @@ def rejection_findings(
     *,
     at_minimum: bool,
 ) -> Iterator[Finding]:
-    """Warnings that name the rejected units of an estimate, and a reason where the result rests on
-    a rejection that nothing confirms.
+    """Warnings that name the rejected units of an estimate, and a reason against the result where
+    it depends on a rejection that nothing confirms.
 
-    at_minimum : whether the estimate is the joint problem's best, as hypotheses about it need.
+    at_minimum : whether the estimate is the minimum of the joint problem, as one-step updates need.
     """
     units = rejected_units(measurements, estimate)
     if at_minimum:
@@ -85,8 +85,8 @@ def rejection_findings(
 
 
 def _unchecked_links(measurements: Measurements, estimate: Estimate) -> Iterator[Finding]:
-    """A warning about links that determine what no other measurement does, so that a wrong one
-    leaves hardly any residual.
+    """A warning about links that alone determine some parameters, so that an error has hardly any
+    residual.
     """
     s = estimate.statistics
     if measurements.n_links and s.dof_links < LEAST_CHECKED_SHARE * s.n_links:
@@ -97,7 +97,7 @@ def _unchecked_links(measurements: Measurements, estimate: Estimate) -> Iterator
 def unused_configurations(
     session: Session, estimate: Estimate, held_out: Sequence[int] | Integers
 ) -> Iterator[Finding]:
-    """A warning about configurations of which nothing was measured, but for those held out."""
+    """A warning about configurations without measurements, except those held out."""
     unused = ~estimate.configurations
     unused[np.asarray(held_out, dtype=int)] = False
     names = [session.configurations[k] for k in np.flatnonzero(unused)]
@@ -107,14 +107,14 @@ def unused_configurations(
 
 
 def _kind(session: Session, station: int) -> str:
-    """What a station's measured poses are called."""
+    """Name of one measured pose of a station."""
     tables = session.trackers[station - len(session.stations) :] if station >= len(
         session.stations) else ()  # fmt: skip
     return tables[0].target.one if tables else "board"
 
 
 def _link_name(links: LinkSet) -> str:
-    """What one of the links is called."""
+    """Name of one of the links."""
     return measurement_kinds()[links.kind].one
 
 
@@ -125,7 +125,7 @@ def _kind_of(session: Session, measurements: Measurements, unit: RejectedUnit) -
 
 
 def _name(session: Session, measurements: Measurements, unit: RejectedUnit) -> str:
-    """A unit by its image's file, or by its configuration where there is none, a link by both."""
+    """Name of a unit: its image's file, else its configuration; both configurations of a link."""
     if unit.link >= 0:
         links, k = measurements.link_at(unit.link)
         first, second = (session.configurations[c] for c in links.configuration[k])

@@ -1,7 +1,4 @@
-"""A calibration as people look at it in Python: short, as a summary, as tables and plots.
-
-The same for one that was just made and for one read back from its file.
-"""
+"""Summary, tables and plots of a calibration in Python, new or read back from its file."""
 
 from __future__ import annotations
 
@@ -26,13 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Overview:
-    """What a summary is made of.
+    """Data of a summary.
 
-    source : the session's name. drawing : (P,) values before. covariance : (P, P). data_share :
+    source : the session's name. drawing : (P,) nominal values. covariance : (P, P). data_share :
     (P,). poses : (n, 4, 4) of the platform, of the configurations in use. legs_observed : whether
-    edges of legs were. residuals : (n,) of edges and poses, whitened, with weights of half and
-    more. chi2 : per degree of freedom, of the noise as stated; NaN where it is not known. warnings
-    : about the session.
+    edges of legs were measured. residuals : (n,) of edges and poses, whitened, with weights of half
+    and more. chi2 : per degree of freedom, of the noise as stated; NaN where unknown. warnings :
+    about the session.
     """
 
     source: str
@@ -51,18 +48,18 @@ class Overview:
 
 
 class CalibrationSummary(ABC):
-    """What a calibration shows of itself."""
+    """Methods common to new and saved calibrations."""
 
     @abstractmethod
     def overview(self) -> Overview:
-        """What it is made of."""
+        """The data of the summary."""
 
     def tool_error(self, T_base_platform: Array) -> ToolError:
-        """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
-        see :func:`pkmcal.identify.tool.tool_error`. No frame is favoured: base and platform are
-        laid over the drawing's by all joint centres, or, where only boards or trackers saw the
-        machine, by these poses. NaN where the machine cannot take a pose. Raises InputError for an
-        array that holds no poses.
+        """Standard deviations of the calibrated machine at poses (n, 4, 4), and the errors of the
+        nominal model there; see :func:`pkmcal.identify.tool.tool_error`. No gauge is preferred:
+        base and platform are laid over the nominal ones by all joint centres, or, where only boards
+        or trackers observed the machine, by these poses. NaN where the machine cannot take a pose.
+        Raises InputError for an array that holds no poses.
         """
         overview = self.overview()
         # what a file's machine calls its drawing are the calibrated values
@@ -78,8 +75,8 @@ class CalibrationSummary(ABC):
 
     @property
     def parameters(self) -> ParameterEstimates:
-        """All parameters: drawing, value, standard deviation, and what decides them. Shows itself
-        as a table; ``to_pandas()`` makes a DataFrame.
+        """All parameters: nominal value, value, standard deviation, and the share of the data.
+        Displays as a table; ``to_pandas()`` makes a DataFrame.
         """
         overview = self.overview()
         return parameter_estimates(
@@ -160,7 +157,7 @@ class CalibrationSummary(ABC):
     # ------------------------------------------------------------------ plots
 
     def plot_residuals(self, ax: Axes | None = None) -> Axes:
-        """Residuals of all edges and poses in standard deviations, against what noise alone makes.
+        """Residuals of all edges and poses in standard deviations, beside those of noise alone.
 
         ax : axes to draw into; new ones unless given. Needs ``pip install '.[plot]'``.
         """
@@ -169,16 +166,16 @@ class CalibrationSummary(ABC):
         return draw_residuals(self.overview().residuals, ax)
 
     def plot_parameters(self, ax: Axes | None = None) -> Axes:
-        """How far each parameter is from its drawing, with two standard deviations, in tolerances
-        of the drawing. ax, needs : as :meth:`plot_residuals`.
+        """Change of each parameter from its nominal value, with two standard deviations, in prior
+        sigmas. ax, needs : as :meth:`plot_residuals`.
         """
         from pkmcal.calibration.plots import parameters
 
         return parameters(self.parameters, self.overview().machine.parameters.tolerance, ax)
 
     def plot_tool(self, T_base_platform: Array | None = None, ax: Axes | None = None) -> Axes:
-        """The tool's error at poses (n, 4, 4), the photographed ones unless given: the drawing's,
-        and what is uncertain after the calibration. ax, needs : as :meth:`plot_residuals`.
+        """The tool's error by the nominal model, and its standard deviation after calibration, at
+        poses (n, 4, 4), by default those in use. ax, needs : as :meth:`plot_residuals`.
         """
         from pkmcal.calibration.plots import tool
 

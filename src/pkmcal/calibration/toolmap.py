@@ -1,5 +1,5 @@
-"""Over the whole workspace: how sure the platform's poses are after a calibration, how sure they
-would be by the drawing's tolerances, and how wrong the drawing was.
+"""Tool map: uncertainty of the platform's poses over the workspace, after calibration and by prior
+sigmas alone, and the errors of the nominal model.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
 TOOL_MAP_POSES = 250
-"""Poses spread over the region, from which figures are told."""
+"""Poses spread over the region, for the figures."""
 CELLS_ALONG_SLICE = 20
 """Cells along a slice's longer side."""
 SLICE_HEIGHT_SHARES = (0.15, 0.5, 0.85)
-"""Where slices lie between the lowest and the highest of those poses."""
+"""Heights of slices, between the lowest and the highest of those poses."""
 SLICE_MARGIN_SHARE = 0.08
-"""What slices reach beyond those poses to either side, in their extent."""
+"""Margin of slices beyond those poses to either side, as a share of their extent."""
 NO_EXTENT = 1e-3
-"""Part of those poses' widest extent below which an axis has none."""
+"""Share of those poses' widest extent below which an axis has none."""
 LEAST_CELLS, LEAST_FILLED_SHARE = 3, 0.4
-"""Rows and columns of cells, and their part that the machine can take, below which it is no slice:
-a platform that only moves aside as it turns is at one orientation in few places."""
+"""Least number of rows and columns of cells, and least share of them that the machine can take, of
+a slice: a platform that moves sideways only as it turns has one orientation in few positions."""
 MOST_OFF_CELL_MIDDLE = 0.25
-"""Of a cell: how far from its middle a pose may be put by rods and axes."""
+"""Largest offset of a pose from its cell's middle, by rods and axes, in cells."""
 MOST_SLICE_TURN = np.deg2rad(3.0)
-"""Turns that crooked axes force on a platform that should only shift; a slice is of one
+"""Largest turn that inclined axes force on a platform that should only shift; a slice has one
 orientation."""
 
 
@@ -46,9 +46,9 @@ orientation."""
 class Slice:
     """Positions in a plane, at home's orientation.
 
-    across, up : axes (0 to 2) of the base frame that the slice lies along. level : its place along
-    the third, m. u (a,), v (b,) : coordinates of the cells' middles, m. rows : (b, a) each cell's
-    pose in the map, -1 where the machine cannot take it.
+    across, up : axes (0 to 2) of the base frame along the slice. level : its coordinate along the
+    third, m. u (a,), v (b,) : coordinates of the cells' middles, m. rows : (b, a) index of each
+    cell's pose in the map, -1 where the machine cannot take it.
     """
 
     across: int
@@ -66,10 +66,10 @@ class Slice:
 
 @dataclass(frozen=True)
 class ToolMap:
-    """Poses of a region, the first ``spread`` of them evenly over it, the rest in slices.
+    """Poses of a region, the first ``spread`` of them evenly over it, the others in slices.
 
-    after : how sure they are as calibrated, and how far the drawing was off. before : how sure they
-    would be by the drawing's tolerances alone.
+    after : standard deviations as calibrated, and errors of the nominal model. before : standard
+    deviations by prior sigmas alone.
     """
 
     region: Region
@@ -86,7 +86,7 @@ class ToolMap:
         return self.before.first(self.spread), self.after.first(self.spread)
 
     def document(self) -> dict[str, Any]:
-        """For programs, of the evenly spread poses: m and rad."""
+        """For programs: figures of the evenly spread poses, m and rad."""
         before, after = self.evenly
         worst = int(np.nanargmax(after.position))
         return {
@@ -103,7 +103,7 @@ class ToolMap:
 
 
 def _summary(position: Array, orientation: Array) -> dict[str, Any]:
-    """Medians and largest, None where nothing is known."""
+    """Medians and maxima, None without finite values."""
     parts = {"position": position, "orientation": orientation}
     finite = {name: values[np.isfinite(values)] for name, values in parts.items()}
     return {
