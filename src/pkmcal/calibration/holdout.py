@@ -1,7 +1,7 @@
-"""Configurations put aside before an estimate is made: which, and the estimate without them.
+"""Holdout: configurations that an estimate does not use, their selection, and the estimate.
 
-They are spread over the workspace, or a region of it. What the calibrated machine then predicts of
-them is judged in :mod:`pkmcal.judge.holdouts`.
+They are spread over the workspace, or fill a region of it. :mod:`pkmcal.judge.holdouts` compares
+them with the calibrated machine's prediction.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from pkmcal.session.readings import same_pose
 from pkmcal.wording import count
 
 FEWEST_TO_CALIBRATE = 3
-"""Configurations without which a calibration of the rest means nothing."""
+"""Least number of configurations for an estimate from the rest."""
 
 MOST_CLUSTERING_ROUNDS = 100
 NAMED_REGION_OFFSET = 0.7
-"""Standard deviations of the whole workspace by which a region must lie off its middle to be named
-by that direction."""
+"""Distance of a region from the middle of the workspace, in standard deviations of the whole, from
+which it is named by that direction."""
 REGION_DIRECTION_NAMES = (
     ("turned about −x", "turned about +x"),
     ("turned about −y", "turned about +y"),
@@ -40,7 +40,7 @@ REGION_DIRECTION_NAMES = (
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Configurations beside each other. rows : (n,) which. name : where, in words."""
+    """Adjacent configurations. rows : (n,) their indices. name : their region, in words."""
 
     rows: Integers
     name: str
@@ -48,9 +48,9 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Holdout:
-    """Configurations that an estimate did not see, to judge it by.
+    """Configurations that an estimate does not use, to test it.
 
-    region : which. measurements : of these and of those in use.
+    region : which. measurements : of all, held out and in use.
     """
 
     region: Neighbours
@@ -58,8 +58,8 @@ class Holdout:
 
 
 def points_of_poses(machine: Machine, poses: Array) -> Array:
-    """Where poses (n, 4, 4) are, as points (n, 6) in metres: turns times the platform's radius,
-    then positions; both from the mean.
+    """Poses (n, 4, 4) as points (n, 6) in metres: turns times the platform's radius, then
+    positions, both from the mean.
     """
     joints = machine.platform_centers()
     radius = float(np.sqrt(np.mean(np.sum((joints - joints.mean(axis=0)) ** 2, axis=1))))
@@ -89,7 +89,7 @@ def clusters(points: Array, n: int) -> Integers:
 
 
 def spread(points: Array, n: int) -> Integers:
-    """Some points, n in rising order, spread over all: the middle one of each of n clusters."""
+    """Indices of n points, rising, spread over all: the middle one of each of n clusters."""
     owner = clusters(points, n)
     chosen: list[int] = []
     for k in range(n):
@@ -113,7 +113,7 @@ def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
 
 
 def _named(middle: Array) -> str:
-    """A region by the two directions in which it lies off the middle the most."""
+    """Name of a region by the two directions in which it is furthest off the middle."""
     order = np.argsort(-np.abs(middle))[:2]
     words = [
         REGION_DIRECTION_NAMES[k][int(middle[k] > 0)]
@@ -129,9 +129,9 @@ def _distances(points: Array, centres: Array) -> Array:
 
 
 def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int) -> Neighbours:
-    """Configurations of n poses, to hold out, spread over the workspace.
+    """Configurations of n poses to hold out, spread over the workspace.
 
-    One that is in use tells of the others of its pose what they read: all of a pose are held out.
+    Configurations of one pose are not independent, so all of a pose are held out.
     """
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
@@ -144,7 +144,7 @@ def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int
 def by_region(
     drawing: Machine, whole: Estimate, measurements: Measurements, n: int
 ) -> tuple[Neighbours, ...]:
-    """The configurations that were seen, in n regions of the workspace, those of a pose in one."""
+    """The measured configurations in n regions of the workspace, those of a pose in one."""
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
     _check(n, first.size - first.size // n, first.size, "regions")
@@ -156,7 +156,7 @@ def by_region(
 
 
 def _poses(whole: Estimate, measurements: Measurements) -> tuple[Integers, Integers]:
-    """The configurations that were seen (n,), and the row of each one's pose (n,)."""
+    """Indices of the measured configurations (n,), and the row of each one's pose (n,)."""
     rows = np.flatnonzero(whole.configurations)
     if not rows.size:
         return rows, rows
@@ -189,10 +189,10 @@ def _check(n: int, remainder: int, total: int, what: str) -> None:
 
 
 def select(measurements: Measurements, keep: Booleans) -> Measurements:
-    """The measurements of some configurations (K,); readings keep their rows. Links stay where both
-    of their configurations do.
+    """Measurements of some configurations, mask (K,); readings keep their rows. Links stay where
+    both of their configurations do.
 
-    Boards on the base hang on no configuration and stay.
+    Boards on the base depend on no configuration and stay.
     """
     edges, poses = measurements.edges, measurements.poses
     on_base = ~measurements.on_platform[poses.mount]
@@ -206,9 +206,9 @@ def select(measurements: Measurements, keep: Booleans) -> Measurements:
 def estimate_without(
     drawing: Machine, turns: RefinementResult, out: Neighbours
 ) -> RefinementResult:
-    """What the last turn left, as if a region's configurations had not been taken.
+    """The refinement's result with an estimate that does not use a region's configurations.
 
-    They did help to find legs in the photographs; no number of the estimate comes from them.
+    They were used to predict legs in images; no number of the estimate depends on them otherwise.
     """
     keep = np.ones(len(turns.measurements.joints), dtype=bool)
     keep[out.rows] = False

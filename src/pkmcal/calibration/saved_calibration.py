@@ -37,8 +37,8 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.wording import listed
 
 SAVED_NUMBER_ROUNDING = 1e-9
-"""Relative difference below which two numbers of a file are the same: rounding leaves 1e-15, a
-change by hand a millionth."""
+"""Relative difference below which two numbers of a file are equal: rounding gives 1e-15, an edit by
+hand a millionth."""
 
 Sigma3 = tuple[float | None, float | None, float | None]
 """None where the data do not determine the number."""
@@ -49,7 +49,7 @@ Factor = Annotated[float, Field(gt=0)]
 
 @dataclass(frozen=True)
 class SavedStation:
-    """One camera's pose as found: T_base_camera (4, 4), m.
+    """One camera's estimated pose: T_base_camera (4, 4), m.
 
     sigma_rotation, sigma_translation : (3,) standard deviations, rad and m, base axes; infinite
     where the data do not determine the number.
@@ -66,10 +66,10 @@ class SavedStation:
 
 @dataclass(frozen=True)
 class CalibrationPrior:
-    """What a calibration knows of its machine, and of the cameras that stand where it had them.
+    """A calibration as the prior of its machine, and of cameras that have not moved since.
 
     covariance : (P + 6 k, P + 6 k) of the parameters and of these cameras' poses, left
-    perturbation. stations : (k,) their numbers in a session; all others have to be found anew.
+    perturbation. stations : (k,) their numbers in a session; all others are localized anew.
     T_camera_base : (k, 4, 4).
     """
 
@@ -78,7 +78,7 @@ class CalibrationPrior:
     T_camera_base: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     def only(self, stations: Sequence[int]) -> CalibrationPrior:
-        """What it knows where no other stations stand as they stood."""
+        """The prior with the poses of these stations only."""
         n = len(self.covariance) - 6 * len(self.stations)
         remainder = np.array([k for k, s in enumerate(self.stations) if s in stations], dtype=int)
         rows = rows_of_stations(n, remainder)
@@ -93,7 +93,7 @@ class CalibrationPrior:
 class SavedCalibration(CalibrationSummary):
     """A calibration read back, in the frames that `gauge` names.
 
-    machine : with the calibrated values. drawing : (P,) values before.
+    machine : with the calibrated values. drawing : (P,) nominal values.
     placed : k stations whose covariance with the machine is known; none of an older file.
     joint_covariance : (P + 6 k, P + 6 k) of the parameters and then of these stations, (omega, tau)
     of T_camera_base, left perturbation, as :class:`~pkmcal.identify.estimate.Estimate` has it.
@@ -126,7 +126,7 @@ class SavedCalibration(CalibrationSummary):
         return self.joint_covariance[:n, :n]
 
     def overview(self) -> Overview:
-        """What it shows of itself; an older file may not have all of it."""
+        """The data of the summary; an older file may not have all of them."""
         document = self.document
         residuals = document.get("residuals") or {}
         edges, poses = (residuals.get(key) or () for key in ("edges", "poses"))
@@ -157,8 +157,8 @@ class SavedCalibration(CalibrationSummary):
         )
 
     def prior(self, names: Sequence[str], of_session: Sequence[str]) -> CalibrationPrior:
-        """What it knows of the machine and of some stations, in their order, by their numbers among
-        those of a session. Raises InputError for one that is not ``placed``.
+        """The prior of the machine and of some stations, by name, with their numbers among those of
+        a session. Raises InputError for one that is not ``placed``.
         """
         for name in names:
             if name in self.placed:
@@ -189,7 +189,7 @@ class SavedCalibration(CalibrationSummary):
 
 
 class _Part(Schema):
-    """Fields that are needed here; a newer pkmcal may write more."""
+    """Schema of the fields that are used; a newer pkmcal may write more."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -240,8 +240,8 @@ Numbers = tuple[float | None, ...]
 
 
 def _has_weight(columns: Sequence[str], fewest: int) -> AfterValidator:
-    """A row of residuals has these columns, of which older files lack the last, and numbers up to
-    its weight.
+    """Validator of rows of residuals: these columns, of which older files lack the last, with
+    numbers up to the weight.
     """
     most = columns.index("weight") + 1
 
@@ -259,7 +259,7 @@ class _Residuals(_Part):
 
 
 class _Statistics(_Part):
-    """All of them are numbers; factors are positive."""
+    """Statistics: numbers, with positive factors."""
 
     noise_scale: Factor = 1.0
     pose_scale: Factor = 1.0
@@ -418,7 +418,7 @@ def _deviations(values: Sigma3) -> Array:
 
 
 def _verdict(saved: _Verdict) -> Verdict:
-    """The verdict in its own words; where a file is from before findings had codes, without."""
+    """The verdict in the words of the file; files from before findings had codes have none."""
     coded = {(one.level, one.text): one for one in saved.findings}
     findings: list[Finding] = []
     for level, texts in (
@@ -442,7 +442,7 @@ def _verdict(saved: _Verdict) -> Verdict:
 
 
 def _mechanism(saved: _Saved) -> MechanismDocument:
-    """The mechanism; of a file from before readings had scales, one whose scales are exact."""
+    """The mechanism; with exact scales in files from before readings had scales."""
     mechanism = saved.mechanism
     if any(p.name.endswith(".scale") for p in saved.parameters):
         return mechanism
@@ -483,7 +483,7 @@ def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> No
 
 
 def _covariance(document: Document, saved: _Saved) -> tuple[tuple[str, ...], Array]:
-    """Names of the stations that are known with the machine, and the covariance of both."""
+    """Names of the stations with a covariance, and the joint covariance with the machine."""
     count, reference_values = len(saved.parameters), saved.station_covariance
     _check_size(document, "covariance", saved.covariance, (count, count), "list of parameters")
     if reference_values is None:

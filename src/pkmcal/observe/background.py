@@ -1,12 +1,12 @@
-"""What stands around the machine, as photographs taken by hand from several places show it.
+"""Log-likelihood of camera poses by the background that hand-held images share.
 
 A machine of equal parts looks much the same from several sides; the room about it does not. Points
-of texture that two photographs share lie on epipolar lines of each other where both were taken from
-where they are believed to be, and anywhere elsewhere. So each place that a photograph could show is
-asked how well the room agrees with photographs that are placed.
+of texture that two images share are on each other's epipolar lines if both poses are right, and
+anywhere otherwise. So each candidate pose of an image has a log-likelihood by the background in
+images that are placed.
 
-Points on the machine itself are left out: they move with it, and a machine alike from two sides
-agrees with itself from both. Points are Lowe's scale-invariant features (International Journal of
+Points on the machine are omitted: they move with it, and a machine that is symmetric agrees with
+itself from several sides. Points are Lowe's scale-invariant features (International Journal of
 Computer Vision 60, 2004) with the roots of their descriptors (Arandjelovic and Zisserman, CVPR
 2012).
 """
@@ -27,43 +27,46 @@ from pkmcal.observe.image_localization import SAME_PLACE_TURN, PoseHypotheses
 from pkmcal.observe.predict import LegsInCamera
 
 LARGEST_TEXTURE_SIDE = 1600
-"""Pixels of a photograph's longer side on which texture is looked for: finer is mostly noise."""
+"""Longer side (px) of the image in which texture is detected: finer texture is mostly noise."""
 MOST_TEXTURE_POINTS = 3000
-"""Points of texture of a photograph, those of most contrast."""
+"""Most points of texture of an image, those of highest contrast."""
 PARTNER_DISTANCE_RATIO = 0.8
-"""Distance to the likeliest partner, in that to the next, above which there is none (Lowe, 7.1)."""
+"""Ratio of distances to the nearest and the next descriptor above which there is no partner (Lowe,
+7.1)."""
 TEXTURE_POINTS_APART = 8.0
-"""Pixels within which points are one: a corner has several descriptions, and tells one thing."""
+"""Distance (px) within which points are one: a corner has several descriptors and is one
+measurement."""
 FEWEST_POINT_PAIRS = 16
-"""Pairs of points without which two photographs tell nothing of each other: of fewer nobody knows
-what chance makes of them."""
+"""Least number of pairs of points in two images: with fewer the distribution by chance is unknown.
+"""
 MACHINE_OUTLINE_FACTOR = 1.5
-"""Size, in that of its joints' outline, of what may belong to the machine in a photograph: plates,
-motors and cables reach beyond the joints, and a drawing does not tell how far."""
+"""Size of the machine in an image, in that of its joints' outline: plates, motors and cables extend
+beyond the joints, by an unknown amount."""
 EPIPOLAR_SPREADS = np.radians([0.1, 0.25, 0.6])
-"""Standard deviations (rad) of points from their epipolar planes, of which the likeliest is taken:
-from what a feature is off, to what a drawing that is wrong by millimetres turns a camera."""
+"""Standard deviations (rad) of points from their epipolar planes, of which the likeliest is used:
+from the error of a feature to the turn of a camera by millimetres of nominal error."""
 RIGHT_PAIR_SHARES = np.linspace(0.02, 0.98, 49)
-"""Shares of right pairs, of which the likeliest is taken."""
+"""Shares of right pairs, of which the likeliest is used."""
 PARTNER_EXCHANGES, EPIPOLAR_WINDOW = 20, np.radians(2.0)
-"""How often partners are exchanged, to see how many chance puts within this angle of the planes."""
+"""Number of random exchanges of partners, and angle to the planes within which they are counted,
+for the density by chance."""
 
 LEAST_LANDMARK_PARALLAX = np.radians(3.0)
-"""Angle between two rays below which their crossing is no place: five of the widest spreads."""
+"""Least angle between two rays of a triangulated point: five of the widest spreads."""
 LANDMARK_TRIPLES_TRIED, LEAST_COSINE_AHEAD = 3000, 0.2
-"""Triples of landmarks that are tried for a photograph's place: one of ten right ones is enough for
-three of them to be found. Rays further off the camera's axis than its cosine are left out."""
+"""Triples of landmarks that are tried for an image's pose: with one right one in ten, a right
+triple is among them. Rays further off the camera's axis than this cosine are omitted."""
 
 CANDIDATES_TESTED_BY_BACKGROUND = 4
-"""Places of a photograph about which the room is asked."""
+"""Candidate poses of an image that are compared by the background."""
 TURN_GRID = np.radians(
     np.stack(np.meshgrid(*[np.arange(-6.0, 7.0, 2.0)] * 2), axis=-1).reshape(-1, 2)
 )
-"""Turns (49, 2) of the machine that are tried there, rad: beyond, the legs are others'."""
+"""Trial turns (49, 2) of the machine, rad: beyond, predicted legs match others."""
 
 
 class Texture(NamedTuple):
-    """Points of one photograph. ray : (n, 3) unit, camera frame. pixel : (n, 2).
+    """Points of one image. ray : (n, 3) unit, camera frame. pixel : (n, 2).
     descriptor : (n, 128).
     """
 
@@ -73,7 +76,7 @@ class Texture(NamedTuple):
 
 
 def texture_of(image: Integers, camera: Camera) -> Texture:
-    """Points of texture of a photograph, grey levels (height, width)."""
+    """Points of texture of an image, grey levels (height, width)."""
     import cv2
 
     scale = min(LARGEST_TEXTURE_SIDE / max(image.shape), 1.0)
@@ -89,7 +92,7 @@ def texture_of(image: Integers, camera: Camera) -> Texture:
 
 
 def partners(one: Texture, other: Texture) -> Integers:
-    """Pairs (n, 2) of points that are each other's likeliest partner, by far; no point twice."""
+    """Pairs (n, 2) of mutual nearest neighbours that pass the ratio test; no point twice."""
     import cv2
 
     if min(len(one.ray), len(other.ray)) < 2:
@@ -114,7 +117,7 @@ def partners(one: Texture, other: Texture) -> Integers:
 
 
 def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans:
-    """Which pixels (n, 2) of a photograph lie beside the machine, legs : (L, 3) of it alone."""
+    """Mask (n,) of pixels (n, 2) of an image beside the machine; legs : (L, 3) of this image."""
     import cv2
 
     joints = camera.project(np.concatenate([legs.a, legs.b]))
@@ -132,11 +135,11 @@ def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans
 
 
 def agreement(one: Array, other: Array, T_other_one: Array) -> float:
-    """Log likelihood that pairs of unit rays (n, 3) see the same points, against chance.
+    """Log-likelihood ratio that pairs of unit rays (n, 3) see the same points, against chance.
 
-    T_other_one : (4, 4) the one camera's frame in the other's. A pair is right, with a share that
-    all have in common, or lies where exchanged partners do. The share and the spread of the right
-    ones are chosen to fit, and paid for as two numbers are (Schwarz, Annals of Statistics 6, 1978).
+    T_other_one : (4, 4) the one camera's frame in the other's. A pair is right, with a probability
+    common to all, or distributed as exchanged partners are. The share and the spread of the right
+    ones are estimated, at the cost of two parameters (Schwarz, Annals of Statistics 6, 1978).
     """
     if len(one) < FEWEST_POINT_PAIRS:
         return 0.0
@@ -156,7 +159,7 @@ def agreement(one: Array, other: Array, T_other_one: Array) -> float:
 
 
 class Neighbour(NamedTuple):
-    """A photograph that is placed. T_camera_base : (4, 4). legs : (L, 3) as it has them."""
+    """A placed image. T_camera_base : (4, 4). legs : (L, 3) in its camera frame."""
 
     camera: Camera
     T_camera_base: Array
@@ -164,8 +167,8 @@ class Neighbour(NamedTuple):
 
 
 class Landmarks(NamedTuple):
-    """Points of the room that two placed photographs show. point : (n, 3) m, base frame. number :
-    (n,) of the photograph's texture that shows it.
+    """Points of the background in two placed images. point : (n, 3) m, base frame. number : (n,)
+    index into the image's texture.
     """
 
     point: Array
@@ -173,10 +176,10 @@ class Landmarks(NamedTuple):
 
 
 class Surroundings:
-    """What a session's photographs share of what stands around the machine.
+    """Background that a session's images share.
 
-    Texture and its partners are looked for once, when they are asked for. photograph : by its
-    number, grey levels and camera.
+    Texture and its partners are computed on first use. photograph : grey levels and camera of an
+    image, by its number.
     """
 
     def __init__(self, photograph: Callable[[int], tuple[Integers, Camera]]) -> None:
@@ -186,13 +189,13 @@ class Surroundings:
         )
 
     def shared(self, one: int, other: int) -> tuple[Integers, Integers]:
-        """Numbers (n,) of the texture that two photographs share, in each."""
+        """Indices (n,) of the texture that two images share, in each."""
         first, second = sorted((one, other))
         pairs = self._pairs(first, second).T
         return (pairs[0], pairs[1]) if first == one else (pairs[1], pairs[0])
 
     def landmarks(self, placed: Mapping[int, Neighbour]) -> dict[int, Landmarks]:
-        """Points that two placed photographs see at one place, by the photograph."""
+        """Triangulated points of two placed images each, by image."""
         results: dict[int, list[tuple[Array, Integers]]] = {k: [] for k in placed}
         for one, other in combinations(placed, 2):
             j, k = self.shared(one, other)
@@ -219,7 +222,7 @@ class Surroundings:
         return beside_machine(self.texture(k).pixel[numbers], neighbour.camera, neighbour.legs)
 
     def place(self, one: int, landmarks: Mapping[int, Landmarks]) -> Array:
-        """The places T_camera_base (0 or 1, 4, 4) that landmarks give a photograph."""
+        """Pose T_camera_base (0 or 1, 4, 4) of an image by landmarks."""
         import cv2
 
         rays: list[Array] = [np.zeros((0, 3))]
@@ -257,10 +260,10 @@ class Surroundings:
         legs: LegsInCamera,
         placed: Mapping[int, Neighbour],
     ) -> Array:
-        """Of the likeliest places of a photograph, those near by (n, 4, 4) that agree with the room
-        better: what the drawing has wrong, or clutter, turns a place that legs alone tell.
+        """Poses (n, 4, 4) near the likeliest ones of an image that agree better with the
+        background: nominal errors, or clutter, turn a pose that is determined by legs alone.
 
-        legs : (H, L, 3) as each of the places has them.
+        legs : (H, L, 3) by each of the poses.
         """
         out = [np.zeros((0, 4, 4))]
         for h, T in enumerate(hypotheses.T_camera_base[:CANDIDATES_TESTED_BY_BACKGROUND]):
@@ -284,11 +287,12 @@ class Surroundings:
         legs: LegsInCamera,
         placed: Mapping[int, Neighbour],
     ) -> PoseHypotheses:
-        """The places of a photograph, weighed with what it shares with placed ones as well.
+        """Pose hypotheses of an image with the likelihood of the background it shares with placed
+        ones.
 
-        hypotheses : its evidence a log likelihood, unit 1. camera : the photograph's. legs : (H, L,
-        3) as each of the places has them. The room tells from which side the photograph was taken;
-        from where exactly, the legs.
+        hypotheses : with log-likelihoods in nats, unit 1. camera : of the image. legs : (H, L, 3)
+        by each of the poses. The background determines from which side the image was taken, the
+        legs from where exactly.
         """
         if not placed:
             return hypotheses
@@ -308,8 +312,8 @@ class Surroundings:
         legs: Sequence[LegsInCamera],
         placed: Mapping[int, Neighbour],
     ) -> Array:
-        """Log likelihood (H,) of places of a photograph by the room, against chance. Any of those
-        that are placed may be the one that shows the same part of it.
+        """Log-likelihood ratios (H,) of poses of an image by the background, against chance, by the
+        placed image that shares most with it.
         """
         texture = self.texture(one)
         gain = np.zeros((len(T_camera_base), len(placed)))
@@ -326,8 +330,8 @@ class Surroundings:
 
 
 def _crossing(eye: Array, ray: Array, eye_b: Array, ray_b: Array) -> tuple[Array, Booleans]:
-    """Points (n, 3) halfway between rays (n, 3) where these are nearest, and where that is a place:
-    before both eyes (3,), seen so from both, from directions that differ.
+    """Points (n, 3) halfway between rays (n, 3) at their closest approach, and which are valid: in
+    front of both cameras (3,), near both rays, with enough parallax.
     """
     base = eye_b - eye
     cosine = dot(ray, ray_b)

@@ -1,15 +1,15 @@
-"""Each leg found in each photograph, then its edges to sub-pixel: what one look at stations gives.
+"""One measurement pass of stations: search of whole legs to a pixel, edges to sub-pixel.
 
-The drawing's errors leave predictions a few pixels off, more than the distance to highlights,
-shadows and neighbours. But all edges of one leg, two to a tube, move together: so
-:func:`search` shifts and tilts the leg as a whole until the grey-level gradients under all its
-edges are strongest. A highlight imitates one edge; four at the right distances it does not.
+Errors of the nominal model displace predictions by a few pixels, more than the distance to
+highlights, shadows and neighbours. But the edges of one leg, two to a tube, move together:
+:func:`search` shifts and tilts the leg as a whole to the largest grey-level gradients under all its
+edges. A highlight imitates one edge, not four at the right distances.
 
-Where the prediction is good to a pixel, :func:`measure` fits every edge by itself, to the profiles
+Where the prediction is good to a pixel, :func:`measure` fits every edge by itself to the profiles
 across it (:mod:`pkmcal.observe.profiles`).
 
-Both take the photographs through in windows (:mod:`pkmcal.observe.image_batches`): what is worked
-out of one is forgotten with it, and a few hundred numbers of its edges remain.
+Both process images in windows (:mod:`pkmcal.observe.image_batches`): intermediate arrays of a
+window are freed, and a few hundred numbers of its edges remain.
 """
 
 from __future__ import annotations
@@ -50,48 +50,48 @@ from pkmcal.observe.profiles import (
 )
 
 USUAL_PICTURE_LENGTH = 1024
-"""Pixels along the longer side of pictures in which a drawing is off by pixels, tubes are some tens
-of them wide, and all lengths below are meant: photographs are binned to about as many."""
+"""Longer side (px) of images in which nominal errors are pixels and tubes some tens of pixels wide;
+all lengths below are in pixels of such images, to which larger ones are binned."""
 BLUR_ROUNDING = 1e-6
-"""Pixels by which the last of the blurs that are tried may be missed."""
+"""Tolerance (px) of an estimated blur at the last trial value."""
 LEG_SEARCH_REACH = 10.0
-"""Pixels to each side that a leg is looked for: 2 mm of drawing error at 0.9 px/mm, several
-times over, and what the station's pose leaves."""
+"""Reach (px) of the search for a leg to each side: several times the 2 mm of nominal error at 0.9
+px/mm, and errors of the station's pose."""
 REPEATED_SEARCH_REACH = 4.0
-"""The same once the other legs have told where it is: beyond lies a highlight, or a neighbour."""
+"""The same after an estimate from other legs: beyond are highlights and neighbours."""
 SEARCH_TILTS = np.arange(-4.0, 4.5, 1.0)
-"""Shifts of a leg's ends against its middle that are tried, px."""
+"""Trial shifts of a leg's ends against its middle, px."""
 LEG_SEARCH_BLUR = 1.0
-"""Pixels of blur (standard deviation) against the noise of dark photographs."""
+"""Smoothing (px, standard deviation) against the noise of dark images."""
 PEAK_HALF_WIDTH = 2
-"""Pixels to each side within which the steepest place counts most."""
+"""Half width (px) within which the steepest point has the largest weight."""
 GRADIENT_HALF = 1.5
-"""Levels per pixel at which an edge counts half of a strong one: strong highlights must not outvote
-three weak edges. Levels are roots of grey levels (255 stays), whose noise is even: 0.3 a pixel once
-smoothed, so this is five times that."""
+"""Gradient (levels a pixel) at which an edge has half of the full strength: strong highlights must
+not outweigh three weak edges. Levels are roots of grey levels (255 stays), with uniform noise of
+0.3 a pixel after smoothing; this is five times that."""
 RIVAL_SCORE_SHARE = 0.95
-"""A second place with this share of the best one's score makes a leg ambiguous."""
+"""Share of the best score from which a second position makes a leg ambiguous."""
 RIVAL_AWAY = 4.0
-"""Pixels from the best place at which another one is a rival, not its flank."""
+"""Distance (px) from the best position from which another one is a rival, not its flank."""
 FEWEST_POINTS = 8
-"""Edge points (of 12 an edge) without which a leg's place is not looked for."""
+"""Least number of edge points (of 12 an edge) for the search of a leg."""
 SEARCH_SIGMA = 1.0
-"""Standard deviation (px) given to edges found this way: one step of the search."""
+"""Standard deviation (px) of edges by this search: one of its steps."""
 SEARCH_SAMPLES = 12
 LEG_TILTS = np.arange(-1.0, 1.25, 0.25)
-"""Shifts of a leg's ends against its middle that are tried once it is known to a pixel, px."""
+"""Trial shifts of a leg's ends against its middle where it is predicted to a pixel, px."""
 EDGE_SEGMENTS = 8
-"""Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
+"""Segments along an edge, each with one position by the mean profile of its samples."""
 POINTS_A_SEGMENT = 3
-"""Points along each that are predicted in full: an odd count, so one is its middle."""
+"""Predicted points along each segment: an odd count, so that one is its middle."""
 FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT = 3, 8
-"""Profiles taken about each of these: one a pixel on edges of 72 to 192 pixels. Faint edges need
-all of them, and more would look at the same pixels; shorter edges are looked at oftener, and of
-longer ones so many tell what shading leaves to be told."""
+"""Profiles about each of these points: one a pixel on edges of 72 to 192 pixels. Faint edges need
+all of them, and more would sample the same pixels; shorter edges are sampled more densely, and on
+longer ones so many suffice in view of errors by shading."""
 FEWEST_SHARE = 1 / 3
-"""Share of a segment's points that must be clear for its mean profile to count."""
+"""Least share of clear points of a segment with a mean profile."""
 OTHER_OUTLINE_CLEARANCE = 5.0
-"""Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
+"""Clearance (px) to other legs' outlines: the outer reach of a profile and the search about it."""
 
 OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
@@ -101,18 +101,18 @@ _NOT_ONE_EDGE = "its places do not lie on one edge"
 
 
 ImageBatchesInUse = Callable[[int], None]
-"""Called with how many photographs more were looked at."""
+"""Called with the number of images that were processed since the last call."""
 
 
 def first_binning(image_size: tuple[int, int]) -> int:
-    """How many pixels of photographs of a size are one where their edges are looked for first."""
+    """First binning of images of a size."""
     return max(round(max(image_size) / USUAL_PICTURE_LENGTH), 1)
 
 
 def sharp_binning(binning: int, blur: float) -> int:
-    """How many pixels are one where edges, so blurred (px) at a binning, are as sharp as usual:
-    averaging fewer of those over which the lens spreads an edge tells no more of it. Twice as many
-    as now where edges are blurred beyond what profiles are explained with.
+    """Binning at which edges with a ``blur`` (px) at a binning are as sharp as usual: less binning
+    adds no information where the lens spreads an edge over several pixels. Twice the binning where
+    the blur is beyond the trial values of the profiles.
     """
     if blur > profiles.BLURS_TRIED[-1] - BLUR_ROUNDING:
         return 2 * binning
@@ -121,11 +121,11 @@ def sharp_binning(binning: int, blur: float) -> int:
 
 @dataclass(frozen=True)
 class LegPlaces:
-    """Where legs were found in photographs, arrays (K, L).
+    """Positions of legs in images, arrays (K, L).
 
     shift, tilt : px sideways, towards side 0, of the leg's middle, and of its visible end near
-    B against the middle. score : 0..1. share : of the leg's edge points that can be seen.
-    clear : False where the leg is hidden or its place ambiguous.
+    B against the middle. score : 0..1. share : of the leg's edge points that are visible. clear :
+    False where the leg is hidden or its position ambiguous.
     """
 
     shift: Array
@@ -135,7 +135,7 @@ class LegPlaces:
     clear: Booleans
 
     def outward(self, points: EdgePoints, visible: Booleans, tubes: TubeList) -> Array:
-        """Outward positions (K, E, n) px of all edges' points that these places mean."""
+        """Outward positions (K, E, n) px of all edges' points for these shifts and tilts."""
         along = place_on_leg(points.along, visible, tubes)
         shift, tilt = (v[:, tubes.leg][..., None] for v in (self.shift, self.tilt))
         return SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * along)
@@ -148,7 +148,7 @@ def search_legs(
     clear: Booleans,
     reach: float = LEG_SEARCH_REACH,
 ) -> LegPlaces:
-    """Shift and tilt of every leg in photographs.
+    """Shift and tilt of every leg in images.
 
     images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
     """
@@ -195,7 +195,7 @@ def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeL
 
 
 def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Array) -> Array:
-    """Strength 0..1 of a photograph's edges across predicted ones, (n, offsets).
+    """Strength 0..1 of an image's edges across predicted ones, (n, offsets).
 
     pixel, outward : (n, 2) of points of these. offsets : whole pixels outward, one by one.
     """
@@ -212,8 +212,8 @@ def gradient_strength(image: Integers, pixel: Array, outward: Array, offsets: Ar
 
 
 def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]:
-    """Columns and rows (n, offsets) of pixels (n, 2) moved so far along unit vectors (n, 2), single
-    precision.
+    """Columns and rows (n, offsets) of pixels (n, 2) shifted by offsets along unit vectors (n, 2),
+    single precision.
     """
     # one small matrix product a coordinate: eight times as fast as to spread and add
     away = np.stack([np.ones(len(offsets)), offsets]).astype(np.float32)
@@ -222,7 +222,7 @@ def _outward_of(pixel: Array, outward: Array, offsets: Array) -> Iterator[Array]
 
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
-    """Place of every point between the ends of its leg's visible part, -1..1; (K, E, n)."""
+    """Position of every point between the ends of its leg's visible part, -1..1; (K, E, n)."""
     legs, first_edge = tubes.by_leg
     ends: list[Array] = []
     for reduce, beyond in ((np.minimum, np.inf), (np.maximum, -np.inf)):
@@ -250,11 +250,11 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
 
 @dataclass(frozen=True)
 class StationEdges:
-    """What one look gave, at one station or, before it is taken apart, at several.
+    """Edges of one measurement pass, of one station or of several.
 
-    points : (M, 2) px and point_edge (M,) the edge in ``edges`` that each supports.
-    blur : px, of the pictures' edges; nan where not estimated. shift : median distance (px) of
-    the edges from where they were predicted.
+    points : (M, 2) px and point_edge (M,) the edge in ``edges`` that each supports. blur : px, of
+    the images' edges; NaN where not estimated. shift : median distance (px) of the edges from their
+    prediction.
     """
 
     edges: EdgeSet
@@ -265,7 +265,7 @@ class StationEdges:
     shift: float
 
     def of_station(self, station: int) -> StationEdges:
-        """What of a look at several is a station's; blur and moved as they are."""
+        """The part of one station; blur and shift unchanged."""
         mine = self.edges.station == station
         at, number = mine[self.point_edge], np.cumsum(mine) - 1
         return replace(
@@ -277,8 +277,8 @@ class StationEdges:
         )
 
     def unbinned(self, count: int) -> StationEdges:
-        """What was seen in binned photographs, in the whole ones: points in their pixels, and edges
-        by their camera's parameters. What is in pixels of an edge itself stays in binned ones.
+        """Edges of binned images in terms of the unbinned ones: points in their pixels, derivatives
+        by their camera's parameters. Lengths in pixels of an edge itself stay in binned ones.
         """
         if count == 1:
             return self
@@ -317,7 +317,7 @@ def search_stations(
 
 
 def _searched(window: PhotographWindow, machine: Machine, reach: float) -> StationEdges:
-    """One window's part of :func:`search_stations`."""
+    """Legs of one window, for :func:`search_stations`."""
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear, reach)
     valid = clear & places.clear[:, tubes.leg][..., None]
@@ -358,9 +358,8 @@ def measure_stations(
 ) -> list[StationEdges]:
     """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
-    blur : from an earlier look; where a station has none, estimated from the profiles of as many of
-    its photographs as are looked at together, spread over all. refine_camera : also how the edges
-    depend on the camera's parameters.
+    blur : from an earlier pass; where a station has none, estimated from the profiles of one window
+    of its images, spread over all. refine_camera : with derivatives by the camera's parameters.
     """
     numbers = dict(blur)
     for one in placed:
@@ -393,7 +392,7 @@ def measure_stations(
 
 
 def _blur_in(across: Profiles, stations: Sequence[int]) -> dict[int, float]:
-    """Px by station, as profiles tell it; where there are none, the usual one."""
+    """Blur (px) by station, by its profiles; where there are none, the usual one."""
     out: dict[int, float] = {}
     for station in stations:
         own = np.flatnonzero(across.station == station)
@@ -403,7 +402,7 @@ def _blur_in(across: Profiles, stations: Sequence[int]) -> dict[int, float]:
 
 
 def joined_passes(passes: Sequence[StationEdges], blur: float, shifted: float) -> StationEdges:
-    """One station's windows, or all stations, as one look."""
+    """Windows of a station, or all stations, as one measurement pass."""
     first = np.cumsum([0, *(len(station_edges.edges) for station_edges in passes)])[:-1]
     number = [station_edges.point_edge + k for station_edges, k in zip(passes, first, strict=True)]
     return StationEdges(
@@ -422,7 +421,7 @@ def joined_passes(passes: Sequence[StationEdges], blur: float, shifted: float) -
 
 @dataclass(frozen=True)
 class _PredictedEdges:
-    """A window's predicted places along edges, and the profiles where they are clear, ``full``
+    """Predicted points along the edges of a window, and profiles of the clear segments, ``full``
     (K, E, EDGE_SEGMENTS).
     """
 
@@ -444,8 +443,8 @@ def _predicted_edges(window: PhotographWindow, machine: Machine) -> _PredictedEd
 def _measured(
     window: PhotographWindow, prediction: _PredictedEdges, blur: BlurByStation, refine_camera: bool
 ) -> tuple[StationEdges, Array]:
-    """One window's part of :func:`measure_stations`, and how far (px) each place was from its
-    prediction.
+    """Edges of one window, for :func:`measure_stations`, and the distance (px) of each point from
+    its prediction.
     """
     tubes, places, full = prediction.tubes, prediction.places, prediction.full
     across, highlight = profiles.without_highlights(prediction.across, blur)
@@ -471,7 +470,7 @@ def _measured(
 def predicted(
     window: PhotographWindow, machine: Machine, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
-    """The tubes' edges, some samples on each, and which of these (K, E, n) nothing obstructs."""
+    """The tubes, samples on their predicted edges, and the unobstructed ones (K, E, n)."""
     tubes = tubes_of(machine)
     legs = legs_in_camera(machine, window.T_camera_base, window.poses, window.joints)
     points = edge_points(machine, window.camera, legs, tubes, samples)
@@ -484,7 +483,7 @@ def _segment_profiles(
 ) -> tuple[Booleans, Profiles]:
     """Mean profiles over each segment's clear samples.
 
-    Returns where there are enough of them, (K, E, EDGE_SEGMENTS), and the profiles there.
+    Returns the mask of segments with enough of them, (K, E, EDGE_SEGMENTS), and their profiles.
     """
     visible = _by_segment(clear)
     full = visible.sum(axis=-1) >= FEWEST_SHARE * visible.shape[-1]
@@ -525,8 +524,8 @@ def _between(visible: Booleans, each: Integers) -> tuple[Integers, Array]:
     """M profiles about the points of N segments that are ``visible`` (N, points of one), ``each``
     (N,) about a point.
 
-    Returns the point of each profile (M,), counted through all segments, and the profile's place
-    (M,) from it, -1/2 to 1/2 of the way to the next.
+    Returns the point of each profile (M,), counted through all segments, and the profile's position
+    (M,) from it, -1/2 to 1/2 of the distance to the next.
     """
     times = (visible * each[:, None]).ravel()
     which = np.repeat(np.arange(times.size), times)
@@ -535,11 +534,11 @@ def _between(visible: Booleans, each: Integers) -> tuple[Integers, Array]:
 
 
 def _on_edges(points: EdgePoints, full: Booleans, which: Integers, at: Array) -> Array:
-    """Places (M, 3) of profiles, single precision. which, at : (M,) as :func:`_between` gives them
-    of the segments that are ``full``.
+    """Positions (M, 3) of profiles, single precision. which, at : (M,) as of :func:`_between` for
+    the segments that are ``full``.
 
-    Points of an edge lie evenly on a line in space, so those between are interpolated there; the
-    profiles' directions hardly turn from one to the next.
+    Points of an edge are evenly spaced on a line in space, so those between are interpolated there;
+    the profiles' directions hardly turn from one to the next.
     """
     k, e, _ = np.nonzero(full)
     step = (points.point[k, e, 1] - points.point[k, e, 0]).astype(np.float32)
@@ -550,10 +549,10 @@ def _on_edges(points: EdgePoints, full: Booleans, which: Integers, at: Array) ->
 
 
 def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList) -> Array:
-    """Where the edges of each profile's leg are by all profiles of the leg, px outward (N,).
+    """Outward position (N,), px, of each profile's edge by all profiles of its leg.
 
     likelihood : (N, shifts) of the profiles at ``full`` (K, E, n). A leg is shifted and tilted as a
-    whole: a highlight beside one edge is likelier there than the edge, but not for all of them.
+    whole: a highlight beside one edge may be likelier there than the edge, but not for all of them.
     """
     every = np.zeros((*full.shape, likelihood.shape[-1]), np.float32)
     every[full] = likelihood
