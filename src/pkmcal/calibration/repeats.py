@@ -1,8 +1,8 @@
-"""Measurement accuracy by experiment, [A] 4.2 and Table 1: how repeated photographs scatter.
+"""Measurement accuracy by experiment, [A] 4.2 and Table 1: scatter of repeated images.
 
-The session is calibrated, so that every leg is looked for where it is; then each photograph is
-measured by itself. What differs between photographs of one configuration from one station is the
-noise of a measurement: of the direction and position of each leg's axis, and of its edges.
+The session is calibrated, so that every leg is predicted well; then each image is measured by
+itself. The scatter between images of one configuration from one station is the noise of a
+measurement: of the direction and position of each leg's axis, and of its edges.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
 CAUSE_NAMED_SHARE = 0.3
-"""Share of the scatter, above what chance explains, from which its cause is told."""
+"""Share of the scatter, above that by chance, from which its cause is named."""
 LEGS_BETTER_SHARE = 0.1
-"""Share by which each leg's own motion must explain more than one of the whole to be the cause."""
+"""Share by which single legs' motions must explain more than a common one to be the cause."""
 MOST_EXPLAINED_BY_CHANCE = 0.9
-"""Share that chance explains from which nothing can be told of a motion: too few edges show it."""
+"""Share explained by chance from which a motion is not identified: too few edges show it."""
 MOSTLY_COMMON = 0.5
-"""Scatter, in what photographs promise, below which averaging repeats gains under an eighth."""
+"""Ratio of scatter to stated noise below which averaging repeats gains less than an eighth."""
 REPEAT_SHUFFLES = 16
-"""Exchanges of the repeats that tell what chance explains, to a few hundredths."""
+"""Random exchanges of the repeats, which give the share by chance to a few hundredths."""
 PAPER_AXIS_NOISE = AxisNoise(images=1)
 """[A] Table 1, upper bounds, in degrees where the paper prints rad (errata)."""
 REPEATS_TABLE_LEGEND = (
@@ -59,20 +59,20 @@ REPEATS_TABLE_LEGEND = (
 )
 
 LEVEL_AXIS_SINE = float(np.sin(np.deg2rad(10.0)))
-"""Part u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2) lies
-far away or nowhere (errata)."""
+"""Component u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2) is
+far away or does not exist (errata)."""
 _RANK = 1e-9
-"""Singular values below this part of the largest are those of motions that no edge shows."""
+"""Singular values below this share of the largest are of unidentifiable motions."""
 
 
 @dataclass(frozen=True)
 class LegScatter:
     """Standard deviations of one photograph of a leg (from 1), pooled over configurations.
 
-    psi, theta (rad), x, z (m) : of the axis, [A] Table 1, camera frame; NaN where there are none.
-    shift, tilt : of an edge, px, as a whole and at its ends. promised : the edges' scatter over
-    what their own photographs promise. photographs, freedom : that saw the leg, and how many of
-    them are repeats.
+    psi, theta (rad), x, z (m) : of the axis, [A] Table 1, camera frame; NaN without any. shift,
+    tilt : of an edge, px, as a whole and at its ends. promised : ratio of the edges' scatter to
+    their stated noise. photographs, freedom : number of images of the leg, and of repeats among
+    them.
     """
 
     station: str
@@ -90,12 +90,11 @@ class LegScatter:
 
 @dataclass(frozen=True)
 class StationScatter:
-    """Why the repeats at a station differ.
+    """Scatter of the repeats at a station, and its cause.
 
-    shift : px, and promised : as for a leg, over all of them. camera, platform, legs : share of
-    the squared scatter that a motion of the camera, of the platform, or of each leg by itself
-    explains, above chance. photographs, configurations : with repeats. dropped : repeats of
-    edges that lay far from the others.
+    shift : px, and promised : as for a leg, over all legs. camera, platform, legs : share of the
+    squared scatter that a motion of the camera, of the platform, or of single legs explains, above
+    chance. photographs, configurations : with repeats. dropped : outlying repeats of edges.
     """
 
     station: str
@@ -110,9 +109,9 @@ class StationScatter:
 
     @property
     def cause(self) -> str:
-        """What moves: ``camera``, ``platform``, ``legs`` or, where nothing does, ``noise``.
+        """What moves: ``camera``, ``platform``, ``legs``, or ``noise`` where nothing does.
 
-        Legs that move by themselves imitate a motion of the whole in part, and explain more.
+        Motions of single legs resemble a common motion in part, and explain more.
         """
         best = "camera" if self.camera >= self.platform else "platform"
         whole = max(self.camera, self.platform)
@@ -135,7 +134,7 @@ class RepeatStudy:
     findings: tuple[Finding, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything under its name, for ``--json``."""
+        """All fields by name, for ``--json``."""
         causes = [{**asdict(s), "cause": s.cause} for s in self.stations]
         paper = {name: getattr(PAPER_AXIS_NOISE, name) for name in ("psi", "theta", "x", "z")}
         findings = [finding.document() for finding in self.findings]
@@ -146,9 +145,9 @@ class RepeatStudy:
 def study_repeats(
     session: Session | Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
 ) -> RepeatStudy:
-    """How photographs of the same configurations scatter, by station and leg.
+    """Scatter of images of the same configurations, by station and leg.
 
-    Raises InputError where the session has no repeats, and what `calibrate_session` raises.
+    Raises InputError where the session has no repeats, and the errors of `calibrate_session`.
     """
     if not isinstance(session, Session):
         session = load_session(session)
@@ -172,7 +171,7 @@ def study_repeats(
 
 
 def require_repeats(session: Session) -> None:
-    """An InputError, with what to write, where no station that observes legs has repeats."""
+    """Raise InputError where no station that observes legs has repeats."""
     for station in session.stations:
         rows = [photo.configuration for photo in station.photographs]
         if _sees_legs(station) and len(set(rows)) < len(rows):
@@ -203,9 +202,9 @@ def _sees_legs(station: Station) -> bool:
 
 @dataclass(frozen=True)
 class _StationEdges:
-    """One station's edges, each photograph's by itself, without those that fell far off.
+    """One station's edges, measured in each image by itself, without outliers.
 
-    photo : (N,) number of the photograph. same : the repeats of each edge. turn : (N, 2) of each
+    photo : (N,) index of the image. same : the repeats of each edge. turn : (N, 2) of each
     from their mean, rad, in the bases (N, 3, 2) of ``basis``.
     """
 
@@ -220,7 +219,7 @@ class _StationEdges:
 
     @classmethod
     def of(cls, calibration: Calibration, photographs: Photographs) -> _StationEdges:
-        """Measure a station's photographs where the calibration says that the legs are."""
+        """Measure a station's images from the calibration's prediction."""
         state, machine = calibration.estimate.state, calibration.machine
         s, rows = photographs.station, photographs.configuration
         camera = calibration.cameras.at_station(int(s))
@@ -289,13 +288,13 @@ def _pooled(values: Array, groups: Groups) -> _Pooled:
 
 
 def _deviation(pooled: _Pooled, mine: Booleans) -> Array:
-    """Standard deviations (n,) over some groups; NaN where nothing repeats."""
+    """Standard deviations (n,) over some groups; NaN without repeats."""
     freedom = pooled.freedom[mine].sum()
     return np.sqrt(pooled.squares[mine].sum(axis=0) / (freedom if freedom else np.nan))
 
 
 def _stated(station_edges: _StationEdges) -> Array:
-    """Standard deviations (N, 2) that each edge's own photograph promises, mean over repeats."""
+    """Stated standard deviations (N, 2) of the edges, mean over repeats."""
     mean = station_edges.same.mean(station_edges.edges.covariance[:, [0, 1], [0, 1]])
     return np.sqrt(mean)[station_edges.same.member]
 
@@ -307,10 +306,11 @@ def _whiten(station_edges: _StationEdges) -> Array:
 
 
 def _axis_scatter(station_edges: _StationEdges) -> tuple[Integers, _Pooled]:
-    """The axes' psi, theta, x, z in every photograph: the leg of each configuration, and sums.
+    """Legs of each configuration, and sums of squares of their axes' psi, theta, x, z in the
+    images.
 
-    An axis is fitted to all edges of the leg, of all of its tubes, weighted as the calibration
-    weights them; one that shows a single side has none.
+    An axis is fitted to all edges of the leg, of all of its tubes, with the calibration's weights;
+    a leg with a single visible side has none.
     """
     edges, legs = station_edges.edges, station_edges.cylinders
     in_view = groups_of(station_edges.photo, edges.leg)
@@ -329,7 +329,7 @@ def _axis_scatter(station_edges: _StationEdges) -> tuple[Integers, _Pooled]:
 
 
 def _station_row(station_edges: _StationEdges, station: str) -> StationScatter:
-    """Scatter over all legs of a station, and what motion explains it."""
+    """Scatter over all legs of a station, and the motion that explains it."""
     edges, same, legs = station_edges.edges, station_edges.same, station_edges.cylinders
     every = np.ones(len(same.first), dtype=bool)
     shift = _deviation(_pooled(station_edges.turn[:, :1] / pixel_units(edges)[:, :1], same), every)
@@ -352,9 +352,9 @@ def _station_row(station_edges: _StationEdges, station: str) -> StationScatter:
 def _explained(station_edges: _StationEdges, rows: Array, groups: Groups) -> float:
     """Share of the squared scatter that motions of groups explain: 0 as by chance, 1 all.
 
-    rows : (N, 2, p) turn of the edges by a group's motion. What chance explains is found by
-    exchanging the repeats of every edge by itself, which leaves its scatter and parts it from
-    the other edges'. Two edges of a leg look like a motion of it however they scatter.
+    rows : (N, 2, p) turn of the edges by a group's motion. The share by chance is that after random
+    exchanges of the repeats of every edge by itself, which keep its scatter and remove the
+    correlation with other edges. Two edges of a leg resemble a motion of it however they scatter.
     """
     whiten, rng = _whiten(station_edges), np.random.default_rng(0)
 
@@ -383,7 +383,7 @@ class Cylinders:
 
 
 def half_angles(edges: EdgeSet, legs: Cylinders) -> Array:
-    """Half the angle (N,), rad, under which the camera sees an edge's length."""
+    """Half of the angle (N,), rad, that an edge's length subtends."""
     d = legs.b - legs.a
     u = d / np.sqrt(dot(d, d))[:, None]
     first, last = (legs.a + edges.span[:, k, None] * u for k in (0, 1))
@@ -414,7 +414,7 @@ def _rigid(points: Array) -> Array:
 
 @dataclass(frozen=True)
 class MotionFit:
-    """Motions that explain edges' turns best, by group.
+    """Least-squares motions by edges' turns, by group.
 
     motion : (G, p). explained, total : sums of squared whitened turns.
     """
@@ -427,7 +427,7 @@ class MotionFit:
 def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> MotionFit:
     """Least squares, by group, of turns (N, 2) on rows (N, 2, p), both whitened by (N, 2, 2).
 
-    Motions that no edge shows stay zero.
+    Unidentifiable motions stay zero.
     """
     white = (whiten @ turn[..., None])[..., 0]
     rows = whiten @ rows
@@ -462,7 +462,7 @@ def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:
 
 
 def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
-    """A quantile of each column over all legs; at share 1 the largest, as [A] Table 1 has them."""
+    """Quantile of each column over all legs; at share 1 the maximum, as in [A] Table 1."""
 
     def quantile(name: str) -> float:
         column = np.array([getattr(row, name) for row in rows])
@@ -514,7 +514,7 @@ def _mm(value: float) -> str:
 
 
 def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
-    """What each station's repeats show, and what more of them would bring."""
+    """Findings on the repeats of each station, and on the gain by more of them."""
     results = [_finding(station) for station in stations] or [doubtful("repeats.none")]
     if stations and all(station.promised < MOSTLY_COMMON for station in stations):
         results.append(note("repeats.mostly_common"))
@@ -522,7 +522,7 @@ def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
 
 
 def _finding(station: StationScatter) -> Finding:
-    """How large the scatter of a station is and where it comes from."""
+    """The scatter of a station, and its cause."""
     share = {"camera": station.camera, "platform": station.platform, "legs": station.legs}
     return finding(
         f"repeats.by_{station.cause}",
