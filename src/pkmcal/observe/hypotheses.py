@@ -65,6 +65,8 @@ FEW_CONFIGURATIONS = 4
 ENOUGH_PHOTOGRAPHS_ALONE, USUAL_PHOTOGRAPHS = 4, 15
 """Images below which there are no two halves, one to search and one to confirm, and one of little
 evidence leaves it open whether the machine is there; and how many are usual."""
+NUMBERING = "readings.numbering_"
+"""Codes of legs that are numbered from another one, or backwards."""
 STATION_PAIRS_SEARCHED = 15
 """Pairs of stations that are searched for the other's pose: of six stations, all."""
 
@@ -146,7 +148,7 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
 
 
 def _little(station: SuspectStation) -> str:
-    """What of the evidence is too little."""
+    """The evidence that is too weak, in words."""
     localization = station.localization
     if localization.by_chance < localization.limit:
         return "legs that fit nearly as well at another place"
@@ -161,8 +163,9 @@ def _little(station: SuspectStation) -> str:
 def _swapped_stations(
     stations: list[SuspectStation], rng: np.random.Generator
 ) -> InputError | None:
-    """Two stations each recognised near the other's pose, and better than mirrored at its own: a
-    symmetric machine's mirror image looks much as the machine does from the other side.
+    """The error about two stations that are each recognised near the other's pose, and better than
+    mirrored at their own: a symmetric machine's mirror image looks much as the machine does from
+    the other side.
     """
     for one, other in islice(combinations(stations, 2), STATION_PAIRS_SEARCHED):
         if one.by_hand is None or other.by_hand is None:
@@ -341,10 +344,6 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
         )
 
 
-NUMBERING = "readings.numbering_"
-"""Codes of legs that are numbered from another one, or backwards."""
-
-
 def _with_half_radii(view: StationView) -> StationView:
     values = view.machine.values.copy()
     values[np.unique(view.tubes.radius)] /= 2
@@ -396,7 +395,7 @@ def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
 
 
 def _best_names(score: Array) -> Integers:
-    """The name (n,) of each photograph, each given once, with the largest sum of scores (n, n)."""
+    """The name (n,) of each image, each used once, with the largest sum of scores (n, n)."""
     others = np.where(np.eye(len(score), dtype=bool), -np.inf, score).max(axis=1)
     gain = np.sort(others - np.diag(score))
     # two photographs at least have to leave their own names for others; where that loses, as a
@@ -442,7 +441,7 @@ def _two_legs(a: int, b: int) -> InputError:
 
 
 def _numbering(order: Integers) -> InputError:
-    """The error about legs numbered otherwise; order : column of each leg, from 0."""
+    """The error about legs that are numbered differently; order : column of each leg, from 0."""
     rising = bool((order[1] - order[0]) % len(order) == 1)
     return InputError(
         "the legs are numbered differently in the readings and in the drawing",
@@ -467,7 +466,7 @@ def _shifted(step: int) -> InputError:
 
 
 def _misnamed(station: SuspectStation, photographs: Integers, fitting: Integers) -> InputError:
-    """The error about photographs, by number, that fit other rows of the readings."""
+    """The error about images, by index, that fit other rows of the readings."""
     files = [station.files[k] for k in photographs]
     fit = [station.configurations[k] for k in fitting]
     return InputError(
@@ -499,7 +498,7 @@ def _mirrored(station: SuspectStation) -> InputError:
 
 
 def diameters(mechanism: str) -> InputError:
-    """The error about radii that are twice too large; mechanism : the drawing's file."""
+    """The error about radii that are twice too large; mechanism : the nominal model's file."""
     return InputError(
         "the tubes' radii look like diameters",
         where=f"{mechanism}, tubes",
