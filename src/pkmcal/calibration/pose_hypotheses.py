@@ -43,6 +43,7 @@ from pkmcal.outcome.hypotheses import (
     log_likelihood,
     parameter_cost,
     posterior,
+    rivals_of,
 )
 from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
@@ -91,13 +92,14 @@ class Diagnosis(NamedTuple):
     hypothesis : None where none does. misfit : rms residual of the poses without the mistake, in
     stated standard deviations. movement : (6,) left perturbation (omega, tau) of a board, or a
     station, that moved; NaN where the data do not determine it. untested : codes and errors of
-    hypotheses without an estimate.
+    hypotheses without an estimate. rivals : other mistakes that are not excluded.
     """
 
     hypothesis: PoseHypothesis | None
     misfit: float
     movement: Array
     untested: tuple[tuple[str, str], ...]
+    rivals: tuple[PoseHypothesis, ...] = ()
 
 
 def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -> Diagnosis:
@@ -154,7 +156,8 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
         EvidenceLevel("closure", by_closure, decides=False, most=OPTIONS.most),
         EvidenceLevel("estimate", by_estimate),
     )
-    best = decide(posterior(pose_hypotheses(machine, measurements, estimate), levels))
+    ranked = posterior(pose_hypotheses(machine, measurements, estimate), levels)
+    best = decide(ranked)
     if best is None:
         return Diagnosis(None, np.inf, np.zeros(6), tuple(untested))
     hypothesis = best.hypothesis
@@ -163,7 +166,9 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
     if hypothesis.code == "readings.reversed":
         constant = _constant_by_estimate(machine, hypothesis, measurements.joints, value)
         hypothesis = replace(hypothesis, facts={**hypothesis.facts, "constant": constant})
-    return Diagnosis(hypothesis, pose_misfit(value), movement, tuple(untested))
+    # such as a camera that moved beside a board that did
+    rivals = [one.hypothesis for one in rivals_of(ranked) if one.log_odds > OPTIONS.report]
+    return Diagnosis(hypothesis, pose_misfit(value), movement, tuple(untested), tuple(rivals))
 
 
 def effective_sample_size(machine: Machine, measurements: Measurements) -> float:
@@ -487,7 +492,19 @@ def check_poses(
         raise error
     diagnosis = diagnose(session.machine, measurements, estimate)
     if diagnosis.hypothesis is not None:
-        raise _error(session, diagnosis.hypothesis, diagnosis, pose_misfit(estimate))
+        misfit = pose_misfit(estimate)
+        error = _error(session, diagnosis.hypothesis, diagnosis, misfit)
+        others = [_error(session, one, diagnosis, misfit).what for one in diagnosis.rivals]
+        if not others:
+            raise error
+        raise InputError(
+            error.what,
+            where=error.where,
+            found=f"{error.found}; the poses fit as well if {' or '.join(others)}",
+            expected=error.expected,
+            next_step=error.next_step,
+            code=error.code,
+        )
     if not diagnosis.untested:
         return ()
     codes = [code for code, _ in diagnosis.untested]
