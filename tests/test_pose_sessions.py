@@ -324,8 +324,7 @@ def test_a_pose_under_another_name_is_told(folder):
     assert values.facts["both"] == "no"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["h4", "delta"])
+@pytest.mark.parametrize("name", [pytest.param("h4", marks=pytest.mark.slow), "delta"])
 def test_a_frozen_reading(folder, name):
     made = make(folder, name, n=30)
     joints = made.joints.copy()

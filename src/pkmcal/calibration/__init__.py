@@ -1,1 +1,1 @@
-"""From a session to a calibrated machine: recognise, look and identify in turns, judge, save."""
+"""From a session to a calibrated machine: localize, measure and estimate in turns, judge, save."""

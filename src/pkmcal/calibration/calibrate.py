@@ -1,9 +1,11 @@
-"""From a session to a calibrated machine: load, observe, identify in turns, judge."""
+"""Calibration of a session: load, localize, measure and estimate in turns, compare hypotheses,
+judge.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +21,6 @@ from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.chance_matches import by_chance, chance_match_reason
 from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
 from pkmcal.calibration.faults import (
-    check_poses,
     lens_notes,
     model_at_fault,
     noise_fault,
@@ -43,6 +44,7 @@ from pkmcal.calibration.localization import (
 )
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
+from pkmcal.calibration.pose_hypotheses import check_frozen, check_poses
 from pkmcal.calibration.refinement import (
     RefinementResult,
     identify_poses,
@@ -86,16 +88,15 @@ CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
 
 @dataclass(frozen=True, repr=False)
 class Calibration(CalibrationSummary):
-    """Everything that a calibration found.
+    """The result of a calibration.
 
-    boards : the calibration board, where stations observe one. findings : what the data tell of
-    the machine and what they leave open. timings : seconds by step. holdout : configurations that
-    the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
-    tells what it predicts of them. violations : what the data show that the model does not have.
-    model_errors : smooth errors of the model that have no name; the covariance contains them.
-    upside_down : cameras whose photographs are, by which they were measured.
-    photographs : of stations whose legs were observed, by their number; those that fitted into
-    memory are decoded.
+    boards : the calibration board, where stations observe one. findings : identifiability of the
+    machine's parameters. timings : seconds by step. holdout : configurations that the estimate does
+    not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them. violations :
+    detected model violations. model_errors : smooth model errors without a name, which the
+    covariance contains. upside_down : cameras, turned by half, by which upside-down images were
+    measured. photographs : images of stations whose legs were observed, by the station's number;
+    those that fitted into memory are decoded.
     """
 
     session: Session
@@ -123,7 +124,7 @@ class Calibration(CalibrationSummary):
         return self.estimate.machine
 
     def overview(self) -> Overview:
-        """What it shows of itself."""
+        """The figures of its summary."""
         session, e = self.session, self.estimate
         edges, poses = e.edge_residuals[e.edge_weights >= 0.5], e.pose_residuals
         return Overview(
@@ -157,12 +158,13 @@ def calibrate_session(
     session : a loaded session, or its folder.
     method : ``bundle`` (joint maximum likelihood), ``four-step`` ([A]), ``linear`` ([B]) or
         ``inverse-kinematic`` ([C]).
-    seed : of the random search for the stations' poses.
+    seed : for the random search for the stations' poses.
     refine_camera : estimate the cameras' intrinsics with the machine, from their calibration's
         covariance on.
-    holdout : poses, spread over the workspace, to leave out, to judge the result by them.
+    holdout : number of poses, spread over the workspace, that the estimate does not use and that
+        test the result.
     progress : called with the step in words and the share done.
-    Raises InputError where the session is at fault, ResultError where nothing can be said.
+    Raises InputError where the session is at fault, ResultError where there is no estimate.
     """
     from threadpoolctl import threadpool_limits
 
@@ -189,10 +191,10 @@ def better_refined(
     """The calibration with the cameras' intrinsics estimated, unless the one with those of the
     files is better; a warning then says so.
 
-    Intrinsics that are estimated can be led astray by photographs that are few or without a sure
-    place. A result that may be used is better, then one that keeps more photographs, then one that
-    fits what it keeps beyond chance better, which no added unknowns do by themselves. Raises the
-    error of ``refined`` where neither ends.
+    Estimated intrinsics can be wrong where images are few or without a sure pose. A usable result
+    is better, then one with more images, then one that fits its data better beyond chance, which
+    additional unknowns do not by themselves. Raises the error of ``refined`` where neither has a
+    result.
     """
     try:
         value = refined()
@@ -252,7 +254,7 @@ def calibrate_measurements(
     *,
     progress: CalibrationProgress | None = None,
 ) -> Calibration:
-    """Calibrate the machine of a session from edges that were measured already, as simulated ones.
+    """Calibrate the machine of a session from edges that are given, such as simulated ones.
 
     No image is read. observation : with the edges of ``measurements``. T_camera_base : (S, 4, 4)
     from where the estimate starts. Raises ResultError where there is no estimate.
@@ -269,7 +271,7 @@ def calibrate_measurements(
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
-    """Raise InputError for what no caller may ask."""
+    """Raise InputError for options without a meaning."""
     if method not in CALIBRATION_METHODS:
         guess = closest(str(method), CALIBRATION_METHODS)
         raise InputError(
@@ -283,11 +285,10 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
 
 
 class Settled(NamedTuple):
-    """A session whose stations all stand where their photographs say, and the estimate of it that
-    no known mistake explains better.
+    """A repaired session and its estimate, which no hypothesis explains better.
 
-    stated : the estimate with the readings' noise as it is stated. turned : cameras whose
-    photographs are upside down, or may be. findings : notes on hypotheses that could not be tested.
+    stated : the estimate with the readings' noise as stated. turned : cameras whose images are
+    upside down, or may be. findings : notes on hypotheses that could not be tested.
     """
 
     case: Case
@@ -302,20 +303,27 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
     """All that decides whether a session can be calibrated: `calibrate` goes on from it, and
     `check` ends with it.
 
-    case : of the session. Raises `InputError` or `ResultError` where it cannot.
+    Repairs change the case, so after each one the machine is estimated and every hypothesis weighed
+    again, until none calls for another repair. Then mistakes that a user has to correct are
+    compared. case : of the session. Raises `InputError` or `ResultError` where it cannot.
     """
-    turns = _identify(case, refine_camera, seed, clock)
-    turned = upside_down(case.session, turns)
-    if sure := {one.file: one.camera for one in turned if one.sure}:
-        session = turned_round(session, sure)
-        case = _observe(session, seed, clock)
+    check_frozen(session, case.boards)
+    repaired: dict[str, UpsideDown] = {}
+    while True:
         turns = _identify(case, refine_camera, seed, clock)
-    # without one that was in a wrong place, another may show itself to be
-    while wrong := by_chance(case.session, turns) or inconsistent_poses(
-        case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
-    ):
+        turned = [one for one in upside_down(case.session, turns) if one.file not in repaired]
+        if sure := [one for one in turned if one.sure]:
+            repaired |= {one.file: one for one in sure}
+            # of the whole session: a station that was left out before may have been upside down
+            cameras = {file: one.camera for file, one in repaired.items()}
+            case = _observe(turned_round(session, cameras), seed, clock)
+            continue
+        wrong = by_chance(case.session, turns) or inconsistent_poses(
+            case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
+        )
+        if not wrong:
+            break
         case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
-        turns = _identify(case, refine_camera, seed, clock)
     clock.progress("Looking for mistakes that explain the data", 0.86)
     machine = case.session.machine
     stated = refit_fixed_noise(machine, turns.measurements, turns.estimate)
@@ -330,13 +338,13 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
         *check_poses(case.session, turns.measurements, stated, richer),
         *check_radii(case, turns.estimate, bool(chance_match_reason(turns)), refine_camera, seed),
     )
-    return Settled(case, turns, stated, richer, turned, untested)
+    return Settled(case, turns, stated, richer, (*repaired.values(), *turned), untested)
 
 
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
-    """The calibration of a settled session."""
+    """The calibration of a session after all repairs."""
     case, turns, stated, richer, turned, untested = settled
     machine = case.session.machine
     turns = imputation_variance(case, turns, np.random.default_rng(0), clock.progress)
@@ -350,9 +358,7 @@ def _finished(
 
 
 class _Identified(NamedTuple):
-    """The last turn, the estimate by the method asked for, richer models that were tried, and what
-    was left out.
-    """
+    """The refinement, the estimate by the requested method, fits of richer models, the holdout."""
 
     turns: RefinementResult
     estimate: Estimate
@@ -361,7 +367,7 @@ class _Identified(NamedTuple):
 
 
 def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> Session:
-    """The session, whole and possible."""
+    """The loaded session, checked for what this observation can use."""
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
@@ -373,8 +379,8 @@ def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> S
 
 
 def _observe(session: Session, seed: int, clock: Clock) -> Case:
-    """Where the stations stand, by what their photographs and tables show; without photographs by
-    hand that could not be placed.
+    """The case of a session with its stations localized, without hand-held images that could not be
+    placed.
     """
     clock.progress("Reading photographs", 0.0)
     photographs = read_photographs(session)
@@ -388,8 +394,8 @@ def _observe(session: Session, seed: int, clock: Clock) -> Case:
 
 
 def _identify(case: Case, refine_camera: bool, seed: int, clock: Clock) -> RefinementResult:
-    """The machine, in turns with looks at the edges; where there is none, diameters for radii may
-    be why.
+    """Refine the machine in turns with measurement passes. Where there is no estimate, diameters
+    may have been written for radii.
     """
     session, cameras = case.session, refinement_of(case.session, refine_camera)
     try:
@@ -415,9 +421,9 @@ def _estimated(
     holdout: int,
     clock: Clock,
 ) -> _Identified:
-    """The estimate without what is held out, by the paper's method if asked for.
+    """The estimate without the holdout, by a paper's method if requested.
 
-    Only now, when all is found, are configurations set aside: photographs that miss are misplaced.
+    Configurations are held out only here, after the localization, which needs all images.
     """
     out = None
     if holdout:
@@ -444,80 +450,48 @@ def _judge(
     seed: int,
     clock: Clock,
 ) -> Calibration:
-    """What the data tell, what they leave open, and whether the result may be used."""
-    session = case.session
+    """Verdict on an estimate: model violations, identifiability and all findings.
+
+    turned : cameras whose images are upside down, or may be. untested : notes on hypotheses that
+    could not be tested.
+    """
     clock.progress("Judging", 0.95)
-    if value.turns.cameras.active:  # the edges are where these cameras see them
-        cameras = value.turns.cameras
-        refined = [
-            replace(station, camera=cameras.at_station(k))
-            for k, station in enumerate(session.stations)
-        ]
-        session = replace(session, stations=tuple(refined))
-    if sure := overruled(value.turns.responses):
-        notes = [
-            replace(station, response=sure[station.entry], response_given=True)
-            if station.entry in sure
-            else station
-            for station in session.stations
-        ]
-        session = replace(session, stations=tuple(notes))
-    ended = linearize_at_solution(value.turns.measurements, value.estimate)
+    session, turns = _as_measured(case.session, value.turns), value.turns
+    ended = linearize_at_solution(turns.measurements, value.estimate)
     detections: tuple[DetectedViolation, ...] = ()
     errors: tuple[ModelError, ...] = ()
     uneven: tuple[Column, ...] = ()
     without = value.estimate
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
-        turns = value.turns
         detections, errors, estimate, uneven = model_violations(
             session, turns.observation, turns.measurements, value.estimate, ended
         )
         value = value._replace(estimate=estimate)
-    findings = _findings(value.turns.measurements, without, ended[1], uneven)
-    uneven_bed = explains_heights(errors)
-    named, images = bool(detections or any(one.sure for one in errors)), value.turns.responses
+    findings = _findings(turns.measurements, without, ended[1], uneven)
     others = (
-        *scale_fault(session, value.estimate),
-        *(() if uneven_bed else noise_fault(session, value.estimate)),
-        *value.turns.reasons,
-        *chance_match_reason(value.turns),
-        *unused_configurations(session, value.estimate, value.out.region.rows if value.out else ()),
-        *rejection_findings(
-            session,
-            value.turns.measurements,
-            value.estimate,
-            findings,
-            at_minimum=method == "bundle",
-        ),
-        *(one.finding for one in detections),
-        *discrepancy_findings(errors),
-        *outlier_explanations(session, value.turns.measurements, value.estimate),
-        *noise_notes(session, value.estimate, named, explained=uneven_bed),
-        *lens_notes(value.turns.cameras),
-        *size_notes(session, value.turns.measurements, value.estimate),
-        *scale_notes(session, value.estimate, tuple(x.of for x in detections)),
+        *_findings_of_estimate(session, value, findings, detections, errors, method == "bundle"),
         *numbering_note(session),
-        *(one.finding for one in (*turned, *images)),
+        *(one.finding for one in (*turned, *turns.responses)),
         *untested,
     )
     verdict = judge(
-        value.turns.observation,
+        turns.observation,
         value.estimate,
         findings,
         method,
         richer=value.richer,
-        explained=uneven_bed,
+        explained=explains_heights(errors),
         others=others,
     )
     clock.lap("identify")
     return Calibration(
         session=session,
-        observation=value.turns.observation,
-        measurements=value.turns.measurements,
+        observation=turns.observation,
+        measurements=turns.measurements,
         estimate=value.estimate,
         verdict=verdict,
         findings=findings,
-        cameras=value.turns.cameras,
+        cameras=turns.cameras,
         method=method,
         seed=seed,
         timings=clock.laps,
@@ -530,12 +504,63 @@ def _judge(
     )
 
 
+def _as_measured(session: Session, turns: RefinementResult) -> Session:
+    """The session with the cameras and responses by which its images were measured in the end."""
+    stations = session.stations
+    if turns.cameras.active:  # the edges are where these cameras see them
+        stations = tuple(
+            replace(station, camera=turns.cameras.at_station(k))
+            for k, station in enumerate(stations)
+        )
+    if sure := overruled(turns.responses):
+        stations = tuple(
+            replace(station, response=sure[station.entry], response_given=True)
+            if station.entry in sure
+            else station
+            for station in stations
+        )
+    return session if stations is session.stations else replace(session, stations=stations)
+
+
+def _findings_of_estimate(
+    session: Session,
+    value: _Identified,
+    findings: Findings,
+    detections: tuple[DetectedViolation, ...],
+    errors: tuple[ModelError, ...],
+    at_minimum: bool,
+) -> Iterator[Finding]:
+    """Findings about an estimate beside those of the verdict.
+
+    detections, errors : model violations, and smooth model errors without a name. at_minimum :
+    whether the estimate is the minimum of the joint problem.
+    """
+    turns, estimate, measurements = value.turns, value.estimate, value.turns.measurements
+    uneven_bed = explains_heights(errors)
+    named = bool(detections or any(one.sure for one in errors))
+    out = value.out.region.rows if value.out else ()
+    yield from scale_fault(session, estimate)
+    if not uneven_bed:
+        yield from noise_fault(session, estimate)
+    yield from turns.reasons
+    yield from chance_match_reason(turns)
+    yield from unused_configurations(session, estimate, out)
+    yield from rejection_findings(session, measurements, estimate, findings, at_minimum=at_minimum)
+    yield from (one.finding for one in detections)
+    yield from discrepancy_findings(errors)
+    yield from outlier_explanations(session, measurements, estimate)
+    yield from noise_notes(session, estimate, named, explained=uneven_bed)
+    yield from lens_notes(turns.cameras)
+    yield from size_notes(session, measurements, estimate)
+    yield from scale_notes(session, estimate, tuple(one.of for one in detections))
+
+
 def _findings(
     measurements: Measurements, estimate: Estimate, info: Information, uneven: tuple[Column, ...]
 ) -> Findings:
-    """What the data tell of the machine, in words, and the paper's conditions.
+    """Identifiability of the machine's parameters, in words, and the papers' conditions.
 
-    info : of the estimate at its end. uneven : the model discrepancy, which bends a bed.
+    info : linearized problem at the estimate. uneven : the model discrepancy, which bends a bed.
     """
     observed = observed_legs(
         measurements.edges,
@@ -556,7 +581,7 @@ def _findings(
 
 
 class Clock:
-    """Seconds by step, each of which may be lapped several times; told : what is being done."""
+    """Seconds by step, each of which may have several laps; progress : called with each step."""
 
     def __init__(self, progress: CalibrationProgress | None) -> None:
         self.progress: CalibrationProgress = progress or (lambda _text, _share: None)

@@ -1,11 +1,12 @@
-"""How photographs code light, told by the edges: as sensors count it, or as telephones write it.
+"""The hypothesis that images have another response than files of their kind, by the score test.
 
-A file's kind says what is usual, not what is so. Blurred edges lean to their dark side where levels
-are coded otherwise than believed, each by its own contrast, and no machine does that: so the way
-from where edges lie by one response to where they lie by the other is a departure of one number
-(:mod:`pkmcal.identify.score`), whose fit is 0 where the first is right. Some photographs, taken by
-themselves, tell whether there is anything to gain, but of polished legs; if so all are measured by
-the other response too, and right is the one from which there is less to gain by going to the other.
+A file's kind has a usual response: linear, or the sRGB curve. Under the wrong response blurred
+edges are displaced to their dark side, each by its own contrast, as no machine displaces them. So
+the change from the edges by one response to those by the other is a column of one number
+(:mod:`pkmcal.identify.score`), whose estimate is 0 where the first response is right. A few images
+by themselves show whether anything is to be gained, except with polished legs. If so, all images
+are measured by the other response as well, and the one from which the change to the other gains
+less is right.
 """
 
 from __future__ import annotations
@@ -25,31 +26,29 @@ from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import Column, EdgeSet, Measurements, concatenate
 from pkmcal.observe.image_batches import Photographs
 from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.outcome.hypotheses import OPTIONS
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
 RESPONSE_TEST_CONFIGURATIONS = 6
-"""Configurations of a camera whose photographs are asked at first: of painted legs their hundred
-and fifty edges show a wrong response by six standard deviations."""
+"""Configurations of a camera whose images are tested first: with painted legs their hundred and
+fifty edges show a wrong response by six standard deviations."""
 LEAST_RESPONSE_GAIN, MOST_TURN_DEVIATION = 2.7, 0.1
-"""chi2 from which all are asked, by chance one session of ten, and the way's standard deviation
-from which some do not tell."""
+"""chi2 from which all images are measured by the other response, by chance in one session of ten;
+and the standard deviation of the change from which few images do not determine it."""
 LEAST_EDGE_SHARE = 0.5
-"""Share of the edges that a response has to find, of those by the usual one, to be right."""
-ODDS_FOR_OTHER_RESPONSE, ODDS_AGAINST_OTHER_RESPONSE = 1000.0, 20.0
-"""Odds from which the edges overrule what is usual for files of a kind; and from which what is
-usual needs no caution."""
+"""Share of the edges by the usual response that the other has to measure, to be right."""
 _Camera = tuple[str, Response]
-"""A camera's file, and what is usual for the photographs' kind."""
+"""A camera's file, and the usual response of its images' kind."""
 
 
 @dataclass(frozen=True)
 class ResponseEstimate:
-    """What edges say of how photographs code light, where they do not say that it is as usual.
+    """Response of a camera's images by their edges, where it may not be the usual one.
 
-    entries : of session.yaml's stations, of one camera. usual : by which their photographs were
-    measured at first. gain : of chi2 by the other response, less what there would be to gain by
-    going back; NaN where the test failed, and failure says why.
+    entries : names of its stations in session.yaml. usual : response by which their images were
+    measured first. gain : of chi2 by the change to the other response, less the gain of the change
+    back; NaN where the test failed, with the reason in failure.
     """
 
     entries: tuple[str, ...]
@@ -58,34 +57,39 @@ class ResponseEstimate:
     failure: str = ""
 
     @property
+    def log_odds(self) -> float:
+        """For the other response, nats; NaN where the test failed."""
+        return self.gain / 2
+
+    @property
     def sure(self) -> bool:
-        """Whether the other response is right."""
-        return self.gain > 2 * np.log(ODDS_FOR_OTHER_RESPONSE)
+        """Whether the images are measured by the other response, against what is usual."""
+        return self.log_odds > OPTIONS.act
 
     @property
     def response(self) -> Response:
-        """The one by which the photographs are measured."""
+        """The response by which the images are measured."""
         return OTHER_RESPONSE[self.usual] if self.sure else self.usual
 
     @property
     def finding(self) -> Finding:
-        """A note where the edges are sure, else a warning."""
+        """A note where the edges decide, else a warning."""
         facts = {
             "usual": self.usual,
             "other": OTHER_RESPONSE[self.usual],
             "stations": self.entries,
-            "log_odds": self.gain / 2,
+            "log_odds": self.log_odds,
         }
         where = listed(self.entries)
         if self.failure:
             return note("image.response_untested", where, **facts, why=self.failure)
         if self.sure:
-            return note("image.response", where, **facts, odds=ODDS_FOR_OTHER_RESPONSE)
+            return note("image.response", where, **facts, odds=round(np.exp(OPTIONS.act)))
         return doubtful("image.response_unknown", where, **facts)
 
 
 def overruled(responses: Sequence[ResponseEstimate]) -> dict[str, Response]:
-    """How photographs code light, by their entry in session.yaml, where it is not as usual."""
+    """Responses by entry in session.yaml, where they are not the usual ones."""
     return {entry: one.response for one in responses if one.sure for entry in one.entries}
 
 
@@ -98,12 +102,12 @@ def responses_by_edges(
     measured: Callable[[list[Photographs]], EdgeSet],
     of_edges: Callable[[EdgeSet], Measurements],
 ) -> tuple[ResponseEstimate, ...]:
-    """Cameras of whose photographs session.yaml does not say how they code light, and whose edges
-    say that it is otherwise than usual, or do not tell.
+    """Cameras without a response in session.yaml whose edges are against the usual one, or do not
+    decide.
 
-    measurements, estimate : by the usual responses. roughly, measured : the edges of photographs,
-    looked for where those of ``measurements`` were, with their blur or with one of their own.
-    of_edges : measurements with these edges instead.
+    measurements, estimate : by the usual responses. roughly, measured : edges of images, searched
+    where those of ``measurements`` were, with the same blur or with their own. of_edges :
+    measurements with these edges instead.
     """
     usual: dict[_Camera, list[Photographs]] = {}
     for p in photographs:
@@ -142,11 +146,11 @@ def responses_by_edges(
         )
         for camera in every
     ]
-    return tuple(one for one in rows if one.gain > -2 * np.log(ODDS_AGAINST_OTHER_RESPONSE))
+    return tuple(one for one in rows if one.log_odds > -OPTIONS.report)
 
 
 def _entries(session: Session, photographs: Sequence[Photographs]) -> tuple[str, ...]:
-    """Their entries in session.yaml."""
+    """Entries of images' stations in session.yaml, each once."""
     return tuple(dict.fromkeys(session.stations[p.station].entry for p in photographs))
 
 
@@ -156,8 +160,8 @@ def _questionable(
     usual: Mapping[_Camera, Sequence[Photographs]],
     roughly: Callable[[list[Photographs]], EdgeSet],
 ) -> list[_Camera]:
-    """Cameras all of whose photographs are to be asked: some have something to gain, or do not
-    tell, as those of polished legs.
+    """Cameras all of whose images are to be measured by the other response: a few images gain by
+    it, or do not determine the change, as with polished legs.
     """
     if estimate.edge_noise.shading.max() > POLISHED_SHADING:
         return list(usual)
@@ -178,14 +182,14 @@ def _otherwise(photographs: Sequence[Photographs]) -> list[Photographs]:
 
 
 def _select(photographs: Sequence[Photographs], which: Sequence[Booleans]) -> list[Photographs]:
-    """Some of each station's photographs, if any."""
+    """Some images of each station, where there are any."""
     pairs = zip(photographs, which, strict=True)
     return [p.select(np.flatnonzero(some)) for p, some in pairs if some.any()]
 
 
 def _test_images(photographs: Sequence[Photographs]) -> list[Booleans]:
-    """Which of each station's photographs are those of some configurations, evenly over a camera's
-    stations.
+    """Masks of each station's images: those of some configurations, spread evenly over the stations
+    of a camera.
     """
     visible = [np.unique(p.configuration) for p in photographs]
     first = np.cumsum([0, *map(len, visible)])
@@ -201,7 +205,7 @@ def _edge_mask(
     usual: Mapping[_Camera, Sequence[Photographs]],
     queries: Mapping[_Camera, Sequence[Booleans]],
 ) -> Booleans:
-    """Which edges (N,) are in the photographs that are asked, or of cameras that are not asked."""
+    """Mask (N,) of edges in the images that are tested, or of cameras that are not tested."""
     out = np.ones(len(edges), dtype=bool)
     for camera, mine in usual.items():
         for p, some in zip(mine, queries[camera], strict=True):
@@ -213,8 +217,8 @@ def _edge_mask(
 def _scored(
     measurements: Measurements, estimate: Estimate, other: Mapping[_Camera, EdgeSet]
 ) -> tuple[dict[_Camera, float], dict[_Camera, float]]:
-    """chi2 that would be gained by going to where other edges are, for the edges of each camera,
-    and the standard deviation of the way that fits.
+    """Gain of chi2 by the change to other edges, for the edges of each camera, and the standard
+    deviation of that change.
     """
     turns = [_normal_turn(measurements.edges, edges) for edges in other.values()]
     effects = [Column("camera.response", edges=turn) for turn in turns]
@@ -227,8 +231,8 @@ def _scored(
 
 
 def _normal_turn(edges: EdgeSet, other: EdgeSet) -> Array:
-    """Turn (N, 2, 1) of the edges' normals, in their bases, to where another look has them; none of
-    those that it does not have, nor of coarse ones, which no response moves.
+    """Turn (N, 2, 1) of the edges' normals, in their bases, to those of another measurement pass;
+    zero for edges that it lacks and for coarse ones, which no response moves.
     """
     mine, theirs = edges.same_as(other)
     both = ~edges.coarse[mine] & ~other.coarse[theirs]

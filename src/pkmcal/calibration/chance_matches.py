@@ -1,10 +1,11 @@
-"""Whether the edges that were measured are the machine's, or what chance offers anywhere.
+"""Test of measured edges against chance matches.
 
-Some edge lies within reach of any place in a picture. A machine that is not the one before the
-camera, recognised all the same, is given a tenth of its edges by that, and the joint estimate makes
-them agree with it, in large deviations. So where few of the edges that should be seen were
-measured, they are looked for again with the whole picture moved aside, in several directions: there
-no leg is where it should be, and what is found is chance's.
+Some image edge is within reach of any predicted edge. A machine that is not the one in the images,
+localized all the same, gets a tenth of its edges by chance, and the joint estimate makes these
+agree, with large standard deviations. So where few of the edges in sight were measured, they are
+measured again with the images shifted, in several directions: there no leg is where it is
+predicted, so all matches are by chance. This is an absolute test; no likelihood ratio between
+explanations replaces it.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ from pkmcal.session.load import Session
 from pkmcal.wording import how_often
 
 IMAGE_OFFSET = 2 * legs.LEG_SEARCH_REACH
-"""Pixels by which the picture is moved: further than legs were looked for."""
+"""Shift of the images, px: further than legs are searched."""
 OFFSET_DIRECTIONS = 8
-"""Directions in which it is, evenly: the chance that is told is that of one more draw."""
+"""Number of directions of the shift, evenly spaced; the p-value is that of one more draw."""
 
 
 class _Offered(NamedTuple):
-    """Edges of some stations: in sight, measured, about how many chance offers aside, and the
-    probability that it offers as many as were measured.
+    """Numbers of edges of some stations: in sight, measured, expected by chance, and the p-value
+    of as many by chance as were measured.
     """
 
     in_sight: int
@@ -43,8 +44,8 @@ class _Offered(NamedTuple):
 
 
 def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
-    """A reason where chance may have offered the edges by which the result was estimated; tested
-    only where less than a third of the edges in sight were measured.
+    """A reason against the result where its edges may be chance matches; tested only where less
+    than a third of the edges in sight were measured.
     """
     offered = _offered(turns, [p.station for p in turns.photographs])
     if offered is None:
@@ -62,10 +63,12 @@ def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
 
 
 def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
-    """Why stations on a tripod may stand elsewhere than they were found, by their numbers, where
-    others tell the machine: chance offers as many edges as were measured there. One search of a
-    thousand ends elsewhere, surely as it seems; and where the machine hardly shows, little is lost.
-    A board on the base tells a place whatever edges do.
+    """Reasons why stations on a tripod may have a wrong pose, by their numbers: as many edges by
+    chance as were measured. Empty where that holds for all stations.
+
+    One search of a thousand ends at a wrong pose although it seems sure, and where the machine
+    hardly shows, little is lost with the station. Stations that see a board on the base have their
+    pose from the board.
     """
     boards = set(turns.measurements.poses.station.tolist())
     wrong: dict[int, str] = {}
@@ -84,7 +87,7 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
 
 
 def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | None:
-    """What chance may have offered of some stations' edges; nothing where it can not have."""
+    """Chance matches among the edges of some stations; None where they cannot explain these."""
     from scipy.special import stdtr
 
     in_view = turns.observation
@@ -111,8 +114,8 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
 
 
 def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> int:
-    """Edges measured from some stations with the pictures moved ``offset`` (2,), in the pixels that
-    edges are in.
+    """Number of edges measured from some stations with the images shifted by ``offset`` (2,), in
+    binned pixels.
     """
     state = turns.estimate.state
     shifted = [

@@ -1,12 +1,11 @@
-"""Photographs that are upside down against their camera's file, told by their edges.
+"""The hypothesis that images are upside down against their camera's file, by the score test.
 
-A program that turns photographs by half shows the machine as well as before, from a station that is
-turned, too, and no look at them tells. But the camera's centre is then on the other side of the
-picture's middle, which no place of the camera makes up for. So the way from a camera to the same
-one turned is a departure of one number (:mod:`pkmcal.identify.score`), whose fit is 0 where the
-file is right and 1 where the photographs are upside down. Where the edges are sure of that, these
-are measured by the camera turned by half; where it is but likelier, the verdict says so. A camera
-that is estimated with the machine is not asked about.
+Images turned by half show the machine as well as before, from a station that is turned, too. But
+the principal point is then on the other side of the image's middle, which no pose of the camera
+makes up for. So the change from a camera to the same one turned by half is a column of one number
+(:mod:`pkmcal.identify.score`), whose estimate is 0 where the file is right and 1 where the images
+are upside down. At log-odds of ``act`` the images are measured by the turned camera (a repair); at
+``report`` the verdict has a warning. Cameras that are estimated with the machine are not tested.
 """
 
 from __future__ import annotations
@@ -26,27 +25,24 @@ from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.score import ScoreTests
 from pkmcal.measurements import Column
 from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.outcome.hypotheses import OPTIONS
 from pkmcal.session.load import Session
 
-ODDS_FOR_UPSIDE_DOWN = 1000.0
-"""Odds from which the edges overrule the file."""
-ODDS_FOR_UPRIGHT = 20.0
-"""Odds from which the photographs of one of session.yaml's stations are upright, so that those of
-the same camera are not taken to be turned alike."""
-ODDS_TO_REPORT = 20.0
-"""Odds from which photographs that may be upside down are said to be so."""
 FURTHER_THAN_TURNED = 1.5
-"""Times the way, from which what fits is neither camera, though one is nearer."""
+"""Multiple of the change beyond which the estimate is neither camera, though one is nearer."""
 USUAL_CENTRE_ERROR = 1.5
-"""px; of a calibrated camera's centre along the way, where the file does not say."""
+"""Prior sigma (px) of a calibrated camera's principal point along the change, where its file states
+none."""
 LEAST_CENTRE_ERROR = 1e-6
-"""px; of a centre that a file holds to be exact."""
+"""Prior sigma (px) of a principal point that a file states to be exact."""
 
 
 @dataclass(frozen=True)
 class UpsideDown:
-    """A camera's file against which photographs are upside down. entries : of session.yaml's
-    stations. camera : the one that took them, as they are. log_odds : for that.
+    """A camera's file against which images are upside down.
+
+    entries : names of the stations in session.yaml. camera : turned by half, as the images are.
+    log_odds : for the turned camera, nats.
     """
 
     file: str
@@ -56,12 +52,12 @@ class UpsideDown:
 
     @property
     def sure(self) -> bool:
-        """Whether they are measured so."""
-        return self.log_odds > np.log(ODDS_FOR_UPSIDE_DOWN)
+        """Whether the images are measured by the camera turned by half."""
+        return self.log_odds > OPTIONS.act
 
     @property
     def finding(self) -> Finding:
-        """A note where the edges are sure, else a warning."""
+        """A note where the images are measured by the turned camera, else a warning."""
         facts = {"file": self.file, "stations": self.entries, "log_odds": self.log_odds}
         if not self.sure:
             return doubtful(
@@ -72,7 +68,7 @@ class UpsideDown:
             "image.upside_down",
             self.file,
             **facts,
-            odds=ODDS_FOR_UPSIDE_DOWN,
+            odds=round(np.exp(OPTIONS.act)),
             centre_x=x,
             centre_y=y,
             written=written_camera(self.file),
@@ -80,7 +76,9 @@ class UpsideDown:
 
 
 def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, ...]:
-    """The cameras against whose files the photographs are upside down, or may well be."""
+    """Cameras whose images are upside down against their files with log-odds of ``report`` or more,
+    and of no station upright with as much.
+    """
     changed = CameraChange.of(session, turns.observation, turns.measurements)
     refined = turns.measurements.intrinsics_factor.shape[-1] > 0
     if changed is None or refined or not len(turns.measurements.edges):
@@ -103,20 +101,20 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, 
         reference_values = _file_sigma(camera)
         alone = [_log_odds(value[[k]], sigma[[k]], reference_values) for k in range(len(own))]
         odds = _log_odds(value, sigma, reference_values)
-        if odds > np.log(ODDS_TO_REPORT) and min(alone) > -np.log(ODDS_FOR_UPRIGHT):
+        if odds > OPTIONS.report and min(alone) > -OPTIONS.report:
             names = tuple(list(cameras)[k] for k in own)
             out.append(UpsideDown(file, names, camera.turned_by_half(), odds))
     return tuple(out)
 
 
 def _half_turn_change(camera: Camera) -> Array:
-    """Change (n,) of a camera's parameters to those of the same turned by half."""
+    """Change (n,) of a camera's parameters to those of the same camera turned by half."""
     return camera.turned_by_half().parameters - camera.parameters
 
 
 def _file_sigma(camera: Camera) -> float:
-    """Standard deviation of how far along the way a camera may be from what its file says, by its
-    centre.
+    """Prior sigma of the position along the change, 0 to 1, by the file's covariance of the
+    principal point; infinite where it is in the middle.
     """
     centre = _half_turn_change(camera)[CENTER]
     length = float(np.linalg.norm(centre))
@@ -129,8 +127,9 @@ def _file_sigma(camera: Camera) -> float:
 
 
 def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
-    """For the end of the way against its begin, by what fits of some stations, (n,) with its
-    deviations; nothing where nothing is told, or it is another camera.
+    """Log-odds of 1 against 0 by estimates (n,) of some stations with standard deviations (n,).
+
+    0 where the estimates determine nothing, or neither camera fits.
     """
     weight = sigma**-2.0
     if not weight.any():
@@ -141,7 +140,7 @@ def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:
 
 
 def turned_round(session: Session, cameras: Mapping[str, Camera]) -> Session:
-    """The session with other cameras in the place of some files'."""
+    """The session with other cameras in place of those of some files."""
     stations = tuple(
         replace(station, camera=cameras.get(station.camera_file, station.camera))
         for station in session.stations

@@ -1,4 +1,4 @@
-"""Recognising the machine in a session's photographs: what `check` and `calibrate` begin with."""
+"""Localization of a session's stations, with which `check` and `calibrate` begin."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from pkmcal.session.readings import frozen
 from pkmcal.wording import listed
 
 MOST_AT_A_STATION, MOST_IN_ALL = 64, 128
-"""Photographs in which the machine is looked for, spread over a station's and shared among the
-stations: a search looks at eight, and of thirty that are asked whether the machine is there, each
-surer by one standard deviation says so by 5 of them together. Their tables take 200 to 400 MB."""
+"""Images in which the machine is localized, spread over a station's and shared among the stations:
+a search uses eight, and thirty that confirm it, each with a z-score of one, have five together.
+Their tables take 200 to 400 MB."""
 FEWEST_AT_A_STATION = 8
-"""However many stations there are: what a search looks at."""
+"""Images of each station, however many stations there are: as many as a search uses."""
 CalibrationProgress = Callable[[str, float], None]
-"""Called with a sentence about the present step and the share that is done, 0 to 1."""
+"""Called with a sentence about the present step and the share done, 0 to 1."""
 ALLOWED_LEG_MISS = 2.0
-"""Tolerances of a centre by which legs may miss the platform at the drawing's nearest pose."""
+"""Prior sigmas of a centre by which legs may miss the platform at the nearest nominal pose."""
 LEAST_REACHED_SHARE = 0.5
-"""Share of the configurations that the drawing has to reach for the rest to be believed."""
+"""Share of the configurations that the nominal model has to reach for the others to be accepted."""
 ALMOST_ALL = 0.9
 
 
 def check_observable(session: Session) -> None:
-    """What the session's form allows but this observation cannot use."""
+    """Raise `InputError` for a session without anything that can be observed."""
     session.machine.check_free(f"{session.document['mechanism']}, fixed")
     visible = [station.name for station in session.stations if "legs" in station.observe]
     if visible and not any(leg.tubes for leg in session.machine.document.legs):
@@ -57,8 +57,8 @@ def check_observable(session: Session) -> None:
 
 
 def read_photographs(session: Session) -> list[Photographs]:
-    """The photographs of stations that observe legs, each of which can be decoded; the first that
-    fit into CACHED_IMAGE_BYTES bytes stay so.
+    """Image batches of the stations that observe legs, checked to be decodable; the first images
+    that fit into CACHED_IMAGE_BYTES bytes stay decoded.
     """
 
     def read(number: int, most: int) -> Photographs:
@@ -83,7 +83,7 @@ def read_photographs(session: Session) -> list[Photographs]:
 
 
 def photograph_files(session: Session, station: Station) -> tuple[list[Path], list[str]]:
-    """Paths of a station's photographs, and what they are called in messages."""
+    """Paths of a station's images, and their names in messages."""
     paths = [photo.path for photo in station.photographs]
     return paths, [label_of(session.folder, path) for path in paths]
 
@@ -94,10 +94,11 @@ def legs_stations(session: Session) -> list[int]:
 
 
 def platform_poses(session: Session, *, most: bool = False) -> Array:
-    """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none.
+    """Nominal poses T_base_platform (K, 4, 4) of all configurations.
 
-    most : be content where the drawing can take the readings of most configurations. What is
-    measured of the platform may tell the rest, for a motor's zero is drawn to degrees at best.
+    most : accept readings that the nominal model can take in most configurations; measured poses
+    may determine the others, for a motor's zero is nominal to degrees at best. Raises `InputError`
+    that names the configurations without a pose.
     """
     try:
         fk = session.machine.forward_result(session.joints)
@@ -120,8 +121,8 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
 
 
 def _check_columns(session: Session, bad: list[str]) -> None:
-    """Raise `InputError` where one motor's readings never change, so that the loops do not close,
-    or would close them all with the other sign.
+    """Raise `InputError` where loops do not close because a reading never changes, or close in
+    nearly all configurations with the other sign of one motor.
     """
     if error := frozen_in(session):
         raise error
@@ -136,11 +137,12 @@ def _check_columns(session: Session, bad: list[str]) -> None:
                 found=f"readings that the machine cannot take in configuration {listed(bad)}",
                 expected="the other sign of this column, with which its legs meet the platform",
                 next_step="Turn the sign of this column round, or the axis in the mechanism file",
+                code="readings.sign",
             )
 
 
 def _taken(session: Session, joints: Array) -> float:
-    """Share of the readings (K, m) that the drawing's machine can take."""
+    """Share of the readings (K, m) that the nominal machine can take."""
     fk = session.machine.forward_result(joints)
     turn = _turn(fk.T_base_platform)
     return float(np.mean(fk.converged & ~(np.abs(turn) > session.machine.most_turn[0])))
@@ -152,7 +154,7 @@ def _turn(poses: Array) -> Array:
 
 
 def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
-    """Raise `InputError` where an articulated platform would turn by more than its parts allow."""
+    """Raise `InputError` where an articulated platform turns by more than its parts allow."""
     turn, (most, obstacle) = _turn(poses), session.machine.most_turn
     bad = np.flatnonzero((np.abs(turn) > most) & usable)
     if not bad.size:
@@ -172,9 +174,9 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
 
 @dataclass(frozen=True)
 class Recognition:
-    """Where the search for each station's pose ended.
+    """Localization of all stations.
 
-    used : numbers of the photographs that were looked at, by station; views : of these.
+    used : indices of the images that were used, by station; views : of these images.
     """
 
     views: tuple[StationView, ...]
@@ -183,7 +185,7 @@ class Recognition:
 
     @property
     def complete(self) -> bool:
-        """Whether the machine was recognised in every station's photographs."""
+        """Whether the machine was recognised in every station's images."""
         return all(pose.good for pose in self.localizations)
 
 
@@ -195,13 +197,13 @@ def recognise(
     boards: Boards | None = None,
     starts: Array | None = None,
 ) -> Recognition:
-    """Look for the machine in the photographs of every station that observes legs, nothing raised.
+    """Localize every station that observes legs; nothing is raised.
 
     poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``photographs``.
-    boards : on the base, give stations without a pose by hand a start, from the stations that were
-    found. starts : (S, 4, 4) of all stations where more is known than by hand, NaN where nothing.
-    A station that is not found from there is looked for anywhere. Of stations of many photographs
-    some are looked at, spread over all.
+    boards : on the base, give stations without a pose by hand a start, from those that were
+    localized. starts : (S, 4, 4) of all stations, where there are better starts than by hand; NaN
+    elsewhere. A station that is not recognised from its start is searched anywhere. For stations
+    with many images some are used, spread over all.
     """
     boards = boards or Boards()
     machine = session.machine
@@ -241,7 +243,7 @@ def _searched(
     before: Sequence[Search],
     rngs: list[np.random.Generator],
 ) -> list[Search]:
-    """What is found already, and else the search from each start that there is."""
+    """Localizations so far, or else by a search from each start that is given."""
 
     def search(
         view: StationView, start: Array | None, before: Search, rng: np.random.Generator
@@ -257,7 +259,7 @@ def _searched(
 def _anywhere(
     views: tuple[StationView, ...], before: Sequence[Search], rngs: list[np.random.Generator]
 ) -> list[LocalizedPose]:
-    """What is surely found already, and else the better of it and of the search all round."""
+    """Localizations that are sure, or else the better of the present one and a global search."""
 
     def search(view: StationView, before: Search, rng: np.random.Generator) -> LocalizedPose:
         if before and before.sure:
@@ -280,10 +282,13 @@ def mistake_in(
     recognition: Recognition,
     rng: np.random.Generator,
 ) -> InputError | None:
-    """The error about stations that were not recognised, or show something else than the session
-    says: the usual mix-ups are tried. A reading that never moved is named before all others, for it
-    may look like any of them.
+    """The error about stations that were not recognised, or whose images a hypothesis explains
+    better than the session as stated. A reading that never changes is named before all others, for
+    its effect may be like any of theirs.
     """
+    still = frozen_in(session)
+    if still is not None and not recognition.complete:  # an error in any case, and cheaper
+        return still
     stations = [session.stations[p.station] for p in photographs]
     error = mistake(
         [
@@ -305,21 +310,21 @@ def mistake_in(
         ],
         rng,
     )
-    return error and (frozen_in(session) or error)
+    return error and (still or error)
 
 
 def frozen_in(session: Session) -> InputError | None:
-    """The error about readings that never moved."""
+    """The error about readings that never change; None without such."""
     joints = session.document["joints"]
     return frozen(session.joints, session.joint_noise, joints["columns"], joints["file"])
 
 
 class StationSearch(NamedTuple):
-    """Where the search for all stations ended.
+    """Poses of all stations.
 
-    recognition : of the machine in the photographs that were searched, one a station, None where
-    none was. T_camera_base : (S, 4, 4), NaN of photographs by hand that nothing tells yet. error :
-    why one that is not by hand is not known, or what is mixed up; poses are then incomplete.
+    recognition : in the images that were searched, None where none were. T_camera_base : (S, 4, 4),
+    NaN for hand-held images that are not placed yet. error : why another station has no pose, or
+    which mistake explains its images; poses are then incomplete.
     """
 
     recognition: Recognition | None
@@ -336,7 +341,7 @@ def localize_stations(
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, as of :func:`locate_stations`.
 
-    Raises `InputError`, or `ResultError`, where nothing tells one that is not by hand.
+    Raises `InputError`, or `ResultError`, where nothing determines one that is not hand-held.
     """
     value = locate_stations(session, photographs, boards, rng, progress)
     if value.error is not None:
@@ -351,10 +356,10 @@ def locate_stations(
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
 ) -> StationSearch:
-    """The poses of all stations, each by the first that tells it: what is known before any leg is
-    looked for, the search for the legs, and what measured poses tell. Nothing is raised.
+    """Poses of all stations, each by the first source that determines it: the session and boards,
+    localization by the legs, measured poses. Nothing is raised.
 
-    photographs : in which the machine is looked for, none by hand. progress : called with the step
+    photographs : in which the machine is localized, none hand-held. progress : called with the step
     in words and the share done.
     """
     nowhere = np.full((len(session.station_names), 4, 4), np.nan)
@@ -390,8 +395,8 @@ def locate_stations(
 
 
 def prior_station_poses(session: Session, boards: Boards) -> Array:
-    """T_camera_base (S, 4, 4) of all stations before any leg is looked for: as the session says, or
-    by what a board on the platform tells; NaN where neither does.
+    """T_camera_base (S, 4, 4) of all stations without any leg: as the session states, or by a board
+    on the platform; NaN where there is neither.
     """
     given = [station.T_camera_base for station in session.stations]
     given = boards.joined(given) + _tracker_starts(session)
@@ -406,9 +411,9 @@ def prior_station_poses(session: Session, boards: Boards) -> Array:
 
 
 def _by_poses(session: Session, boards: Boards, start_poses: Array) -> Array:
-    """Stations (S, 4, 4) with those that are not known (NaN) by what measured poses tell.
+    """Stations (S, 4, 4), those without a pose (NaN) determined by measured poses.
 
-    Raises `InputError`, or `ResultError`, where they tell too little.
+    Raises `InputError`, or `ResultError`, where these do not determine them.
     """
     from pkmcal.papers.hand_eye import start_from_poses
 
@@ -421,7 +426,7 @@ def _by_poses(session: Session, boards: Boards, start_poses: Array) -> Array:
 
 
 def _tracker_starts(session: Session) -> list[Array | None]:
-    """First poses of trackers whose points or heights do not tell their turn."""
+    """Start poses of trackers whose points or heights do not determine their orientation."""
     if not session.trackers and not session.links:
         return []
     try:
@@ -437,9 +442,9 @@ def _tracker_starts(session: Session) -> list[Array | None]:
 
 
 def boards_of(session: Session, photographs: list[Photographs]) -> Boards:
-    """The session's board in its photographs; see :func:`pkmcal.boards.stations.find_boards`.
+    """The session's board in its images; see :func:`pkmcal.boards.stations.find_boards`.
 
-    Photographs that only show the board are decoded one by one, as they are looked at.
+    Images that only show the board are decoded one by one, on access.
     """
     if session.board is None:  # as most, and what looks for boards takes a while to load
         return Boards()

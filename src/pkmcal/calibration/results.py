@@ -1,7 +1,7 @@
-"""What a calibration leaves on disk: mechanism.yaml and calibration.json, written.
+"""Files of a calibration: mechanism.yaml and calibration.json, written.
 
-calibration.json holds everything that a calibration found, in SI units, in the frames that
-``gauge`` names; without dates, so that the same session gives the same file but for its timings.
+calibration.json holds the whole result in SI units, in the frames that ``gauge`` names; without
+dates, so that the same session gives the same file except for timings.
 :mod:`pkmcal.calibration.saved_calibration` reads it back.
 """
 
@@ -47,7 +47,7 @@ CALIBRATION_RESULT_FILES = (
     CALIBRATION_DOCUMENT_FILE,
 )
 CAMERA_FILE = re.compile(r"camera-.+\.yaml")
-"""Cameras as refined with the machine, where that was asked for."""
+"""Files of cameras that were refined with the machine."""
 FORMAT_KEY, CALIBRATION_FORMAT = "pkmcal_calibration", 1
 PACKAGES_WITH_VERSION = ("numpy", "scipy", "opencv-contrib-python-headless")
 CALIBRATION_CONVENTIONS = (
@@ -60,25 +60,26 @@ CALIBRATION_CONVENTIONS = (
 EDGE_COLUMNS = (
     "station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt", "coarse",
 )  # fmt: skip
-"""Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations;
-coarse is 1 where the edge was not measured but told by its silhouette, else 0."""
+"""Columns of residuals.edges, names as numbers from 1; shift and tilt in standard deviations;
+coarse is 1 for an edge by its silhouette, 0 for one that was measured by profiles."""
 LINK_COLUMNS = ("from", "to", "weight", "value", "sigma", "residual")
-"""Of a row in residuals of what links two configurations: these as numbers from 1, the value and
-its stated standard deviation in SI, the residual in standard deviations."""
+"""Columns of residuals of links: two configurations as numbers from 1, the value and its stated
+standard deviation in SI, the residual in standard deviations."""
 POSE_COLUMNS = (
     "station", "configuration", "target", "weight", "turn1", "turn2", "turn3", "x", "y", "z",
 )  # fmt: skip
-"""Of a row in residuals.poses, the last six whitened together, in standard deviations."""
+"""Columns of residuals.poses, the last six whitened together, in standard deviations."""
 EDGE_WEIGHT, POSE_WEIGHT = EDGE_COLUMNS.index("weight"), POSE_COLUMNS.index("weight")
 EDGE_RESIDUALS = slice(EDGE_COLUMNS.index("shift"), EDGE_COLUMNS.index("tilt") + 1)
 
 
 def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
-    """Raise `InputError` where a result cannot go into `folder`; call it before the work.
+    """Raise `InputError` where a result cannot be written to `folder`; to be called before the
+    work.
 
-    Only a new or empty folder, or an earlier result, is written to: a session's own
-    mechanism.yaml must not be lost to its calibrated one. Returns the files of that result, which
-    is kept beside its place (:mod:`pkmcal.calibration.archive`) unless ``force`` replaces it.
+    Only a new or empty folder, or an earlier result, is written to: a session's mechanism.yaml must
+    not be replaced by its calibrated one. Returns the files of that result, which is archived
+    beside the folder (:mod:`pkmcal.calibration.archive`) unless ``force`` replaces it.
     """
     folder = Path(folder)
     check_writable(folder)
@@ -111,7 +112,7 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
 
 
 def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, str | bytes]:
-    """What a calibration leaves on disk besides its page, texts by their files' names.
+    """Files of a calibration besides its page, contents by file name.
 
     document : of :func:`calibration_document`.
     """
@@ -131,7 +132,7 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
 
 
 def calibrated_mechanism_text(calibration: Calibration) -> str:
-    """The calibrated machine as a mechanism file, with what it is on top."""
+    """The calibrated machine as a mechanism file with a header."""
     verdict = calibration.verdict
     name = resolved(calibration.session.folder).name
     lines = [
@@ -156,10 +157,9 @@ def calibration_document(
 ) -> dict[str, Any]:
     """The content of calibration.json, plain data without NaN and dates.
 
-    not_identified : sentences about what the data could not decide, as the report tells them.
-    holdout : residuals on configurations that were held out, beside those in use. over : the tool
-    over the workspace, or why there is no map of it. photographs : their digests, read unless
-    given.
+    not_identified : sentences about unidentifiable directions, as in the report. holdout :
+    residuals of held-out configurations, beside those in use. over : the tool over the workspace,
+    or why there is no map of it. photographs : digests of the images, computed unless given.
     """
     session, estimate = calibration.session, calibration.estimate
     bed = calibration.findings.bed
@@ -205,7 +205,7 @@ def calibration_document(
 
 
 def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
-    """One entry for each tube of a leg, from 1: what its edges scatter by."""
+    """Noise of the edges of each tube of a leg, from 1."""
     if not estimate.edge_weights.size:
         return []
     value = estimate.edge_noise
@@ -229,12 +229,12 @@ def versions() -> Mapping[str, str]:
 
 
 def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
-    """One entry a parameter."""
+    """One entry for each parameter."""
     return [asdict(row) for row in calibration.parameters]
 
 
 def identifiability_of(findings: Findings) -> dict[str, Any]:
-    """The rank, what is open in words, and the paper's conditions.
+    """Rank, unidentifiable directions in words, and the papers' conditions.
 
     moves_platform : m, root mean square over the platform's joints and poses.
     """
@@ -281,9 +281,9 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _station_covariance(calibration: Calibration) -> dict[str, Any]:
-    """Stations that a camera may be left in, by name, and their rows (6 k, P + 6 k) of the joint
-    covariance of all parameters and these stations, (omega, tau) of T_base_camera. What felt
-    heights stands nowhere along the bed.
+    """Stations in which a camera may stay, by name, and their rows (6 k, P + 6 k) of the joint
+    covariance of all parameters and these stations, (omega, tau) of T_base_camera. Probes of
+    heights have no position along the bed.
     """
     session, estimate = calibration.session, calibration.estimate
     nowhere = {station.name for station in session.stations if station.handheld}
@@ -299,13 +299,13 @@ def _station_covariance(calibration: Calibration) -> dict[str, Any]:
 
 
 def rows_of_stations(n: int, stations: Integers) -> Integers:
-    """Rows of n parameters and then of some stations in a joint covariance."""
+    """Indices of n parameters, then of some stations, in a joint covariance."""
     return np.concatenate([np.arange(n), (n + 6 * stations[:, None] + np.arange(6)).ravel()])
 
 
 def of_inverse_poses(joint: Array, T_a_b: Array) -> Array:
-    """A joint covariance of parameters and poses (k, 4, 4), (omega, tau) of T_a_b, as that of the
-    parameters and (omega, tau) of T_b_a.
+    """Joint covariance of parameters and inverse poses, (omega, tau) of T_b_a, from that of the
+    parameters and poses T_a_b (k, 4, 4).
     """
     n = len(joint) - 6 * len(T_a_b)
     by = np.eye(len(joint))
@@ -316,7 +316,7 @@ def of_inverse_poses(joint: Array, T_a_b: Array) -> Array:
 
 
 def _focal_scale(calibration: Calibration, number: int) -> dict[str, Any]:
-    """By how much a hand-held photograph's focal lengths are its camera's, and how well known."""
+    """Factor of a hand-held image's focal lengths on its camera's, with its standard deviation."""
     cameras, estimate = calibration.cameras, calibration.estimate
     if number >= len(cameras.breathes) or not cameras.breathes[number]:
         return {}
@@ -327,7 +327,7 @@ def _focal_scale(calibration: Calibration, number: int) -> dict[str, Any]:
 
 
 def _targets(calibration: Calibration) -> list[dict[str, Any]]:
-    """Boards, and what trackers measured, on their body; sigma null where nothing tells it."""
+    """Boards and trackers' targets on their body; sigma null where not identified."""
     estimate, mounts = calibration.estimate, calibration.measurements.mounts
     sizes = estimate.state.columns.get(BOARD_SIZE, ())  # the papers' methods estimate none
     sizes = iter(zip(sizes, estimate.column_sigma(BOARD_SIZE), strict=True))
@@ -376,7 +376,7 @@ def _inverse_errors(transform: Array) -> Array:
 
 
 def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
-    """Each camera file once, with its edge shift, px of its photographs outward."""
+    """Each camera file once, with its edge shift, px of its images outward."""
     estimate, numbers = calibration.estimate, calibration.measurements.camera_of_station.tolist()
     stations = calibration.session.stations
     # trackers, whose number means nothing, come last
@@ -396,7 +396,7 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
-    """The intrinsics where they were refined with the machine, with their deviations."""
+    """Intrinsics that were refined with the machine, with their standard deviations."""
     if not calibration.cameras.refined:
         return {}
     camera = calibration.cameras.result(calibration.estimate, file)
@@ -412,8 +412,8 @@ def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
 def _configurations(
     calibration: Calibration, in_view: Mapping[str, Sequence[str]]
 ) -> list[dict[str, Any]]:
-    """Poses of all configurations; those not used have theirs from the readings alone. in_view :
-    the photographs' digests.
+    """Poses of all configurations; of unused ones by the readings alone. in_view : digests of the
+    images.
     """
     session, estimate = calibration.session, calibration.estimate
     return [
@@ -430,7 +430,7 @@ def _configurations(
 
 
 def _residuals(calibration: Calibration) -> dict[str, Any]:
-    """One row an edge, and one a pose, whitened; what they are of, by numbers from 1."""
+    """Whitened residuals, one row for each edge and each pose, with indices from 1."""
     estimate = calibration.estimate
 
     def rows(places: Sequence[Integers], *reals: Array) -> list[list[float]]:
@@ -458,7 +458,7 @@ def _residuals(calibration: Calibration) -> dict[str, Any]:
 
 
 def _link_residuals(calibration: Calibration) -> dict[str, Any]:
-    """Those of each kind of link that the session has, under its name."""
+    """Residuals of each kind of link in the session, under its name."""
     estimate, links = calibration.estimate, calibration.measurements.links
     out: dict[str, Any] = {"link_columns": LINK_COLUMNS} if links else {}
     first = 0
@@ -473,8 +473,8 @@ def _link_residuals(calibration: Calibration) -> dict[str, Any]:
 
 
 def rejected_photographs(session: Session) -> list[dict[str, Any]]:
-    """Photographs that do not show where they were taken from, one entry each: file by its path in
-    the session, station, configuration, and the reason in words.
+    """Images without a pose, one entry each: file by its path in the session, station,
+    configuration, and the reason in words.
     """
     return [
         {
@@ -489,7 +489,7 @@ def rejected_photographs(session: Session) -> list[dict[str, Any]]:
 
 
 def _rejected(calibration: Calibration) -> list[dict[str, Any]]:
-    """What was left out, by reason; leg, tube and side from 1, 0 where all of them are meant."""
+    """Rejections by reason; leg, tube and side from 1, 0 where all of them are meant."""
     session = calibration.session
     groups: dict[str, list[list[Any]]] = {}
     for item in calibration.observation.rejected:

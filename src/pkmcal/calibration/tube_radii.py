@@ -1,11 +1,11 @@
-"""Diameters that were taken for radii.
+"""The hypothesis that diameters were written for radii.
 
-Thick tubes of half the width are found in the photographs all the same: their edges lie on what is
-seen inside of the right ones, and the camera at another distance. A search in the picture does not
-tell them apart, for a tube's highlights, too, are edges at less than its width. What tells is the
-joint estimate: with the drawing's radii few edges are found, which disagree with the machine, now
-and then by no more than is accepted of a result, or are no more than chance offers; with half of
-them there are more, and they agree.
+Tubes modelled twice as thick are localized all the same: their edges match edges beside the right
+ones, with the camera at another distance. The likelihood of the images does not decide between the
+two, for the highlights of a tube, too, are edges at less than its width. The joint estimate does:
+with the stated radii few edges are measured, which disagree with the machine, sometimes by no more
+than is accepted of a result, or are chance matches; with half of the radii there are more edges,
+and they agree.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from pkmcal.calibration.camera_refinement import refinement_of
 from pkmcal.calibration.case import Case
-from pkmcal.calibration.faults import CURED_MISFIT_SHARE
 from pkmcal.calibration.handheld import localize_case
 from pkmcal.calibration.refinement import refine_alternating
 from pkmcal.errors import PkmcalError
@@ -28,19 +27,22 @@ from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.observe.hypotheses import diameters
 from pkmcal.outcome.finding import Finding, note
 
+SUSPECT_NOISE_SHARE = 0.5
+"""Part of TOO_NOISY by which edges have to scatter for other radii to be tried, and below which
+these explain the edges."""
+
 
 def check_radii(
     case: Case, estimate: Estimate | None, by_chance: bool, refine_camera: bool, seed: int
 ) -> tuple[Finding, ...]:
-    """Raise `InputError` where edges disagree with the machine more than with one whose mistake is
-    put right, and more of them agree with a machine of half the radii; a note where the machine of
-    half the radii has no estimate.
+    """Raise `InputError` where edges disagree with the machine and more of them agree with one of
+    half the radii; a note where the machine of half the radii has no estimate.
 
-    estimate : with the drawing's radii, None where there is none. by_chance : whether chance may
-    have offered its edges, which then agree with anything. refine_camera : whether it estimated the
-    cameras. seed : of the search for the stations.
+    estimate : with the stated radii, None where there is none. by_chance : whether its edges may be
+    chance matches, which agree with anything. refine_camera : whether the cameras were estimated.
+    seed : for the localization of the stations.
     """
-    agree = CURED_MISFIT_SHARE * TOO_NOISY
+    agree = SUSPECT_NOISE_SHARE * TOO_NOISY
     bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
     if not bad or not case.photographs:
         return ()

@@ -1,62 +1,75 @@
-"""Hypotheses about mistakes in a table of joint readings, as transformations of the readings.
+"""Mistakes in a table of joint readings, as transformations of the readings.
 
-Board and tracker poses compare these hypotheses by their misfit, images by the likelihood of edges;
-the list of hypotheses is the same.
+One list for images, boards and trackers: a motor that counts the other way, two columns exchanged,
+columns counted from another leg or backwards, rows shifted by one configuration. Boards and
+trackers weigh these hypotheses by how platform poses close, images by the likelihood of edges.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import combinations
-from typing import Literal
+from math import log
+from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
+from pkmcal.outcome.hypotheses import Hypothesis
 
 RANGE_MARGIN = 0.05
-"""Margin of a reading beyond its range, as a share of the stroke: homing shifts a range by the
-prior sigma of the offset."""
+"""Part of a stroke by which a reading may leave its range: homing shifts a range by the offset's
+tolerance."""
 CONSTANTS_IN_A_STROKE = 16
-"""Constants tried for a reversed motor in one stroke. The nearest is at most half a step off, which
-moves the platform by a thirtieth of the stroke, a tenth of the effect of reversed readings."""
+"""Constants that are tried for a reversed motor in one stroke. One that is half a step off moves
+the platform by a thirtieth of the stroke, a tenth of what the reversed readings do."""
+
+ReadingHypothesis = Hypothesis[Array]
+"""Data of these hypotheses are readings (K, m), m or rad. Facts: ``motors``, the columns (from 0)
+of one motor or two; ``constant`` of a reversed motor, the sum (m or rad) of a reading and the joint
+value that it stands for, 0 for a wrong sign alone; ``order`` (m,), the column of each leg;
+``step``, by how many rows the readings come late."""
 
 
-@dataclass(frozen=True)
-class ReadingHypothesis:
-    """Readings (K, m) that may be the true ones of a session.
+def reading_hypotheses(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
+    """All mistakes in readings that are weighed, with equal prior odds for each explanation.
 
-    motors : columns that differ.
-    constant : for a reversed motor, the sum (m or rad) of a reading and its true value; 0 for a
-        wrong sign alone.
+    joints : (K, m). ranges : (m, 2) smallest and largest reading, NaN where not known.
     """
-
-    code: Literal["readings.reversed", "readings.exchanged", "readings.renumbered"]
-    motors: tuple[int, ...]
-    joints: Array
-    constant: float = 0.0
-
-
-def reversed_motor(joints: Array, motor: int, constant: float) -> ReadingHypothesis:
-    """Readings (K, m) with one motor reversed."""
-    turned = joints.copy()
-    turned[:, motor] = constant - joints[:, motor]
-    return ReadingHypothesis("readings.reversed", (motor,), turned, constant)
+    hypotheses = [
+        *reversed_motors(joints, ranges),
+        *exchanged_motors(joints.shape[1]),
+        *renumbered_legs(joints.shape[1]),
+        *shifted_rows(len(joints)),
+    ]
+    prior = -log(max(len({one.meaning for one in hypotheses}), 1))
+    return [replace(one, log_prior=prior) for one in hypotheses]
 
 
-def reversed_motors(joints: Array, ranges: Array) -> list[list[ReadingHypothesis]]:
-    """Hypotheses for each motor: reversed readings with constants that put them into range.
+def reversed_motor(motor: int, constant: float) -> ReadingHypothesis:
+    """One motor that counts the other way."""
 
-    joints : (K, m).
-    ranges : (m, 2) smallest and largest reading, NaN if unknown.
-    Returns a list for each motor. The wrong sign alone comes first if these readings are in range;
-    for an unknown range it is the only hypothesis. The list is empty if no constant is possible.
+    def apply(joints: Array) -> Array:
+        turned = joints.copy()
+        turned[:, motor] = constant - joints[:, motor]
+        return turned
+
+    code = "readings.reversed" if constant else "readings.sign"
+    facts: dict[str, Any] = {"motors": (motor,), "constant": constant}
+    return ReadingHypothesis(code, f"motor {motor + 1}", apply, facts=facts)
+
+
+def reversed_motors(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
+    """Each motor that counts the other way, with constants by which its readings are in range.
+
+    A wrong sign alone (constant 0) is the first of a motor where it is in range, and the only one
+    where the range is not known.
     """
-    out: list[list[ReadingHypothesis]] = []
+    out: list[ReadingHypothesis] = []
     for motor, (low, high) in enumerate(ranges):
         stroke = high - low
         if not np.isfinite(stroke):
-            out.append([reversed_motor(joints, motor, 0.0)])
+            out.append(reversed_motor(motor, 0.0))
             continue
         slack = RANGE_MARGIN * stroke
         least = low - slack + joints[:, motor].max()
@@ -64,15 +77,53 @@ def reversed_motors(joints: Array, ranges: Array) -> list[list[ReadingHypothesis
         count = int(np.ceil(CONSTANTS_IN_A_STROKE * (most - least) / stroke)) + 1
         constants = np.linspace(least, most, count) if least <= most else np.zeros(0)
         signs = [0.0] if least <= 0 <= most else []
-        out.append([reversed_motor(joints, motor, float(c)) for c in (*signs, *constants)])
+        out += [reversed_motor(motor, float(c)) for c in (*signs, *constants)]
     return out
 
 
-def exchanged_motors(joints: Array) -> list[ReadingHypothesis]:
-    """Readings (K, m) with two motors exchanged, for every pair."""
+def exchanged_motors(count: int) -> list[ReadingHypothesis]:
+    """The readings of two of ``count`` motors exchanged, every pair."""
     out: list[ReadingHypothesis] = []
-    for one, other in combinations(range(joints.shape[1]), 2):
-        order = np.arange(joints.shape[1])
+    for one, other in combinations(range(count), 2):
+        order = np.arange(count)
         order[[one, other]] = other, one
-        out.append(ReadingHypothesis("readings.exchanged", (one, other), joints[:, order]))
+        subject = f"motors {one + 1} and {other + 1}"
+        out.append(reordered("readings.exchanged", subject, order, motors=(one, other)))
     return out
+
+
+def renumbered_legs(count: int) -> list[ReadingHypothesis]:
+    """Columns that begin with another leg, or run backwards, but for those that are the nominal
+    order or an exchange of two.
+    """
+    own = np.arange(count)
+    turned = [("turned", np.roll(own, -first)) for first in range(1, count)]
+    turned += [("reversed", np.roll(own[::-1], first)) for first in range(count)]
+    out: dict[tuple[int, ...], ReadingHypothesis] = {}
+    for direction, order in turned:
+        if np.count_nonzero(order != own) > 2:
+            hypothesis = reordered(f"readings.numbering_{direction}", f"leg {order[0] + 1}", order)
+            out.setdefault(tuple(order.tolist()), hypothesis)
+    return list(out.values())
+
+
+def reordered(code: str, subject: str, order: Integers, **facts: Any) -> ReadingHypothesis:
+    """Columns in another order, (m,): the column of each leg."""
+    return ReadingHypothesis(
+        code, subject, lambda joints: joints[:, order], facts={"order": order, **facts}
+    )
+
+
+def shifted_rows(count: int) -> list[ReadingHypothesis]:
+    """Readings that stand one configuration late or early, of ``count`` rows."""
+    if count <= 2:  # a shift is an exchange then
+        return []
+    return [
+        ReadingHypothesis(
+            "readings.shifted",
+            f"{step:+d} row",
+            lambda joints, step=step: np.roll(joints, step, axis=0),
+            facts={"step": step},
+        )
+        for step in (1, -1)
+    ]

@@ -1,1 +1,1 @@
-"""Photographs to measurements. The only place besides cameras/ that touches cv2."""
+"""Images to measurements. The only package besides cameras/ that uses cv2."""

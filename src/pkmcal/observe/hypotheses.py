@@ -1,18 +1,21 @@
-"""What is not as the session says: the usual mix-ups, as hypotheses beside the one that was found.
+"""What may be wrong with a session whose images do not show what it states.
 
-A hypothesis is the same photographs with other readings, other names, or mirrored. It is looked at
-where the machine was found, and where that is not where the user says, there too; only the
-likeliest are searched in full, and named where they explain the photographs better, one by one. A
-machine that was recognised is asked too: with two columns exchanged, four legs in six still fit.
+Hypotheses are all mistakes in the readings (:mod:`pkmcal.mechanisms.reading_hypotheses`), images
+under other names, mirrored images and diameters taken for radii. Levels of evidence compare their
+log-likelihoods with that of the session as stated: a short search in few images, the same in all,
+and a full search of the likeliest, from whose poses all are compared. A machine that was localized
+is compared as well: with two columns exchanged, four legs of six still fit.
+
+A search gives a lower bound of the likelihood, for it may end beside the best pose. So before the
+full search hypotheses are dropped by their order alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import partial
-from itertools import chain, combinations, islice
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
-from pkmcal.mechanisms.reading_hypotheses import reversed_motors
+from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_hypotheses
 from pkmcal.observe.pose_likelihood import (
     StationView,
     likelihood_from,
@@ -28,36 +31,49 @@ from pkmcal.observe.pose_likelihood import (
     settled,
 )
 from pkmcal.observe.station_localization import LocalizedPose, find_station, likelihood_nearby
+from pkmcal.outcome.hypotheses import (
+    OPTIONS,
+    EvidenceLevel,
+    Hypothesis,
+    HypothesisOptions,
+    posterior,
+    rivals_of,
+)
 from pkmcal.wording import DISPLAY_UNITS, how_often, listed, number
 
-DIAGNOSIS_LOG_ODDS = math.log(30 / 0.05)
-"""Log odds from which one of some thirty hypotheses replaces the session's word, or excludes
-another."""
+SEARCH_OPTIONS = HypothesisOptions(beam=math.inf, most=3)
+"""Of hypotheses whose likelihood a search bounds from below: the likeliest three go on."""
+OTHER_EXPLANATIONS = 4
+"""Explanations of images beside those of the readings: shifted, under other names, mirrored,
+diameters for radii."""
+POSE_BY_HAND_LOG_ODDS = 1000.0
+"""Nats by which a pose by hand speaks against readings by which the camera stands on another side
+of the machine: more than any images."""
 NEAR_SEARCH_TURN = np.radians(15.0)
-"""Turn from the pose by hand beyond which hypotheses are looked for about that, too."""
+"""Turn from the pose by hand beyond which hypotheses are searched about that pose, too."""
 OTHER_POSE_TURN = np.radians(45.0)
-"""Turn from the pose by hand beyond which the machine was found where the user does not see it: a
-machine of three or six equal parts looks the same from there."""
+"""Turn from the pose by hand beyond which the machine was localized where the user does not see it:
+a machine of three or six equal parts looks the same from there."""
 RIGHT_NAME_SHARE = 0.1
-"""Share of what a photograph of a recognised machine tells on average that one under the right name
-has to tell more: of two configurations that are nearly alike, what the drawing has wrong decides.
-Of simulated machines exchanged ones told 0.2 to 2 times as much, right ones up to 0.03."""
+"""Share of the mean log-likelihood ratio of a localized machine's images by which another name has
+to be likelier: of two configurations that are nearly equal, errors of the nominal model decide. Of
+simulated machines exchanged ones had 0.2 to 2 times as much, right ones up to 0.03."""
 NAMING_ROUNDS = 3
-"""Rounds of names for photographs, and of the pose that these tell."""
+"""Rounds of names for images, and of the pose by these names."""
 FEW_CONFIGURATIONS = 4
-"""Photographs of which all hypotheses about the readings are asked."""
-HYPOTHESES_SEARCHED = 3
-"""Hypotheses about the readings, likeliest first, that are searched in full."""
+"""Images in which all hypotheses about the readings are compared."""
 ENOUGH_PHOTOGRAPHS_ALONE, USUAL_PHOTOGRAPHS = 4, 15
-"""Photographs below which there are no two halves to search and to ask, and one that says little
-leaves it open whether the machine is there; and how many are usual."""
+"""Images below which there are no two halves, one to search and one to confirm, and one of little
+evidence leaves it open whether the machine is there; and how many are usual."""
+NUMBERING = "readings.numbering_"
+"""Codes of legs that are numbered from another one, or backwards."""
 STATION_PAIRS_SEARCHED = 15
 """Pairs of stations that are searched for the other's pose: of six stations, all."""
 
 
 class SuspectStation(NamedTuple):
-    """A station: its name, the files of its photographs and the names of the session's
-    configurations, its view, pose by hand (4, 4) if there is one, and what was found.
+    """A station: its name, the files of its images and the names of the session's configurations,
+    its view, its pose by hand (4, 4) if there is one, and its localization.
     """
 
     name: str
@@ -69,31 +85,30 @@ class SuspectStation(NamedTuple):
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the machine was found far from where the user says, or not at all."""
+        """Whether the machine was localized far from where the user says, or not at all."""
         return not self.localization.good or self.turned > OTHER_POSE_TURN
 
     @property
     def turned(self) -> float:
-        """Turn (rad) of the found pose from the one by hand; 0 without one."""
+        """Turn (rad) of the localized pose from the one by hand; 0 without one."""
         if self.by_hand is None:
             return 0.0
         return float(angle_between(self.localization.T_camera_base, self.by_hand))
 
 
-class Hypothesis(NamedTuple):
-    """What the photographs may show instead, the error that names it, and the logarithm of how many
-    of its kind it was chosen from. readings : (K, m) that the photographs would have, where nothing
-    else is another.
+@dataclass(frozen=True)
+class ImageHypothesis(Hypothesis[StationView]):
+    """What the images of a station may show instead; its data are the station's view.
+
+    error : that names the mistake. readings : (K, m) of the images, where nothing else differs.
     """
 
-    view: Callable[[], StationView]
-    error: InputError
-    log_choices: float = 0.0
+    error: InputError = field(default_factory=lambda: InputError(""))
     readings: Array | None = None
 
 
 def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputError | None:
-    """The error about stations whose photographs show something else than the session says."""
+    """The error about stations whose images show something else than the session states."""
     error = _swapped_stations([s for s in stations if s.elsewhere], rng)
     if error is not None or not stations:
         return error
@@ -108,8 +123,7 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
         return error
     if not bad:  # readings are wrong for all stations, but names for one alone
         rest = (station for station in stations if station is not worst)
-        named = ((s, list(_other_photographs(s))) for s in rest)
-        errors = (_likelier(s, others, True, rng, len(others)) for s, others in named)
+        errors = (_likelier(s, list(_other_images(s)), True, rng) for s in rest)
         return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
@@ -134,7 +148,7 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
 
 
 def _little(station: SuspectStation) -> str:
-    """What of the evidence is too little."""
+    """The evidence that is too weak, in words."""
     localization = station.localization
     if localization.by_chance < localization.limit:
         return "legs that fit nearly as well at another place"
@@ -149,8 +163,9 @@ def _little(station: SuspectStation) -> str:
 def _swapped_stations(
     stations: list[SuspectStation], rng: np.random.Generator
 ) -> InputError | None:
-    """Two stations each recognised near the other's pose, and better than mirrored at its own: a
-    symmetric machine's mirror image looks much as the machine does from the other side.
+    """The error about two stations that are each recognised near the other's pose, and better than
+    mirrored at their own: a symmetric machine's mirror image looks much as the machine does from
+    the other side.
     """
     for one, other in islice(combinations(stations, 2), STATION_PAIRS_SEARCHED):
         if one.by_hand is None or other.by_hand is None:
@@ -164,7 +179,7 @@ def _swapped_stations(
             continue
         view = replace(one.view, tables=one.view.tables.mirrored())
         mirrored = find_station(view, one.by_hand, rng, near_prior=True)
-        if not (mirrored.good and mirrored.likelier(swapped[0].localization) > DIAGNOSIS_LOG_ODDS):
+        if not (mirrored.good and mirrored.likelier(swapped[0].localization) > OPTIONS.act):
             return InputError(
                 f"stations {one.name} and {other.name} are mixed up",
                 where="session.yaml, stations",
@@ -179,7 +194,10 @@ def _swapped_stations(
 def _mixed_up(
     station: SuspectStation, in_order: bool, rng: np.random.Generator
 ) -> InputError | None:
-    """The hypothesis that explains a station's photographs better than the session, if any."""
+    """The error of the hypothesis that explains a station's images better than the session, if any.
+
+    in_order : whether another station shows that the readings are in order.
+    """
     view, localization = station.view, station.localization
     starts = (
         [localization.T_camera_base] if localization.good or station.by_hand is not None else []
@@ -188,159 +206,174 @@ def _mixed_up(
     if wide and station.by_hand is not None:
         starts.append(station.by_hand)
     begin = np.array(starts).reshape(-1, 4, 4)
-    hypotheses = list(_hypotheses(station))
-    display = [h.readings for h in hypotheses if h.readings is not None]
-    few, every = view.few(FEW_CONFIGURATIONS), view.few(len(view.configuration))
-    own, *log_likelihood_ratio = likelihood_nearby(
-        view, np.stack([view.joints, *display]), begin, wide, few, rng
-    )
-    for h in hypotheses[len(log_likelihood_ratio) :]:  # other legs, with the same readings
-        other = h.view()
-        log_likelihood_ratio.append(
-            likelihood_nearby(other, other.joints[None], begin, wide, few, rng)[0]
+
+    def searched(images: Integers) -> EvidenceLevel[ImageHypothesis]:
+        def ratios(hypotheses: Sequence[ImageHypothesis]) -> Array:
+            readings = [view.joints, *(h.readings for h in hypotheses if h.readings is not None)]
+            own, *together = likelihood_nearby(
+                view, np.stack(readings), begin, wide, images, rng
+            ).tolist()
+            values = np.empty(len(hypotheses))
+            for k, h in enumerate(hypotheses):
+                if h.readings is not None:
+                    values[k] = together.pop(0)
+                    continue
+                other = h.apply(view)  # other legs, with the same readings
+                joints = other.joints[None]
+                values[k] = likelihood_nearby(other, joints, begin, wide, images, rng)[0]
+            values = (values - own) / localization.correlation_length
+            # where the machine is as the user says, another explanation has to be better at once
+            return values if station.elsewhere else np.where(values > 0, values, -np.inf)
+
+        return EvidenceLevel(
+            f"{len(images)} images", ratios, decides=False, most=SEARCH_OPTIONS.most
         )
-    best = np.argsort(np.negative(log_likelihood_ratio))[:HYPOTHESES_SEARCHED]
+
+    levels = [searched(view.few(FEW_CONFIGURATIONS))]
     if not station.elsewhere:
-        # where the machine is as the user says, another word has to be better there at once, of few
-        # photographs, any of which another may fit better by chance, and of all
-        best = [k for k in best if log_likelihood_ratio[k] > own]
-        if best:
-            queries = np.stack([view.joints, *(display[k] for k in best)])
-            own, *log_likelihood_ratio = likelihood_nearby(view, queries, begin, wide, every, rng)
-            best = [k for k, e in zip(best, log_likelihood_ratio, strict=True) if e > own]
-    likely = [hypotheses[k] for k in best]
-    others = list(_other_photographs(station))
-    tried = len(hypotheses) + len(others)
-    return _likelier(station, [*others, *likely], in_order, rng, tried)
+        # of few images any other explanation may fit better by chance
+        levels.append(searched(view.few(len(view.configuration))))
+    hypotheses, others = list(_hypotheses(station)), list(_other_images(station))
+    likely = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
+    count = len(hypotheses) + len(others)
+    return _likelier(station, [*others, *likely], in_order, rng, count)
 
 
 def _likelier(
     station: SuspectStation,
-    others: list[Hypothesis],
+    hypotheses: list[ImageHypothesis],
     in_order: bool,
     rng: np.random.Generator,
-    query: int,
+    count: int | None = None,
 ) -> InputError | None:
-    """The likeliest of hypotheses, searched in full, that explain a station better than the
-    session, if any; with it those that it does not exclude. query : of how many they are the best.
+    """The error of the likeliest hypothesis, by a full search, that explains a station better than
+    the session, if any; it names those that it does not exclude.
+
+    count : of hypotheses of which these are the likeliest; all, if None. By chance one of so many
+    is confirmed, so each has to be recognised more surely by as much.
     """
-    if not others:
+    if not hypotheses:
         return None
     view, localization = station.view, station.localization
-    in_view = [h.view() for h in others]
-    own, *searched = (
-        find_station(each, station.by_hand, rng, near_prior=True) for each in (view, *in_view)
-    )
-    places = np.stack([f.T_camera_base for f in (localization, own, *searched)])
-    named = likelihood_from(view, places)
-    odds = [
-        (likelihood_from(other, places) - named) / localization.correlation_length
-        for other in in_view
+    count = count or len(hypotheses)
+
+    def by_full_search(hypotheses: Sequence[ImageHypothesis]) -> Array:
+        views = [h.apply(view) for h in hypotheses]
+        own, *searched = (
+            find_station(each, station.by_hand, rng, near_prior=True) for each in (view, *views)
+        )
+        poses = np.stack([f.T_camera_base for f in (localization, own, *searched)])
+        stated = likelihood_from(view, poses)
+        out = np.full(len(hypotheses), -np.inf)
+        for k, (h, other, at) in enumerate(zip(hypotheses, views, searched, strict=True)):
+            if not at.good or station._replace(localization=at).elsewhere:
+                continue
+            ratio = (likelihood_from(other, poses) - stated) / localization.correlation_length
+            # by its own readings the camera stands where the user does not see it, and no other
+            # station shows that they are in order
+            if station.elsewhere and localization.good and not in_order and h.readings is not None:
+                out[k] = ratio + POSE_BY_HAND_LOG_ODDS
+            elif at.by_chance * count < at.limit:
+                out[k] = ratio
+        return out
+
+    level = EvidenceLevel("full search", by_full_search)
+    ranked = [
+        one
+        for one in posterior(hypotheses, [level], SEARCH_OPTIONS)
+        if one.log_odds > OPTIONS.report
     ]
-    better = [
-        (o, h)
-        for o, f, h in zip(odds, searched, others, strict=True)
-        if _replaces(f, o - h.log_choices, station, in_order or h.readings is None, query)
-    ]
-    if not better:
+    if not ranked:
         return None
-    better.sort(key=lambda item: -item[0])
-    first, error = better[0][0], better[0][1].error
-    # several constants of one motor are told by the same words
-    also = [h.error.what for o, h in better[1:]
-            if first - o < DIAGNOSIS_LOG_ODDS and h.error.what != error.what]  # fmt: skip
+    error = ranked[0].hypothesis.error
+    also = [one.hypothesis.error.what for one in rivals_of(ranked)]
     if station.elsewhere and localization.good:
         also.append("the pose by hand is of another side of the machine")
-    if not also:
+    distinct = [what for what in dict.fromkeys(also) if what != error.what]  # several numberings
+    if not distinct:
         return error
-    distinct = dict.fromkeys(also)  # and several numberings
     message = f"{error.found}; they fit as well if {' or '.join(distinct)}"
     return InputError(
         error.what, where=error.where, found=message, next_step=error.next_step, code=error.code
     )
 
 
-def _replaces(
-    localization: LocalizedPose, odds: float, station: SuspectStation, in_order: bool, query: int
-) -> bool:
-    """Whether a hypothesis, found there, explains a station better than its own readings, by log
-    odds against these; it has to be recognised more surely by as much as there were others, for of
-    thirty that are asked of two photographs of any machine, chance confirms one sooner or later.
-    Where its own readings put the camera elsewhere than the user, and no other station shows that
-    they are in order, to be recognised where the user says is enough.
-    """
-    if not localization.good or station._replace(localization=localization).elsewhere:
-        return False
-    if station.elsewhere and station.localization.good and not in_order:
-        return True
-    return odds > DIAGNOSIS_LOG_ODDS and localization.by_chance * query < localization.limit
+def _log_prior(view: StationView) -> float:
+    """Prior log-odds of each explanation of a station's images, all alike."""
+    readings = reading_hypotheses(view.all_joints, view.machine.joint_ranges)
+    return -math.log(len({h.meaning for h in readings}) + OTHER_EXPLANATIONS)
 
 
-def _hypotheses(station: SuspectStation) -> Iterator[Hypothesis]:
-    """What is tried: motors that count the other way, columns turned, turned round and exchanged,
-    names shifted; of a station that was not recognised, diameters taken for radii.
+def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
+    """All mistakes in the readings, and images under their neighbours' names; of a station that was
+    not localized, diameters taken for radii.
     """
-    view = station.view
-    count = view.all_joints.shape[1]
-    own = np.arange(count)
-    for h in chain(*reversed_motors(view.all_joints, view.machine.joint_ranges)):
-        error = _reversed(h.motors[0] + 1, h.constant, view.machine.joint_units[h.motors[0]])
-        readings = h.joints[view.configuration]
-        yield Hypothesis(partial(view.with_joints, h.joints), error, readings=readings)
-    exchanged: dict[tuple[int, ...], InputError] = {}
-    for a, b in combinations(range(count), 2):
-        order = own.copy()
-        order[[a, b]] = b, a
-        exchanged[tuple(order.tolist())] = _two_legs(a + 1, b + 1)
-    turned = [np.roll(own, -r) for r in range(1, count)]
-    turned += [np.roll(own[::-1], r) for r in range(count)]
-    if station.localization.good and station.by_hand is None:
-        turned.clear()  # of a machine with equal thirds, any of its equal numberings would do
-    for order in turned:
-        exchanged.setdefault(tuple(order.tolist()), _numbering(order))
-    exchanged.pop(tuple(own.tolist()), None)
-    for columns, error in exchanged.items():
-        joints = view.all_joints[:, columns]
-        readings = joints[view.configuration]
-        yield Hypothesis(partial(view.with_joints, joints), error, readings=readings)
+    view, prior = station.view, _log_prior(station.view)
+    # of a machine with equal thirds, any of its equal numberings would do
+    any_numbering = station.localization.good and station.by_hand is None
+    for h in reading_hypotheses(view.all_joints, view.machine.joint_ranges):
+        if h.code == "readings.shifted" or (any_numbering and h.code.startswith(NUMBERING)):
+            continue  # images may be of some configurations: their names shift, below
+        joints = h.apply(view.all_joints)
+        yield ImageHypothesis(
+            h.code,
+            h.subject,
+            lambda view, joints=joints: view.with_joints(joints),
+            prior,
+            facts=h.facts,
+            error=_reading_error(h, view.machine.joint_units),
+            readings=joints[view.configuration],
+        )
     names = view.configuration
     if 2 < len(names) == len(np.unique(names)):
         for step in (1, -1):
-            shifted = partial(replace, view, configuration=np.roll(names, step))
-            readings = view.all_joints[np.roll(names, step)]
-            yield Hypothesis(shifted, _shifted(step), readings=readings)
-    # thin legs of few pixels are as likely to be thinner still, and two photographs of right ones
-    # can fit so by chance: only where nothing else explains
+            shifted = np.roll(names, step)
+            yield ImageHypothesis(
+                "image.shifted",
+                f"{step:+d}",
+                lambda view, shifted=shifted: replace(view, configuration=shifted),
+                prior,
+                error=_shifted(step),
+                readings=view.all_joints[shifted],
+            )
+    # thin legs of few pixels are as likely to be thinner still, and two images of right ones can
+    # fit so by chance: only where nothing else explains
     if not station.localization.good and len(names) > 2:
-        values = view.machine.values.copy()
-        values[np.unique(view.tubes.radius)] /= 2
-        thinner = partial(replace, view, machine=view.machine.with_values(values))
-        yield Hypothesis(thinner, diameters("mechanism.yaml"))
+        yield ImageHypothesis(
+            "tube.diameter", "tubes", _with_half_radii, prior, error=diameters("mechanism.yaml")
+        )
 
 
-def _other_photographs(station: SuspectStation) -> Iterator[Hypothesis]:
-    """Photographs under the names that fit each of them best; where the machine was not recognised,
-    or elsewhere than the user says, as its mirror image is, mirrored ones.
+def _with_half_radii(view: StationView) -> StationView:
+    values = view.machine.values.copy()
+    values[np.unique(view.tubes.radius)] /= 2
+    return replace(view, machine=view.machine.with_values(values))
+
+
+def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
+    """Images under the names that fit each of them best; mirrored images where the machine was not
+    localized, or elsewhere than the user says, as its mirror image is.
     """
     view, T_camera_base = station.view, station.localization.T_camera_base
-    names = view.configuration
+    names, prior = view.configuration, _log_prior(view)
     if station.elsewhere:
-        mirrored = partial(replace, view, tables=view.tables.mirrored())
-        yield Hypothesis(mirrored, _mirrored(station))
+        yield ImageHypothesis(
+            "image.mirrored",
+            station.name,
+            lambda view: replace(view, tables=view.tables.mirrored()),
+            prior,
+            error=_mirrored(station),
+        )
     if not 2 < len(names) == len(np.unique(names)):
         return
     columns = np.arange(len(names))
-    # any name could be on each photograph, and the fewest that bear wrong ones are two; without
-    # this, photographs of configurations that are alike would change names for nothing
+    # any name could be on each image, and the fewest that bear wrong ones are two; without this,
+    # images of equal configurations would change names for nothing
     choices, own = math.log(len(names)), station.localization
     keep_evidence = (
         own.log_likelihood_ratio / (own.correlation_length * len(names)) if own.good else 0.0
     )
-    keeps = (
-        np.eye(len(names))
-        * station.localization.correlation_length
-        * (DIAGNOSIS_LOG_ODDS / 2 + choices)
-    )
+    keeps = np.eye(len(names)) * own.correlation_length * (OPTIONS.act / 2 + choices)
     for _ in range(NAMING_ROUNDS):  # the wrong names have moved the pose, and it the names
         fits = log_likelihood_by_name(
             replace(view, configuration=names[columns]), T_camera_base, names
@@ -351,13 +384,18 @@ def _other_photographs(station: SuspectStation) -> Iterator[Hypothesis]:
         T_camera_base = settled(replace(view, configuration=names[columns]), T_camera_base)
     shifted = np.flatnonzero(columns != np.arange(len(names)))
     if 0 < len(shifted) <= len(names) // 2:
-        right = partial(replace, view, configuration=names[columns])
-        error = _misnamed(station, shifted, names[columns[shifted]])
-        yield Hypothesis(right, error, len(shifted) * (choices + RIGHT_NAME_SHARE * keep_evidence))
+        right = names[columns]
+        yield ImageHypothesis(
+            "image.exchanged",
+            station.name,
+            lambda view: replace(view, configuration=right),
+            prior - len(shifted) * (choices + RIGHT_NAME_SHARE * keep_evidence),
+            error=_misnamed(station, shifted, names[columns[shifted]]),
+        )
 
 
 def _best_names(score: Array) -> Integers:
-    """The name (n,) of each photograph, each given once, with the largest sum of scores (n, n)."""
+    """The name (n,) of each image, each used once, with the largest sum of scores (n, n)."""
     others = np.where(np.eye(len(score), dtype=bool), -np.inf, score).max(axis=1)
     gain = np.sort(others - np.diag(score))
     # two photographs at least have to leave their own names for others; where that loses, as a
@@ -369,17 +407,25 @@ def _best_names(score: Array) -> Integers:
     return linear_sum_assignment(-score)[1]
 
 
-def _reversed(motor: int, constant: float, unit: str) -> InputError:
-    """The error about a motor, counted from 1, whose readings are the constant less its values."""
-    scale, display = DISPLAY_UNITS[unit]
-    sum_ = f"{number(scale * constant, 0 if unit == 'm' else 1)} {display}"
-    less = f"some {sum_} less the reading" if constant else "the reading with the other sign"
+def _reading_error(hypothesis: ReadingHypothesis, units: Sequence[str]) -> InputError:
+    """The error that names a mistake in the readings. units : ``m`` or ``rad`` of each."""
+    facts = hypothesis.facts
+    if hypothesis.code == "readings.exchanged":
+        return _two_legs(*(k + 1 for k in facts["motors"]))
+    if hypothesis.code.startswith(NUMBERING):
+        return _numbering(facts["order"])
+    (motor,) = facts["motors"]
+    scale, display = DISPLAY_UNITS[units[motor]]
+    constant = f"{number(scale * facts['constant'], 0 if units[motor] == 'm' else 1)} {display}"
+    less = f"some {constant} less the reading" if facts["constant"] else (
+        "the reading with the other sign")  # fmt: skip
     return InputError(
-        f"the readings of motor {motor} count the other way",
+        f"the readings of motor {motor + 1} count the other way",
         where="joints.csv",
         found=f"the photographs fit with {less}",
         next_step=f"Turn the motor's direction round where it is set, or write {less} into this"
         " column; what is left of a constant is calibrated",
+        code=hypothesis.code,
     )
 
 
@@ -395,7 +441,7 @@ def _two_legs(a: int, b: int) -> InputError:
 
 
 def _numbering(order: Integers) -> InputError:
-    """The error about legs numbered otherwise; order : column of each leg, from 0."""
+    """The error about legs that are numbered differently; order : column of each leg, from 0."""
     rising = bool((order[1] - order[0]) % len(order) == 1)
     return InputError(
         "the legs are numbered differently in the readings and in the drawing",
@@ -420,7 +466,7 @@ def _shifted(step: int) -> InputError:
 
 
 def _misnamed(station: SuspectStation, photographs: Integers, fitting: Integers) -> InputError:
-    """The error about photographs, by number, that fit other rows of the readings."""
+    """The error about images, by index, that fit other rows of the readings."""
     files = [station.files[k] for k in photographs]
     fit = [station.configurations[k] for k in fitting]
     return InputError(
@@ -452,7 +498,7 @@ def _mirrored(station: SuspectStation) -> InputError:
 
 
 def diameters(mechanism: str) -> InputError:
-    """The error about radii that are twice too large; mechanism : the drawing's file."""
+    """The error about radii that are twice too large; mechanism : the nominal model's file."""
     return InputError(
         "the tubes' radii look like diameters",
         where=f"{mechanism}, tubes",

@@ -129,7 +129,7 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     poses do not determine the camera's rotation.
     """
     # all starts of all runs as one batch
-    starts = [_placed(body, visibility, *turns) for turns in _turns(body, visibility)]
+    starts = closed_forms(body, visibility)
     n, runs = len(starts), len(body)
     every = Pair(*(np.concatenate(parts) for parts in zip(*starts, strict=True)))
     body, visibility = (np.concatenate([part] * n) for part in (body, visibility))
@@ -153,6 +153,13 @@ def solve_pairs(body: Array, visibility: Array, size: float) -> Pair:
     pair = take(every, chosen)
     _check_identifiable(problem.select(chosen), pair)
     return pair
+
+
+def closed_forms(body: Array, visibility: Array) -> list[Pair]:
+    """Starts for :func:`solve_pairs`, each of B runs: one for every way in which the platform's
+    turns may leave the rotations open.
+    """
+    return [_placed(body, visibility, *turns) for turns in _turns(body, visibility)]
 
 
 def _check_identifiable(problem: PairProblem, pair: Pair) -> None:

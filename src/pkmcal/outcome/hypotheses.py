@@ -1,0 +1,172 @@
+"""Hypotheses about what is wrong with a session, and their posterior odds.
+
+A hypothesis is a transformation of the data: two columns of readings exchanged, images mirrored, a
+board that moved. The null hypothesis is the data as stated. The log-odds of a hypothesis h are
+
+    log O(h) = log L(data | h) - log L(data | null) + log prior odds of h
+
+in nats. Levels of evidence, cheap ones first, each give the log-likelihood ratios of all hypotheses
+that are still in the running; the first level that decides ends the comparison. Each level has the
+effective sample size inside: correlated residuals count once.
+
+A likelihood ratio compares explanations. It does not tell whether any of them is tenable: that the
+machine is in the images at all, or that the residuals of the best hypothesis are as small as their
+noise, are absolute tests, which a level makes by returning minus infinity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import log
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
+
+import numpy as np
+
+from pkmcal.arrays import Array
+
+Data = TypeVar("Data")
+Subject = TypeVar("Subject", bound="Hypothesis[Any]")
+
+
+@dataclass(frozen=True)
+class HypothesisOptions:
+    """Thresholds of all decisions between hypotheses, in nats.
+
+    act : log-odds from which data are used otherwise than stated (a repair), which the user learns
+    only afterwards; also the log-odds by which a hypothesis excludes another.
+    report : log-odds from which the user hears of a hypothesis: as the reason of a refusal, or as a
+    warning. She can look for herself, so one false report in twenty is acceptable.
+    beam : log-likelihood ratio to the best explanation below which a hypothesis is dropped before
+    the next level of evidence: e^-12 = 6e-6, far less than a finer level changes.
+    most : hypotheses at most that go on to a level that costs seconds for each.
+    """
+
+    act: float = log(1000.0)
+    report: float = log(20.0)
+    beam: float = 12.0
+    most: int = 6
+
+
+OPTIONS = HypothesisOptions()
+
+
+@dataclass(frozen=True)
+class Hypothesis(Generic[Data]):
+    """What may be wrong with a session.
+
+    code : of its finding, such as readings.exchanged. subject : the motor, station, file or image
+    concerned; hypotheses with one code and one subject are variants of one explanation. apply : the
+    data (of a session, of a station, of poses) as they would be without the mistake. log_prior :
+    prior log-odds, with the number of alternatives of the same kind and the cost of free parameters
+    (:func:`parameter_cost`). action : what follows where the hypothesis is decided for. facts : for
+    the finding, by name.
+    """
+
+    code: str
+    subject: str
+    apply: Callable[[Data], Data]
+    log_prior: float = 0.0
+    action: Literal["refuse", "repair"] = "refuse"
+    facts: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def meaning(self) -> tuple[str, str]:
+        """What variants of one explanation have in common."""
+        return self.code, self.subject
+
+
+class EvidenceLevel(NamedTuple, Generic[Subject]):
+    """One way to compare hypotheses with the data.
+
+    log_likelihood_ratios : (N,) nats, of N hypotheses against the null; minus infinity for those
+    that are untenable. decides : whether the comparison may end here. most : hypotheses that go on
+    to the next level, without limit where None.
+    """
+
+    name: str
+    log_likelihood_ratios: Callable[[Sequence[Subject]], Array]
+    decides: bool = True
+    most: int | None = None
+
+
+class Ranked(NamedTuple, Generic[Subject]):
+    """A hypothesis with its log-odds against the null, and the level of evidence that gave them."""
+
+    hypothesis: Subject
+    log_odds: float
+    level: str = "prior"
+
+
+def posterior(
+    hypotheses: Sequence[Subject],
+    levels: Sequence[EvidenceLevel[Subject]],
+    options: HypothesisOptions = OPTIONS,
+) -> list[Ranked[Subject]]:
+    """Hypotheses that no level of evidence has dropped, the likeliest first.
+
+    levels : cheapest first. Later levels are skipped once one that may decide has found a
+    hypothesis with odds of ``act`` against the null and against each other explanation.
+    """
+    ranked = [Ranked(h, h.log_prior) for h in hypotheses]
+    for level in levels:
+        if not ranked:
+            break
+        ratios = np.asarray(level.log_likelihood_ratios([one.hypothesis for one in ranked]))
+        # prior odds stay as they are, so only the likelihood shows what is worth more evidence
+        least = max(float(ratios.max()), 0.0) - options.beam
+        ranked = [
+            Ranked(one.hypothesis, one.hypothesis.log_prior + float(ratio), level.name)
+            for one, ratio in zip(ranked, ratios, strict=True)
+            if ratio > least
+        ]
+        ranked.sort(key=lambda one: -one.log_odds)
+        sure = bool(ranked) and ranked[0].log_odds > options.act
+        if level.decides and sure and not rivals_of(ranked, options):
+            break
+        ranked = ranked[: level.most]
+    return ranked
+
+
+def decide(
+    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
+) -> Ranked[Subject] | None:
+    """The hypothesis to follow, None where none is likely enough for its action."""
+    if not ranked:
+        return None
+    limit = options.act if ranked[0].hypothesis.action == "repair" else options.report
+    return ranked[0] if ranked[0].log_odds > limit else None
+
+
+def rivals_of(
+    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
+) -> list[Ranked[Subject]]:
+    """Other explanations that the first of the ranked hypotheses does not exclude, each once."""
+    first, out = ranked[0], dict[tuple[str, str], Ranked[Subject]]()
+    for one in ranked[1:]:
+        if one.log_odds > first.log_odds - options.act:
+            out.setdefault(one.hypothesis.meaning, one)
+    out.pop(first.hypothesis.meaning, None)
+    return list(out.values())
+
+
+def parameter_cost(count: int, n_effective: float) -> float:
+    """Log-prior of ``count`` free parameters that a hypothesis adds, by the Bayesian information
+    criterion (Schwarz, Estimating the dimension of a model, 1978): half of log n each.
+    """
+    return -0.5 * count * log(max(n_effective, 1.0))
+
+
+def log_likelihood(misfit: Array, n_effective: float) -> Array:
+    """Log-likelihood (nats) of residuals by their root mean square ``misfit``, in stated standard
+    deviations, up to a constant.
+
+    Their true scale s is unknown, no smaller than stated and otherwise the likeliest, so that an
+    imperfect model does not make small differences decisive: -n (log s + misfit^2 / (2 s^2)).
+    n_effective : number n of independent residuals.
+    """
+    misfit = np.asarray(misfit, dtype=float)
+    scale = np.maximum(misfit, 1.0)
+    with np.errstate(invalid="ignore"):
+        value = -n_effective * (np.log(scale) + 0.5 * (misfit / scale) ** 2)
+    return np.where(np.isfinite(misfit), value, -np.inf)

@@ -1,0 +1,237 @@
+"""Hypotheses about a session: their posterior, the list for readings, and closure as evidence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp, log
+
+import numpy as np
+import pytest
+
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.calibration.pose_hypotheses import closure_misfits, contradicted_by_closure
+from pkmcal.mechanisms.reading_hypotheses import reading_hypotheses
+from pkmcal.outcome.hypotheses import (
+    OPTIONS,
+    EvidenceLevel,
+    Hypothesis,
+    decide,
+    log_likelihood,
+    parameter_cost,
+    posterior,
+    rivals_of,
+)
+from pkmcal.session.load import load_session
+from test_pose_sessions import make
+
+
+def named(code, subject="", log_prior=0.0, action="refuse"):
+    return Hypothesis(code, subject, lambda data: data, log_prior, action)
+
+
+def level(name, ratios, **options):
+    """A level that gives each code its log-likelihood ratio, and the codes that it was given."""
+    given = []
+
+    def log_likelihood_ratios(hypotheses):
+        given.append([one.code for one in hypotheses])
+        return np.array([ratios[one.code] for one in hypotheses])
+
+    return EvidenceLevel(name, log_likelihood_ratios, **options), given
+
+
+# the posterior
+
+
+def test_log_odds_are_those_of_bayes():
+    """Three coins: a fair one is the null, of two that are not one is rarer."""
+    heads, tosses = 9, 10
+    chance = {"biased": 0.8, "two heads": 0.99}
+    prior = {"biased": 0.1, "two heads": 0.001}
+    ratios = {
+        name: heads * log(p / 0.5) + (tosses - heads) * log((1 - p) / 0.5)
+        for name, p in chance.items()
+    }
+    one, _ = level("tosses", ratios)
+    ranked = posterior([named(name, log_prior=log(p)) for name, p in prior.items()], [one])
+    odds = {item.hypothesis.code: exp(item.log_odds) for item in ranked}
+    for name, p in chance.items():
+        expected = prior[name] * p**heads * (1 - p) ** (tosses - heads) / 0.5**tosses
+        assert odds[name] == pytest.approx(expected)
+
+
+def test_the_cheapest_level_that_decides_is_the_last():
+    cheap, _ = level("cheap", {"a": OPTIONS.act + 1, "b": -1.0})
+    costly, given = level("costly", {"a": 0.0, "b": 0.0})
+    ranked = posterior([named("a"), named("b")], [cheap, costly])
+    assert decide(ranked).hypothesis.code == "a"
+    assert ranked[0].level == "cheap"
+    assert given == []
+
+
+@pytest.mark.parametrize("other", [OPTIONS.act, 2.0])
+def test_a_level_does_not_decide_between_explanations_that_it_cannot_tell_apart(other):
+    cheap, _ = level("cheap", {"a": OPTIONS.act + 1, "b": other})
+    costly, given = level("costly", {"a": 1.0, "b": 20.0})
+    ranked = posterior([named("a"), named("b")], [cheap, costly])
+    assert given == [["a", "b"]]
+    assert decide(ranked).hypothesis.code == "b"
+
+
+def test_variants_of_one_explanation_are_no_rivals():
+    cheap, _ = level("cheap", {"a": OPTIONS.act + 1})
+    costly, given = level("costly", {"a": 0.0})
+    ranked = posterior([named("a", "motor 1"), named("a", "motor 1")], [cheap, costly])
+    assert given == []
+    assert rivals_of(ranked) == []
+
+
+def test_what_the_likelihood_drops_is_not_weighed_again():
+    """The prior of a hypothesis alone drops none: more evidence may outweigh it."""
+    cheap, _ = level(
+        "cheap", {"best": 1.0, "rare": 0.5, "worse": -OPTIONS.beam, "none": -np.inf}, decides=False
+    )
+    costly, given = level("costly", {"best": 0.0, "rare": 100.0})
+    ranked = posterior(
+        [named("best"), named("rare", log_prior=-50.0), named("worse"), named("none")],
+        [cheap, costly],
+    )
+    assert given == [["best", "rare"]]
+    assert ranked[0].hypothesis.code == "rare"
+
+
+def test_only_so_many_go_on():
+    cheap, _ = level("cheap", {"a": 1.0, "b": 3.0, "c": 2.0}, decides=False, most=2)
+    costly, given = level("costly", {"b": 0.0, "c": 0.0})
+    posterior([named("a"), named("b"), named("c")], [cheap, costly])
+    assert given == [["b", "c"]]
+
+
+def test_a_repair_needs_more_than_a_report():
+    between = 0.5 * (OPTIONS.report + OPTIONS.act)
+    for action, limit in (("refuse", OPTIONS.report), ("repair", OPTIONS.act)):
+        for odds in (OPTIONS.report - 0.1, between, OPTIONS.act + 0.1):
+            one, _ = level("only", {"a": odds})
+            assert (decide(posterior([named("a", action=action)], [one])) is not None) == (
+                odds > limit
+            )
+
+
+def test_nothing_is_decided_of_no_hypotheses():
+    one, _ = level("only", {})
+    assert decide(posterior([], [one])) is None
+
+
+@pytest.mark.parametrize("misfit", [0.3, 1.0, 7.0])
+def test_the_log_likelihood_has_the_likeliest_scale(misfit):
+    """Normal residuals, n of them, of any scale that is no smaller than stated."""
+    n = 12
+    scales = np.linspace(1.0, 10.0, 9001)
+    each = -n * np.log(scales) - n * misfit**2 / (2 * scales**2)
+    assert log_likelihood(np.array(misfit), n) == pytest.approx(each.max(), abs=1e-5)
+
+
+def test_no_misfit_is_worse_than_an_infinite_one():
+    np.testing.assert_array_equal(log_likelihood(np.array([np.inf, np.nan]), 9), -np.inf)
+
+
+def test_free_parameters_cost_what_noise_gains_by_them():
+    """BIC, beside what k numbers of noise explain on average, k / 2: no parameter gains by that."""
+    for n in (10, 100):
+        assert parameter_cost(6, n) < -3.0
+    assert parameter_cost(0, 100) == 0.0
+
+
+# readings
+
+
+def test_every_order_of_columns_is_one_hypothesis():
+    for count in (2, 3, 4, 6):
+        joints = np.arange(float(5 * count)).reshape(5, count)
+        orders = [
+            tuple(one.apply(joints)[0])
+            for one in reading_hypotheses(joints, np.full((count, 2), np.nan))
+            if one.code in ("readings.exchanged", "readings.numbering_turned",
+                            "readings.numbering_reversed")
+        ]  # fmt: skip
+        assert len(set(orders)) == len(orders)
+        assert tuple(joints[0]) not in orders
+        assert tuple(np.roll(joints[0], 1)) in orders
+        assert tuple(joints[0, ::-1]) in orders
+
+
+def test_reversed_readings_stay_in_their_range():
+    rng = np.random.default_rng(0)
+    ranges = np.array([[0.3, 0.5], [-1.0, 1.0], [np.nan, np.nan]])
+    joints = np.column_stack(
+        [rng.uniform(0.35, 0.4, 9), rng.uniform(-0.9, 0.9, 9), rng.uniform(0, 1, 9)]
+    )
+    for one in reading_hypotheses(joints, ranges):
+        if one.code not in ("readings.reversed", "readings.sign"):
+            continue
+        (motor,) = one.facts["motors"]
+        low, high = ranges[motor]
+        values, slack = one.apply(joints)[:, motor], 0.05 * (high - low) + 1e-12
+        np.testing.assert_allclose(values + joints[:, motor], one.facts["constant"], atol=1e-12)
+        if np.isfinite(low):
+            assert values.min() >= low - slack
+            assert values.max() <= high + slack
+
+
+# closure
+
+SPOILT = {
+    "readings.reversed": lambda joints: np.column_stack(
+        [joints[:, 0].min() + joints[:, 0].max() + 0.01 - joints[:, 0], joints[:, 1:]]
+    ),
+    "readings.exchanged": lambda joints: joints[:, [1, 0, *range(2, joints.shape[1])]],
+    "readings.numbering_turned": lambda joints: np.roll(joints, 1, axis=1),
+    "readings.shifted": lambda joints: np.roll(joints, 1, axis=0),
+}
+
+
+@pytest.mark.parametrize("code", SPOILT)
+@pytest.mark.parametrize(
+    ("name", "kind"), [("gough-stewart", "poses"), ("gough-stewart", "points"), ("h4", "poses")]
+)
+def test_closure_finds_the_mistake(tmp_path, name, kind, code):
+    """Without any estimate, as a session would be spoilt; of a right one it finds none."""
+    make(tmp_path / "session", name, kind, n=24)
+    session = load_session(tmp_path / "session")
+    machine, right = session.machine, measurements_of(session, Boards())
+    spoilt = replace(right, joints=SPOILT[code](right.joints))
+    for measurements, expected in ((spoilt, code), (right, None)):
+        hypotheses = reading_hypotheses(measurements.joints, machine.joint_ranges)
+        cases = [replace(measurements, joints=one.apply(measurements.joints)) for one in hypotheses]
+        null, *misfits = closure_misfits(machine, [measurements, *cases])
+        best = int(np.argmin(misfits))
+        if expected is None:  # a machine of equal thirds is the same turned by one
+            assert misfits[best] > 0.9 * null
+        else:
+            assert hypotheses[best].code == expected
+            assert misfits[best] < 0.2 * null
+            if name == "gough-stewart" and code == "readings.numbering_turned":
+                continue  # or turned by a third more, which is the same machine
+            restored = hypotheses[best].apply(spoilt.joints)
+            assert np.median(np.abs(restored - right.joints)) < 0.02
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "delta"])
+def test_a_reading_that_stands_still_contradicts_the_poses(tmp_path, name):
+    """But not where the machine stood so in truth."""
+    made = make(tmp_path / "session", name, n=24)
+    session = load_session(tmp_path / "session")
+    right = measurements_of(session, Boards())
+    joints = right.joints.copy()
+    joints[:, 1] = joints[0, 1]
+    frozen, rng = replace(right, joints=joints), np.random.default_rng(0)
+    assert contradicted_by_closure(session.machine, frozen, rng)
+    held = made.machine.forward_result(joints)
+    body = held.T_base_platform[held.converged]
+    rows = np.flatnonzero(held.converged)
+    poses = right.poses.select(rows)
+    there = right.poses.T_station_target[0] @ np.linalg.inv(body[0]) @ body
+    still = replace(right, joints=joints[rows], poses=replace(
+        poses, T_station_target=there, configuration=np.arange(len(rows))))  # fmt: skip
+    assert not contradicted_by_closure(session.machine, still, rng)
