@@ -167,9 +167,7 @@ def test_legs_that_give_way_are_found_and_contained():
     estimate = bundle(drawing, data, right.state)
     result = discrepancy_in(data, estimate)
     assert result.scales[0].code == "readings.workspace"
-    contained = with_discrepancy(
-        data, estimate, linearize_at_solution(data, estimate)[1].problem, result
-    )
+    contained = with_discrepancy(estimate, linearize_at_solution(data, estimate)[1].problem, result)
     before, after = (tool_in_sigmas(truth, x, true) for x in (estimate, contained))
     assert before > 3
     assert after < 3
@@ -208,9 +206,7 @@ def test_noisy_readings_are_noise_and_hardly_more():
     _, data, estimate, _ = session_estimate(9, lambda q: 3e-5 * rng.standard_normal(q.shape))
     assert estimate.statistics.reading_scale > 3
     result = discrepancy_in(data, estimate)
-    contained = with_discrepancy(
-        data, estimate, linearize_at_solution(data, estimate)[1].problem, result
-    )
+    contained = with_discrepancy(estimate, linearize_at_solution(data, estimate)[1].problem, result)
     offsets = estimate.machine.parameters.of_kind("offset")
     more, before = (np.diag(x.covariance)[offsets].sum() for x in (contained, estimate))
     assert more < 2 * before

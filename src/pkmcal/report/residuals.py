@@ -75,6 +75,8 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
     joints : (K, m) readings.
     camera : (S,) index of each station's camera.
     """
+    if not len(edges):
+        return np.zeros(0)
     machine, state = estimate.machine, estimate.state
     k, j = edges.configuration, edges.leg
     legs = legs_in_camera(

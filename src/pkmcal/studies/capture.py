@@ -222,7 +222,11 @@ def _edges(
         radius = machine.values[tubes.radius]
         exact, _ = visible_edges(camera, tubes, radius, apply(T, ends.a), apply(T, ends.b))
         place = np.full(len(exact), station)
-        sets.append(replace(exact, station=place, configuration=rows[exact.configuration]))
+        # the problem gets a column for each shift that is not zero; each run has its own
+        shift = np.broadcast_to([1.0, 0.0], exact.shift.shape)
+        sets.append(
+            replace(exact, station=place, configuration=rows[exact.configuration], shift=shift)
+        )
     return concatenate(sets)
 
 
