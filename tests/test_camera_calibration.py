@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.board import Detection, chessboard
-from pkmcal.boards.camera import calibrate_camera, calibrate_photographs
 from pkmcal.boards.fit import (
     board_poses,
     covariance_of,
@@ -22,7 +21,8 @@ from pkmcal.boards.fit import (
     settled_poses,
     views_of,
 )
-from pkmcal.boards.selection import (
+from pkmcal.camera_calibration.calibrate import calibrate_camera, calibrate_photographs
+from pkmcal.camera_calibration.model_selection import (
     best_of,
     camera_candidates,
     first_fit,
@@ -104,7 +104,7 @@ def alone(monkeypatch, model):
     """Fit this model only; for a requested model, other models only show whether they fit
     better.
     """
-    monkeypatch.setattr("pkmcal.boards.camera.DISTORTION_CANDIDATES", (model,))
+    monkeypatch.setattr("pkmcal.camera_calibration.calibrate.DISTORTION_CANDIDATES", (model,))
 
 
 @pytest.fixture(params=TRUE)
@@ -132,7 +132,7 @@ def calibration_of(name):
 @pytest.fixture(scope="module")
 def wide_calibration(wide_pool):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.boards.camera.camera_candidates", lambda *_: wide_pool)
+        patch.setattr("pkmcal.camera_calibration.calibrate.camera_candidates", lambda *_: wide_pool)
         return calibration_of("unified")
 
 
@@ -345,7 +345,9 @@ def test_lines_are_great_circles(true):
 @pytest.fixture
 def fitted_once(wide_pool, monkeypatch):
     """A calibration finds these fits in place of its own."""
-    monkeypatch.setattr("pkmcal.boards.camera.camera_candidates", lambda *_: wide_pool)
+    monkeypatch.setattr(
+        "pkmcal.camera_calibration.calibrate.camera_candidates", lambda *_: wide_pool
+    )
 
 
 @pytest.mark.usefixtures("fitted_once")

@@ -32,7 +32,7 @@ from pkmcal.identify.verdict import judge
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
-from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
+from pkmcal.starter import TO_FILL, session_texts, untouched_files
 from test_pose_sessions import make
 from test_report_page import Found
 
@@ -615,7 +615,7 @@ def test_no_traceback_whatever_happens(error, code, said, tmp_path, monkeypatch)
     def fail(*_words):
         raise error
 
-    monkeypatch.setattr("pkmcal.session.starter.write_session", fail)
+    monkeypatch.setattr("pkmcal.starter.write_session", fail)
     monkeypatch.delenv("PKMCAL_DEBUG", raising=False)
     done = run("new", tmp_path)
     assert (done.code, done.out) == (code, "")

@@ -16,8 +16,8 @@ from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.gauge import moved_centres
-from pkmcal.identify.machine_change import machine_change
 from pkmcal.judge.difference import _shared_data, difference
+from pkmcal.judge.machine_change import machine_change
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level

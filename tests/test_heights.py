@@ -27,9 +27,9 @@ from pkmcal.printers.probed import read_touches
 from pkmcal.printers.read import read_printer
 from pkmcal.printers.session import write_printer_session
 from pkmcal.session.load import load_session
-from pkmcal.session.starter import untouched_files
 from pkmcal.simulation.drives import to_simulate
 from pkmcal.simulation.placement import draw_configurations
+from pkmcal.starter import untouched_files
 
 SAYS = printers.Settings()
 BUILT = printers.Settings(radius=105.6, angle=(210.3, 329.8, 90.0), rod=(270.3, 269.8, 270.1))

@@ -15,7 +15,7 @@ from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.session.image_files import image_header
 from pkmcal.session.load import load_session
 from pkmcal.session.schema import session_schema
-from pkmcal.session.starter import write_session
+from pkmcal.starter import write_session
 
 
 @pytest.fixture

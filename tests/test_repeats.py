@@ -10,7 +10,11 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
-from pkmcal.calibration.repeats import (
+from pkmcal.commands.comparison import compare_with_truth
+from pkmcal.errors import InputError
+from pkmcal.geometry.cylinders import tangent_basis
+from pkmcal.geometry.rigid import dot, look_at, perturb
+from pkmcal.judge.repeatability import (
     Cylinders,
     RepeatStudy,
     _findings,
@@ -22,10 +26,6 @@ from pkmcal.calibration.repeats import (
     require_repeats,
     study_repeats,
 )
-from pkmcal.commands.comparison import compare_with_truth
-from pkmcal.errors import InputError
-from pkmcal.geometry.cylinders import tangent_basis
-from pkmcal.geometry.rigid import dot, look_at, perturb
 from pkmcal.measurements import concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.legs import StationEdges
@@ -415,7 +415,7 @@ def looked(repeats):
         return made[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.calibration.repeats.calibrate_session", once)
+        patch.setattr("pkmcal.judge.repeatability.calibrate_session", once)
         study = study_repeats(repeats)
     (calibration,) = made
     return Looked(study, calibration)
@@ -428,7 +428,7 @@ def once(looked, checked, monkeypatch):
     """
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     monkeypatch.setattr(
-        "pkmcal.calibration.repeats.study_repeats", lambda *_, **_more: looked.study
+        "pkmcal.judge.repeatability.study_repeats", lambda *_, **_more: looked.study
     )
 
 

@@ -12,10 +12,10 @@ from pkmcal.calibration.toolmap import map_of
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, laid_over
-from pkmcal.identify.comparison import compare
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres, in_gauge
 from pkmcal.identify.tool import tool_error
+from pkmcal.judge.machine_errors import compare
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.report.calibration import save

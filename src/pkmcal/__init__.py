@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pkmcal.api.plan import plan
     from pkmcal.api.simulate import simulate
     from pkmcal.cameras import load_camera
-    from pkmcal.identify.comparison import compare
+    from pkmcal.judge.machine_errors import compare
     from pkmcal.mechanisms import Machine, load_mechanism
     from pkmcal.session.load import load_session
     from pkmcal.studies.findings import study
@@ -47,7 +47,7 @@ __all__ = [
 _HOMES = {
     "Machine": "pkmcal.mechanisms",
     "calibrate": "pkmcal.api.calibrate",
-    "compare": "pkmcal.identify.comparison",
+    "compare": "pkmcal.judge.machine_errors",
     "load_camera": "pkmcal.cameras",
     "load_mechanism": "pkmcal.mechanisms",
     "load_result": "pkmcal.api.calibrate",

@@ -248,7 +248,7 @@ def results(folder: Path) -> None:
     at = os.getcwd()  # noqa: PTH109
     os.chdir(folder)
     few = patch("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
-    one = patch("pkmcal.boards.camera.DISTORTION_CANDIDATES", ("pinhole",))
+    one = patch("pkmcal.camera_calibration.calibrate.DISTORTION_CANDIDATES", ("pinhole",))
     try:
         for words in (
             "calibrate tracker -o calibration",

@@ -57,7 +57,7 @@ from pkmcal.observe.station_localization import LocalizedPose
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, of_error
 from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, Station, load_session
-from pkmcal.session.starter import untouched_files
+from pkmcal.starter import untouched_files
 from pkmcal.wording import listed
 
 BROKEN_PHOTOGRAPHS_NAMED = 10

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.repeats import RepeatStudy, part_of
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.results import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
 from pkmcal.files import resolved
+from pkmcal.judge.repeatability import RepeatStudy, part_of
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Mark, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note

@@ -60,7 +60,7 @@ def camera(
     from dataclasses import replace
 
     from pkmcal.boards.board import load_board
-    from pkmcal.boards.camera import calibrate_photographs
+    from pkmcal.camera_calibration.calibrate import calibrate_photographs
     from pkmcal.files import check_writable, default_output
     from pkmcal.report.camera import outcome_of
 

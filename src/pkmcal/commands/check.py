@@ -42,7 +42,7 @@ def check(
     with console.progress(as_json) as progress:
         check = check_session(session, seed=seed, progress=progress)
         if repeat and check.exit_code < 2:
-            from pkmcal.calibration.repeats import study_repeats
+            from pkmcal.judge.repeatability import study_repeats
 
             study = study_repeats(session, seed=seed, progress=progress)
         outcome = outcome_of(check, study)

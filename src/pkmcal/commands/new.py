@@ -12,7 +12,7 @@ import typer
 from pkmcal.commands import console
 
 if TYPE_CHECKING:
-    from pkmcal.session.starter import ObservedChoice
+    from pkmcal.starter import ObservedChoice
 
 SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
@@ -58,7 +58,7 @@ def new(
     as_json: console.Json = False,
 ) -> int:
     """Write a commented session to fill in."""
-    from pkmcal.session.starter import write_session
+    from pkmcal.starter import write_session
 
     if printer is not None or probed is not None:
         others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}

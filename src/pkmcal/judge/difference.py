@@ -15,7 +15,7 @@ from pkmcal.calibration.toolmap import ToolMap, map_of
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import json_value
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.identify.machine_change import MachineChange, machine_change
+from pkmcal.judge.machine_change import MachineChange, machine_change
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import REGION_AXES, Region
 from pkmcal.outcome import Verdict

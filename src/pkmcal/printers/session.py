@@ -13,7 +13,7 @@ from pkmcal.mechanisms import MechanismDocument, checked_machine
 from pkmcal.printers.printer import CARRIAGE_STEP, Printer, Touches
 from pkmcal.printers.probed import FEWEST_BED_POINTS, read_touches
 from pkmcal.printers.read import read_printer
-from pkmcal.session.starter import (
+from pkmcal.starter import (
     STARTER_SQUARE_CHOICES,
     board_text,
     example_readings,

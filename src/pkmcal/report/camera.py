@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pkmcal.arrays import THREADS
-from pkmcal.boards.camera import COVERAGE_CELLS, CameraCalibration, coverage, tilts
+from pkmcal.camera_calibration.calibrate import COVERAGE_CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.pages import charts, page

@@ -19,7 +19,7 @@ from pkmcal.boards.fit import (
     covariance_of,
     views_of,
 )
-from pkmcal.boards.selection import (
+from pkmcal.camera_calibration.model_selection import (
     DISTORTION_CANDIDATES,
     Candidate,
     HeldOut,
