@@ -39,14 +39,14 @@ def true_normals(edges: Any, truth: TrueMachine, radius: np.ndarray, row: np.nda
     return edge_normal_jacobians(a, b, radius, edges.side).n
 
 
-def true_radii(folder: Path, drawing: Any, edges: Any) -> np.ndarray:
+def true_radii(folder: Path, nominal: Any, edges: Any) -> np.ndarray:
     """Radii (n,) m of the edges' tubes."""
     data = json.loads((folder / TRUTH).read_text())
     if "tube_radius" in data:
         return np.where(edges.tube == 0, data["tube_radius"], data["rod_radius"])
     from pkmcal.simulation.truth import load_truth
 
-    return load_truth(folder, drawing).machine.radii_of(edges.leg, edges.tube)
+    return load_truth(folder, nominal).machine.radii_of(edges.leg, edges.tube)
 
 
 def edges_at(edges: Any, normal: np.ndarray, turn: np.ndarray) -> Any:

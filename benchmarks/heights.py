@@ -10,10 +10,10 @@ moves over places that nobody probed.
 
 Printers are off what their firmware says, one standard deviation: delta radius and end switches 0.5
 mm, towers 0.2 degrees, rods 0.3 mm together and 0.1 mm each. Those "of a kit" have towers that lean
-by 0.1 degrees and motors that go 0.03 % wrong besides, which no firmware holds; the drawing states
-these two tolerances as the printers have them. In the last table one touch is 0.3 mm too high, as
-of a crumb on the bed. Deviations stated of a bed are compared with errors over the disc that was
-probed, which is what they are stated for; all else is told of the whole bed.
+by 0.1 degrees and motors that go 0.03 % wrong besides, which no firmware holds; the nominal model
+states these two tolerances as the printers have them. In the last table one touch is 0.3 mm too
+high, as of a crumb on the bed. Deviations stated of a bed are compared with errors over the disc
+that was probed, which is what they are stated for; all else is told of the whole bed.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 
 FILE is ``ten-runs.txt`` of ../shared/data/maslow-frames, or the folder that holds it: runs of rows
 ``{bl:…, br:…, tr:…, tl:…}``, mm, four rows a waypoint. Each run becomes a session of readings alone
-with the catalogue's four-belt machine, its drawing held to half a metre, and is calibrated as
+with the catalogue's four-belt machine, its nominal model held to half a metre, and is calibrated as
 `pkmcal calibrate` does. For each of the anchors' coordinates, with bl = (0, 0) and br.y = 0:
 
 - spread: standard deviation over the runs. The waypoints are the same in all runs, and so is what
@@ -58,8 +58,8 @@ def runs_of(path: Path) -> list[np.ndarray]:
 
 def calibrated(lengths: np.ndarray, model: str, noise: float) -> Calibration:
     """One run's calibration, by way of a session on disk."""
-    drawing = load_mechanism("four-belt")
-    text = mechanism_text(drawing).replace("center: 0.02", f"center: {LOOSE}")
+    nominal = load_mechanism("four-belt")
+    text = mechanism_text(nominal).replace("center: 0.02", f"center: {LOOSE}")
     document = {
         "pkmcal": 1,
         "mechanism": "mechanism.yaml",

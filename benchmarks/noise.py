@@ -35,14 +35,14 @@ def main() -> None:
     parser.add_argument("--configurations", type=int, default=15)
     parser.add_argument("--cases", type=int, nargs="*", default=list(range(len(CASES))))
     args = parser.parse_args()
-    drawing, camera = load_mechanism("gough-stewart"), demo_camera()
+    nominal, camera = load_mechanism("gough-stewart"), demo_camera()
     print(f"{args.runs} sessions, {args.stations} x {args.configurations} photographs")
     print("true, stated (um)   told  factor   tool (mm)  stated    z")
     for true_noise, stated in (CASES[k] for k in args.cases):
         rows, factors, off, sigma, z = [], [], [], [], []
         for seed in range(args.runs):
             settings = Settings(stations=args.stations, configurations=args.configurations)
-            truth = draw_truth(drawing, (camera,) * args.stations, settings, seed)
+            truth = draw_truth(nominal, (camera,) * args.stations, settings, seed)
             rng = np.random.default_rng(1000 + seed)
             edges, joints = simulate_edges(
                 truth.machine, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(),
@@ -52,7 +52,7 @@ def main() -> None:
                 edges, joints, stated, args.stations, np.zeros(args.stations, dtype=int)
             )
             rough = np.stack([place.T_camera_base() for place in truth.rough])
-            fit = bundle(drawing, given, start_state(drawing, given, rough))
+            fit = bundle(nominal, given, start_state(nominal, given, rough))
             by = platform_by_parameters(fit.machine, fit.state.T_base_platform)
             error = by @ (fit.machine.values - truth.machine.values)
             covariance = by @ fit.covariance @ by.T

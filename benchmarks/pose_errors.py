@@ -299,17 +299,17 @@ class Made(NamedTuple):
 
 def truth_of(observer: str, seed: int) -> tuple[Any, Any, Any]:
     """Nominal model, truth and camera."""
-    drawing = with_forearms(load_mechanism("gough-stewart"))
+    nominal = with_forearms(load_mechanism("gough-stewart"))
     camera = camera_of_size(IMAGE_SIZE)
     count = CONFIGURATIONS if observer == "legs" else POSES
     settings = Settings(stations=STATIONS if observer == "legs" else 1, configurations=count)
     cameras = one_a_station(camera, settings.n_stations)
-    return drawing, draw_truth(drawing, cameras, settings, seed), camera
+    return nominal, draw_truth(nominal, cameras, settings, seed), camera
 
 
 def made(error: str, observer: str, seed: int, folder: Path) -> Made:
     """The session, written into a folder."""
-    drawing, truth, camera = truth_of(observer, seed)
+    nominal, truth, camera = truth_of(observer, seed)
     rng = np.random.default_rng([seed, 51])
     q, poses = truth.joints, truth.T_base_platform
     ends = truth.machine.ends_at(q, poses)
@@ -319,7 +319,7 @@ def made(error: str, observer: str, seed: int, folder: Path) -> Made:
     d = Deformed(np.zeros(q.shape), still, np.zeros((K, 6)), np.zeros((K, L, RADII_ALONG, 3)),
                  np.zeros((L, RADII_ALONG)))  # fmt: skip
     ERRORS[error][0](scene, d, rng)
-    write_texts(folder, drawing, truth, camera, truth.readings + d.readings, observer)
+    write_texts(folder, nominal, truth, camera, truth.readings + d.readings, observer)
     if observer == "poses":
         write_poses(folder, scene, d, truth.T_camera_base[0], rng)
         session = load_session(folder)
@@ -402,11 +402,11 @@ def edges_of(
 
 
 def write_texts(
-    folder: Path, drawing: Any, truth: Any, camera: Any, readings: Any, observer: str
+    folder: Path, nominal: Any, truth: Any, camera: Any, readings: Any, observer: str
 ) -> None:
     """Files of a session; of images there are blank ones, which nothing reads."""
-    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
-    rows = [["configuration", *drawing.joint_names]]
+    (folder / "mechanism.yaml").write_text(mechanism_text(nominal))
+    rows = [["configuration", *nominal.joint_names]]
     rows += [
         [n, *map(repr, v)] for n, v in zip(truth.configurations, readings.tolist(), strict=True)
     ]

@@ -67,8 +67,8 @@ def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) ->
     folder = keep / f"{machine}-{stations}x{count}-{seed}"
     if not folder.exists():
         settings = Settings(stations=stations, configurations=count)
-        drawing = with_forearms(load_mechanism(machine))
-        simulate_session(folder, drawing, camera_of_size(SIZE), settings, seed=seed)
+        nominal = with_forearms(load_mechanism(machine))
+        simulate_session(folder, nominal, camera_of_size(SIZE), settings, seed=seed)
     return folder
 
 

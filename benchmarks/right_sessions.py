@@ -3,12 +3,12 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/right_sessions.py [--sessions 10] [--kind KIND ...]
                                                                [--first SEED] [--workers 2]
 
-Of each kind so many sessions, each of a machine of its own that is off its drawing as its drawing
-says, with noise as stated. For each kind: sessions that are refused, that have a departure, a
-configuration said to be outvoted, a stated noise said to be wrong, and any of these; intervals of
-the readings' noise at 95 % that hold the truth, of those that have two ends and of all; the tool's
-error over the session's poses in stated standard deviations (root mean square over the sessions,
-and the largest); seconds. Then each of these findings, in its own words.
+Of each kind so many sessions, each of a machine of its own that is off its nominal model as its
+nominal model says, with noise as stated. For each kind: sessions that are refused, that have a
+departure, a configuration said to be outvoted, a stated noise said to be wrong, and any of these;
+intervals of the readings' noise at 95 % that hold the truth, of those that have two ends and of
+all; the tool's error over the session's poses in stated standard deviations (root mean square over
+the sessions, and the largest); seconds. Then each of these findings, in its own words.
 
 Legs and photographs by hand are rendered; boards are corners with noise, trackers tables, and
 printers the heights that their firmware keeps.
@@ -68,7 +68,7 @@ class Outcome(NamedTuple):
     seconds: float
 
 
-def written(folder: Path, drawing: Any, readings: Any, noise: float, **more: Any) -> None:
+def written(folder: Path, nominal: Any, readings: Any, noise: float, **more: Any) -> None:
     """Files of a session without images."""
     from pkmcal.files import csv_text, yaml_text
     from pkmcal.mechanisms import mechanism_text
@@ -76,7 +76,7 @@ def written(folder: Path, drawing: Any, readings: Any, noise: float, **more: Any
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"{k:03d}" for k in range(len(readings))]
     columns = [f"motor{k + 1}" for k in range(readings.shape[1])]
-    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    (folder / "mechanism.yaml").write_text(mechanism_text(nominal))
     (folder / "joints.csv").write_text(csv_text(columns, names, readings))
     document = {
         "pkmcal": 1,
@@ -97,9 +97,9 @@ def photographed(
         from pkmcal.simulation import Settings, simulate_session, with_forearms
         from pkmcal.simulation.demo import camera_of_size
 
-        drawing = with_forearms(load_mechanism(machine))
+        nominal = with_forearms(load_mechanism(machine))
         settings = Settings(stations=stations, configurations=count, handheld=handheld)
-        truth = simulate_session(folder, drawing, camera_of_size(size), settings, seed=seed)
+        truth = simulate_session(folder, nominal, camera_of_size(size), settings, seed=seed)
         return Session(folder, truth.machine, truth.T_base_platform, truth.joints)
 
     return make
@@ -119,14 +119,14 @@ def board(machine: str, count: int, noise: float) -> Callable[[Path, int], Sessi
         from pkmcal.simulation.demo import camera_of_size
         from pkmcal.simulation.placement import one_a_station
 
-        drawing = with_forearms(load_mechanism(machine))
-        made, camera = board_for(drawing, "platform"), camera_of_size((1280, 960))
+        nominal = with_forearms(load_mechanism(machine))
+        made, camera = board_for(nominal, "platform"), camera_of_size((1280, 960))
         settings = Settings(
             stations=1, configurations=count, board=made, board_on="platform", observe=("board",),
             joint_noise=noise,
         )  # fmt: skip
         cameras = one_a_station(camera, 1)
-        truth = draw_truth(drawing, cameras, settings, seed)
+        truth = draw_truth(nominal, cameras, settings, seed)
         T = truth.T_camera_base[0] @ truth.T_base_platform @ truth.T_platform_board
         pixels = camera.project(apply(T[:, None], made.points))
         rng = np.random.default_rng([seed, 1])
@@ -151,7 +151,7 @@ def board(machine: str, count: int, noise: float) -> Callable[[Path, int], Sessi
             "camera": "camera.yaml", "images": "images/{configuration}.png", "observe": "board",
         }  # fmt: skip
         more = {"stations": {"tripod": station}, "board": "board.yaml"}
-        written(folder, drawing, truth.readings, noise, **more)
+        written(folder, nominal, truth.readings, noise, **more)
         return Session(folder, truth.machine, truth.T_base_platform, truth.joints, tuple(results))
 
     return make
@@ -168,8 +168,8 @@ def tracker(machine: str, count: int, noise: float, *, points: bool) -> Any:
         from pkmcal.simulation.placement import draw_configurations
 
         rng = np.random.default_rng(seed)
-        drawing = load_mechanism(machine)
-        truth = true_machine(drawing, 1.0, rng)
+        nominal = load_mechanism(machine)
+        truth = true_machine(nominal, 1.0, rng)
         poses, joints = draw_configurations(truth, count, 0.5, rng)
         place = pose(rotation(rng.normal(size=3)), rng.normal(size=3))
         target = pose(rotation(rng.normal(size=3)), 0.03 * rng.normal(size=3))
@@ -179,7 +179,7 @@ def tracker(machine: str, count: int, noise: float, *, points: bool) -> Any:
         sigma = {"rotation": TRACKER_SIGMA[0], "position": TRACKER_SIGMA[3]}
         table = {"poses": "poses.csv", "noise": {k: float(v) for k, v in sigma.items()}}
         readings = joints + noise * rng.normal(size=joints.shape)
-        written(folder, drawing, readings, noise, stations={"tracker": {"tracker": table}})
+        written(folder, nominal, readings, noise, stations={"tracker": {"tracker": table}})
         names = [f"{k:03d}" for k in range(len(poses))]
         (folder / "poses.csv").write_text(csv_text(columns, names, values[:, : len(columns)]))
         return Session(folder, truth, poses, joints)

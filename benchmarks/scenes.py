@@ -251,13 +251,13 @@ def _tool(
 # ------------------------------------------------------------------ sessions
 
 
-def read_truth(folder: Path, drawing: Any) -> TrueMachine | str:
+def read_truth(folder: Path, nominal: Any) -> TrueMachine | str:
     """The truth of a session, or why there is none that this script can use."""
     data = json.loads((folder / TRUTH).read_text())
     if "pkmcal_truth" in data:
         from pkmcal.simulation.truth import load_truth
 
-        items = load_truth(folder, drawing)
+        items = load_truth(folder, nominal)
         numbers = numbers_of(items.machine)
         if isinstance(numbers, str):
             return numbers

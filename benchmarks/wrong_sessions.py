@@ -292,17 +292,17 @@ def ingredients(in_view: str, seed: int) -> tuple[Any, Any, Any, Any]:
     from pkmcal.simulation.truth import draw_truth
 
     stations, count, size = SESSIONS[in_view]
-    drawing = with_forearms(load_mechanism("gough-stewart" if in_view == "legs" else "h4"))
+    nominal = with_forearms(load_mechanism("gough-stewart" if in_view == "legs" else "h4"))
     lens = camera_of_size(size)
     values = lens.parameters.copy()
     values[4] = DISTORTION
     lens = replace(lens, parameters=values)
     settings = Settings(stations=stations, configurations=count)
     if in_view == "board":
-        seen_board = board_for(drawing, "platform")
+        seen_board = board_for(nominal, "platform")
         settings = replace(settings, board=seen_board, board_on="platform", observe=("board",))
     cameras = one_a_station(lens, stations)
-    return draw_truth(drawing, cameras, settings, seed), cameras, settings, drawing
+    return draw_truth(nominal, cameras, settings, seed), cameras, settings, nominal
 
 
 def simulated(in_view: str, seed: int, keep: Path) -> Path:
@@ -311,8 +311,8 @@ def simulated(in_view: str, seed: int, keep: Path) -> Path:
 
     folder = keep / f"{in_view}-{seed}"
     if not folder.exists():
-        _, cameras, settings, drawing = ingredients(in_view, seed)
-        simulate_session(folder, drawing, cameras, settings, seed=seed)
+        _, cameras, settings, nominal = ingredients(in_view, seed)
+        simulate_session(folder, nominal, cameras, settings, seed=seed)
         if in_view == "board":  # a print is not exact, unlike a simulated board
             edited(folder / "board.yaml", lambda document: document.pop("tolerance"))
     return folder

@@ -24,7 +24,7 @@ def built(name, seed=1, share=0.3):
     table = machine.parameters
     sigma = table.tolerances_free()
     z = share * sigma * np.random.default_rng(seed).normal(size=sigma.size)
-    return machine.with_values(table.drawing + table.free_matrix() @ z)
+    return machine.with_values(table.nominal + table.free_matrix() @ z)
 
 
 def with_scales(machine, tolerance):
@@ -76,7 +76,7 @@ def calibration(folder: Path, machine, *, usable=True, camera=CAMERA, session=Tr
         "gauge": "three centres: legs 1, 3, 5",
         "parameters": [
             {"name": n, "drawing": d, "value": v, "data_share": 1.0}
-            for n, d, v in zip(table.names, table.drawing, _values(machine), strict=True)
+            for n, d, v in zip(table.names, table.nominal, _values(machine), strict=True)
         ],
         "covariance": root @ root.T,
         "stations": stations,

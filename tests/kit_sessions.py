@@ -47,7 +47,7 @@ class Kit:
 
     name: str
     folder: object
-    drawing: object
+    nominal: object
     truth: object
     detections: tuple = ()
 
@@ -72,14 +72,14 @@ class Error(NamedTuple):
     sideways: float
 
 
-def built(drawing, rng):
+def built(nominal, rng):
     """The machine as built from its parts."""
-    table = drawing.parameters
+    table = nominal.parameters
     free = table.free_matrix()
     own = np.array([LENGTH if unit == "m" else ANGLE for unit in table.units])
     own[table.of_kind("scale")] = table.tolerance[table.of_kind("scale")]
     step = rng.normal(size=free.shape[1]) * (np.abs(free).T @ own) / np.abs(free).sum(axis=0)
-    return drawing.with_values(table.unit_axes(drawing.values + free @ step))
+    return nominal.with_values(table.unit_axes(nominal.values + free @ step))
 
 
 def places(name, n, rng):
@@ -119,7 +119,7 @@ def board_kit(folder, name, seed=0, n=25):
     station = {"camera": "cameras/webcam.yaml", "images": "images/{configuration}.png",
                "observe": "board"}  # fmt: skip
     _session(kit, {"webcam": station}, T, rng, board="board.yaml")
-    return Kit(name, folder, kit.drawing, kit.truth, count)
+    return Kit(name, folder, kit.nominal, kit.truth, count)
 
 
 def bed(n=7, radius=0.08):
@@ -144,7 +144,7 @@ def probe_kit(folder, seed=0, n=7, rods=None):
         document = yaml.safe_load(mechanism_text(_rods_measured(kit, rods, rng)))
         document["tolerance"]["offset"] = rods
         (folder / "mechanism.yaml").write_text(yaml_text(document))
-        kit = replace(kit, drawing=load_mechanism(folder / "mechanism.yaml"))
+        kit = replace(kit, nominal=load_mechanism(folder / "mechanism.yaml"))
     xy = bed(n)
     z = NOZZLE + TOUCH * rng.normal(size=n)
     T = pose(np.eye(3), np.column_stack([xy, z]))
@@ -157,17 +157,17 @@ def probe_kit(folder, seed=0, n=7, rods=None):
 
 def _rods_measured(kit, sigma, rng):
     """Nominal model with the true rods' lengths, as measured."""
-    values = kit.drawing.values.copy()
-    rows = [kit.drawing.parameters.index(f"legs[{j}].length.constant") for j in (1, 2, 3)]
+    values = kit.nominal.values.copy()
+    rows = [kit.nominal.parameters.index(f"legs[{j}].length.constant") for j in (1, 2, 3)]
     values[rows] = kit.truth.values[rows] + sigma * rng.normal(size=3)
-    return kit.drawing.with_values(values)
+    return kit.nominal.with_values(values)
 
 
 def _written(folder, name, rng):
-    drawing = load_mechanism(name)
+    nominal = load_mechanism(name)
     folder.mkdir()
-    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
-    return Kit(name, folder, drawing, built(drawing, rng))
+    (folder / "mechanism.yaml").write_text(mechanism_text(nominal))
+    return Kit(name, folder, nominal, built(nominal, rng))
 
 
 def _session(kit, stations, T, rng, **more):
@@ -191,7 +191,7 @@ def tool(kit, value, n=200):
     """The tool's errors at readings that were not measured."""
     T = places(kit.name, n, np.random.default_rng(99))
     joints, there = kit.truth.inverse(T), T[:, :3, 3]
-    before = laid_over(kit.drawing.forward(joints)[:, :3, 3], there)
+    before = laid_over(kit.nominal.forward(joints)[:, :3, 3], there)
     poses = value.machine.forward(joints)
     after = laid_over(poses[:, :3, 3], there)
     by = pose_by_parameters(value.machine, joints, poses)[:, 3:]

@@ -142,14 +142,14 @@ def machine_of(name):
                 text,
             )
         return made(f"{text}\nhome: {{position: {position}, rotation_vector: {vector}}}\n")
-    drawing = load_mechanism(name.removeprefix("wrong "))
+    nominal = load_mechanism(name.removeprefix("wrong "))
     if not name.startswith("wrong"):
-        return drawing
-    rng = np.random.default_rng(CATALOGUE.index(drawing.name))
-    table = drawing.parameters
+        return nominal
+    rng = np.random.default_rng(CATALOGUE.index(nominal.name))
+    table = nominal.parameters
     # the H4's axes are drawn to 2 degrees; half of that leaves its home within reach
     error = 0.5 * table.tolerances_free() * rng.normal(size=len(table.free_names()))
-    return drawing.with_values(table.drawing + table.free_matrix() @ error)
+    return nominal.with_values(table.nominal + table.free_matrix() @ error)
 
 
 class Simulated:

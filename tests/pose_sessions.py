@@ -80,12 +80,12 @@ def papers_case(truth, rng, noise=1.0):
     return measured(truth, papers_poses()[rng.permutation(81)[:71]], rng, noise)
 
 
-def estimated(drawing, case, rng, **options):
+def estimated(nominal, case, rng, **options):
     """The joint estimate, the camera known to a degree and a centimetre."""
     guess = perturb(T_CAMERA_BASE, rng.normal(size=6) * np.repeat([0.02, 0.01], 3))
-    start = start_state(drawing, case.measurements, guess[None])
+    start = start_state(nominal, case.measurements, guess[None])
     options = {"robust": False, "scale_noise": False, **options}
-    return bundle(drawing, case.measurements, start, **options)
+    return bundle(nominal, case.measurements, start, **options)
 
 
 def predicted(machine, T_camera_base, T_platform_board, joints):

@@ -59,13 +59,13 @@ def machine(settings, lean=None, scale=(1.0, 1.0, 1.0), endstops=(0.0, 0.0, 0.0)
         }
         for k in range(3)
     ]  # fmt: skip
-    drawing = {
+    nominal = {
         "name": "printer",
         "motion": "translation",
         "legs": legs,
         "home": {"position": [0.0, 0.0, 0.1]},
     }
-    text = json.dumps(drawing, default=float)
+    text = json.dumps(nominal, default=float)
     return machine_from_document(
         validated_document(parse_yaml(text, Path("m.yaml")), MechanismDocument)
     )

@@ -210,7 +210,7 @@ def test_photographs_of_something_else(session):
         "session.yaml, stations.station2: the machine is not recognised in the photographs of"
         " station2; found legs that readings of other configurations fit as well",
         "Check that these photographs show this machine's legs, that each bears the name of its"
-        " configuration, and that the drawing is this machine's.",
+        " configuration, and that the nominal model is this machine's.",
     )
 
 

@@ -28,7 +28,7 @@ BOARDS = {
 
 
 def content_of(pdf):
-    """Size of the page in mm, and its drawing commands."""
+    """Size of the page in mm, and its nominal model commands."""
     size = np.array(re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf).groups(), dtype=float)
     stream = re.search(rb"stream\n(.*?)\nendstream", pdf, re.DOTALL)[1]
     return size * POINT, zlib.decompress(stream).decode("latin-1")

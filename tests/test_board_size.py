@@ -31,19 +31,19 @@ NOISE = np.array([3e-4, 3e-4, 3e-4, 3e-5, 3e-5, 6e-5])
 TOLERANCE = 2e-3
 
 
-def seen_by(drawing, rng, size, tolerance, count=20):
+def seen_by(nominal, rng, size, tolerance, count=20):
     """Machine within its tolerances, and a camera's measurements of a board that is larger than its
     file states by the share ``size``.
     """
-    table = drawing.parameters
+    table = nominal.parameters
     free = table.free_matrix()
     change = free @ (table.tolerances_free() * rng.standard_normal(free.shape[1]))
-    true = drawing.with_values(table.unit_axes(table.drawing + change))
+    true = nominal.with_values(table.unit_axes(table.nominal + change))
     poses = draw_configurations(true, count, 0.5, rng)[0][:count]
     there = perturb(CAMERA @ poses, NOISE * rng.standard_normal((count, 6)))
     there[:, :3, 3] /= 1 + size
     covariance = np.tile(np.diag(NOISE**2), (count, 1, 1))
-    readings = true.inverse(poses) + 1e-5 * rng.standard_normal((count, drawing.n_joints))
+    readings = true.inverse(poses) + 1e-5 * rng.standard_normal((count, nominal.n_joints))
     data = Measurements(
         EdgeSet.empty(),
         readings,
@@ -56,23 +56,23 @@ def seen_by(drawing, rng, size, tolerance, count=20):
     return true, data
 
 
-def estimated(drawing, data):
-    start = start_state(drawing, data, CAMERA[None])
-    return bundle(drawing, data, replace(start, T_mount=np.eye(4)[None]), scale_noise=False)
+def estimated(nominal, data):
+    start = start_state(nominal, data, CAMERA[None])
+    return bundle(nominal, data, replace(start, T_mount=np.eye(4)[None]), scale_noise=False)
 
 
 def test_derivatives_by_the_size_are_those_of_the_residuals():
-    drawing = load_mechanism("linear-delta")
+    nominal = load_mechanism("linear-delta")
     rng = np.random.default_rng(0)
-    _, data = seen_by(drawing, rng, 0.001, TOLERANCE)
+    _, data = seen_by(nominal, rng, 0.001, TOLERANCE)
     both = replace(
         data,
         mounts=(Mount("tool", "platform"), Mount("board", "platform", TOLERANCE)),
         poses=replace(data.poses, mount=np.arange(20) % 2),
     )
-    assembled = assemble(drawing, both, default_gauge(drawing))
-    start = start_state(drawing, both, CAMERA[None])
-    state = batch_of(drawing, assembled, replace(start, T_mount=np.tile(np.eye(4), (2, 1, 1))))
+    assembled = assemble(nominal, both, default_gauge(nominal))
+    start = start_state(nominal, both, CAMERA[None])
+    state = batch_of(nominal, assembled, replace(start, T_mount=np.tile(np.eye(4), (2, 1, 1))))
     problem = assembled.problem
     sizes = problem.unknowns.of_code(BOARD_SIZE)
     at = sizes.start - problem.unknowns.effects.start
@@ -91,9 +91,9 @@ def test_derivatives_by_the_size_are_those_of_the_residuals():
 
 
 def test_readings_of_carriages_tell_how_large_the_board_is():
-    drawing = load_mechanism("linear-delta")
-    _, data = seen_by(drawing, np.random.default_rng(1), 0.003, TOLERANCE)
-    result = estimated(drawing, data)
+    nominal = load_mechanism("linear-delta")
+    _, data = seen_by(nominal, np.random.default_rng(1), 0.003, TOLERANCE)
+    result = estimated(nominal, data)
     value, sigma = result.state.columns[BOARD_SIZE][0], result.column_sigma(BOARD_SIZE)[0]
     assert sigma < 0.3 * TOLERANCE
     assert abs(value - 0.003) < 4 * sigma
@@ -103,15 +103,15 @@ def errors_at_the_tool(name, runs, tolerance, assumed):
     """z of the tool's displacement, by run and assumed tolerance: RMS over the workspace after
     fitting the frames, over its stated standard deviation.
     """
-    drawing = load_mechanism(name)
-    work = poses_in(drawing.limits(), Region(), 30)
+    nominal = load_mechanism(name)
+    work = poses_in(nominal.limits(), Region(), 30)
     out = []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        true, data = seen_by(drawing, rng, tolerance * rng.standard_normal(), tolerance)
+        true, data = seen_by(nominal, rng, tolerance * rng.standard_normal(), tolerance)
         z = []
         for one in assumed:
-            value = estimated(drawing, replace(data, mounts=(Mount("board", "platform", one),)))
+            value = estimated(nominal, replace(data, mounts=(Mount("board", "platform", one),)))
             covariance = free_of_gauge(value.machine, value.covariance)
             values = tool_error(true, value.machine, covariance, work, legs_observed=False)
             z.append(np.sqrt(np.nanmean(values.off_position**2) / np.nanmean(values.position**2)))
@@ -130,10 +130,10 @@ def test_sigma_contains_the_size_where_nothing_tells_it(runs):
 
 @pytest.mark.parametrize("size", [0.0, 0.01, -0.01])
 def test_a_hint_says_what_size_all_else_would_have(size):
-    drawing = load_mechanism("h4")
-    _, data = seen_by(drawing, np.random.default_rng(1), size, TOLERANCE)
+    nominal = load_mechanism("h4")
+    _, data = seen_by(nominal, np.random.default_rng(1), size, TOLERANCE)
     session = SimpleNamespace(document={"board": {"file": "board.yaml"}})
-    (information,) = size_notes(session, data, estimated(drawing, data))
+    (information,) = size_notes(session, data, estimated(nominal, data))
     code = "board.size_disagrees" if size else "board.size_by_file"
     assert (information.code, information.subject) == (code, "board.yaml")
     assert information.facts["tolerance"] == pytest.approx(0.2)

@@ -57,9 +57,9 @@ def known_radii(scene):
     """
     machine = scene.machine
     radius = machine.parameters.of_kind("radius")
-    drawing = machine.parameters.drawing.copy()
-    drawing[radius] = scene.theta[0, radius]
-    machine = replace(machine, parameters=replace(machine.parameters, drawing=drawing))
+    nominal = machine.parameters.nominal.copy()
+    nominal[radius] = scene.theta[0, radius]
+    machine = replace(machine, parameters=replace(machine.parameters, nominal=nominal))
     return replace(scene, machine=machine, edge_shift=np.zeros(1))
 
 
@@ -75,7 +75,7 @@ def test_truth_is_recovered_to_rounding(robust):
         scene,
         without_noise(rng, scene),
         rng,
-        use_drawing=False,
+        use_prior=False,
         robust=robust,
         scale_noise=False,
     )
@@ -235,7 +235,7 @@ def test_starts_far_away_find_the_same_answer():
     rng = np.random.default_rng(5)
     scene = make_scene(rng, runs=30, configurations=10)
     assembled, truth = scene.batch(rng)
-    centres = assembled.problem.free.T @ (scene.machine.parameters.drawing * 0 + 1) > 0
+    centres = assembled.problem.free.T @ (scene.machine.parameters.nominal * 0 + 1) > 0
     z = truth.z + rng.uniform(-0.005, 0.005, truth.z.shape) * centres * (
         np.array(scene.machine.parameters.kinds) != "radius"
     )
@@ -353,7 +353,7 @@ def test_what_is_told_of_a_machine_stands_for_what_told_it():
     np.testing.assert_allclose(ratio, 1, atol=0.05)
     # with the nominal model as prior; without it the result still has the requested gauge
     without = bundle(
-        scene.machine, other, start, marginal_prior=information, use_drawing=False, **plain
+        scene.machine, other, start, marginal_prior=information, use_prior=False, **plain
     )
     np.testing.assert_array_equal(without.state.theta, fit.state.theta)
     # a motion below its standard deviation changes nothing; by the nominal model alone it did
@@ -372,10 +372,10 @@ def test_fixed_and_tied_parameters():
     scene = make_scene(rng, machine=machine)
     value = estimate(scene, scene.measurements(rng), rng)
     fixed = table.index("legs[3].length.offset")
-    assert value.state.theta[fixed] == table.drawing[fixed]
+    assert value.state.theta[fixed] == table.nominal[fixed]
     assert value.covariance[fixed].max() == 0
     tied = [table.index(n) for n in radii]
-    change = value.state.theta[tied] - table.drawing[tied]
+    change = value.state.theta[tied] - table.nominal[tied]
     np.testing.assert_allclose(change, change[0], atol=1e-15)
     np.testing.assert_allclose(np.diag(value.covariance)[tied], value.covariance[tied[0], tied[1]])
     truth = in_gauge(machine, scene.state(), ThreeCentres())
@@ -414,7 +414,7 @@ def test_what_cannot_be_identified_is_named():
         "legs[4].tubes[2].radius",
     )
     assert result.data_share[radius] == pytest.approx(0, abs=1e-9)
-    assert result.state.theta[radius] == pytest.approx(scene.machine.parameters.drawing[radius])
+    assert result.state.theta[radius] == pytest.approx(scene.machine.parameters.nominal[radius])
 
 
 def test_one_configuration_is_singular_and_two_suffice():

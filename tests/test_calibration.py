@@ -27,8 +27,8 @@ def photographed(folder, seed):
     """
     parameters = np.array([565.0, 566.0, 322.0, 238.5, -0.1, 0.08, 4e-4, -3e-4, 0.0])
     camera = camera_models()["pinhole"]((640, 480), parameters)
-    drawing = pkmcal.load_mechanism("gough-stewart")
-    return rendered(folder, drawing, camera, Settings(configurations=6), seed)
+    nominal = pkmcal.load_mechanism("gough-stewart")
+    return rendered(folder, nominal, camera, Settings(configurations=6), seed)
 
 
 def errors_in_sigmas(calibration, folder):
@@ -49,9 +49,9 @@ def check_found(value, folder, centre):
     deviations.
     """
     errors = compare_with_truth(value, folder)
-    assert errors.drawing.centre > 1e-3
+    assert errors.nominal.centre > 1e-3
     assert errors.calibrated.centre < centre
-    assert errors.calibrated.orientation < errors.drawing.orientation / 5
+    assert errors.calibrated.orientation < errors.nominal.orientation / 5
     # 30 values, correlated: their rms over sigma scatters by some 0.2, about 0.8 on such sessions
     z = errors_in_sigmas(value, folder)
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6
@@ -79,7 +79,7 @@ def test_slim_bare_rods_are_told_honestly(tmp_path):
     folder = photographed(tmp_path / "session", seed=5)
     value = pkmcal.calibrate(folder)
     result = compare_with_truth(value, folder)
-    assert result.calibrated.centre < result.drawing.centre / 5
+    assert result.calibrated.centre < result.nominal.centre / 5
     assert np.sqrt(np.mean(errors_in_sigmas(value, folder) ** 2)) < 1.2
 
 
@@ -113,8 +113,8 @@ def test_start_from_a_bad_drawing(demo, calibrated):
     kinematic = np.array(table.kinds) != "radius"
     off = np.where(kinematic, rng.uniform(-5e-3, 5e-3, len(table)), 0.0)
     loose = np.where(kinematic, 5e-3, table.tolerance)
-    table = replace(table, drawing=table.drawing + off, tolerance=loose)
-    machine = replace(session.machine, parameters=table, values=table.drawing)
+    table = replace(table, nominal=table.nominal + off, tolerance=loose)
+    machine = replace(session.machine, parameters=table, values=table.nominal)
     value = pkmcal.calibrate(replace(session, machine=machine))
     errors = compare_with_truth(value, demo.session).calibrated
     assert (

@@ -191,12 +191,12 @@ def loads_back(built):
 
 def test_a_3_upu_turns_by_what_its_axes_are_off():
     """0.3 degrees between the axes of a leg turn the platform by as much; none, not at all."""
-    drawing = load_mechanism("3-upu")
-    poses, _ = draw_configurations(drawing, 40, 0.5, np.random.default_rng(0))
+    nominal = load_mechanism("3-upu")
+    poses, _ = draw_configurations(nominal, 40, 0.5, np.random.default_rng(0))
     np.testing.assert_allclose(
         poses[:, :3, :3], np.broadcast_to(np.eye(3), (len(poses), 3, 3)), atol=1e-9
     )
-    built = true_machine(drawing, 1.0, np.random.default_rng(0))
+    built = true_machine(nominal, 1.0, np.random.default_rng(0))
     between = np.arccos(np.sum(built.base_axes() * built.platform_axes(), axis=1))
     assert np.all((np.degrees(between) > 0.05) & (np.degrees(between) < 1.5))
     poses, _ = draw_configurations(built, 40, 0.5, np.random.default_rng(0))
@@ -222,23 +222,23 @@ def simulated(machine, seed, stations=1):
     return truth, Measurements(edges, readings, 3e-6, stations, zeros)
 
 
-def free_errors(drawing, estimate, truth):
+def free_errors(nominal, estimate, truth):
     """Errors of the free unknowns, deviations, and their covariance, in the estimate's frames.
 
     Axes by their turns: along them, components change by squares of small angles only.
     """
-    table = drawing.parameters
+    table = nominal.parameters
     values = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform)
-    true = in_gauge(drawing, values, default_gauge(drawing)).theta
+    true = in_gauge(nominal, values, default_gauge(nominal)).theta
     error = table.to_free(estimate.machine.values) - table.to_free(true)
     to_free = np.linalg.pinv(table.free_matrix())
     covariance = to_free @ estimate.covariance @ to_free.T
     return error, np.sqrt(np.diag(covariance)), covariance
 
 
-def whitened(drawing, estimate, truth):
+def whitened(nominal, estimate, truth):
     """Errors over their deviations, made independent."""
-    error, scale, covariance = free_errors(drawing, estimate, truth)
+    error, scale, covariance = free_errors(nominal, estimate, truth)
     above_limit = scale > 1e-9
     c = covariance[np.ix_(above_limit, above_limit)] / np.outer(
         scale[above_limit], scale[above_limit]
@@ -248,10 +248,10 @@ def whitened(drawing, estimate, truth):
     return (vectors.T @ (error[above_limit] / scale[above_limit]))[keep] / np.sqrt(values[keep])
 
 
-def in_sigmas(drawing, estimate, truth):
+def in_sigmas(nominal, estimate, truth):
     """Each kinematic value's error over its deviation."""
-    error, scale, _ = free_errors(drawing, estimate, truth)
-    table = drawing.parameters
+    error, scale, _ = free_errors(nominal, estimate, truth)
+    table = nominal.parameters
     above_limit = (scale > 1e-9) & (np.array(table.kinds)[table.first_of_free()] != "radius")
     return error[above_limit] / scale[above_limit]
 
@@ -281,12 +281,12 @@ def test_photographs_calibrate(name, tmp_path):
     Bare rods' edges are shifted by some hundredths of a pixel, equally in all images from a place,
     which no standard deviation contains; hence a bound as in test_calibration.
     """
-    drawing = load_mechanism(name)
-    simulate_session(tmp_path / "s", drawing, CAMERA, Settings(stations=RENDERED[name]), seed=1)
+    nominal = load_mechanism(name)
+    simulate_session(tmp_path / "s", nominal, CAMERA, Settings(stations=RENDERED[name]), seed=1)
     value = pkmcal.calibrate(tmp_path / "s")
     assert value.verdict.usable
-    truth = load_truth(tmp_path / "s", drawing)
+    truth = load_truth(tmp_path / "s", nominal)
     errors = compare_with_truth(value, tmp_path / "s")
-    assert errors.calibrated.position < errors.drawing.position / 5
-    assert errors.calibrated.orientation < errors.drawing.orientation / 5
-    assert np.sqrt(np.mean(in_sigmas(drawing, value.estimate, truth) ** 2)) < 1.6
+    assert errors.calibrated.position < errors.nominal.position / 5
+    assert errors.calibrated.orientation < errors.nominal.orientation / 5
+    assert np.sqrt(np.mean(in_sigmas(nominal, value.estimate, truth) ** 2)) < 1.6

@@ -141,7 +141,7 @@ def test_what_cannot_be_observed_is_told(session):
     (session / "mechanism.yaml").write_text("\n".join(lines) + "\n")
     check = check_session(session)
     assert check.exit_code == 2
-    assert "no leg of the drawing has visible cylinders" in texts(check, Level.WRONG)[0]
+    assert "no leg of the nominal model has visible cylinders" in texts(check, Level.WRONG)[0]
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def test_shares_are_parts_of_a_whole(found):
     values = found.forecast
     assert sum(leg.tells for leg in values.legs) == pytest.approx(1)
     legs = sum(leg.variance for leg in values.legs)
-    assert legs + values.readings + values.drawing == pytest.approx(1)
+    assert legs + values.readings + values.nominal == pytest.approx(1)
     assert legs > 0.5
     assert [(leg.station, leg.leg) for leg in values.legs[:2]] == [("station1", 1), ("station1", 2)]
     assert len(values.legs) == 18
@@ -316,7 +316,7 @@ def test_the_command_writes_page_and_pictures(alone, tmp_path, monkeypatch):
     assert len(list((tmp_path / "drawn").iterdir())) == 3
     assert all(Path(path).exists() for path in done.json["files"].values())
     page = (tmp_path / "out" / "check.html").read_text()
-    assert "The drawing over the photographs" in page
+    assert "The nominal model over the photographs" in page
     assert "What a full capture would give" in page
     # again, over the same; but not beside what is somebody's
     assert run("check", alone, "--pictures", tmp_path / "drawn").code == done.code

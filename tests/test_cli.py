@@ -319,7 +319,7 @@ def test_a_new_session_with_a_board_and_places(tmp_path):
     )
     refused = run("new", tmp_path / "delta", "--machine", "delta", "--legs")
     assert refused.code == 2
-    assert "the drawing of delta has no cylinders that a camera could see" in refused.err
+    assert "the nominal model of delta has no cylinders that a camera could see" in refused.err
     assert not (tmp_path / "delta").exists()
 
 
@@ -480,11 +480,11 @@ def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch
 
 
 def test_an_output_folder_with_other_things_is_left_alone(session):
-    drawing = (session / "mechanism.yaml").read_bytes()
+    nominal = (session / "mechanism.yaml").read_bytes()
     done = run("calibrate", session, "-o", session)
     assert done.code == 2
     assert "the output folder holds something other than a calibration" in done.err
-    assert (session / "mechanism.yaml").read_bytes() == drawing
+    assert (session / "mechanism.yaml").read_bytes() == nominal
 
 
 # simulate

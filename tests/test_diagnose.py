@@ -115,7 +115,7 @@ def test_two_columns_exchanged(pair, by_hand, seed):
     assert str(error) == (
         f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the photographs"
         f" fit with these two columns exchanged. Exchange the columns of legs {a + 1} and {b + 1}"
-        " in joints.csv, or the two legs in the drawing."
+        " in joints.csv, or the two legs in the nominal model."
     )
 
 
@@ -142,10 +142,11 @@ def test_columns_turned_round(turn, or_else):
     """A hexapod turned by a third looks the same, and only the rough pose decides."""
     error = said(pictures(), readings_with(np.roll(np.arange(6), turn)), by_hand=given(True))
     assert str(error) == (
-        "joints.csv: the legs are numbered differently in the readings and in the drawing; found"
+        "joints.csv: the legs are numbered differently in the readings and in the nominal"
+        " model; found"
         f" the photographs fit when leg 1 takes the readings of column {turn + 1}, leg 2 those of"
         f" column {turn + 2}, and so on round{or_else}. Give the columns of joints.csv the order of"
-        " the legs in the drawing."
+        " the legs in the nominal model."
     )
 
 
@@ -265,8 +266,8 @@ def test_diameters_for_radii():
     radii = np.unique(tubes_of(mechanism).radius)
     values = mechanism.values.copy()
     values[radii] *= 2
-    rng, drawing = np.random.default_rng(0), mechanism.with_values(values)
-    station = looked_for(rng, pictures(), mechanism=drawing, by_hand=given(True))
+    rng, nominal = np.random.default_rng(0), mechanism.with_values(values)
+    station = looked_for(rng, pictures(), mechanism=nominal, by_hand=given(True))
     unsure = station._replace(localization=replace(station.localization, by_chance=1.0))
     error = mistake([unsure], rng)
     assert "the tubes' radii look like diameters" in str(error)
@@ -325,8 +326,8 @@ def test_configurations_that_are_alike_do_not_change_names(tmp_path):
     """Three legs, a nominal model with errors of some millimetres: two images fit each other's
     readings better by 12 in log odds, where an image of that station contributes 125.
     """
-    drawing, settings = load_mechanism("3-rps"), Settings(stations=1, configurations=10)
-    simulate_session(tmp_path / "s", drawing, camera_of_size((640, 480)), settings, seed=7)
+    nominal, settings = load_mechanism("3-rps"), Settings(stations=1, configurations=10)
+    simulate_session(tmp_path / "s", nominal, camera_of_size((640, 480)), settings, seed=7)
     path = tmp_path / "s/session.yaml"
     document = yaml.safe_load(path.read_text())
     del document["stations"]["station1"]["pose"]

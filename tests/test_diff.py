@@ -127,11 +127,11 @@ def test_what_changed_is_found_where_it_changed(pairs, name, times):
 
 def test_a_drawing_is_taken_at_its_word(pairs):
     a = pairs["new data"][0][0]
-    drawing = a.machine.with_values(a.machine.parameters.drawing)
-    value = machine_change(drawing, a.machine, (None, a.covariance))
+    nominal = a.machine.with_values(a.machine.parameters.nominal)
+    value = machine_change(nominal, a.machine, (None, a.covariance))
     assert value.dof > 40
     assert value.chi2 > 10 * value.dof  # it was built two millimetres off
-    both = machine_change(drawing, a.machine, (None, None))
+    both = machine_change(nominal, a.machine, (None, None))
     assert both.dof == 0
     assert not both.sigma.any()
     assert np.allclose(both.change, value.change)
@@ -217,15 +217,15 @@ def test_another_machine_is_refused(saved):
 
 
 def test_two_drawings():
-    drawing = load_mechanism("gough-stewart")
-    values = drawing.values.copy()
-    k = drawing.parameters.index("legs[2].length.offset")
+    nominal = load_mechanism("gough-stewart")
+    values = nominal.values.copy()
+    k = nominal.parameters.index("legs[2].length.offset")
     values[k] += 1e-3
-    value = difference(drawing, drawing.with_values(values))
+    value = difference(nominal, nominal.with_values(values))
     assert value.changed
     assert value.change.dof == 0
     assert value.ordered[0] == k
-    assert value.verdict.headline.startswith("The drawings differ: the tool differs by ")
+    assert value.verdict.headline.startswith("The nominal models differ: the tool differs by ")
     assert np.isnan(value.chances).all()
     document = value.document()
     assert document["chi2"] is None
@@ -234,10 +234,10 @@ def test_two_drawings():
 
 def test_a_fixed_number_that_differs_is_told():
     """It has no standard deviation, and no frame can absorb it."""
-    drawing = load_mechanism("gough-stewart")
+    nominal = load_mechanism("gough-stewart")
     name = "legs[2].length.offset"
-    held = replace(drawing, parameters=drawing.parameters.with_roles(fixed=(name,)))
-    k = drawing.parameters.index(name)
+    held = replace(nominal, parameters=nominal.parameters.with_roles(fixed=(name,)))
+    k = nominal.parameters.index(name)
     values = held.values.copy()
     values[k] += 1e-4
     value = difference(held, held.with_values(values))
@@ -266,7 +266,9 @@ def test_the_command(demo, tmp_path):
     page = (out / "diff.html").read_text()
     assert "How far each joint moved" in page
     done = run("diff", demo.calibration, "gough-stewart", "-o", out)
-    assert "✗ Drawing and calibration differ by more than chance explains: the tool" in done.out
+    assert (
+        "✗ Nominal model and calibration differ by more than chance explains: the tool" in done.out
+    )
     assert "What changed" in done.out
     assert max(map(len, done.out.splitlines())) <= 80 + len(str(out))
 

@@ -39,18 +39,18 @@ def session_estimate(seed, change=None, count=30):
     """
     if change is None:
         return right_session(seed, count)
-    drawing, data, where = measured(seed, count=count)
+    nominal, data, where = measured(seed, count=count)
     true = data.joints.copy()
     data = replace(data, joints=true + change(true))
-    estimate = bundle(drawing, data, start_state(drawing, data, where))
-    return drawing, data, estimate, true
+    estimate = bundle(nominal, data, start_state(nominal, data, where))
+    return nominal, data, estimate, true
 
 
 @lru_cache(4)
 def right_session(seed, count):
     """Session with unchanged readings."""
-    drawing, data, where = measured(seed, count=count)
-    return drawing, data, bundle(drawing, data, start_state(drawing, data, where)), data.joints
+    nominal, data, where = measured(seed, count=count)
+    return nominal, data, bundle(nominal, data, start_state(nominal, data, where)), data.joints
 
 
 def scales_in_use(estimate):
@@ -139,9 +139,9 @@ def test_scores_beside_random_effects_are_those_of_correlated_noise():
         assert score.chi2 == pytest.approx((g @ y) ** 2 / (g @ g), rel=1e-3)
 
 
-def loads(drawing, data, estimate):
+def loads(nominal, data, estimate):
     """Forces (K, m) in the legs under the platform's weight, less their mean, mean size one."""
-    ends = drawing.ends_at(data.joints, estimate.state.T_base_platform)
+    ends = nominal.ends_at(data.joints, estimate.state.T_base_platform)
     u = line_through(ends.a, ends.b)[0]
     arm = np.cross(ends.b - estimate.state.T_base_platform[:, None, :3, 3], u)
     rows = np.concatenate([u, arm], axis=-1).swapaxes(1, 2)
@@ -160,11 +160,11 @@ def tool_in_sigmas(truth, estimate, joints):
 
 def test_legs_that_give_way_are_found_and_contained():
     """Session with a right one's estimate as truth, and readings shortened by the legs' load."""
-    drawing, data, right, true = session_estimate(1)
-    sag = 2e-4 * loads(drawing, data, right)
+    nominal, data, right, true = session_estimate(1)
+    sag = 2e-4 * loads(nominal, data, right)
     truth = right.machine, right.state.T_base_platform
     data = replace(data, joints=true + sag)
-    estimate = bundle(drawing, data, right.state)
+    estimate = bundle(nominal, data, right.state)
     result = discrepancy_in(data, estimate)
     assert result.scales[0].code == "readings.workspace"
     contained = with_discrepancy(estimate, linearize_at_solution(data, estimate)[1].problem, result)

@@ -143,7 +143,7 @@ FAULTS = {
         "3-upu",
         [("legs:", 'tied: [["legs[1].base.axis", "legs[2].base.axis"]]\nlegs:')],
         "m.yaml, line 3, tied[1][1]: "
-        "axes that differ in the drawing are tied; found legs[1].base.axis, "
+        "axes that differ in the nominal model are tied; found legs[1].base.axis, "
         "legs[2].base.axis, expected whole axes with the same direction in their bodies' frames.",
     ),
     "an axis tied to a number": (
@@ -226,24 +226,24 @@ def test_an_axis_of_any_length_is_a_direction(tmp_path):
 SHORT = [("constant: 0.415", "constant: 0.1")] * 2
 UNASSEMBLED = (
     "mechanism 'constant-legs' cannot be assembled with its legs at mid-range; found closure "
-    "error 125 mm, expected a platform that all legs reach. Check the drawing's centres and "
+    "error 125 mm, expected a platform that all legs reach. Check the nominal model's centres and "
     "ranges, or give home: {position: ...}."
 )
 
 
 def test_simulate_refuses_a_drawing_that_cannot_be_assembled(tmp_path):
-    drawing = drawn(tmp_path, "constant-legs", *SHORT)
-    values = run("simulate", tmp_path / "session", "--mechanism", drawing)
+    nominal = drawn(tmp_path, "constant-legs", *SHORT)
+    values = run("simulate", tmp_path / "session", "--mechanism", nominal)
     assert values.code == 2
     assert UNASSEMBLED in " ".join(values.err.split())
     assert not (tmp_path / "session").exists()
 
 
 def test_simulate_refuses_a_home_far_from_any_configuration(tmp_path):
-    drawing = drawn(
+    nominal = drawn(
         tmp_path, "constant-legs", ("legs:", "home: {position: [0, 0, 5]}\nlegs:"), *SHORT
     )
-    values = run("simulate", tmp_path / "session", "--mechanism", drawing)
+    values = run("simulate", tmp_path / "session", "--mechanism", nominal)
     assert values.code == 2
     assert "has too few usable configurations" in values.err
 

@@ -211,17 +211,19 @@ def test_what_is_read_again_closes_from_beside(name):
 
 
 def test_the_header_says_what_it_is():
-    drawing = machine_of("delta")
-    _, text = exported(drawing)
+    nominal = machine_of("delta")
+    _, text = exported(nominal)
     assert "Drawing only" in text
     assert "a test" in text
-    sigma = np.full(len(drawing.parameters), 1.5e-5)
-    _, values = exported(drawing, sigma=sigma, calibrated=True, headline="Better than the drawing.")
+    sigma = np.full(len(nominal.parameters), 1.5e-5)
+    _, values = exported(
+        nominal, sigma=sigma, calibrated=True, headline="Better than the nominal model."
+    )
     header = values.partition("<mujoco")[0]
-    for word in ("Better than the drawing.", "sigma 1.5e-05 m", "T_base_platform",
+    for word in ("Better than the nominal model.", "sigma 1.5e-05 m", "T_base_platform",
                  "PLACEHOLDERS", "legs[3].length.constant = 0.22 m"):  # fmt: skip
         assert word in header
-    assert exporters()["mujoco"].notes(MachineSource(drawing))
+    assert exporters()["mujoco"].notes(MachineSource(nominal))
 
 
 def test_a_name_cannot_break_the_text():

@@ -45,10 +45,10 @@ def test_a_path_is_followed(name):
 
 def test_one_of_other_values_and_another_start():
     """With a calibrated machine's values, not the nominal ones; started at its pose."""
-    drawing = load_mechanism("gough-stewart")
+    nominal = load_mechanism("gough-stewart")
     rng = np.random.default_rng(0)
-    values = drawing.values + drawing.parameters.tolerance * rng.normal(size=drawing.values.size)
-    machine = drawing.with_values(values)
+    values = nominal.values + nominal.parameters.tolerance * rng.normal(size=nominal.values.size)
+    machine = nominal.with_values(values)
     there = perturb(machine.home(), np.array([0.2, -0.1, 0.15, 0.03, -0.02, 0.03]))
     follow = machine.follower(there)
     np.testing.assert_allclose(follow(machine.inverse(there)), there, atol=1e-12)

@@ -41,35 +41,35 @@ JOINT_NOISE = 3e-6
 class Scene:
     """Nominal model, true machine, all true unknowns, and their measurements."""
 
-    drawing: Machine
+    nominal: Machine
     truth: State
     measurements: Measurements
 
     @property
     def machine(self) -> Machine:
         """The true machine."""
-        return self.drawing.with_values(self.truth.theta)
+        return self.nominal.with_values(self.truth.theta)
 
     def select(self, keep) -> Measurements:
         """The measurements with the edges that a mask picks."""
         return replace(self.measurements, edges=self.measurements.edges.select(keep))
 
 
-def true_machine(drawing: Machine, rng, size: float = 1.0, parallel: bool = True) -> Machine:
+def true_machine(nominal: Machine, rng, size: float = 1.0, parallel: bool = True) -> Machine:
     """Errors of ``size`` tolerances on all but the radii.
 
     parallel : both axes of a universal-universal leg are rotated equally, so that the machine
     translates.
     """
-    table = drawing.parameters
+    table = nominal.parameters
     free = table.free_matrix()
     z = size * table.tolerances_free() * rng.normal(size=free.shape[1])
     z[[table.kinds[k] == "radius" for k in table.first_of_free()]] = 0
-    theta = table.drawing + free @ z
-    both = (drawing.layout.base_axis[:, 0] >= 0) & (drawing.layout.platform_axis[:, 0] >= 0)
+    theta = table.nominal + free @ z
+    both = (nominal.layout.base_axis[:, 0] >= 0) & (nominal.layout.platform_axis[:, 0] >= 0)
     if parallel and both.any():
-        theta[drawing.layout.platform_axis[both]] = theta[drawing.layout.base_axis[both]]
-    return drawing.with_values(table.unit_axes(theta))
+        theta[nominal.layout.platform_axis[both]] = theta[nominal.layout.base_axis[both]]
+    return nominal.with_values(table.unit_axes(theta))
 
 
 def stations(machine: Machine, n: int, distance: float = 0.9) -> np.ndarray:
@@ -96,15 +96,15 @@ def make_scene(
     """Images of the session; shared : all stations have images of every configuration, else each
     its own.
     """
-    drawing = name if isinstance(name, Machine) else load_mechanism(name)
+    nominal = name if isinstance(name, Machine) else load_mechanism(name)
     # the four steps have no scales
-    drawing = machine_from_document(with_exact_scales(drawing.document))
-    machine = true_machine(drawing, rng, **errors)
+    nominal = machine_from_document(with_exact_scales(nominal.document))
+    machine = true_machine(nominal, rng, **errors)
     if joints is None:
         joints, poses = readings_of(machine, rng, configurations)
     else:
         configurations, poses = len(joints), machine.forward(joints)
-    T = stations(drawing, n_stations)
+    T = stations(nominal, n_stations)
     grid = np.meshgrid(
         np.arange(n_stations),
         np.arange(configurations),
@@ -121,7 +121,7 @@ def make_scene(
         edges, joints, JOINT_NOISE, n_stations, np.zeros(n_stations, dtype=int)
     )
     truth = State(machine.values, T, poses)
-    return Scene(drawing, in_gauge(drawing, truth, default_gauge(drawing)), measurements)
+    return Scene(nominal, in_gauge(nominal, truth, default_gauge(nominal)), measurements)
 
 
 def true_edges(machine, T, joints, poses, index) -> EdgeSet:
@@ -179,18 +179,18 @@ def assert_same(value: State, truth: State, atol=1e-8):
 @pytest.mark.parametrize("name", [m for m in MACHINES if m != "3-upu"])
 def test_the_chain_is_exact_without_noise(name, shared):
     scene = make_scene(name, np.random.default_rng(1), 24, shared=shared)
-    value = four_step(scene.drawing, scene.measurements)
+    value = four_step(scene.nominal, scene.measurements)
     assert_same(value, scene.truth)
     # and the errors that it found are those of the tolerances, not nothing
-    assert np.abs(scene.truth.theta - scene.drawing.values).max() > 1e-3
+    assert np.abs(scene.truth.theta - scene.nominal.values).max() > 1e-3
 
 
 def test_three_upu():
     """Centres, offsets and the difference of each leg's axes; their common turn stays drawn."""
     scene = make_scene("3-upu", np.random.default_rng(2), 24)
-    value = four_step(scene.drawing, scene.measurements)
-    layout, theta, truth = scene.drawing.layout, value.theta, scene.truth.theta
-    plain = np.array([kind != "axis" for kind in scene.drawing.parameters.kinds])
+    value = four_step(scene.nominal, scene.measurements)
+    layout, theta, truth = scene.nominal.layout, value.theta, scene.truth.theta
+    plain = np.array([kind != "axis" for kind in scene.nominal.parameters.kinds])
     np.testing.assert_allclose(theta[plain], truth[plain], atol=1e-8)
     np.testing.assert_allclose(value.T_camera_base, scene.truth.T_camera_base, atol=1e-8)
     # the platform of this machine does not turn: its frame stands at one angle to the base's
@@ -213,18 +213,18 @@ def test_three_upu_whose_platform_turns():
     all.
     """
     scene = make_scene("3-upu", np.random.default_rng(5), 40, parallel=False)
-    assert_same(four_step(scene.drawing, scene.measurements), scene.truth, atol=1e-6)
+    assert_same(four_step(scene.nominal, scene.measurements), scene.truth, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", MACHINES)
 def test_the_printed_form_runs_on_every_machine(name):
     """Noise-free, its lengths are right; what lies across coplanar joints need not be."""
     scene = make_scene(name, np.random.default_rng(3), 24, parallel=True)
-    value = four_step(scene.drawing, scene.measurements, form="printed")
-    rod = scene.drawing.layout.rod
+    value = four_step(scene.nominal, scene.measurements, form="printed")
+    rod = scene.nominal.layout.rod
     rod = rod[rod >= 0]
     np.testing.assert_allclose(value.theta[rod], scene.truth.theta[rod], atol=1e-7)
-    flat = centre_index(scene.drawing.layout)[0][:, :2]
+    flat = centre_index(scene.nominal.layout)[0][:, :2]
     np.testing.assert_allclose(value.theta[flat], scene.truth.theta[flat], atol=2e-3)
 
 
@@ -235,7 +235,7 @@ def test_a_start_from_anywhere(name):
     turn = perturb(np.eye(4), np.array([0.4, -0.8, 1.1, 0, 0, 0]))[:3, :3]
     edges = scene.measurements.edges
     turned = replace(edges, normal=edges.normal @ turn.T, basis=turn @ edges.basis)
-    values = four_step(scene.drawing, replace(scene.measurements, edges=turned))
+    values = four_step(scene.nominal, replace(scene.measurements, edges=turned))
     np.testing.assert_allclose(
         values.T_camera_base[:, :3, :3], turn @ scene.truth.T_camera_base[:, :3, :3], atol=1e-7
     )
@@ -273,8 +273,8 @@ def three_spr(folder) -> Machine:
 
 def test_revolute_axes_on_the_platform(tmp_path):
     scene = make_scene(three_spr(tmp_path), np.random.default_rng(6), 24)
-    assert np.isfinite(scene.drawing.platform_axes()).all()
-    assert_same(four_step(scene.drawing, scene.measurements), scene.truth)
+    assert np.isfinite(scene.nominal.platform_axes()).all()
+    assert_same(four_step(scene.nominal, scene.measurements), scene.truth)
 
 
 @pytest.mark.parametrize("name", ["3-rpr", "3-rps", "3-spr"])
@@ -293,13 +293,13 @@ def test_a_passive_leg_on_machines_with_axes(name, tmp_path):
     if name == "3-spr":
         three_spr(tmp_path)
         text = (tmp_path / "machine.yaml").read_text()
-    drawing = machine_from(text.replace("tolerance:", fourth), tmp_path)
-    scene = make_scene(drawing, np.random.default_rng(15), 24)
-    assert_same(four_step(scene.drawing, scene.measurements), scene.truth)
+    nominal = machine_from(text.replace("tolerance:", fourth), tmp_path)
+    scene = make_scene(nominal, np.random.default_rng(15), 24)
+    assert_same(four_step(scene.nominal, scene.measurements), scene.truth)
 
 
 def test_a_planar_machine_whose_legs_and_frames_stand_at_different_heights(tmp_path):
-    drawing = variant(
+    nominal = variant(
         "3-rpr",
         tmp_path,
         ("0.3200, 0.1000]", "0.3200, 0.2500]"),
@@ -308,17 +308,17 @@ def test_a_planar_machine_whose_legs_and_frames_stand_at_different_heights(tmp_p
         ("0.0669, 0.1000]", "0.0669, -0.1000]"),
         ("tolerance:", "home: {position: [0, 0, 0.2]}\ntolerance:"),
     )
-    scene = make_scene(drawing, np.random.default_rng(7), 24)
-    assert_same(four_step(scene.drawing, scene.measurements), scene.truth)
+    scene = make_scene(nominal, np.random.default_rng(7), 24)
+    assert_same(four_step(scene.nominal, scene.measurements), scene.truth)
 
 
 def test_a_machine_that_translates(tmp_path):
     """Motion by definition: each image may then have a single leg."""
-    drawing = variant("3-upu", tmp_path, ("motion: spatial", "motion: translation"))
-    scene = make_scene(drawing, np.random.default_rng(8), 24)
-    assert_same(four_step(scene.drawing, scene.measurements), scene.truth)
-    flat = four_step(scene.drawing, scene.measurements, form="printed")
-    rod = drawing.layout.rod
+    nominal = variant("3-upu", tmp_path, ("motion: spatial", "motion: translation"))
+    scene = make_scene(nominal, np.random.default_rng(8), 24)
+    assert_same(four_step(scene.nominal, scene.measurements), scene.truth)
+    flat = four_step(scene.nominal, scene.measurements, form="printed")
+    rod = nominal.layout.rod
     np.testing.assert_allclose(flat.theta[rod], scene.truth.theta[rod], atol=1e-7)
     rot = flat.T_base_platform[:, :3, :3]
     np.testing.assert_allclose(rot, np.broadcast_to(rot[0], rot.shape), atol=1e-12)
@@ -332,7 +332,7 @@ def test_stations_that_see_two_legs_of_a_planar_machine():
     edges = scene.measurements.edges
     for hidden in ([0, 1, 2], [2, 0, 1]):
         part = scene.select(edges.leg != np.array(hidden)[edges.station])
-        assert_same(four_step(scene.drawing, part), scene.truth)
+        assert_same(four_step(scene.nominal, part), scene.truth)
 
 
 THREE_BY_TWO = np.array([[0, 1], [2, 3], [4, 5]])
@@ -355,8 +355,8 @@ def test_a_board_on_the_base_joins_stations_that_share_no_legs():
         edges = measurements.edges.select(seen_by(scene, legs))
         without = replace(scene.measurements, edges=edges)
         with pytest.raises(ResultError, match="too few legs"):
-            four_step(scene.drawing, without)
-        value = four_step(scene.drawing, replace(measurements, edges=edges))
+            four_step(scene.nominal, without)
+        value = four_step(scene.nominal, replace(measurements, edges=edges))
         assert_same(value, scene.truth)
         np.testing.assert_allclose(value.T_mount, boards, atol=1e-7)
         np.testing.assert_array_equal(value.on_platform, [False, True])
@@ -370,7 +370,7 @@ def test_two_boards_in_a_chain():
     measurements = with_boards(scene, boards, ("base", "base"), sees)
     legs = np.array([[0, 1, 6], [2, 3, 3], [4, 5, 5]])
     part = replace(measurements, edges=measurements.edges.select(seen_by(scene, legs)))
-    value = four_step(scene.drawing, part)
+    value = four_step(scene.nominal, part)
     assert_same(value, scene.truth)
     np.testing.assert_allclose(value.T_mount, boards, atol=1e-7)
 
@@ -378,7 +378,7 @@ def test_two_boards_in_a_chain():
 def test_given_poses_join_stations_that_share_no_legs():
     scene = make_scene("gough-stewart", np.random.default_rng(12), 24)
     part = scene.select(seen_by(scene, THREE_BY_THREE))
-    value = four_step(scene.drawing, part, T_camera_base_guess=scene.truth.T_camera_base)
+    value = four_step(scene.nominal, part, T_camera_base_guess=scene.truth.T_camera_base)
     assert_same(value, scene.truth)
 
 
@@ -390,17 +390,17 @@ def test_the_bundle_starts_from_the_steps(name):
     rng = np.random.default_rng(13)
     scene = make_scene(name, rng, 24)
     measurements = noisy(scene.measurements, rng)
-    values = four_step(scene.drawing, measurements)
+    values = four_step(scene.nominal, measurements)
     assert np.isfinite(values.theta).all()
     assert np.abs(values.theta - scene.truth.theta).max() < 0.03
-    far = scene.drawing.with_values(values.theta)
-    reference_values = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
-    start = initial_guess(scene.drawing, measurements, reference_values)
-    assert edge_misfit(scene.drawing, measurements, start) <= edge_misfit(
-        scene.drawing, measurements, reference_values
+    far = scene.nominal.with_values(values.theta)
+    reference_values = start_state(scene.nominal, measurements, scene.truth.T_camera_base)
+    start = initial_guess(scene.nominal, measurements, reference_values)
+    assert edge_misfit(scene.nominal, measurements, start) <= edge_misfit(
+        scene.nominal, measurements, reference_values
     )
-    best = bundle(scene.drawing, measurements, start)
-    again = bundle(scene.drawing, measurements, four_step(far, measurements))
+    best = bundle(scene.nominal, measurements, start)
+    again = bundle(scene.nominal, measurements, four_step(far, measurements))
     np.testing.assert_allclose(again.state.theta, best.state.theta, atol=1e-5)
 
 
@@ -415,9 +415,9 @@ def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     board = perturb(np.eye(4), rng.normal(size=(1, 6)))
     measurements = with_boards(scene, board, ("base",), [(0, 0), (1, 0), (2, 0)])
     measurements = noisy(measurements, rng)
-    reference_values = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
-    joint = bundle(scene.drawing, measurements, reference_values)
-    values = methods.by_paper("four-step", scene.drawing, measurements, joint)
+    reference_values = start_state(scene.nominal, measurements, scene.truth.T_camera_base)
+    joint = bundle(scene.nominal, measurements, reference_values)
+    values = methods.by_paper("four-step", scene.nominal, measurements, joint)
     sigma = np.sqrt(np.diag(values.covariance))
     free = sigma > 1e-9
     ratio = ((values.state.theta - scene.truth.theta)[free] / sigma[free]) ** 2

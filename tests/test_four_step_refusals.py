@@ -27,7 +27,7 @@ from test_identify_scene import exact
 
 def refused(scene, measurements, *words, **options) -> ResultError:
     with pytest.raises(ResultError) as caught:
-        four_step(scene.drawing, measurements, **options)
+        four_step(scene.nominal, measurements, **options)
     for word in words:
         assert word in str(caught.value)
     assert caught.value.next_step
@@ -47,7 +47,7 @@ def test_no_edge_at_all(hexapod):
 @pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "6-spu-passive"])
 def test_a_leg_that_no_station_sees(name):
     scene = make_scene(name, np.random.default_rng(2), 12)
-    last = scene.drawing.n_legs
+    last = scene.nominal.n_legs
     part = scene.select(scene.measurements.edges.leg != last - 1)
     refused(scene, part, f"leg {last} of {last} is seen by no station")
 
@@ -122,7 +122,7 @@ def test_legs_that_are_never_seen_together(hexapod):
     with_bridge = hexapod.select(
         ((edges.leg // 3) == edges.configuration % 2) | (edges.configuration > 15)
     )
-    four_step(hexapod.drawing, with_bridge)
+    four_step(hexapod.nominal, with_bridge)
 
 
 def test_photographs_of_one_configuration_by_several_stations_are_at_once(hexapod):
@@ -132,10 +132,10 @@ def test_photographs_of_one_configuration_by_several_stations_are_at_once(hexapo
     keep = seen_by(scene, THREE_BY_TWO)
     part = scene.select(keep)
     guess = scene.truth.T_camera_base
-    values = four_step(scene.drawing, part, T_camera_base_guess=guess)
+    values = four_step(scene.nominal, part, T_camera_base_guess=guess)
     np.testing.assert_allclose(values.theta, scene.truth.theta, atol=1e-8)
     with pytest.raises(ResultError, match="no configuration shows enough legs"):
-        four_step(scene.drawing, part, T_camera_base_guess=guess, form="printed")
+        four_step(scene.nominal, part, T_camera_base_guess=guess, form="printed")
 
 
 def test_a_passive_leg_without_three_others():
@@ -148,18 +148,18 @@ def test_a_passive_leg_without_three_others():
 
 def test_a_passive_leg_that_does_not_turn():
     """Heave with a leg in the middle: its joints could lie anywhere along it."""
-    drawing = exact("6-spu-passive")
-    low, high = drawing.joint_ranges.T
+    nominal = exact("6-spu-passive")
+    low, high = nominal.joint_ranges.T
     heave = low + (high - low) * np.linspace(0.2, 0.8, 24)[:, None]
     rng = np.random.default_rng(5)
-    scene = make_scene(drawing, rng, joints=heave)
+    scene = make_scene(nominal, rng, joints=heave)
     refused(scene, noisy(scene.measurements, rng), "leg 7 of 7 does not change its direction")
 
 
 def test_lengths_that_the_distances_do_not_tell():
     """A platform that only shifts with parallel legs: a common length is free (errata)."""
     scene = make_scene("constant-legs", np.random.default_rng(6), 12)
-    legs = legs_as_drawn(scene.drawing)
+    legs = legs_as_drawn(scene.nominal)
     # a parallelogram: all legs parallel in every configuration, platform and base congruent
     rng = np.random.default_rng(7)
     u = np.array([0.0, 0, 1]) + 0.3 * rng.normal(size=(12, 3))
@@ -171,7 +171,7 @@ def test_lengths_that_the_distances_do_not_tell():
     axes = Axes(0 * k, k, np.ones((12, 6), dtype=bool), u, 0 * u, np.zeros((1, 12, 6)))
     with pytest.raises(ResultError, match="do not tell the lengths of legs 1 to 6"):
         checks.lengths_are_fixed(
-            scene.drawing,
+            scene.nominal,
             axes,
             np.ones(1, dtype=bool),
             legs.base[None],
@@ -181,8 +181,8 @@ def test_lengths_that_the_distances_do_not_tell():
 
 
 def test_a_length_that_collapsed_is_told():
-    drawing = exact("constant-legs")
-    legs = legs_as_drawn(drawing)
+    nominal = exact("constant-legs")
+    legs = legs_as_drawn(nominal)
     q0 = np.where(np.arange(6) == 2, 0.001, legs.rod)[None]
     with pytest.raises(ResultError, match="leg 3 of constant length shrank"):
         checks.not_collapsed(legs, q0[0])
@@ -245,5 +245,5 @@ def test_counts_are_necessary_at_most(hexapod):
     two = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [0, 1, 4, 5]])
     visible = np.zeros((3, 6), dtype=bool)
     visible[np.arange(3)[:, None], two] = True
-    assert all(c.met for c in conditions(hexapod.drawing, visible))
+    assert all(c.met for c in conditions(hexapod.nominal, visible))
     refused(hexapod, hexapod.select(seen_by(hexapod, two)), "share too few legs")

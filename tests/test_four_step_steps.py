@@ -167,7 +167,7 @@ def _frame_rows(items):
     """Rows that hold the sum of the centres and of their turns."""
     p = items.drawn - items.drawn.mean(axis=0)
     n = len(p)
-    rows = np.zeros((6, len(items.drawing), 3))
+    rows = np.zeros((6, len(items.nominal), 3))
     for k in range(3):
         rows[k, :n, k] = 1
         rows[3 + k, :n] = np.cross(np.eye(3)[k], p)
@@ -326,7 +326,7 @@ def test_constant_lengths_and_their_false_minimum():
     """
     machine, axes, a = constant_legs(np.random.default_rng(13))
     rod = machine.layout.rod
-    start = machine.parameters.drawing[rod]
+    start = machine.parameters.nominal[rod]
     truth = machine.values[rod]
     for form in ("corrected", "printed"):
         np.testing.assert_allclose(
@@ -364,14 +364,14 @@ def test_platform_centres_by_registration_and_by_distances():
     rng = np.random.default_rng(15)
     axes, base, body, T, q0 = body_axes(rng)
     b = base[:, None] + (axes.readings + q0[:, None])[..., None] * axes.u
-    drawing = body[0] + 1e-3 * rng.normal(size=(4, 3))
+    nominal = body[0] + 1e-3 * rng.normal(size=(4, 3))
     body = body[:1]
     b = apply(T[:, :, None], body[:, None])
-    items = Items(b, axes.visible, b[:, :, :0], axes.visible[:, :0], drawing, np.zeros((0, 3)))
+    items = Items(b, axes.visible, b[:, :, :0], axes.visible[:, :0], nominal, np.zeros((0, 3)))
     gauge = _frame_rows(items)
     for item in (
-        platform_by_registration(b, axes.visible, drawing, gauge),
-        platform_by_distances(b, axes.visible, axes.station, drawing, gauge),
+        platform_by_registration(b, axes.visible, nominal, gauge),
+        platform_by_distances(b, axes.visible, axes.station, nominal, gauge),
     ):
         e = poses_laying_items(item, np.broadcast_to(body, item.shape), np.ones(item.shape[:2]))
         np.testing.assert_allclose(
@@ -393,17 +393,17 @@ def test_a_platform_that_moves_less_needs_fewer_legs(motion):
     visible[8, 1:] = False
     visible[8, 0] = motion is TRANSLATION
     b = apply(T[:, :, None], body[:, None])
-    drawing = body[0] + 1e-3 * rng.normal(size=(4, 3))
-    fixed = fixes_pose(drawing, visible, motion=motion)
+    nominal = body[0] + 1e-3 * rng.normal(size=(4, 3))
+    fixed = fixes_pose(nominal, visible, motion=motion)
     np.testing.assert_array_equal(fixed, k < 8 if motion is PLANAR else k < 9)
-    assert not fixes_pose(drawing, visible[:8], motion=SPATIAL).any() or motion is PLANAR
-    assert loose(drawing, visible, motion=motion).shape[-1] == 0
-    x = (drawing - drawing.mean(axis=0))[:, :2]
+    assert not fixes_pose(nominal, visible[:8], motion=SPATIAL).any() or motion is PLANAR
+    assert loose(nominal, visible, motion=motion).shape[-1] == 0
+    x = (nominal - nominal.mean(axis=0))[:, :2]
     rows = np.zeros((6, 4, 3))
     rows[2, :, 0], rows[2, :, 1] = -x[:, 1], x[:, 0]
     rows[3:] = np.eye(3)[:, None]
     gauge = motion.T @ rows.reshape(6, 12)
-    values = platform_by_registration(b[:, fixed], visible[fixed], drawing, gauge, motion)
+    values = platform_by_registration(b[:, fixed], visible[fixed], nominal, gauge, motion)
     e = poses_laying_items(values, body, np.ones((2, 4)), motion=motion)
     np.testing.assert_allclose(apply(e[:, None], values), body, atol=1e-9)
     if motion is TRANSLATION:
@@ -542,8 +542,8 @@ def test_three_centres_stay_the_frame_of_a_spatial_machine():
     from pkmcal.papers.four_step import four_step
 
     scene = make_scene("6-spu-passive", np.random.default_rng(24), 20)
-    value = four_step(scene.drawing, scene.measurements)
-    rows = ThreeCentres().constraints(scene.drawing)
+    value = four_step(scene.nominal, scene.measurements)
+    rows = ThreeCentres().constraints(scene.nominal)
     np.testing.assert_allclose(
-        rows @ (value.theta - scene.drawing.parameters.drawing), 0, atol=1e-9
+        rows @ (value.theta - scene.nominal.parameters.nominal), 0, atol=1e-9
     )

@@ -299,13 +299,13 @@ def test_what_the_rods_can_tell():
 # Joint estimates from board poses (noise 0.2 mm, 0.03 degrees)
 
 
-def several(truth_of, drawing, runs, **options):
+def several(truth_of, nominal, runs, **options):
     out = []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         truth = truth_of(rng)
         case = papers_case(truth, rng)
-        estimate = estimated(drawing, case, rng, **options)
+        estimate = estimated(nominal, case, rng, **options)
         out.append((truth, case, estimate))
     return out
 
@@ -328,10 +328,10 @@ def test_the_right_model_is_as_good_as_noise_allows(model, truth, position):
 
     ``position`` is the mean of 24 runs, m. Eight runs scatter by a fifth.
     """
-    drawing = load_mechanism("h4", model=model)
-    fits = several(truth, drawing, 8)
+    nominal = load_mechanism("h4", model=model)
+    fits = several(truth, nominal, 8)
     errors = rms([score(e, t, np.random.default_rng(1)) for t, _, e in fits])
-    limit = rms([bound(drawing, c, e, np.random.default_rng(1)) for _, c, e in fits[:3]])
+    limit = rms([bound(nominal, c, e, np.random.default_rng(1)) for _, c, e in fits[:3]])
     assert errors[0] == pytest.approx(position, rel=0.25)
     assert 0.7 < errors[0] / limit[0] < 1.25
     assert errors[1] / limit[1] < 1.25
@@ -365,7 +365,7 @@ def test_truth_is_found_without_noise():
         (with_rods(rng), "rods"),
     ):
         case = papers_case(truth, rng, noise=1e-5)
-        value = estimated(load_mechanism("h4", model=model), case, rng, use_drawing=True)
+        value = estimated(load_mechanism("h4", model=model), case, rng, use_prior=True)
         # the prior biases weak directions, by as little as the data let it
         assert score(value, truth, rng)[0] < 2e-5
         camera = value.state.T_camera_base[0] @ case.poses @ value.state.T_mount[0]

@@ -26,15 +26,15 @@ BOARD = (Mount("board", "platform"),)
 MACHINES = sorted(catalogue())
 
 
-def true_machine(drawing, rng, shift=0.002, turn=0.035):
-    table = drawing.parameters
+def true_machine(nominal, rng, shift=0.002, turn=0.035):
+    table = nominal.parameters
     kinds = np.array([table.kinds[k] for k in table.first_of_free()])
     sigma = np.where(np.isin(kinds, ["axis", "angle"]), turn, shift) * (kinds != "radius")
     sigma = np.where(kinds == "scale", table.tolerances_free(), sigma)
-    if drawing.name == "3-upu":  # its axes are parallel in pairs, or it does not translate
+    if nominal.name == "3-upu":  # its axes are parallel in pairs, or it does not translate
         sigma = sigma * (kinds != "axis")
-    return drawing.with_values(
-        drawing.values + table.free_matrix() @ (sigma * rng.normal(size=len(sigma)))
+    return nominal.with_values(
+        nominal.values + table.free_matrix() @ (sigma * rng.normal(size=len(sigma)))
     )
 
 
@@ -89,12 +89,12 @@ def off(state, poses):
 def test_every_machine_with_a_drawing_2_mm_and_2_degrees_off(name, seed):
     """Prediction as good as the nominal model allows; a wrong branch would be off by a radian."""
     rng = np.random.default_rng(seed)
-    drawing = exact(name)
-    truth = true_machine(drawing, rng)
+    nominal = exact(name)
+    truth = true_machine(nominal, rng)
     body, joints = platform_poses(truth, rng)
     camera, mount = anywhere(rng, 1.0), anywhere(rng, 0.05)
     data = measured(seen_from(camera, body, mount, rng), joints)
-    state = start_from_poses(drawing, data)
+    state = start_from_poses(nominal, data)
     turn, shift = off(state, data.poses)
     assert turn < np.radians(6)
     assert shift < 0.02

@@ -419,12 +419,12 @@ def test_a_board_on_a_printer(cfg):
 def test_the_drawing_of_a_printer_is_simulated(cfg):
     """Its rods meet in one point, all that a firmware has of the platform."""
     run("new", cfg.parent / "kit", "--printer", cfg, "--board")
-    drawing = load_mechanism(cfg.parent / "kit" / "mechanism.yaml")
+    nominal = load_mechanism(cfg.parent / "kit" / "mechanism.yaml")
     poses, joints = draw_configurations(
-        to_simulate(drawing, "x"), 30, 0.3, np.random.default_rng(0)
+        to_simulate(nominal, "x"), 30, 0.3, np.random.default_rng(0)
     )
     assert len(poses) >= 30
-    np.testing.assert_allclose(drawing.forward(joints), poses, atol=1e-9)
+    np.testing.assert_allclose(nominal.forward(joints), poses, atol=1e-9)
 
 
 REPRAP = """\

@@ -44,7 +44,7 @@ def test_constraints_hold_and_nothing_measurable_changes(gauge):
     state = moved_state(rng, scene, 0.2)
     values = in_gauge(machine, state, gauge)
     c = gauge.constraints(machine)
-    np.testing.assert_allclose(c @ values.theta, c @ machine.parameters.drawing, atol=1e-14)
+    np.testing.assert_allclose(c @ values.theta, c @ machine.parameters.nominal, atol=1e-14)
     legs = closure(machine.layout, values.theta, scene.joints[0], values.T_base_platform)
     np.testing.assert_allclose(legs.rows.value, 0, atol=1e-13)
     base, _ = centre_index(machine.layout)
@@ -58,7 +58,7 @@ def test_three_centres_as_the_design_says():
     rng = np.random.default_rng(1)
     scene = make_scene(rng)
     base = centre_index(scene.machine.layout)[0]
-    d = scene.machine.parameters.drawing[base]
+    d = scene.machine.parameters.nominal[base]
     a = in_gauge(scene.machine, moved_state(rng, scene), ThreeCentres()).theta[base]
     np.testing.assert_allclose(a[0], d[0], atol=1e-14)
     np.testing.assert_allclose(np.cross(a[2] - a[0], d[2] - d[0]), 0, atol=1e-14)
@@ -72,11 +72,11 @@ def test_best_fit_is_the_least_squares_fit():
     rng = np.random.default_rng(2)
     scene = make_scene(rng)
     values = in_gauge(scene.machine, moved_state(rng, scene), BestFit())
-    drawing = scene.machine.parameters.drawing
+    nominal = scene.machine.parameters.nominal
 
     def cost(e, f):
         theta = changed_frames(scene.machine.layout, values, e, f).theta
-        return sum(np.sum((theta - drawing)[i] ** 2) for i in centre_index(scene.machine.layout))
+        return sum(np.sum((theta - nominal)[i] ** 2) for i in centre_index(scene.machine.layout))
 
     least = cost(np.eye(4), np.eye(4))
     for _ in range(20):
@@ -166,7 +166,7 @@ def test_covariance_transformed_equals_covariance_recomputed(first, second):
     machine, m = scene.machine, scene.measurements(np.random.default_rng(7))
     values = []
     for rows in (first, second):
-        assembled = assemble(machine, m, rows, use_drawing=False)
+        assembled = assemble(machine, m, rows, use_prior=False)
         state = in_gauge(machine, scene.state(), rows)
         info = Information(assembled.problem, batch_of(machine, assembled, state))
         values.append(
@@ -205,7 +205,7 @@ def test_fixed_parameters_take_frames_away():
         held = replace(machine, parameters=machine.parameters.with_roles(fixed=fixed))
         basis = freedoms(held)
         assert basis.shape == (12, remainder)
-        shifted = generators(held.layout, held.parameters.drawing) @ basis
+        shifted = generators(held.layout, held.parameters.nominal) @ basis
         rows = [held.parameters.index(name) for name in fixed]
         np.testing.assert_allclose(shifted[rows], 0, atol=1e-12)
 

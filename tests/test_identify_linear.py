@@ -123,8 +123,8 @@ def test_scale_of_the_radius():
     assert procrustes_scale(value, base) == pytest.approx(1.02)
     # the pairs 40 mm apart dominate the mean of ratios once the nominal model is a little wrong
     rng = np.random.default_rng(6)
-    drawings = base + 5e-4 * rng.normal(size=(200, 6, 3))
-    spread = [np.std([f(value, d) for d in drawings]) for f in (scale_ratio, procrustes_scale)]
+    nominals = base + 5e-4 * rng.normal(size=(200, 6, 3))
+    spread = [np.std([f(value, d) for d in nominals]) for f in (scale_ratio, procrustes_scale)]
     assert spread[0] > 1.5 * spread[1]
 
 

@@ -122,7 +122,7 @@ def test_jacobian_of_edges_that_are_whitened_in_pairs():
     rng = np.random.default_rng(4)
     data = HexapodByAxes(poses=3).draw(Batch("hexapod", 2, np.random.SeedSequence(4)))
     problem = joint_problem(data.machine, data, ThreeCentres())
-    z = (data.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
+    z = (data.theta - problem.nominal) @ np.linalg.pinv(problem.free).T
     T = np.broadcast_to(data.view.T_camera_base, (2, 3, 4, 4))
     check(problem, BatchState(z, T, data.T_base_platform, np.zeros((2, 1))), rng)
 
@@ -257,7 +257,7 @@ def test_unknowns_stand_one_after_the_other():
 def test_reduced_rows_are_the_least_squares_of_the_unknowns_kept():
     """The machine's step by them is its part of the whole problem's step, nothing known of it."""
     rng = np.random.default_rng(12)
-    assembled, truth = make_scene(rng, configurations=8).batch(rng, use_drawing=False)
+    assembled, truth = make_scene(rng, configurations=8).batch(rng, use_prior=False)
     problem, state = assembled.problem, replace(truth, z=0 * truth.z)
     machine = problem.unknowns.machine
     info = Information(problem, state)

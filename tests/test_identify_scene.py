@@ -112,7 +112,7 @@ class Scene:
         joints = self.joints + JOINT_NOISE * rng.normal(size=self.joints.shape)
         data = replace(old, basis=basis, joints=joints)
         problem = replace(assembled.problem, data=data)
-        z = (self.theta - self.machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
+        z = (self.theta - self.machine.parameters.nominal) @ np.linalg.pinv(problem.free).T
         stations = np.broadcast_to(self.T_camera_base, (len(z), *self.T_camera_base.shape))
         lines = np.zeros((len(z), assembled.problem.unknowns.columns(SHADING).size))
         columns = np.concatenate([self.edge_shift[:, None], lines], axis=1)
@@ -157,7 +157,7 @@ def make_scene(
     table = machine.parameters
     free = table.free_matrix()
     sigma = table.tolerance[np.argmax(free, axis=0)]
-    theta = table.drawing + (tolerance * sigma * rng.normal(size=(runs, len(sigma)))) @ free.T
+    theta = table.nominal + (tolerance * sigma * rng.normal(size=(runs, len(sigma)))) @ free.T
     turn = reach * rng.uniform(-0.25, 0.25, (runs, configurations, 3))
     move = reach * rng.uniform(-0.04, 0.04, (runs, configurations, 3))
     poses = perturb(machine.home(), np.concatenate([turn, move], axis=-1))

@@ -42,7 +42,7 @@ class Session:
             stations=stations, configurations=configurations, joint_noise=JOINT_NOISE
         )
         eye = camera()
-        self.drawing = machine
+        self.nominal = machine
         self.truth = draw_truth(machine, (eye,) * stations, settings, seed)
         rng = np.random.default_rng(seed + 1000)
         edges, joints = simulate_edges(
@@ -87,20 +87,20 @@ class Session:
     def guess(self, rng, measurements=None):
         step = rng.normal(size=(len(self.truth.T_camera_base), 6)) * np.repeat([0.02, 0.01], 3)
         rough = perturb(self.truth.T_camera_base, step)
-        return start_state(self.drawing, measurements or self.measurements, rough)
+        return start_state(self.nominal, measurements or self.measurements, rough)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_jacobian_with_boards(name):
     rng = np.random.default_rng(1)
     session = Session(load_mechanism(name), configurations=3, boards=("base", "platform"))
-    assembled = assemble(session.drawing, session.measurements, default_gauge(session.drawing))
-    state = batch_of(session.drawing, assembled, session.state())
+    assembled = assemble(session.nominal, session.measurements, default_gauge(session.nominal))
+    state = batch_of(session.nominal, assembled, session.state())
     check(assembled.problem, state, rng)
     shifted = replace(
         state,
         T_base_platform=perturb(state.T_base_platform, 0.02 * rng.normal(size=(1, 6, 6))
-                                @ session.drawing.layout.motion @ session.drawing.layout.motion.T),
+                                @ session.nominal.layout.motion @ session.nominal.layout.motion.T),
         T_mount=perturb(state.T_mount, 0.3 * rng.normal(size=(1, 2, 6))),
     )  # fmt: skip
     check(assembled.problem, shifted, rng)
@@ -113,14 +113,14 @@ def test_truth_is_found_without_noise(name):
     machine = exact(name) if name == "3-upu" else load_mechanism(name)
     session = Session(machine, boards=("base",), noise=1e-4)
     fit = bundle(
-        session.drawing,
+        session.nominal,
         session.measurements,
         session.guess(np.random.default_rng(2)),
         robust=False,
         scale_noise=False,
     )
-    truth = in_gauge(session.drawing, session.state(), default_gauge(session.drawing))
-    error = fit.machine.values - session.drawing.parameters.unit_axes(truth.theta)
+    truth = in_gauge(session.nominal, session.state(), default_gauge(session.nominal))
+    error = fit.machine.values - session.nominal.parameters.unit_axes(truth.theta)
     sigma = np.sqrt(np.diag(fit.covariance))
     # micrometres where images leave tens of them; the prior biases what they do not determine
     assert np.all(np.abs(error) < 1e-5 + 4 * sigma)
@@ -139,10 +139,10 @@ def test_errors_are_as_large_as_they_say(name):
     for seed in range(6):
         session = Session(load_mechanism(name), seed=seed)
         fit = bundle(
-            session.drawing, session.measurements, session.guess(np.random.default_rng(seed))
+            session.nominal, session.measurements, session.guess(np.random.default_rng(seed))
         )
-        truth = in_gauge(session.drawing, session.state(), default_gauge(session.drawing))
-        table = session.drawing.parameters
+        truth = in_gauge(session.nominal, session.state(), default_gauge(session.nominal))
+        table = session.nominal.parameters
         # an axis by its two turns: along itself it changes by squares of small angles only
         error = table.to_free(fit.machine.values) - table.to_free(truth.theta)
         by = np.linalg.pinv(table.free_matrix())

@@ -510,4 +510,6 @@ def test_a_machine_that_cannot_be_assembled():
     legs.append(((0, 1, 0), (0, 0, 0), "actuated: true, range: [0.1, 0.11]"))
     message = sentence(GeometryError, machine_of("translation", legs).home)
     assert message.startswith("mechanism 'made' cannot be assembled with its legs at mid-range")
-    assert message.endswith("the drawing's centres and ranges, or give home: {position: ...}.")
+    assert message.endswith(
+        "the nominal model's centres and ranges, or give home: {position: ...}."
+    )

@@ -57,14 +57,14 @@ def test_the_report_promises_what_is_kept(by_board):
     assert unit == "mm"
     error = tool(kit, result)
     assert 0.5 < 1e-3 * float(value) / error.expected < 1.5
-    off = cards[questions.index("What did the drawing do to the platform's pose?")]
+    off = cards[questions.index("What did the nominal model do to the platform's pose?")]
     assert 0.5 < 1e-3 * float(off.values[0][0]) / error.before < 1.5
 
 
 def test_heights_flatten_the_bed_and_are_accepted_for_that(by_heights):
     kit, value = by_heights
     error = tool(kit, value)
-    assert flatness(kit, value.machine) < 0.3 * flatness(kit, kit.drawing)
+    assert flatness(kit, value.machine) < 0.3 * flatness(kit, kit.nominal)
     assert flatness(kit, value.machine) < 3e-5
     assert error.after < error.before
     assert error.after > 1e-4  # a flat bed is no proof
@@ -85,7 +85,7 @@ def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
     assert value.verdict.usable
     assert value.verdict.of("bed.height_unnoticed")
     assert value.findings.bed.unnoticed is None or (
-        value.findings.bed.unnoticed > 0.5 * value.findings.bed.by_drawing
+        value.findings.bed.unnoticed > 0.5 * value.findings.bed.by_nominal
     )
     ranks = value.findings.identifiability
     assert ranks.rank == 4
@@ -118,26 +118,26 @@ def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
     assert numbers
     radius = 1e-3 * float(numbers[1])
     share = 1e-2 * float(numbers[3]) * (1 if numbers[2] == "stretch" else -1)
-    drawing = load_mechanism("linear-delta")
-    other = sized(drawing, 1e-3, radius)
-    assert flatness(kit_of(drawing), other) < 3e-6
-    xy = drawing.forward(joints := bed_readings(drawing))[:, :2, 3]
+    nominal = load_mechanism("linear-delta")
+    other = sized(nominal, 1e-3, radius)
+    assert flatness(kit_of(nominal), other) < 3e-6
+    xy = nominal.forward(joints := bed_readings(nominal))[:, :2, 3]
     shifted = other.forward(joints)[:, :2, 3] - xy
     assert np.sum(shifted * xy) / np.sum(xy**2) == pytest.approx(share, rel=0.1)
     # the other way round they bend the bed
-    assert flatness(kit_of(drawing), sized(drawing, 1e-3, -radius)) > 2e-5
+    assert flatness(kit_of(nominal), sized(nominal, 1e-3, -radius)) > 2e-5
     # 6 mm wrong, and a bed flat to 0.01 mm: what users of printers met
-    assert flatness(kit_of(drawing), sized(drawing, 6e-3, 6 * radius)) < 1e-5
+    assert flatness(kit_of(nominal), sized(nominal, 6e-3, 6 * radius)) < 1e-5
 
 
-def sized(drawing, rod, radius):
+def sized(nominal, rod, radius):
     """The machine with longer rods and a larger radius of the base joints."""
-    values, table = drawing.values.copy(), drawing.parameters
+    values, table = nominal.values.copy(), nominal.parameters
     for leg in (1, 2, 3):
         values[table.index(f"legs[{leg}].length.constant")] += rod
         centre = [table.index(f"legs[{leg}].base.center.{axis}") for axis in "xy"]
         values[centre] *= 1 + radius / np.linalg.norm(values[centre])
-    return drawing.with_values(values)
+    return nominal.with_values(values)
 
 
 def kit_of(machine):
@@ -160,9 +160,9 @@ def test_the_firmwares_model_holds_what_no_firmware_can(tmp_path):
     held = [
         table.index(f"legs[{j}].{what}") for j in (1, 2, 3) for what in ("scale", "base.axis.x")
     ]
-    assert np.array_equal(calibration.machine.values[held], table.drawing[held])
+    assert np.array_equal(calibration.machine.values[held], table.nominal[held])
     assert calibration.verdict.usable
-    assert flatness(kit, calibration.machine) < 0.2 * flatness(kit, kit.drawing)
+    assert flatness(kit, calibration.machine) < 0.2 * flatness(kit, kit.nominal)
     source = MachineSource(calibration.machine, bed=calibration.findings.bed.z)
     (note, *_) = make_export(source, "klipper").notes
     off = re.search(r"off by ([\d.]+) mm at most", note.text)

@@ -37,7 +37,7 @@ def true_machine(rng, share=1.0):
     """Machine with errors as large as the prior sigmas."""
     table = DRAWING.parameters
     off = share * table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
-    return DRAWING.with_values(table.drawing + table.free_matrix() @ off)
+    return DRAWING.with_values(table.nominal + table.free_matrix() @ off)
 
 
 def seen(machine, rng, noise, configurations=12, shading=0.0):
@@ -93,10 +93,10 @@ def test_exact_edges_give_the_base_and_the_edge_shift():
     radii = truth.parameters.of_kind("radius")
     tolerance = np.ones(len(truth.values))
     tolerance[radii] = 1e-9
-    drawing = DRAWING.values.copy()
-    drawing[radii] = truth.values[radii]
-    table = replace(DRAWING.parameters, drawing=drawing, tolerance=tolerance)
-    machine = replace(DRAWING, parameters=table, values=drawing)
+    nominal = DRAWING.values.copy()
+    nominal[radii] = truth.values[radii]
+    table = replace(DRAWING.parameters, nominal=nominal, tolerance=tolerance)
+    machine = replace(DRAWING, parameters=table, values=nominal)
     sharp = EdgeNoise(shift=1e-6, tilt=1e-6, outward=0.2)
     measurements = seen(truth, rng, sharp)
     stated = replace(measurements.edges, covariance=1e6 * measurements.edges.covariance)
@@ -206,12 +206,12 @@ def test_verdict_says_how_far_the_method_goes(scenes):
     verdict = judge(observation, estimate, Findings(information, (), (), 1.0), "linear")
     assert not verdict.usable
     (base,) = verdict.of("estimate.base_only")
-    both, edges, drawing = (
+    both, edges, nominal = (
         1e3 * base.facts[name] for name in ("sigma", "edges_sigma", "nominal_sigma")
     )
-    assert both < min(edges, drawing)
+    assert both < min(edges, nominal)
     # of 18 coordinates with 2 mm each, six are frames
-    assert drawing == pytest.approx(2 * np.sqrt(12 / 18), rel=0.05)
+    assert nominal == pytest.approx(2 * np.sqrt(12 / 18), rel=0.05)
     n = len(estimate.covariance)
     keep = transformation(estimate.machine, estimate.state, BestFit())[:n, :n]
     spread = np.diag(keep @ estimate.covariance @ keep.T)[centre_index(machine.layout)[0].ravel()]

@@ -83,14 +83,14 @@ def test_calibrated_values_come_back_to_the_last_bit(machine, tmp_path):
     (tmp_path / "m.yaml").write_text(mechanism_text(changed))
     again = load_mechanism(tmp_path / "m.yaml")
     np.testing.assert_array_equal(again.values, changed.values)
-    np.testing.assert_array_equal(machine.values, machine.parameters.drawing)
+    np.testing.assert_array_equal(machine.values, machine.parameters.nominal)
 
 
 def built(machine, steps):
     """Values (P,) of a machine that can be: ties kept, axes of length one."""
     table = machine.parameters
     free = table.free_matrix()
-    return table.unit_axes(table.drawing + free @ (free.T @ steps))
+    return table.unit_axes(table.nominal + free @ (free.T @ steps))
 
 
 def at_path(document, name):
@@ -213,8 +213,8 @@ def test_tied_parameters_change_by_the_same_amount():
     table = roles(tied=(NAMES[:2],))
     matrix = table.free_matrix()
     assert matrix.shape == (len(table), len(table) - 1)
-    values = table.drawing + matrix @ np.arange(1.0, matrix.shape[1] + 1)
-    shifted = values - table.drawing
+    values = table.nominal + matrix @ np.arange(1.0, matrix.shape[1] + 1)
+    shifted = values - table.nominal
     a, b, c = (shifted[table.index(name)] for name in NAMES)
     assert a == pytest.approx(b)
     assert a != pytest.approx(c)

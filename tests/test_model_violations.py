@@ -46,14 +46,14 @@ def measured(seed, *, scale=None, turned=None, play=None, machine=None, count=30
     scales by default.
     """
     rng = np.random.default_rng(seed)
-    drawing = machine or exact("gough-stewart")
-    table = drawing.parameters
-    true = drawing.with_values(
-        table.drawing + table.free_matrix() @ (table.tolerances_free() * rng.standard_normal(
+    nominal = machine or exact("gough-stewart")
+    table = nominal.parameters
+    true = nominal.with_values(
+        table.nominal + table.free_matrix() @ (table.tolerances_free() * rng.standard_normal(
             table.free_matrix().shape[1]))
     )  # fmt: skip
     camera = camera_of_size((1280, 960))
-    rig = of_machine(drawing, [camera, camera], drawing.joint_names, seed=seed).rig
+    rig = of_machine(nominal, [camera, camera], nominal.joint_names, seed=seed).rig
     poses, _ = draw_configurations(true, count, 0.5, rng)
     poses = poses[:count]
     pairs = np.array([(s, k) for s in (0, 1) for k in range(count)])
@@ -71,15 +71,15 @@ def measured(seed, *, scale=None, turned=None, play=None, machine=None, count=30
         direction = np.sign(np.diff(joints[:, play[0]], prepend=joints[0, play[0]]))
         joints[:, play[0]] -= play[1] / 2 * direction
     data = Measurements(concatenate(sets), joints, 3e-6, 2, np.zeros(2, dtype=int))
-    return drawing, data, where
+    return nominal, data, where
 
 
-def score_tests(drawing, data, where, readings, shifted, families=None):
+def score_tests(nominal, data, where, readings, shifted, families=None):
     """Score tests of an estimate of the data: by changes of the readings (K, m, 1), and of the
     first camera's place from the middle on.
     """
-    estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
-    assembled = assemble(estimate.machine, data, default_gauge(drawing))
+    estimate = bundle(nominal, data, start_state(nominal, data, where), scale_noise=False)
+    assembled = assemble(estimate.machine, data, default_gauge(nominal))
     info = Information(assembled.problem, batch_of(estimate.machine, assembled, estimate.state))
     effects = [Column("readings.test", readings=by) for by in readings]
     if shifted:
@@ -98,8 +98,8 @@ def plays(data):
 
 
 def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate():
-    drawing, data, where = measured(1, scale=(2, 2e-3))
-    estimate, tests = score_tests(drawing, data, where, scales(data), False)
+    nominal, data, where = measured(1, scale=(2, 2e-3))
+    estimate, tests = score_tests(nominal, data, where, scales(data), False)
     value = tests.tests_beyond(FALSE_ALARM)
     assert value[0][0] == 2
     fit = tests.fitted([2])[0]
@@ -109,12 +109,12 @@ def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate()
     joints = data.joints.copy()
     joints[:, 2] *= 1 + fit.value[0]
     again = bundle(
-        drawing, replace(data, joints=joints), start_state(drawing, data, where), scale_noise=False
+        nominal, replace(data, joints=joints), start_state(nominal, data, where), scale_noise=False
     )
     gain = estimate.statistics.chi2 - again.statistics.chi2
     assert gain == pytest.approx(tests.scores()[2].chi2, rel=0.05)
     shifted = again.machine.values - estimate.machine.values
-    offsets = drawing.parameters.of_kind("offset")
+    offsets = nominal.parameters.of_kind("offset")
     np.testing.assert_allclose(
         shifted[offsets], fit.by_data[offsets], atol=0.1 * np.abs(shifted).max()
     )
@@ -122,12 +122,12 @@ def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate()
 
 def test_a_scale_beyond_its_tolerance_is_found_whole():
     """Freed beside its prior the violation leaves the parameter nominal, and is the only one."""
-    drawing = load_mechanism("gough-stewart")
-    drawing, data, where = measured(1, scale=(2, 1e-2), machine=drawing)
-    estimate, tests = score_tests(drawing, data, where, scales(data), False)
+    nominal = load_mechanism("gough-stewart")
+    nominal, data, where = measured(1, scale=(2, 1e-2), machine=nominal)
+    estimate, tests = score_tests(nominal, data, where, scales(data), False)
     assert tests.tests_beyond(FALSE_ALARM)[0][0] == 2
     fit = tests.fitted([2])[0]
-    row = drawing.parameters.index("legs[3].scale")
+    row = nominal.parameters.index("legs[3].scale")
     present = estimate.machine.values[row]
     assert 2e-3 < present - 1 < 1e-2
     assert fit.by_data[row] == pytest.approx(1 - present, abs=1e-3)
@@ -136,13 +136,13 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
 
 
 def test_play_and_a_pushed_camera_are_told_from_each_other():
-    drawing, data, where = measured(2, play=(4, 4e-4))
-    _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+    nominal, data, where = measured(2, play=(4, 4e-4))
+    _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
     assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == [6 + 4]
     assert tests.fitted([10])[0].value[0] == pytest.approx(4e-4, rel=0.2)
     step = np.array([0.0, 0.0, 0.0, 6e-4, -5e-4, 4e-4])
-    drawing, data, where = measured(3, turned=step)
-    _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+    nominal, data, where = measured(3, turned=step)
+    _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
     assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == [12]
     fit = tests.fitted([12])[0]
     off = fit.value - step
@@ -150,8 +150,8 @@ def test_play_and_a_pushed_camera_are_told_from_each_other():
 
 
 def test_two_departures_are_found_one_after_the_other():
-    drawing, data, where = measured(4, scale=(0, 4e-3), play=(3, 5e-4))
-    _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+    nominal, data, where = measured(4, scale=(0, 4e-3), play=(3, 5e-4))
+    _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
     assert {k for k, _ in tests.tests_beyond(FALSE_ALARM)} == {0, 6 + 3}
     one, other = tests.fitted([0, 9])
     assert one.value[0] == pytest.approx(4e-3, rel=0.3)
@@ -159,8 +159,8 @@ def test_two_departures_are_found_one_after_the_other():
 
 
 def test_nothing_is_found_twice():
-    drawing, data, where = measured(7, scale=(1, 6e-3))
-    _, tests = score_tests(drawing, data, where, scales(data)[1:3], False, [0, 1])
+    nominal, data, where = measured(7, scale=(1, 6e-3))
+    _, tests = score_tests(nominal, data, where, scales(data)[1:3], False, [0, 1])
     results = [k for k, _ in tests.tests_beyond(FALSE_ALARM)]
     assert results[0] == 0
     assert len(results) == len(set(results))
@@ -168,9 +168,9 @@ def test_nothing_is_found_twice():
 
 def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     """Against dense algebra, all columns of all rows at once; and in pieces as in one."""
-    drawing, data, where = measured(8, scale=(1, 2e-3), count=14)
-    estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
-    assembled = assemble(estimate.machine, data, default_gauge(drawing))
+    nominal, data, where = measured(8, scale=(1, 2e-3), count=14)
+    estimate = bundle(nominal, data, start_state(nominal, data, where), scale_noise=False)
+    assembled = assemble(estimate.machine, data, default_gauge(nominal))
     state, problem = batch_of(estimate.machine, assembled, estimate.state), assembled.problem
     effects = [Column("a", readings=scales(data)[1]), Column("b", station=1, since=5)]
     turns = np.stack([data.edges.shift, data.edges.normal[:, :2]], axis=-1)
@@ -223,8 +223,8 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
 def false_alarms(seeds):
     chances = []
     for seed in seeds:
-        drawing, data, where = measured(seed, count=16)
-        _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+        nominal, data, where = measured(seed, count=16)
+        _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
         chances.append([score.chance for score in tests.scores()])
     return np.array(chances)
 
@@ -241,12 +241,12 @@ def test_errors_of_whole_configurations_are_no_departure():
     """
     named = np.zeros(2, dtype=int)
     for seed in range(6):
-        drawing, data, where = measured(40 + seed, count=20)
+        nominal, data, where = measured(40 + seed, count=20)
         wrong = data.joints.copy()
         off = np.random.default_rng(seed).normal(0, 5e-3, len(wrong))
         wrong[:, 2] *= 1 + off
         data = replace(data, joints=wrong)
-        _, tests = score_tests(drawing, data, where, scales(data)[2:3], False)
+        _, tests = score_tests(nominal, data, where, scales(data)[2:3], False)
         named += (
             tests.scores()[0].adjusted < FALSE_ALARM,
             len(tests.tests_beyond(FALSE_ALARM)),
@@ -266,25 +266,25 @@ def test_right_sessions_have_chances_like_dice_often():
 
 
 def test_what_no_data_see_is_not_tested():
-    drawing, data, where = measured(5, count=12)
+    nominal, data, where = measured(5, count=12)
     nothing = np.zeros((*data.joints.shape, 1))
     # a common error is its offset, an unknown that only the nominal model determines better
     offset = nothing.copy()
     offset[:, 1] = 1.0
-    _, tests = score_tests(drawing, data, where, [nothing, offset], False)
+    _, tests = score_tests(nominal, data, where, [nothing, offset], False)
     assert [score.dof for score in tests.scores()] == [0, 1]
     assert tests.tests_beyond(FALSE_ALARM) == []
     none, some = tests.fitted([0, 1])
     assert none.sigma[0] == np.inf
-    offsets = np.flatnonzero(drawing.parameters.of_kind("offset"))
-    assert some.sigma[0] > drawing.parameters.tolerance[offsets[1]]
+    offsets = np.flatnonzero(nominal.parameters.of_kind("offset"))
+    assert some.sigma[0] > nominal.parameters.tolerance[offsets[1]]
 
 
 def test_what_is_seen_beside_what_is_not_keeps_its_deviation():
-    drawing, data, where = measured(6, scale=(1, 5e-3))
+    nominal, data, where = measured(6, scale=(1, 5e-3))
     nothing = np.zeros((*data.joints.shape, 1))
     six = np.concatenate([plays(data)[0], nothing], axis=-1)  # two numbers, of which one is seen
-    _, tests = score_tests(drawing, data, where, [scales(data)[1], six], False)
+    _, tests = score_tests(nominal, data, where, [scales(data)[1], six], False)
     alone, beside = tests.fitted([0])[0], tests.fitted([0, 1])
     np.testing.assert_allclose(beside[0].value, alone.value, rtol=0.2)
     assert np.isfinite(beside[0].sigma).all()
@@ -324,7 +324,7 @@ def outlined(seed, lines_off):
     """Findings on tubes whose edges are moved by {(leg, tube, station, side): px} outward, and that
     shift in mm, median of all.
     """
-    drawing, data, where = measured(seed, count=20)
+    nominal, data, where = measured(seed, count=20)
     edges = data.edges
     turn, away = np.zeros((len(edges), 2)), np.zeros(0)
     for (leg, tube, station, side), px in lines_off.items():
@@ -340,9 +340,9 @@ def outlined(seed, lines_off):
     basis, by = np.linalg.qr(turned)
     basis = basis * np.sign(np.einsum("nii->ni", by))[:, None]
     data = replace(data, edges=replace(edges, normal=normal, basis=basis), shaded=True)
-    estimate = bundle(drawing, data, start_state(drawing, data, where))
+    estimate = bundle(nominal, data, start_state(nominal, data, where))
     session = SimpleNamespace(
-        machine=drawing, station_names=("one", "two"), document={"mechanism": "mechanism.yaml"}
+        machine=nominal, station_names=("one", "two"), document={"mechanism": "mechanism.yaml"}
     )
     values = list(outlines(session, data, estimate))
     return values, 1e3 * np.median(away) if away.size else 0.0

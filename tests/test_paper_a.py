@@ -26,7 +26,7 @@ from pkmcal.studies.paper_a import (
     hexapod_with_held_radii,
     joint_from_readings,
     parameters_by_group,
-    start_off_drawing,
+    start_off_nominal,
     thirty,
 )
 from pkmcal.studies.simulated import Noise
@@ -116,10 +116,10 @@ def test_the_bound_has_its_own_end_effector(reduced):
 
 def test_depth_as_printed_is_the_drawings(reduced):
     """Products of distances do not determine depth; the nominal error stays, to the micrometre."""
-    drawing, printed = (reduced.of(name) for name in ("drawing", "four steps as printed"))
-    assert printed["base_z"].value == pytest.approx(drawing["base_z"].value, rel=1e-3)
-    assert printed["platform_z"].value == pytest.approx(drawing["platform_z"].value, rel=1e-3)
-    assert printed["base_xy"].value < drawing["base_xy"].value / 10
+    nominal, printed = (reduced.of(name) for name in ("drawing", "four steps as printed"))
+    assert printed["base_z"].value == pytest.approx(nominal["base_z"].value, rel=1e-3)
+    assert printed["platform_z"].value == pytest.approx(nominal["platform_z"].value, rel=1e-3)
+    assert printed["base_xy"].value < nominal["base_xy"].value / 10
 
 
 def test_standard_errors_are_the_scatter_of_studies():
@@ -167,7 +167,7 @@ def test_the_thirty_parameters():
     assert len(set(actual_names.names)) == 30
     assert {"A3 x", "A5 y", "B5 x", "q6"} <= set(actual_names.names)
     assert not {"A1 x", "A3 y", "A5 z"} & set(actual_names.names)
-    value = dict(zip(actual_names.names, actual_names.drawing, strict=True))
+    value = dict(zip(actual_names.names, actual_names.nominal, strict=True))
     centres = machine.base_centers()
     assert value["A3 x"] == pytest.approx(np.linalg.norm(centres[2] - centres[0]))
     assert np.hypot(value["A5 x"], value["A5 y"]) == pytest.approx(
@@ -227,7 +227,7 @@ def test_noise_free_measurements_give_the_truth():
     tiny = HexapodByAxes(poses=4, noise=none, joint_noise=1e-13)
     data = tiny.draw(Batch("hexapod", 3, np.random.SeedSequence(8)))
     stated = replace(data, noise=Noise(3e-6, axis=AxisNoise().sigma()))
-    start = start_off_drawing(stated, np.zeros_like(data.theta))
+    start = start_off_nominal(stated, np.zeros_like(data.theta))
     np.testing.assert_allclose(joint_from_readings(stated, start).theta, data.theta, atol=2e-9)
 
 

@@ -19,8 +19,8 @@ from pkmcal.studies.paper_c import (
     EQ5_AS_PRINTED,
     EQ5_WHITENED,
     PAPER_C_BOUND,
-    PAPER_C_DRAWING,
     PAPER_C_JOINT,
+    PAPER_C_NOMINAL,
     ROTATION_AXIS_METHOD,
     H4ByBoard,
 )
@@ -107,10 +107,10 @@ def test_checks_pass_and_each_can_fail(short):
         own = Sample({**short.samples[key].values, **changes})
         return replace(short, samples={**short.samples, key: own})
 
-    drawn = short.values("control_mean", "design", "design", PAPER_C_DRAWING)
+    drawn = short.values("control_mean", "design", "design", PAPER_C_NOMINAL)
     spoilt = [
         (short, start._replace(shift=0.02)),
-        (with_values(PAPER_C_DRAWING, control_mean=0.9 * drawn), start),
+        (with_values(PAPER_C_NOMINAL, control_mean=0.9 * drawn), start),
         (with_values(EQ3_AS_PRINTED, square=np.full((RUNS, 4), 6e-4)), start),
         (with_values(EQ3_AS_PRINTED, rank=np.full(RUNS, 22)), start),
         (with_accuracy(("design", ROTATION_AXIS_METHOD), chi2=1.3), start),

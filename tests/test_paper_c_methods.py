@@ -101,12 +101,12 @@ def test_turns_between_directions():
 
 def session(name, rng, chosen=None, noise=1.0):
     """Nominal model, truth and measurements of a machine with one board."""
-    drawing = load_mechanism(name, model=chosen)
-    truth = true_machine(drawing, rng, shift=5e-4, turn=2e-3)
+    nominal = load_mechanism(name, model=chosen)
+    truth = true_machine(nominal, rng, shift=5e-4, turn=2e-3)
     body, joints = platform_poses(truth, rng, 40)
     data = measured(seen_from(anywhere(rng, 1.0), body, anywhere(rng, 0.05), rng), joints)
     exact = data.poses.T_station_target if noise else None
-    return drawing, truth, data, exact
+    return nominal, truth, data, exact
 
 
 @pytest.mark.parametrize(
@@ -127,10 +127,10 @@ def session(name, rng, chosen=None, noise=1.0):
 def test_jacobians(name, form):
     """Exact derivatives, against central differences, off the solution."""
     rng = np.random.default_rng(3)
-    drawing, _, data, _ = session(name, rng)
-    start = start_from_poses(drawing, data)
+    nominal, _, data, _ = session(name, rng)
+    start = start_from_poses(nominal, data)
     in_view, joints = data.poses.T_station_target, data.joints[data.poses.configuration]
-    problem, state = pose_problem(drawing, data, in_view[None], joints[None], start, form)
+    problem, state = pose_problem(nominal, data, in_view[None], joints[None], start, form)
     rows = problem.layout.n_equations + 6 - problem.layout.motion.shape[1]
     problem = replace(problem, weigh=np.eye(rows)[None, None])
     linear = problem.linearize(state)
@@ -156,7 +156,7 @@ def test_whitened_rows_have_unit_variance():
         replace_start(machine, truth),
         "implicit",
     )
-    z = (truth.theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
+    z = (truth.theta - machine.parameters.nominal) @ np.linalg.pinv(problem.free).T
     state = state._replace(z=z)
     noise = np.broadcast_to(np.diag(truth.noise.pose**2), (n, 6, 6))
     whitened = replace(problem, weigh=problem.whitening(state, noise, truth.noise.reading))
@@ -170,7 +170,7 @@ def replace_start(machine, truth):
     from pkmcal.identify.estimate import State
 
     return State(
-        machine.parameters.drawing,
+        machine.parameters.nominal,
         truth.view.T_camera_base,
         np.zeros((0, 4, 4)),
         T_mount=truth.view.T_platform_board[None],
@@ -224,15 +224,15 @@ def test_whitened_is_the_joint_estimate():
 def test_any_machine_with_a_board(name):
     """From the nominal model to the noise: the predicted boards of new configurations."""
     rng = np.random.default_rng(6)
-    drawing = load_mechanism(name)
-    truth = true_machine(drawing, rng, shift=1e-3, turn=3e-3)
+    nominal = load_mechanism(name)
+    truth = true_machine(nominal, rng, shift=1e-3, turn=3e-3)
     body, joints = platform_poses(truth, rng, 60)
     camera, mount = anywhere(rng, 1.0), anywhere(rng, 0.05)
     first = seen_from(camera, body[:40], mount, rng)
     data = measured(first, joints[:40])
-    begin = start_from_poses(drawing, data)
-    state = inverse_kinematic(drawing, data, begin)
-    solved = drawing.with_values(state.theta)
+    begin = start_from_poses(nominal, data)
+    state = inverse_kinematic(nominal, data, begin)
+    solved = nominal.with_values(state.theta)
 
     def apart(machine, start):
         poses = machine.forward_result(joints[40:]).T_base_platform
@@ -241,7 +241,7 @@ def test_any_machine_with_a_board(name):
         return np.sqrt(np.mean(np.sum(off[:, 3:] ** 2, axis=1)))
 
     after = apart(solved, state)
-    before = apart(drawing, begin)
+    before = apart(nominal, begin)
     assert after < 3e-4
     assert after < before  # of a planar machine, too, though the start takes up most there
 

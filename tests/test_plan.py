@@ -394,7 +394,7 @@ def test_a_session_without_places(demo, quick_plans, tmp_path):
         (["gough-stewart", "--tracker", "2e-5", "--places", "2"], "no camera whose place"),
         (["gough-stewart", "--edge-noise", "0"], "over 0 to 100"),
         (["gough-stewart", "--joint-noise", "2"], "--joint-noise: this number cannot be used"),
-        (["h4"], "no leg of the drawing has visible cylinders"),
+        (["h4"], "no leg of the nominal model has visible cylinders"),
         (["nothing-like-it"], "nothing-like-it"),
     ],
 )

@@ -46,7 +46,7 @@ class Made:
     """A session's folder and its truth."""
 
     folder: object
-    drawing: object
+    nominal: object
     machine: object
     joints: np.ndarray
     T: np.ndarray
@@ -55,8 +55,8 @@ class Made:
 def make(folder, name, kind="poses", n=24, seed=0, scale=1.0, model=None, station=None):
     """A session of one tracker; its noise is as stated."""
     rng = np.random.default_rng(seed)
-    drawing = load_mechanism(name, model=model)
-    machine = true_machine(drawing, scale, rng)
+    nominal = load_mechanism(name, model=model)
+    machine = true_machine(nominal, scale, rng)
     T, joints = configurations(machine, n, rng)
     place = np.eye(4) if kind == "heights" else T_TRACKER_BASE
     target = T_PLATFORM_TARGET if station is None else station
@@ -65,7 +65,7 @@ def make(folder, name, kind="poses", n=24, seed=0, scale=1.0, model=None, statio
     noise = 1e-5
     readings = joints + noise * rng.normal(size=joints.shape)
     folder.mkdir()
-    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    (folder / "mechanism.yaml").write_text(mechanism_text(nominal))
     write_joints(folder, readings)
     write_poses(folder, in_view, kind)
     document = {
@@ -82,7 +82,7 @@ def make(folder, name, kind="poses", n=24, seed=0, scale=1.0, model=None, statio
         },
     }
     (folder / "session.yaml").write_text(yaml_text(document))
-    return Made(folder, drawing, machine, readings, T)
+    return Made(folder, nominal, machine, readings, T)
 
 
 def configurations(machine, n, rng):
@@ -140,7 +140,7 @@ def test_whole_poses_calibrate_any_machine(folder, name):
     # of n numbers that are noise, the root mean square has the deviation 1 / sqrt(2 n)
     assert s.pose_scale < 1 + 4 / np.sqrt(2 * s.dof_poses)
     assert s.n_poses > 6 * 24 - 0.01  # none is let go, though one may be four deviations off
-    before, after = tool_error(made.drawing, made), tool_error(result.machine, made)
+    before, after = tool_error(made.nominal, made), tool_error(result.machine, made)
     assert after < 0.1 * before
     assert after < 6e-5
     assert not [text for text in result.verdict.warnings if "outvoted" in text]
@@ -163,7 +163,7 @@ def test_points_alone(folder):
     made = make(folder, "gough-stewart", "points", n=40)
     result = calibrate_session(folder)
     assert result.estimate.statistics.n_poses == 120
-    assert tool_error(result.machine, made) < 0.3 * tool_error(made.drawing, made)
+    assert tool_error(result.machine, made) < 0.3 * tool_error(made.nominal, made)
 
 
 def test_heights_of_a_flat_bed(folder):
@@ -184,7 +184,7 @@ def test_heights_of_a_flat_bed(folder):
         plane = np.column_stack([T[:, 0, 3], T[:, 1, 3], np.ones(len(T))])
         return np.sqrt(np.mean((z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]) ** 2))
 
-    assert bulge(result.machine) < 0.2 * bulge(made.drawing)
+    assert bulge(result.machine) < 0.2 * bulge(made.nominal)
 
 
 def test_outliers_are_let_go_and_named(folder):
@@ -224,7 +224,7 @@ def test_inverse_kinematic_is_a_method(folder, monkeypatch):
     monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # standard deviations are not tested
     made = make(folder, "h4", n=30)
     result = calibrate_session(folder, method="inverse-kinematic")
-    assert tool_error(result.machine, made) < 0.1 * tool_error(made.drawing, made)
+    assert tool_error(result.machine, made) < 0.1 * tool_error(made.nominal, made)
 
 
 def test_everything_is_saved_and_read_back(folder, tmp_path):

@@ -167,12 +167,12 @@ def test_parameters_are_a_table(result, loaded):
     table = result.machine.parameters
     assert [row.name for row in value] == list(table.names)
     assert np.array_equal([row.value for row in value], result.machine.values)
-    assert np.array_equal([row.drawing for row in value], result.session.machine.values)
+    assert np.array_equal([row.nominal for row in value], result.session.machine.values)
     variance = np.diag(result.estimate.covariance)
     assert np.allclose([row.sigma**2 for row in value], variance, atol=1e-30)
     row = value["legs[2].base.center.x"]
     assert row == value[table.index("legs[2].base.center.x")]
-    assert row.change == row.value - row.drawing
+    assert row.change == row.value - row.nominal
     assert [r.value for r in loaded.parameters] == [r.value for r in value]
     assert [r.decided_by for r in loaded.parameters] == [r.decided_by for r in value]
     with pytest.raises(InputError, match=r"such as 'legs\[2\].base.center.x'"):
@@ -229,11 +229,11 @@ def axes(monkeypatch):
 
 def test_plots_show_the_numbers(result, loaded, axes):
     assert result.plot_tool(ax=axes) is axes
-    drawing, calibrated = (np.asarray(line.get_ydata()) for line in axes.get_lines())
+    nominal, calibrated = (np.asarray(line.get_ydata()) for line in axes.get_lines())
     poses = result.estimate.state.T_base_platform[result.estimate.configurations]
     tool = result.tool_error(poses)
     assert np.allclose(np.sort(calibrated), np.sort(tool.position) * 1e3)
-    assert np.allclose(np.sort(drawing), np.sort(tool.off_position) * 1e3)
+    assert np.allclose(np.sort(nominal), np.sort(tool.off_position) * 1e3)
     for one in (result, loaded):
         ax = one.plot_parameters()
         free = [r for r in one.parameters if r.decided_by in ("data", "drawing")]

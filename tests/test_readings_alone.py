@@ -69,17 +69,17 @@ def alone(joints, noise):
     return Measurements(EdgeSet.empty(), joints, noise, 0, np.zeros(0, dtype=int))
 
 
-def estimate(drawing, joints, noise):
+def estimate(nominal, joints, noise):
     given = alone(joints, noise)
-    return bundle(drawing, given, start_state(drawing, given, np.zeros((0, 4, 4))))
+    return bundle(nominal, given, start_state(nominal, given, np.zeros((0, 4, 4))))
 
 
 def whitened(value, truth):
     """The parameters' errors in the result's frames, along the covariance's axes, in sigmas."""
     from pkmcal.identify.gauge import default_gauge, in_gauge
 
-    drawing = value.machine.with_values(value.machine.parameters.drawing)
-    true = in_gauge(drawing, replace(value.state, theta=truth.values), default_gauge(drawing)).theta
+    nominal = value.machine.with_values(value.machine.parameters.nominal)
+    true = in_gauge(nominal, replace(value.state, theta=truth.values), default_gauge(nominal)).theta
     error, c = value.machine.values - true, value.covariance
     above_limit = np.flatnonzero(np.diag(c) > 0)
     error, c = error[above_limit], c[np.ix_(above_limit, above_limit)]
@@ -102,16 +102,16 @@ def test_the_truth_is_within_the_stated_deviations(make, noise, n):
     """Twenty-one machines with errors as large as the prior sigmas; the noise is stated three times
     too large, three times too small, and right, and is estimated.
     """
-    drawing, rng = make(), np.random.default_rng(3)
-    assert drawing.redundancy == drawing.n_joints - drawing.layout.own_motion.shape[1] > 0
+    nominal, rng = make(), np.random.default_rng(3)
+    assert nominal.redundancy == nominal.n_joints - nominal.layout.own_motion.shape[1] > 0
     errors, scales = [], []
-    poses = draw_configurations(drawing, n, 0.0, rng)[0][:n]
+    poses = draw_configurations(nominal, n, 0.0, rng)[0][:n]
     for run in range(21):
-        truth = true_machine(drawing, 1.0, rng)
+        truth = true_machine(nominal, 1.0, rng)
         joints = truth.inverse(poses)
         joints = joints + noise * rng.standard_normal(joints.shape)
         stated = (3.0, 1 / 3, 1.0)[run % 3]
-        value = estimate(drawing, joints, noise * stated)
+        value = estimate(nominal, joints, noise * stated)
         errors.append(whitened(value, truth))
         scales.append(value.statistics.reading_scale * stated)
         low, high = value.statistics.reading_range
@@ -126,15 +126,15 @@ def test_the_truth_is_within_the_stated_deviations(make, noise, n):
 
 def test_without_a_drawing_worth_the_name():
     """Tolerances of half a metre: the data determine all but the frame."""
-    drawing = load_mechanism("four-belt")
-    document = drawing.document.model_copy(
-        update={"tolerance": drawing.document.tolerance.model_copy(update={"center": 0.5})}
+    nominal = load_mechanism("four-belt")
+    document = nominal.document.model_copy(
+        update={"tolerance": nominal.document.tolerance.model_copy(update={"center": 0.5})}
     )
-    drawing = machine_from_document(document)
+    nominal = machine_from_document(document)
     rng = np.random.default_rng(4)
-    truth = true_machine(drawing, 0.2, rng)
+    truth = true_machine(nominal, 0.2, rng)
     joints = readings(truth, 25, rng)
-    values = estimate(drawing, joints, 1e-6)
+    values = estimate(nominal, joints, 1e-6)
     np.testing.assert_allclose(whitened(values, truth), 0, atol=1e4)
     a = truth.base_centers()
     b = values.machine.base_centers()
@@ -148,9 +148,9 @@ def test_without_a_drawing_worth_the_name():
 # ------------------------------------------------------------------ sessions
 
 
-def write(folder, drawing, joints, noise):
+def write(folder, nominal, joints, noise):
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "mechanism.yaml").write_text(mechanism_text(drawing), encoding="utf-8")
+    (folder / "mechanism.yaml").write_text(mechanism_text(nominal), encoding="utf-8")
     names = [f"{k:03d}" for k in range(len(joints))]
     columns = [f"leg{k + 1}" for k in range(joints.shape[1])]
     (folder / "joints.csv").write_text(csv_text(columns, names, joints), encoding="utf-8")
@@ -166,12 +166,12 @@ def write(folder, drawing, joints, noise):
 @pytest.fixture(scope="module")
 def belts(tmp_path_factory):
     """Folder and truth of a session of 30 poses, whose noise is stated ten times too small."""
-    drawing, rng = load_mechanism("four-belt"), np.random.default_rng(5)
-    truth = true_machine(drawing, 1.0, rng)
+    nominal, rng = load_mechanism("four-belt"), np.random.default_rng(5)
+    truth = true_machine(nominal, 1.0, rng)
     joints = readings(truth, 30, rng)
     joints = joints + NOISE * rng.standard_normal(joints.shape)
     folder = tmp_path_factory.mktemp("alone") / "belts"
-    return write(folder, drawing, joints, NOISE / 10), truth
+    return write(folder, nominal, joints, NOISE / 10), truth
 
 
 def test_a_session_of_readings_is_calibrated_from_the_command_line(belts):
@@ -215,27 +215,27 @@ def test_new_readings_tell_whether_the_machine_changed(belts, tmp_path):
 
 def test_repeats_of_a_pose_count_once(tmp_path):
     """The model's error is the same in all repeats: four of each do not halve sigma."""
-    drawing, rng = load_mechanism("four-belt"), np.random.default_rng(7)
-    truth = true_machine(drawing, 1.0, rng)
+    nominal, rng = load_mechanism("four-belt"), np.random.default_rng(7)
+    truth = true_machine(nominal, 1.0, rng)
     joints = readings(truth, 20, rng)
     joints = joints + NOISE * rng.standard_normal(joints.shape)
     again = np.repeat(joints, 4, axis=0) + 1e-4 * rng.standard_normal((80, 4))
-    session = load_session(write(tmp_path / "repeats", drawing, again, NOISE))
+    session = load_session(write(tmp_path / "repeats", nominal, again, NOISE))
     assert session.configurations == tuple(f"{4 * k:03d}" for k in range(20))
     np.testing.assert_allclose(session.joints, again.reshape(20, 4, 4).mean(axis=1), atol=1e-15)
     (values,) = session.findings
     assert values.code == "readings.repeated_poses"
     assert (values.facts["number"], values.facts["poses"]) == (80, 20)
-    once = calibrate_session(write(tmp_path / "once", drawing, joints, NOISE)).estimate
+    once = calibrate_session(write(tmp_path / "once", nominal, joints, NOISE)).estimate
     calibration = calibrate_session(session).estimate
     sigma = [np.sqrt(np.trace(e.covariance)) for e in (once, calibration)]
     assert sigma[1] == pytest.approx(sigma[0], rel=0.1)
 
 
 def test_a_machine_without_redundancy_is_refused(tmp_path):
-    drawing = load_mechanism("3-rpr")
-    joints = readings(drawing, 10, np.random.default_rng(0))
-    folder = write(tmp_path / "three", drawing, joints, 1e-5)
+    nominal = load_mechanism("3-rpr")
+    joints = readings(nominal, 10, np.random.default_rng(0))
+    folder = write(tmp_path / "three", nominal, joints, 1e-5)
     with pytest.raises(InputError, match="no more of them than freedoms") as refused:
         load_session(folder)
     assert refused.value.found == "3 readings for 3 freedoms"
@@ -244,10 +244,10 @@ def test_a_machine_without_redundancy_is_refused(tmp_path):
 
 def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path):
     """A centimetre, where an offset is drawn to five millimetres."""
-    drawing, rng = load_mechanism("four-belt"), np.random.default_rng(8)
-    joints = readings(drawing, 20, rng)
+    nominal, rng = load_mechanism("four-belt"), np.random.default_rng(8)
+    joints = readings(nominal, 20, rng)
     joints = joints + 0.01 * rng.standard_normal(joints.shape)
-    calibration = calibrate_session(write(tmp_path / "wild", drawing, joints, NOISE))
+    calibration = calibrate_session(write(tmp_path / "wild", nominal, joints, NOISE))
     assert not calibration.verdict.usable
     assert calibration.verdict.of("readings.noise_beyond_tolerance")
 

@@ -357,8 +357,8 @@ def test_repeats_without_an_edge_in_common_are_no_accuracy():
 
 def simulated(folder, repeats, *, size=(480, 360), **more):
     settings = Settings(**{"stations": 2, "configurations": 4, "repeats": repeats, **more})
-    drawing = load_mechanism("gough-stewart")
-    return rendered(folder, drawing, camera_of_size(size), settings, seed=5)
+    nominal = load_mechanism("gough-stewart")
+    return rendered(folder, nominal, camera_of_size(size), settings, seed=5)
 
 
 @pytest.fixture(scope="module")

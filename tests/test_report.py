@@ -70,7 +70,7 @@ def test_table_rows_carry_value_change_and_sigma(case):
     row = rows["legs[2].base.center.x"]
     k = case.session.machine.parameters.index(row.name)
     after = case.estimate.machine.values[k] * 1e3
-    assert (row.sigma, row.unit, row.drawing) == ("0.034", "mm", "269.300")
+    assert (row.sigma, row.unit, row.nominal) == ("0.034", "mm", "269.300")
     assert row.calibrated == f"{after:.3f}"
     assert row.change == f"{after - 269.3:+.3f}".replace("-", "−")
     assert rows["legs[1].base.center.y"].source == "frame"
@@ -155,13 +155,13 @@ def test_uncertainty_does_not_depend_on_the_frame(case):
 def test_drawing_is_laid_over_before_the_change_is_told(case):
     session, estimate = case.session, case.estimate
     turned = np.array([0.01, -0.02, 0.03, 0.1, 0.2, 0.3])
-    drawing, values = session.machine, session.machine.values.copy()
-    index = drawing.layout.base[0].index[:, :3]
+    nominal, values = session.machine, session.machine.values.copy()
+    index = nominal.layout.base[0].index[:, :3]
     values[index] = apply(perturb(np.eye(4), turned), values[index])
-    base, platform = joint_centres(drawing, drawing.with_values(values), estimate.covariance)
+    base, platform = joint_centres(nominal, nominal.with_values(values), estimate.covariance)
     assert np.abs(base.change).max() < 1e-12
     assert np.abs(platform.change).max() < 1e-12
-    tool = tool_error(drawing, estimate.machine, estimate.covariance,
+    tool = tool_error(nominal, estimate.machine, estimate.covariance,
                       estimate.state.T_base_platform[[1, 3]], session.joints[[1, 3]])  # fmt: skip
     assert (tool.position > 1e-5).all()
     assert (tool.off_position > 1e-4).all()
@@ -225,10 +225,10 @@ def test_joints_are_drawn_where_the_camera_sees_them(case):
     for spot in shot.spots:
         side, T = (base, T_camera_base) if spot.end == "base" else (platform, T_camera_base @ pose)
         new, old = (
-            project(apply(T, points[spot.leg - 1])) for points in (side.calibrated, side.drawing)
+            project(apply(T, points[spot.leg - 1])) for points in (side.calibrated, side.nominal)
         )
         np.testing.assert_allclose(spot.calibrated, new, atol=0.051)  # one decimal is written
-        np.testing.assert_allclose(spot.drawing, old, atol=0.051)
+        np.testing.assert_allclose(spot.nominal, old, atol=0.051)
 
 
 def test_straight_curves_are_two_points_and_bent_ones_are_kept():
@@ -348,8 +348,8 @@ def test_a_session_is_called_by_its_folder_or_the_one_around_it(case):
 
 
 def test_the_table_can_be_taken_along(case):
-    estimate, drawing = case.estimate, case.session.machine
-    html = str(parameters.section(drawing, estimate).html)
+    estimate, nominal = case.estimate, case.session.machine
+    html = str(parameters.section(nominal, estimate).html)
     results = dict(re.findall(r'<a download="([\w.]+)" href="data:[^"]*;base64,([\w+/=]+)"', html))
     texts = {name: base64.b64decode(packed).decode("utf-8") for name, packed in results.items()}
     assert set(texts) == {"parameters.csv", "parameters.tex", "parameters.json"}
@@ -357,7 +357,7 @@ def test_the_table_can_be_taken_along(case):
     table = estimate.machine.parameters
     assert [row["name"] for row in rows] == list(table.names)
     assert [float(row["value"]) for row in rows] == estimate.machine.values.tolist()
-    assert [float(row["drawing"]) for row in rows] == drawing.values.tolist()
+    assert [float(row["drawing"]) for row in rows] == nominal.values.tolist()
     sigma = np.sqrt(np.diag(estimate.covariance))
     np.testing.assert_allclose([float(row["sigma"]) for row in rows], sigma, atol=1e-9)
     again = json.loads(texts["parameters.json"])["parameters"]

@@ -97,18 +97,18 @@ def edges_of(machine, T_camera_base, poses, joints, shift) -> EdgeSet:
 
 def make_case(folder: Path, n_poses=5, n_stations=3, station="front", prefix="c") -> Case:
     rng = np.random.default_rng(7)
-    drawing = load_mechanism("gough-stewart")
-    errors = 1e-3 * rng.normal(size=len(drawing.parameters))
-    errors[drawing.parameters.of_kind("radius")] = 0
-    machine = drawing.with_values(drawing.values + errors)
-    poses = perturb(drawing.home(), 0.05 * rng.normal(size=(n_poses, 6)))
+    nominal = load_mechanism("gough-stewart")
+    errors = 1e-3 * rng.normal(size=len(nominal.parameters))
+    errors[nominal.parameters.of_kind("radius")] = 0
+    machine = nominal.with_values(nominal.values + errors)
+    poses = perturb(nominal.home(), 0.05 * rng.normal(size=(n_poses, 6)))
     joints = machine.inverse(poses)
     angle = 2 * np.pi * np.arange(n_stations) / n_stations + 0.4
     places = np.stack([np.cos(angle), np.sin(angle), 0.3 + 0 * angle], -1)
     T = np.stack([look_at(p, np.array([0, 0, 0.17]), np.array([0, 0, 1.0])) for p in places])
     edges = edges_of(machine, T, poses, joints, OUTWARD + CAMERA_SHIFT)
     return Case(
-        make_session(folder, drawing, joints, T, station, prefix),
+        make_session(folder, nominal, joints, T, station, prefix),
         Observation(edges, rejected(), np.zeros((0, 2)), np.zeros(0, int), T),
         make_estimate(machine, poses, T, edges, rng),
     )
@@ -122,7 +122,7 @@ def rejected() -> tuple[Rejection, ...]:
     )
 
 
-def make_session(folder, drawing, joints, T, station, prefix) -> Session:
+def make_session(folder, nominal, joints, T, station, prefix) -> Session:
     stations = []
     for s, pose in enumerate(T):
         photographs = []
@@ -137,7 +137,7 @@ def make_session(folder, drawing, joints, T, station, prefix) -> Session:
         )
     return Session(
         folder=folder,
-        machine=drawing,
+        machine=nominal,
         configurations=tuple(f"{prefix}{k}" for k in range(len(joints))),
         joints=joints,
         joint_noise=3e-6,

@@ -80,7 +80,7 @@ def test_a_whole_session_has_nothing_to_list():
     table = load_mechanism("gough-stewart").parameters
     assert directions_headline(findings).startswith("The data fix 42 of 42 directions (")
     assert directions_headline(findings).endswith(
-        "Each is known better from the data than from the drawing."
+        "Each is known better from the data than from the nominal model."
     )
     assert findings.unidentified == findings.weak == ()
     assert (held_text(findings, table), tied(table)) == ("", "")
@@ -95,7 +95,7 @@ def test_the_spectrum_shows_lost_directions_as_stubs(apart):
     assert bars[-1].tip == "Direction 42: the data do not determine it"
     assert not bars[-1].quiet
     assert bars[0].quiet
-    assert "times better than the drawing" in bars[0].tip
+    assert "times better than the nominal model" in bars[0].tip
     # the line where data and nominal model have equal information is the tick with 1
     assert (drawn.curve[0][1], "1") in drawn.ticks
 
@@ -107,7 +107,7 @@ def test_what_was_held_is_said_with_its_reason(apart):
     )
     text = held_text(apart, table)
     assert text.startswith("Leg 1 base centre x, leg 1 base centre y, leg 1 base centre z and")
-    assert "under fixed, so the drawing's value counts as exact" in text
+    assert "under fixed, so the nominal model's value counts as exact" in text
     assert (
         tied(table)
         == "Changes together, as one value: leg 3 length offset and leg 4 length offset."

@@ -129,8 +129,8 @@ def test_a_wrong_radius_scales_the_machine(short):
 def test_what_is_believed_is_what_was_estimated(short, ran):
     given = short.values("centres", CONTROLLED_POPULATION, CONTROLLED_POPULATION, ROBUST_REGRESSION)
     np.testing.assert_allclose(ran.centres[E2], given, atol=1e-12)
-    drawing = hexapod_with_cylinder_legs().base_centers()
-    apart = np.linalg.norm(drawing[:, None] - drawing, axis=-1)
+    nominal = hexapod_with_cylinder_legs().base_centers()
+    apart = np.linalg.norm(nominal[:, None] - nominal, axis=-1)
     for name in (E1, *CAMERA_BY_HAND_ERRORS):
         items = ran.centres[name]
         values = np.linalg.norm(items[:, :, None] - items[:, None], axis=-1)

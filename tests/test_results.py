@@ -50,7 +50,7 @@ def test_it_comes_back(calibrated, tmp_path):
     save(calibrated, tmp_path / "out")
     saved, estimate = load(tmp_path / "out"), calibrated.estimate
     assert np.array_equal(saved.machine.values, estimate.machine.values)
-    assert np.array_equal(saved.drawing, calibrated.session.machine.values)
+    assert np.array_equal(saved.nominal, calibrated.session.machine.values)
     assert np.array_equal(saved.covariance, estimate.covariance)
     assert np.array_equal(saved.sigma, np.sqrt(np.diag(estimate.covariance)))
     assert np.array_equal(saved.data_share, estimate.data_share, equal_nan=True)

@@ -235,7 +235,7 @@ def test_a_calibration_from_before_scales_has_exact_ones(demo, tmp_path):
     now = load_mechanism("gough-stewart")
     _check_machine(saved, SimpleNamespace(machine=now))
     other = now.with_values(now.values + 0.1)
-    table = replace(now.parameters, drawing=other.values)
+    table = replace(now.parameters, nominal=other.values)
     with pytest.raises(InputError, match="another machine"):
         _check_machine(saved, SimpleNamespace(machine=replace(other, parameters=table)))
     again = machine_from_document(now.document)

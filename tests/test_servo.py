@@ -396,13 +396,13 @@ def test_estimates_have_the_errors_asked_for(eye):
     table = eye.true.machine.parameters
     sigma = np.where(np.array(table.units) == "m", 6e-5, 0.0)
     unsure = Uncertainty(np.diag(sigma**2), np.full(3, 1e-4), np.full(3, 2e-4))
-    drawing = eye.true.theta + 1e-3 * np.sin(np.arange(len(sigma)))
+    nominal = eye.true.theta + 1e-3 * np.sin(np.arange(len(sigma)))
     rng = np.random.default_rng(0)
-    true, identified, cad, hand = estimates(eye.true, drawing, unsure, 300, rng, 0.05, 0.1)
+    true, identified, cad, hand = estimates(eye.true, nominal, unsure, 300, rng, 0.05, 0.1)
     assert np.all(true.view.theta == eye.true.theta)
     off = identified.view.theta - eye.true.theta
     np.testing.assert_allclose(off.std(axis=0), sigma, rtol=0.2)
-    np.testing.assert_allclose(cad.view.theta, drawing)
+    np.testing.assert_allclose(cad.view.theta, nominal)
     # eq. 15: the nominal model fits the identified base centres as well as possible
     index = [table.names.index(f"legs[{j}].base.center.{x}") for j in range(1, 7) for x in "xyz"]
     a = [apply(e.view.T_camera_base[:, None], e.view.theta[..., index].reshape(-1, 6, 3))
@@ -411,7 +411,7 @@ def test_estimates_have_the_errors_asked_for(eye):
     assert np.abs(gap.mean(axis=1)).max() < 1e-12
     assert np.sqrt(np.mean(gap**2)) < 1.2e-3
     place = inverse(hand.view.T_camera_base)
-    exact = inverse(estimates(eye.true, drawing, unsure, 2, rng, 0.0, 0.0)[3].view.T_camera_base)
+    exact = inverse(estimates(eye.true, nominal, unsure, 2, rng, 0.0, 0.0)[3].view.T_camera_base)
     np.testing.assert_allclose(
         np.linalg.norm(place[:, :3, 3] - exact[0, :3, 3], axis=-1), 0.05, atol=1e-9
     )

@@ -397,9 +397,9 @@ def test_true_machines_follow_the_tolerances(machine):
     held = "legs[1].base.center.x"
     tie = ("legs[2].length.offset", "legs[3].length.offset")
     table = machine.parameters.with_roles((held,), (tie,))
-    drawing = replace(machine, parameters=table)
+    nominal = replace(machine, parameters=table)
     rng = np.random.default_rng(0)
-    step = np.stack([true_machine(drawing, 2.0, rng).values for _ in range(400)]) - drawing.values
+    step = np.stack([true_machine(nominal, 2.0, rng).values for _ in range(400)]) - nominal.values
     assert np.all(step[:, table.index(held)] == 0)
     np.testing.assert_array_equal(*(step[:, table.index(name)] for name in tie))
     spread = np.delete(step / table.tolerance, table.index(held), axis=1).std(axis=0)

@@ -67,16 +67,16 @@ def seen_along(parts, origin, targets):
 
 
 def test_rods_without_cylinders_get_one(machine):
-    drawing = load_mechanism(machine.name)
-    assert not any(leg.tubes for leg in drawing.document.legs)
+    nominal = load_mechanism(machine.name)
+    assert not any(leg.tubes for leg in nominal.document.legs)
     length = machine.document.legs[0].length.constant
     for leg in machine.document.legs:
         (tube,) = leg.tubes
         assert 0 < tube.start < 0.1 * length
         assert 0.9 * length < tube.stop < length
         assert tube.radius == pytest.approx(0.02 * length, abs=0.00026)
-    assert machine.layout.motion.shape == drawing.layout.motion.shape
-    assert len(machine.parameters) == len(drawing.parameters) + machine.n_legs
+    assert machine.layout.motion.shape == nominal.layout.motion.shape
+    assert len(machine.parameters) == len(nominal.parameters) + machine.n_legs
     assert with_forearms(machine) is machine
 
 
@@ -249,8 +249,8 @@ def photographed(folder, name, camera, configurations, board, seed):
         stations=1, configurations=configurations, joint_noise=1e-5, board=board,
         board_on="platform",
     )  # fmt: skip
-    drawing = with_forearms(load_mechanism(name))
-    return rendered(folder, drawing, camera, settings, seed)
+    nominal = with_forearms(load_mechanism(name))
+    return rendered(folder, nominal, camera, settings, seed)
 
 
 def observing(folder, words):
@@ -277,8 +277,8 @@ def test_forearms_and_board_in_photographs(mixed):
     assert value.verdict.usable
     assert value.estimate.statistics.n_poses >= 6 * 2
     assert len(value.observation.edges) > 40
-    assert errors.calibrated.position < errors.drawing.position / 10
-    assert errors.calibrated.orientation < errors.drawing.orientation / 10
+    assert errors.calibrated.position < errors.nominal.position / 10
+    assert errors.calibrated.orientation < errors.nominal.orientation / 10
 
 
 @pytest.mark.slow
@@ -286,7 +286,7 @@ def test_forearms_alone_in_photographs(mixed):
     value = pkmcal.calibrate(observing(mixed, "legs"))
     errors = compare_with_truth(value, mixed)
     assert value.estimate.statistics.n_poses == 0
-    assert errors.calibrated.position < errors.drawing.position / 5
+    assert errors.calibrated.position < errors.nominal.position / 5
 
 
 @pytest.mark.slow
@@ -335,16 +335,16 @@ def test_legs_and_board_know_more_than_each(name, tmp_path):
     sigma = []
     for words in ("legs", "board", ["legs", "board"]):
         value = pkmcal.calibrate(observing(folder, words))
-        drawing = value.session.machine
-        z = whitened(drawing, value.estimate, load_truth(folder, drawing))
+        nominal = value.session.machine
+        z = whitened(nominal, value.estimate, load_truth(folder, nominal))
         assert np.sqrt(np.mean(z**2)) < 1.3
         errors = compare_with_truth(value, folder)
-        assert errors.calibrated.position < errors.drawing.position
+        assert errors.calibrated.position < errors.nominal.position
         sigma.append(np.sqrt(np.diag(value.estimate.covariance)))
-    kinematic = np.array(drawing.parameters.kinds) != "radius"
+    kinematic = np.array(nominal.parameters.kinds) != "radius"
     legs, board, both = (np.median(s[kinematic & (s > 1e-9)]) for s in sigma)
     assert both < min(legs, board)
-    assert errors.calibrated.position < errors.drawing.position / 3
+    assert errors.calibrated.position < errors.nominal.position / 3
 
 
 def test_a_home_that_a_limb_does_not_reach_is_told_with_its_file(tmp_path):

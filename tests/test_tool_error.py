@@ -36,11 +36,11 @@ def known(machine, share=0.02):
 
 @pytest.fixture(scope="module")
 def small():
-    """A hexapod whose drawing is off, with a covariance, in a few poses."""
-    drawing = load_mechanism("gough-stewart")
-    machine = true_machine(drawing, 1.0, np.random.default_rng(2))
+    """A hexapod whose nominal model is off, with a covariance, in a few poses."""
+    nominal = load_mechanism("gough-stewart")
+    machine = true_machine(nominal, 1.0, np.random.default_rng(2))
     poses = poses_in(machine.limits(), Region(turn=0.2), 12)
-    return SimpleNamespace(drawing=drawing, machine=machine, poses=poses, covariance=known(machine))
+    return SimpleNamespace(nominal=nominal, machine=machine, poses=poses, covariance=known(machine))
 
 
 def drawn_poses(case, draws=1500):
@@ -64,7 +64,7 @@ def drawn_poses(case, draws=1500):
 def test_sigma_is_the_scatter_of_machines_drawn_by_the_covariance(small):
     """Each drawn machine is laid over by all joint centres, with no word of derivatives."""
     values = tool_error(
-        small.drawing, small.machine, free_of_gauge(small.machine, small.covariance), small.poses
+        small.nominal, small.machine, free_of_gauge(small.machine, small.covariance), small.poses
     )
     count = drawn_poses(small)
     scatter = np.einsum("dni,dnj->nij", count, count) / len(count)
@@ -82,19 +82,19 @@ def test_what_frames_do_is_in_no_sigma_where_only_boards_saw_the_machine(small):
 
     by = generators(small.machine.layout, small.machine.values) @ freedoms(small.machine)
     covariance = 1e-6 * by @ by.T
-    values = tool_error(small.drawing, small.machine, covariance, small.poses, legs_observed=False)
-    loose = tool_error(small.drawing, small.machine, covariance, small.poses)
+    values = tool_error(small.nominal, small.machine, covariance, small.poses, legs_observed=False)
+    loose = tool_error(small.nominal, small.machine, covariance, small.poses)
     assert loose.position.min() > 1e-4
     assert values.position.max() < 1e-9
 
 
 def test_the_drawings_error_is_that_of_its_poses_at_the_same_readings(small):
-    machine, drawing = small.machine, small.drawing
-    values = tool_error(drawing, machine, small.covariance, small.poses)
+    machine, nominal = small.machine, small.nominal
+    values = tool_error(nominal, machine, small.covariance, small.poses)
     joints = machine.inverse(small.poses)
-    base = laid_over(drawing.base_centers(), machine.base_centers())
-    platform = laid_over(drawing.platform_centers(), machine.platform_centers())
-    before = base @ drawing.forward(joints) @ inverse(platform)
+    base = laid_over(nominal.base_centers(), machine.base_centers())
+    platform = laid_over(nominal.platform_centers(), machine.platform_centers())
+    before = base @ nominal.forward(joints) @ inverse(platform)
     distance = np.linalg.norm(before[:, :3, 3] - small.poses[:, :3, 3], axis=1)
     np.testing.assert_allclose(values.off_position, distance, rtol=1e-9)
     assert distance.max() > 1e-4
@@ -105,7 +105,7 @@ def test_the_drawings_error_is_that_of_its_poses_at_the_same_readings(small):
 
 def test_frames_by_some_of_the_poses(small):
     """Fitted on all poses or on those that are asked for alone, the same where these are all."""
-    arguments = small.drawing, small.machine, small.covariance
+    arguments = small.nominal, small.machine, small.covariance
     whole = tool_error(*arguments, small.poses, legs_observed=False)
     named = tool_error(*arguments, small.poses, legs_observed=False, fitted=np.arange(12))
     some = tool_error(*arguments, small.poses, legs_observed=False, fitted=np.arange(6))
@@ -132,7 +132,7 @@ def test_from_a_calibration_and_from_its_file(calibrated, tmp_path):
     assert (values.position > 0).all()
     np.testing.assert_allclose(again.position, values.position, rtol=1e-9)
     np.testing.assert_allclose(again.off, values.off, rtol=1e-6, atol=1e-12)
-    assert (values.off_position > 1.5 * values.position).all()  # the drawing was off by more
+    assert (values.off_position > 1.5 * values.position).all()  # the nominal model was off by more
     with pytest.raises(InputError, match="what are no poses"):
         calibrated.tool_error(poses[0])
 
@@ -145,9 +145,9 @@ def test_from_a_calibration_and_from_its_file(calibrated, tmp_path):
     [pytest.param(n, marks=pytest.mark.slow) if n == "h4-rods" else n for n in sorted(catalogue())],
 )
 def test_every_machine_has_a_map(name):
-    drawing = load_mechanism(name)
-    machine = true_machine(drawing, 0.2, np.random.default_rng(3))
-    made = map_of(drawing, machine, known(machine))
+    nominal = load_mechanism(name)
+    machine = true_machine(nominal, 0.2, np.random.default_rng(3))
+    made = map_of(nominal, machine, known(machine))
     assert made.spread == 250
     assert np.isfinite(made.after.position).all()
     assert (made.after.position > 0).all()
@@ -160,7 +160,7 @@ def test_every_machine_has_a_map(name):
         assert np.abs(place[:, cut.across] - u[there]).max() < 0.26 * cell
         assert np.abs(place[:, cut.up] - v[there]).max() < 0.26 * cell
         assert np.abs(place[:, cut.normal] - cut.level).max() < 0.26 * cell
-    # by the drawing's tolerances alone, fifty times what is known
+    # by the nominal model's tolerances alone, fifty times what is known
     ratio = np.median(made.before.position) / np.median(made.after.position)
     assert 20 < ratio < 120
 
@@ -168,7 +168,7 @@ def test_every_machine_has_a_map(name):
 def test_a_map_of_a_region(small):
     """Inside it, and what its document tells."""
     region = Region(x=(-0.02, 0.03), y=(0.0, 0.04))
-    made = map_of(small.drawing, small.machine, small.covariance, region)
+    made = map_of(small.nominal, small.machine, small.covariance, region)
     place = made.after.T_base_platform[:, :3, 3]
     assert place[:, 0].min() > -0.021
     assert place[:, 1].max() < 0.041
@@ -184,12 +184,12 @@ def test_a_map_of_a_region(small):
 
 def page_of(name, **region):
     """The report's section of a machine whose map is made, and the map."""
-    drawing = load_mechanism(name)
-    machine = true_machine(drawing, 0.2, np.random.default_rng(3))
-    made = map_of(drawing, machine, known(machine), Region(**region))
+    nominal = load_mechanism(name)
+    machine = true_machine(nominal, 0.2, np.random.default_rng(3))
+    made = map_of(nominal, machine, known(machine), Region(**region))
     state = SimpleNamespace(T_base_platform=made.after.T_base_platform[:4])
     estimate = SimpleNamespace(configurations=np.ones(4, dtype=bool), state=state)
-    session = SimpleNamespace(machine=drawing, configurations=tuple("abcd"))
+    session = SimpleNamespace(machine=nominal, configurations=tuple("abcd"))
     return section(session, estimate, made, Links.of([])), made
 
 
@@ -274,15 +274,15 @@ def test_frames_are_no_error(small):
 
 def test_errors_beside_a_known_machine_are_those_of_its_poses(small):
     joints = small.machine.inverse(small.poses)
-    error = compare(small.drawing, small.machine, joints)
-    there = error.T_base @ small.drawing.forward(joints) @ inverse(error.T_platform)
+    error = compare(small.nominal, small.machine, joints)
+    there = error.T_base @ small.nominal.forward(joints) @ inverse(error.T_platform)
     off = pose_difference(there, small.poses)
     np.testing.assert_allclose(error.position, np.linalg.norm(off[:, 3:], axis=1), atol=1e-12)
     np.testing.assert_allclose(error.orientation, np.linalg.norm(off[:, :3], axis=1), atol=1e-12)
-    k = small.drawing.parameters.of_kind("offset")
-    np.testing.assert_allclose(error.offset, (small.drawing.values - small.machine.values)[k])
+    k = small.nominal.parameters.of_kind("offset")
+    np.testing.assert_allclose(error.offset, (small.nominal.values - small.machine.values)[k])
     # by the poses too, where no legs tell where the joints are: never further apart
-    by_poses = compare(small.drawing, small.machine, joints, legs_observed=False)
+    by_poses = compare(small.nominal, small.machine, joints, legs_observed=False)
     assert np.sum(by_poses.position**2) < np.sum(error.position**2)
 
 

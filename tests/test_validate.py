@@ -28,7 +28,7 @@ from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.start import start_state
 from pkmcal.judge.comparison import (
-    compare_with_drawing,
+    compare_with_nominal,
     finite_rms,
     improvement_ratio,
     promise,
@@ -57,9 +57,9 @@ STATIONS = 3
 
 def legs_case(seed, true=None):
     """A hexapod's edges from three stations, eight configurations each."""
-    drawing, camera = exact("gough-stewart"), demo_camera()
+    nominal, camera = exact("gough-stewart"), demo_camera()
     settings = Settings(stations=STATIONS, configurations=8)
-    truth = draw_truth(drawing, (camera,) * STATIONS, settings, seed)
+    truth = draw_truth(nominal, (camera,) * STATIONS, settings, seed)
     true = true or truth.machine
     rng = np.random.default_rng(seed)
     edges, readings = simulate_edges(
@@ -67,23 +67,23 @@ def legs_case(seed, true=None):
         photographs=truth.photographs,
     )  # fmt: skip
     data = Measurements(edges, readings, 3e-6, STATIONS, np.zeros(STATIONS, dtype=int))
-    return drawing, true, truth.T_camera_base, data
+    return nominal, true, truth.T_camera_base, data
 
 
 def calibrated(seed):
-    drawing, true, stations, data = legs_case(seed)
-    return drawing, true, bundle(drawing, data, start_state(drawing, data, stations)), data
+    nominal, true, stations, data = legs_case(seed)
+    return nominal, true, bundle(nominal, data, start_state(nominal, data, stations)), data
 
 
 def seen_by(machine, data, stations):
     return predict(machine, data, start_state(machine, data, stations))
 
 
-def judged_on(drawing, estimate, machine, data, stations):
+def judged_on(nominal, estimate, machine, data, stations):
     value = seen_by(machine, data, stations)
-    by_drawing = seen_by(drawing, data, stations)
+    by_nominal = seen_by(nominal, data, stations)
     rows = np.flatnonzero(value.observed)
-    return compare_with_drawing(drawing, estimate.covariance, data, value, by_drawing, rows)
+    return compare_with_nominal(nominal, estimate.covariance, data, value, by_nominal, rows)
 
 
 def changed(machine, name, by):
@@ -106,12 +106,12 @@ def new(hexapod):
 @pytest.fixture(scope="module")
 def h4():
     """[C]'s machine and its calibration from 71 poses."""
-    drawing = load_mechanism("h4", model="calibration")
+    nominal = load_mechanism("h4", model="calibration")
     rng = np.random.default_rng(3)
-    true = true_machine(drawing, 1.0, rng)
+    true = true_machine(nominal, 1.0, rng)
     case = papers_case(true, rng)
-    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
-    return drawing, true, bundle(drawing, case.measurements, start), case, rng
+    start = start_state(nominal, case.measurements, T_CAMERA_BASE[None])
+    return nominal, true, bundle(nominal, case.measurements, start), case, rng
 
 
 # the machine held
@@ -126,11 +126,11 @@ def test_held_leaves_radii_alone_free():
 
 
 def test_residuals_scatter_as_promised(hexapod):
-    drawing, true, estimate, _ = hexapod
+    nominal, true, estimate, _ = hexapod
     chi2 = []
     for seed in range(60, 63):
         _, _, stations, data = legs_case(seed, true)
-        chi2.append(judged_on(drawing, estimate, estimate.machine, data, stations).promise)
+        chi2.append(judged_on(nominal, estimate, estimate.machine, data, stations).promise)
     share = np.mean([test.chi2 / test.dof for test in chi2])
     assert abs(share - 1) < 0.2  # one calibration in all of them; its error is 4 % of the noise
     assert all(test.holds for test in chi2)
@@ -166,7 +166,7 @@ def test_a_refined_camera_is_no_part_of_the_machine(hexapod, new):
 
 
 def test_own_readings_have_no_part_where_a_board_needs_the_others(h4):
-    drawing, _, estimate, case, _ = h4
+    nominal, _, estimate, case, _ = h4
     few = select(case.measurements, np.arange(71) < 12)
     few = replace(few, joints=few.joints[:12])
     wrong = replace(few, joints=few.joints + 1e-2 * (np.arange(12) == 4)[:, None])
@@ -176,7 +176,7 @@ def test_own_readings_have_no_part_where_a_board_needs_the_others(h4):
     assert np.abs(shift - 1e-2).max() < 2e-4  # to first order of a leave-one-out by leverage
     # the others do take notice, through the camera's and the board's place
     assert np.abs(bad.errors.residuals[5] - good.errors.residuals[5]).max() > 1e-5
-    del drawing
+    del nominal
 
 
 def test_a_board_in_one_configuration_tells_nothing(h4):
@@ -191,12 +191,12 @@ def test_a_board_in_one_configuration_tells_nothing(h4):
 
 
 def test_better_than_the_drawing(hexapod, new):
-    drawing, _, estimate, _ = hexapod
+    nominal, _, estimate, _ = hexapod
     stations, data = new
-    judged = judged_on(drawing, estimate, estimate.machine, data, stations)
+    judged = judged_on(nominal, estimate, estimate.machine, data, stations)
     verdict = validation_verdict(judged, (), estimate.machine, data)
     assert verdict.usable
-    assert "times better than the drawing: 0." in verdict.headline
+    assert "times better than the nominal model: 0." in verdict.headline
     assert judged.ratio.low > 3
     assert finite_rms(judged.after) < np.sqrt(2) * judged.floor
     (advice,) = verdict.of("validation.noise_each_once")
@@ -219,26 +219,26 @@ def test_rows_that_contradict_the_verdict_are_explained(hexapod):
     """One station determines depth badly: plain root mean squares are its noise, the weighted ones
     not.
     """
-    drawing, true, estimate, _ = hexapod
+    nominal, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
-    judged = judged_on(drawing, estimate, estimate.machine, data, stations)
+    judged = judged_on(nominal, estimate, estimate.machine, data, stations)
     assert not validation_verdict(judged, (), estimate.machine, data).warnings
-    in_view, as_drawn = judged.calibrated, judged.figures(judged.drawing)
+    in_view, as_drawn = judged.calibrated, judged.figures(judged.nominal)
     worse = as_drawn.joint_rms[2] / judged.figures(in_view).joint_rms[2]
     off = in_view.residuals * np.where(np.arange(6) == 2, 1.1 * worse, 1.0)
     blurred = replace(judged, calibrated=replace(in_view, residuals=off))
     (values,) = validation_verdict(blurred, (), estimate.machine, data).warnings
     promised = f"{1e3 * judged.promise.joint_rms[2]:.2g} mm"
     assert f"(joint 3: to {promised}) that single rows" in values
-    far = replace(judged, calibrated=replace(in_view, position=judged.drawing.position * 1.1))
+    far = replace(judged, calibrated=replace(in_view, position=judged.nominal.position * 1.1))
     (values,) = validation_verdict(far, (), estimate.machine, data).warnings
     assert values.startswith("Some directions are seen so badly in these photographs that single")
 
 
 def test_a_leg_that_changed_is_named(hexapod):
-    drawing, true, estimate, _ = hexapod
+    nominal, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, changed(true, "legs[3].length.offset", 1e-3))
-    judged = judged_on(drawing, estimate, estimate.machine, data, stations)
+    judged = judged_on(nominal, estimate, estimate.machine, data, stations)
     verdict = validation_verdict(judged, (), estimate.machine, data)
     assert not verdict.usable
     assert judged.ratio.better  # it is still better than the nominal model
@@ -247,33 +247,33 @@ def test_a_leg_that_changed_is_named(hexapod):
 
 
 def test_a_calibration_that_made_it_worse(hexapod, new):
-    drawing, _, estimate, _ = hexapod
+    nominal, _, estimate, _ = hexapod
     stations, data = new
     worse = changed(estimate.machine, "legs[3].length.offset", 0.02)
-    judged = judged_on(drawing, estimate, worse, data, stations)
+    judged = judged_on(nominal, estimate, worse, data, stations)
     verdict = validation_verdict(judged, (), worse, data)
     assert not verdict.usable
-    assert verdict.headline.startswith("The drawing predicts the readings")
+    assert verdict.headline.startswith("The nominal model predicts the readings")
     assert "made the machine worse" in verdict.reasons[0]
     assert "larger than the calibration's deviations" in verdict.reasons[1]
 
 
 def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod, new):
-    drawing, _, estimate, _ = hexapod
+    nominal, _, estimate, _ = hexapod
     stations, data = new
-    judged = judged_on(drawing, estimate, drawing, data, stations)
-    verdict = validation_verdict(judged, (), drawing, data)
+    judged = judged_on(nominal, estimate, nominal, data, stations)
+    verdict = validation_verdict(judged, (), nominal, data)
     assert not verdict.usable
     assert not judged.ratio.better
 
 
 def test_a_board_on_an_h4(h4):
-    drawing, true, estimate, _, rng = h4
+    nominal, true, estimate, _, rng = h4
     new = measured(true, papers_poses()[rng.permutation(81)[:12]], rng)
     start = start_state(estimate.machine, new.measurements, T_CAMERA_BASE[None])
     prediction = predict(estimate.machine, new.measurements, start)
-    judged = compare_with_drawing(
-        drawing, estimate.covariance, new.measurements, prediction, None, np.arange(12)
+    judged = compare_with_nominal(
+        nominal, estimate.covariance, new.measurements, prediction, None, np.arange(12)
     )
     verdict = validation_verdict(judged, (), estimate.machine, new.measurements)
     assert verdict.usable, verdict
@@ -353,48 +353,48 @@ def test_regions_are_whole_named_and_the_same_again():
 
 
 def test_held_out_regions_know_nothing_of_their_readings(hexapod):
-    drawing, _, estimate, data = hexapod
-    region = chosen(drawing, estimate, data, 5)
-    value = hold_out(drawing, data, estimate, region)
+    nominal, _, estimate, data = hexapod
+    region = chosen(nominal, estimate, data, 5)
+    value = hold_out(nominal, data, estimate, region)
     assert list(value.left_out.rows) == list(region.rows)
     assert not value.estimate.configurations[region.rows].any()
     spoiled = data.joints.copy()
     spoiled[region.rows] += 1e-3
-    other = hold_out(drawing, replace(data, joints=spoiled), estimate, region)
+    other = hold_out(nominal, replace(data, joints=spoiled), estimate, region)
     assert np.allclose(other.estimate.machine.values, value.estimate.machine.values, atol=1e-9)
     shift = other.left_out.calibrated.residuals - value.left_out.calibrated.residuals
     assert np.abs(shift - 1e-3).max() < 1e-4
 
 
 def test_regions_judged_together(hexapod):
-    drawing, _, estimate, data = hexapod
-    count = by_regions(drawing, data, estimate, 3)
+    nominal, _, estimate, data = hexapod
+    count = by_regions(nominal, data, estimate, 3)
     assert sum(len(item.left_out.rows) for item in count) == estimate.configurations.sum()
-    verdict = validation_verdict(None, count, drawing, data)
+    verdict = validation_verdict(None, count, nominal, data)
     assert verdict.usable, verdict
     assert "of regions that it did not see" in verdict.headline
 
 
 def test_poor_extrapolation_is_told(hexapod):
-    drawing, _, estimate, data = hexapod
-    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
+    nominal, _, estimate, data = hexapod
+    item = hold_out(nominal, data, estimate, chosen(nominal, estimate, data, 4))
     far = replace(item, left_out=replace(item.left_out, after=5 * item.left_out.after))
-    (warning,) = validation_verdict(None, (far,), drawing, data).warnings
+    (warning,) = validation_verdict(None, (far,), nominal, data).warnings
     assert warning.startswith("Extrapolation is poor where the platform is spread")
 
 
 @pytest.mark.parametrize("n", [0, 13, 24])
 def test_how_many_to_hold_out(hexapod, n):
-    drawing, _, estimate, data = hexapod
+    nominal, _, estimate, data = hexapod
     with pytest.raises(InputError, match=r"configurations held out is not possible.*1 to 12, for"):
-        chosen(drawing, estimate, data, n)
+        chosen(nominal, estimate, data, n)
 
 
 def test_too_few_configurations_to_hold_out(hexapod):
-    drawing, _, estimate, data = hexapod
+    nominal, _, estimate, data = hexapod
     few = SimpleNamespace(configurations=np.arange(24) < 3, state=estimate.state)
     with pytest.raises(InputError, match="too few configurations to hold any out"):
-        chosen(drawing, few, data, 1)
+        chosen(nominal, few, data, 1)
 
 
 def photographed_again(estimate, data):
@@ -412,29 +412,29 @@ def photographed_again(estimate, data):
 
 
 def test_a_pose_under_several_names_is_held_out_whole(hexapod):
-    drawing, _, estimate, data = hexapod
+    nominal, _, estimate, data = hexapod
     whole, again = photographed_again(estimate, data)
-    out = chosen(drawing, whole, again, 5).rows
+    out = chosen(nominal, whole, again, 5).rows
     assert list(np.unique(out % 22, return_counts=True)[1]) == [3] * 5
-    count = by_region(drawing, whole, again, 4)
+    count = by_region(nominal, whole, again, 4)
     assert sum(len(region.rows) for region in count) == 66
     for region in count:
         assert set(np.unique(region.rows % 22, return_counts=True)[1]) == {3}
     with pytest.raises(InputError, match=r"found 12, expected 1 to 11, for 22 poses seen"):
-        chosen(drawing, whole, again, 12)
+        chosen(nominal, whole, again, 12)
 
 
 def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
-    drawing, _, estimate, data = hexapod
-    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
+    nominal, _, estimate, data = hexapod
+    item = hold_out(nominal, data, estimate, chosen(nominal, estimate, data, 4))
     joints = data.joints.copy()
 
     def text():
         session = SimpleNamespace(
-            machine=drawing,
+            machine=nominal,
             joints=joints,
             joint_noise=data.joint_noise,
-            document={"joints": {"columns": drawing.joint_names}},
+            document={"joints": {"columns": nominal.joint_names}},
         )
         return " ".join(held_out_part(item, session).terminal_text)
 
@@ -517,11 +517,11 @@ def test_poses_that_the_calibration_used_are_known_by_their_readings(demo):
 
 def test_the_drawing_is_the_drawing_again(kept, demo):
     """Held-out regions must not influence the calibration through the nominal model."""
-    from pkmcal.judge.validate import drawing_of
+    from pkmcal.judge.validate import nominal_of
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")
-    values = drawing_of(load(kept.folder / "c"))
-    assert np.array_equal(values.parameters.drawing, drawn.parameters.drawing)
+    values = nominal_of(load(kept.folder / "c"))
+    assert np.array_equal(values.parameters.nominal, drawn.parameters.nominal)
     assert np.array_equal(values.values, drawn.values)
     assert np.array_equal(values.parameters.free_matrix(), drawn.parameters.free_matrix())
 

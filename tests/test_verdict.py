@@ -81,7 +81,7 @@ def test_stations_apart_are_refused_with_words_and_advice(apart):
     assert findings.identifiability.weak[-1].information < 0.05
     assert findings.unidentified[0].dimensions == 3
     reason = next(r for r in verdict.reasons if r.startswith("Legs 2 and 5 are never seen"))
-    assert "Within the drawing's tolerances this moves the platform by" in reason
+    assert "Within the nominal model's tolerances this moves the platform by" in reason
     assert "Add a station that sees legs 2 and 5 together with" in reason
     assert "observe: [legs, board]" in reason
 
@@ -126,7 +126,7 @@ def sentence(moves, *names, matters=True):
 
 def test_the_share_of_the_drawings_error_decides(whole):
     observation, estimate, findings, _ = whole
-    least = UNIDENTIFIABLE * findings.by_drawing
+    least = UNIDENTIFIABLE * findings.by_nominal
 
     def verdict(*open_):
         return judge(observation, estimate, replace(findings, unidentified=open_))
@@ -147,7 +147,7 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
     it.
     """
     observation, estimate, findings, _ = whole
-    open_ = (sentence(2 * UNIDENTIFIABLE * findings.by_drawing),)
+    open_ = (sentence(2 * UNIDENTIFIABLE * findings.by_nominal),)
     findings = replace(findings, unidentified=open_)
     assert not judge(observation, estimate, findings).usable
     unsure = replace(estimate, joint_covariance=1e3 * estimate.joint_covariance)
@@ -159,7 +159,7 @@ def test_a_result_that_is_no_gain_is_refused(whole):
     observation, estimate, findings, _ = whole
     sigma = platform_sigma(estimate)
     for share, usable in ((0.9, True), (1.1, False)):
-        factor = share * NOMINAL_ERROR_SHARE * findings.by_drawing / sigma
+        factor = share * NOMINAL_ERROR_SHARE * findings.by_nominal / sigma
         unsure = replace(estimate, joint_covariance=factor**2 * estimate.joint_covariance)
         value = judge(observation, unsure, findings)
         assert value.usable == usable
@@ -178,7 +178,7 @@ def test_without_a_degree_of_freedom_it_is_refused(whole):
 def test_what_the_drawing_knows_better_counts_where_a_value_is_undecided(whole):
     observation, estimate, findings, _ = whole
     name = "legs[3].length.offset"
-    weak = replace(findings, weak=(sentence(findings.by_drawing, name),))
+    weak = replace(findings, weak=(sentence(findings.by_nominal, name),))
     assert judge(observation, estimate, weak).usable
     share = estimate.data_share.copy()
     share[estimate.machine.parameters.index(name)] = 0.3

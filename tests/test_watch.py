@@ -56,15 +56,15 @@ FEW = 4
 
 def made_calibration():
     """The estimate of a hexapod from three stations: its machine is the truth of these tests."""
-    drawing = exact("gough-stewart")
-    truth = draw_truth(drawing, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
+    nominal = exact("gough-stewart")
+    truth = draw_truth(nominal, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
     edges, readings = simulate_edges(
         truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
         np.random.default_rng(1), photographs=truth.photographs,
     )  # fmt: skip
     data = Measurements(edges, readings, 3e-6, 3, np.zeros(3, dtype=int))
-    start = start_state(drawing, data, truth.T_camera_base)
-    return bundle(drawing, data, start, robust=False, scale_noise=False)
+    start = start_state(nominal, data, truth.T_camera_base)
+    return bundle(nominal, data, start, robust=False, scale_noise=False)
 
 
 def photographs_of(machine):
@@ -142,11 +142,11 @@ def looked(n=FEW):
 
 def board_case(name, rng, **model):
     """A machine calibrated by a board on its platform: its truth and the estimate."""
-    drawing = load_mechanism(name, **model)
-    true = true_machine(drawing, 1.0, rng)
+    nominal = load_mechanism(name, **model)
+    true = true_machine(nominal, 1.0, rng)
     case = papers_case(true, rng)
-    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
-    return true, bundle(drawing, case.measurements, start)
+    start = start_state(nominal, case.measurements, T_CAMERA_BASE[None])
+    return true, bundle(nominal, case.measurements, start)
 
 
 def by_board(estimate, machine, poses, rng):
@@ -449,13 +449,13 @@ def test_too_few_poses_of_a_board(h4):
 
 def test_a_planar_machine_by_its_board():
     rng = np.random.default_rng(12)
-    drawing = load_mechanism("3-rpr")
-    true = true_machine(drawing, 1.0, rng)
+    nominal = load_mechanism("3-rpr")
+    true = true_machine(nominal, 1.0, rng)
     truth = draw_truth(true, (CAMERA,), Settings(stations=1, configurations=60, tolerance=0.0), 2)
     poses = truth.T_base_platform
     case = measured(true, poses[:50], rng)
-    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
-    estimate = bundle(drawing, case.measurements, start)
+    start = start_state(nominal, case.measurements, T_CAMERA_BASE[None])
+    estimate = bundle(nominal, case.measurements, start)
     same = detect_changes(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
     assert not same.changed
     now = moved(true, leg2_length__offset=3e-3)
@@ -468,18 +468,18 @@ def test_a_planar_machine_by_its_board():
 def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
     """They are reported as too few, with the detectable change."""
     rng = np.random.default_rng(5)
-    drawing = load_mechanism("gough-stewart")
-    true = true_machine(drawing, 1.0, rng)
+    nominal = load_mechanism("gough-stewart")
+    true = true_machine(nominal, 1.0, rng)
     settings = Settings(stations=1, configurations=43, tolerance=0.0)
     poses = draw_truth(true, (CAMERA,), settings, 3).T_base_platform
     case = measured(true, poses[:40], rng)
-    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
-    estimate = bundle(drawing, case.measurements, start)
+    start = start_state(nominal, case.measurements, T_CAMERA_BASE[None])
+    estimate = bundle(nominal, case.measurements, start)
     judged = detect_changes(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
     verdict = watch_verdict(judged, looked(3))
     assert not verdict.usable
     assert not judged.changed
-    assert "which is more than the drawing's tolerance" in verdict.reasons[0]
+    assert "which is more than the nominal model's tolerance" in verdict.reasons[0]
 
 
 def test_poses_that_cannot_be_found(watched, monkeypatch):

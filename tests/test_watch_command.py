@@ -35,11 +35,11 @@ from pkmcal.simulation.truth import draw_truth
 from rendered import rendered
 
 
-def photographed(folder, drawing, machine, camera, seed, **settings):
+def photographed(folder, nominal, machine, camera, seed, **settings):
     """New images of a machine, beside its nominal model; the truth is not used otherwise."""
     wanted = {"stations": 1, "configurations": 4, "tolerance": 0.0, **settings}
     rendered(folder, machine, camera, Settings(**wanted), seed)
-    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    (folder / "mechanism.yaml").write_text(mechanism_text(nominal))
     (folder / "truth.json").unlink()
     return folder
 
@@ -58,10 +58,10 @@ def later(demo, tmp_path_factory):
     much less.
     """
     folder = tmp_path_factory.mktemp("watch")
-    drawing = load_mechanism(demo.session / "mechanism.yaml")
-    true = load_truth(demo.session, drawing).machine
+    nominal = load_mechanism(demo.session / "mechanism.yaml")
+    true = load_truth(demo.session, nominal).machine
     camera = load_camera(next((demo.session / "cameras").iterdir()))
-    same = photographed(folder / "same", drawing, true, camera, 34)
+    same = photographed(folder / "same", nominal, true, camera, 34)
     off = shutil.copytree(same, folder / "off")
     table = read_csv(same / "joints.csv")
     readings = table.values - 2.5e-3 * (np.arange(6) == 2)
@@ -199,12 +199,12 @@ def test_no_calibration_there(again):
 @pytest.fixture(scope="module")
 def stayed(demo, later):
     """New images by the demonstration's first camera, which nobody touched."""
-    drawing = load_mechanism(demo.session / "mechanism.yaml")
-    truth = load_truth(demo.session, drawing)
+    nominal = load_mechanism(demo.session / "mechanism.yaml")
+    truth = load_truth(demo.session, nominal)
     camera = load_camera(next((demo.session / "cameras").iterdir()))
     place = StationPlace.of(truth.T_camera_base[0])
     folder = later.folder / "stayed"
-    photographed(folder, drawing, truth.machine, camera, 35, stations=(place,))
+    photographed(folder, nominal, truth.machine, camera, 35, stations=(place,))
     assert load_session(folder).station_names == truth.stations[:1]
     return SimpleNamespace(folder=folder, name=truth.stations[0])
 
@@ -290,27 +290,27 @@ def seen_through(camera, wrong, edges):
 
 def test_a_cameras_magnification_is_told():
     """Images by a lens that is 0.5 % longer than its file states: the change is recovered."""
-    drawing, camera, longer = load_mechanism("gough-stewart"), demo_camera(), 5e-3
+    nominal, camera, longer = load_mechanism("gough-stewart"), demo_camera(), 5e-3
     focal = camera.parameters.copy()
     focal[:2] *= 1 + longer
     real = replace(camera, parameters=focal)
     settings = Settings(stations=2, configurations=6, tolerance=0.0)
-    truth = draw_truth(drawing, (camera,) * 2, settings, 4)
+    truth = draw_truth(nominal, (camera,) * 2, settings, 4)
     edges, readings = simulate_edges(
         truth.machine, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(),
         np.random.default_rng(4), photographs=truth.photographs,
     )  # fmt: skip
-    cause, got = magnification(drawing, 0), []
+    cause, got = magnification(nominal, 0), []
     for through in (camera, real):
         observed = seen_through(through, camera, edges)
         data = Measurements(observed.edges, readings, 3e-6, 2, np.zeros(2, dtype=int))
-        start = start_state(drawing, data, truth.T_camera_base)
+        start = start_state(nominal, data, truth.T_camera_base)
         wide = magnified(data, observed, (camera, camera))
-        exact = np.diag(np.full(len(drawing.parameters), 1e-12))
+        exact = np.diag(np.full(len(nominal.parameters), 1e-12))
         count = change_evidence(
-            hold(drawing, data, start, Trust.full(data), wide), CalibrationPrior(exact)
+            hold(nominal, data, start, Trust.full(data), wide), CalibrationPrior(exact)
         )
-        assert count.by.shape[1] == len(drawing.parameters) + 1
+        assert count.by.shape[1] == len(nominal.parameters) + 1
         got.append(change(count, cause))
     assert got[1].sigma[0] < longer / 4
     assert got[1].value[0] - got[0].value[0] == pytest.approx(longer, rel=0.05)
@@ -322,17 +322,17 @@ def test_a_cameras_magnification_is_told():
 @pytest.mark.slow
 def test_half_a_millimetre_in_five_photographs(tmp_path):
     """Rendered at 800x600: five machines that did not change, and a leg's zero off by 0.5 mm."""
-    drawing, camera = load_mechanism("gough-stewart"), demo_camera()
+    nominal, camera = load_mechanism("gough-stewart"), demo_camera()
     settings = Settings(stations=3, configurations=8)
-    truth = simulate_session(tmp_path / "before", drawing, camera, settings, seed=11)
+    truth = simulate_session(tmp_path / "before", nominal, camera, settings, seed=11)
     save(calibrate_session(tmp_path / "before"), tmp_path / "calibration")
     retained = load(tmp_path / "calibration")
     for seed in range(5):
         folder = tmp_path / f"same{seed}"
-        photographed(folder, drawing, truth.machine, camera, 100 + seed, configurations=5)
+        photographed(folder, nominal, truth.machine, camera, 100 + seed, configurations=5)
         assert watch_machine(retained, folder).verdict.usable
     off = changed(truth.machine, "legs[3].length.offset", 0.5e-3)
-    folder = photographed(tmp_path / "off", drawing, off, camera, 303, stations=2, configurations=5)
+    folder = photographed(tmp_path / "off", nominal, off, camera, 303, stations=2, configurations=5)
     value = watch_machine(retained, folder)
     first = value.judged.findings[0].suspect
     assert not value.verdict.usable

@@ -59,7 +59,7 @@ def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3, machine=No
     machine = machine or exact(name)
     table = machine.parameters
     draw = table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
-    theta = table.drawing + errors * table.free_matrix() @ draw
+    theta = table.nominal + errors * table.free_matrix() @ draw
     poses = moved(machine, rng, n) if poses is None else poses
     value = kinematics.on_manifold(machine.layout, theta, poses)
     poses = value.T_base_platform[value.converged]
@@ -116,7 +116,9 @@ def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
     values, _, sentences = told_of(make(name, machine=machine))
     assert len(values.unidentified) == 1
     (size,) = sentences
-    assert size.text.startswith("The size of everything is known from the drawing only, by the")
+    assert size.text.startswith(
+        "The size of everything is known from the nominal model only, by the"
+    )
     scales = {f"legs[{j + 1}].scale" for j in range(machine.n_legs)}
     assert set(size.parameters) == scales
     # all scales as one, each known to 0.05 %: 0.05 % / sqrt(legs) of the joints' way
@@ -374,7 +376,7 @@ def test_what_the_drawing_knows_better_is_not_called_free():
     visible = np.ones((1, 6), bool)
     (weak,) = describe(Situation(machine, visible, poses), null, np.array([0.5]))
     (open_,) = describe(Situation(machine, visible, poses), null)
-    assert weak.text.startswith("The length offset of leg 3 is known from the drawing only.")
+    assert weak.text.startswith("The length offset of leg 3 is known from the nominal model only.")
     assert "smaller tolerances" in weak.advice
     assert weak.moves_platform == pytest.approx(open_.moves_platform / np.sqrt(1.25))
 
@@ -416,7 +418,7 @@ def test_a_model_is_fixed_where_its_own_entries_stand():
         change = unit(machine, {f"legs[{j}].length.constant": 1.0 for j in (1, 2)})[None]
         around = Situation(machine, visible, moved(machine, np.random.default_rng(0), 5))
         (sentence,) = describe(around, change)
-        return re.search(r"; or (.*) if the drawing", sentence.advice)[1]
+        return re.search(r"; or (.*) if the nominal model", sentence.advice)[1]
 
     assert advice(None).endswith("] in the mechanism file")
     assert advice("firmware").endswith(
@@ -545,7 +547,7 @@ def test_what_a_carrier_names_is_said(monkeypatch):
     poses = moved(machine, np.random.default_rng(1), 5)
     around = Situation(machine, np.ones((1, 3), bool), poses, photographed=False)
     (sentence,) = describe(around, null)
-    assert sentence.text.startswith("How legs 1 and 3 drift is free. Within the drawing's")
+    assert sentence.text.startswith("How legs 1 and 3 drift is free. Within the nominal model's")
     assert sentence.dimensions == 2
 
 

@@ -101,7 +101,7 @@ def test_what_the_advice_holds_leaves_nothing_open():
 def test_parallelism_is_said_to_be_the_boards():
     _, findings, _ = told_of("h4")
     (tilt,) = of(findings, "How the cranks' axes of legs 1 to 4 are tilted to each other")
-    assert "is known from the drawing only in one way: +1 mm of leg " in tilt.text
+    assert "is known from the nominal model only in one way: +1 mm of leg " in tilt.text
     assert any(".base.axis." in name for name in tilt.parameters)
     assert (tilt.weak, tilt.matters) == (True, False)  # readings do not determine it
 
@@ -122,10 +122,10 @@ def test_poses_on_one_line_confound_sizes():
     _, findings, _ = told_of("delta", None, "straight")
     (sizes,) = of(findings, "The base radius and the arm length, of all legs alike")
     assert sizes.matters
-    assert sizes.moves_platform > 0.1 * findings.by_drawing
+    assert sizes.moves_platform > 0.1 * findings.by_nominal
     assert set(sizes.parameters) >= {"legs[1].base.arm", "legs[1].base.center.y"}
     whole = told_of("delta")[1]
-    assert all(s.moves_platform < 0.1 * whole.by_drawing for s in alike(whole))
+    assert all(s.moves_platform < 0.1 * whole.by_nominal for s in alike(whole))
 
 
 def alike(findings):
@@ -165,7 +165,7 @@ def test_weak_and_free_are_told_together():
     (lean,) = of(findings, "How the guides of legs 1 to 3 lean cannot be told from where they")
     assert lean.weak
     assert lean in findings.weak
-    assert "better than the drawing does" in lean.text
+    assert "better than the nominal model does" in lean.text
     assert not any(s.weak for s in findings.unidentified)
 
 

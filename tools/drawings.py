@@ -1,4 +1,6 @@
-"""The documentation's drawings, each from the program's own functions and a simulated session."""
+"""The documentation's drawings, each from the program's own functions and a simulated
+session.
+"""
 
 from __future__ import annotations
 
@@ -146,8 +148,8 @@ def looks(case: Case) -> str:
     drawn = session.machine.forward(session.joints[row])
     state = result.estimate.state
     views = [
-        (session.machine, by_hand, drawn, DRAWING, "1  pose by hand, the drawing's machine"),
-        (session.machine, recognised, drawn, DRAWING, "2  station recognised, still the drawing"),
+        (session.machine, by_hand, drawn, DRAWING, "1  pose by hand, the nominal model's machine"),
+        (session.machine, recognised, drawn, DRAWING, "2  localized, still the nominal model"),
         (result.machine, state.T_camera_base[s], state.T_base_platform[row], CALIBRATED,
          "3  after identification"),
     ]  # fmt: skip

@@ -35,7 +35,7 @@ def main(machines: int) -> None:
                 kit = make(Path(folder) / "session", seed)
                 value = kit.calibrated()
             e = tool(kit, value)
-            bed = flatness(kit, kit.drawing), flatness(kit, value.machine)
+            bed = flatness(kit, kit.nominal), flatness(kit, value.machine)
             rows.append((e.before, e.after, e.after / e.expected, e.sideways, *bed))
             usable += value.verdict.usable
         x = np.array(rows)

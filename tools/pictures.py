@@ -102,9 +102,10 @@ def result(case: Case) -> Shot:
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}'
         '<div class="grid"><div>{{ draw.picture(shot) }}<p>A photograph, the edges fitted in it,'
-        " and the joints of the calibrated machine (rings) and of the drawing (crosses)</p></div>"
+        " and the joints of the calibrated machine (rings) and of the nominal model"
+        " (crosses)</p></div>"
         '<div class="right">{{ draw.view(view) }}<p>The machine from above, mm: joints by'
-        ' <b class="d">the drawing</b> and <b class="c">as calibrated</b>, their'
+        ' <b class="d">the nominal model</b> and <b class="c">as calibrated</b>, their'
         " differences {{ '{:g}'.format(scene.factor) }} times enlarged, ellipses of 2σ"
         " {{ '{:g}'.format(scene.spread_factor) }} times</p></div></div>"
     )
@@ -205,8 +206,8 @@ def _edge_scores(case: Case, seed: int) -> Array:
     scales, would otherwise be wrong by the same in all of them.
     """
     truth, rng = case.truth, np.random.default_rng(seed)
-    drawing = case.session.machine
-    machine = true_machine(drawing, DEMO_SETTINGS.tolerance, rng)
+    nominal = case.session.machine
+    machine = true_machine(nominal, DEMO_SETTINGS.tolerance, rng)
     edges, joints = simulate_edges(
         machine,
         truth.T_camera_base,
@@ -218,8 +219,8 @@ def _edge_scores(case: Case, seed: int) -> Array:
     )
     cameras = np.zeros(len(truth.stations), dtype=int)
     measured = Measurements(edges, joints, 3e-6, len(cameras), cameras)
-    start = start_state(drawing, measured, truth.T_camera_base)
-    estimate = bundle(drawing, measured, start, use_drawing=False, scale_noise=False)
+    start = start_state(nominal, measured, truth.T_camera_base)
+    estimate = bundle(nominal, measured, start, use_prior=False, scale_noise=False)
     centres = joint_centres(
         machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
     )
@@ -254,7 +255,7 @@ def accuracy(case: Case) -> None:
         value = pkmcal.calibrate(folder)
         tell(f"{count} configurations a station, {sum(value.timings.values()):.1f} s")
         compared = compare_with_truth(value, folder)
-        for what, e in (("drawing", compared.drawing), ("calibrated", compared.calibrated)):
+        for what, e in (("drawing", compared.nominal), ("calibrated", compared.calibrated)):
             tell(
                 f"  {what}: centres {e.centre * 1e3:.3f} mm, offsets {e.offset * 1e3:.3f} mm,"
                 f" platform {e.position * 1e3:.3f} mm, {np.rad2deg(e.orientation):.4f} degrees"

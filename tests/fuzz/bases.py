@@ -38,10 +38,10 @@ GRID = {"type": "aruco_grid", "markers": [4, 3], "marker": 0.03, "gap": 0.01,
 def make(folder: Path) -> None:
     """All bases into a new folder."""
     folder.mkdir(parents=True)
-    drawing = load_mechanism("3-rpr")
+    nominal = load_mechanism("3-rpr")
     camera = camera_of_size(SIZE)
-    rendered(folder / "legs", drawing, camera, Settings(stations=1, configurations=4))
-    rendered(folder / "hand", drawing, camera, Settings(configurations=3, handheld=True))
+    rendered(folder / "legs", nominal, camera, Settings(stations=1, configurations=4))
+    rendered(folder / "hand", nominal, camera, Settings(configurations=3, handheld=True))
     for name in ("legs", "hand"):
         (folder / name / "truth.json").unlink()
     more(folder / "legs" / "session.yaml", EVERYTHING)
@@ -103,10 +103,10 @@ def measured(folder: Path, seed: int, count: int) -> None:
     """A hexapod measured by a laser tracker, with distances between positions of its
     tool's point.
     """
-    rng, drawing = np.random.default_rng(seed), load_mechanism("gough-stewart")
-    built = np.random.default_rng(0).normal(size=len(drawing.values))
-    truth = drawing.with_values(drawing.values + 0.5 * drawing.parameters.tolerance * built)
-    T = drawing.home() @ pose(
+    rng, nominal = np.random.default_rng(seed), load_mechanism("gough-stewart")
+    built = np.random.default_rng(0).normal(size=len(nominal.values))
+    truth = nominal.with_values(nominal.values + 0.5 * nominal.parameters.tolerance * built)
+    T = nominal.home() @ pose(
         rotation(rng.uniform(-0.15, 0.15, (count, 3))), rng.uniform(-0.03, 0.03, (count, 3))
     )
     joints = truth.inverse(T)
@@ -122,7 +122,7 @@ def measured(folder: Path, seed: int, count: int) -> None:
     (folder / "joints.csv").write_text(csv_text([f"leg{k}" for k in range(1, 7)], names, joints))
     columns = ["x", "y", "z", "rx", "ry", "rz"]
     (folder / "poses.csv").write_text(csv_text(columns, names, np.hstack([points, turns])))
-    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    (folder / "mechanism.yaml").write_text(mechanism_text(nominal))
     station = {"poses": "poses.csv", "noise": {"position": 2e-5, "rotation": 1e-4}}
     session = {"pkmcal": 1, "mechanism": "mechanism.yaml",
                "joints": {"file": "joints.csv", "noise": 3e-6},
@@ -161,9 +161,9 @@ def boards(folder: Path) -> None:
         noisy = cv2.GaussianBlur(in_view, (0, 0), 0.7) + rng.normal(0, 1.0, in_view.shape)
         picture = np.clip(noisy, 0, 255).astype(np.uint8)
         assert cv2.imwrite(str(folder / "images" / f"{name}.png"), picture)
-    drawing = load_mechanism("gough-stewart")
-    T = drawing.home() @ pose(rotation(rng.uniform(-0.2, 0.2, (7, 3))), np.zeros((7, 3)))
-    joints = drawing.inverse(T)
+    nominal = load_mechanism("gough-stewart")
+    T = nominal.home() @ pose(rotation(rng.uniform(-0.2, 0.2, (7, 3))), np.zeros((7, 3)))
+    joints = nominal.inverse(T)
     (folder / "joints.csv").write_text(csv_text([f"leg{k}" for k in range(1, 7)], names, joints))
     (folder / "board.yaml").write_text(yaml_text(BOARD))
     camera = {**CAMERA, "image_size": list(size), "focal": [282.0, 282.4],

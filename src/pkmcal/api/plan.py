@@ -116,7 +116,7 @@ def plan(
             session = subject if isinstance(subject, Session) else None
             session = session or load_session(folder or "", measured=False)
             rig_subject = as_it_stands(
-                session, after, from_drawing=from_drawing, same_place=same_place,
+                session, after, from_nominal=from_drawing, same_place=same_place,
                 anywhere=places is not None, edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
             return run(rig_subject, region=session.workspace, **planned)

@@ -132,7 +132,7 @@ class Calibration(CalibrationSummary):
             method=self.method,
             machine=e.machine,
             verdict=self.verdict,
-            drawing=session.machine.values,
+            nominal=session.machine.values,
             covariance=e.covariance,
             data_share=e.data_share,
             poses=e.state.T_base_platform[e.configurations],
@@ -413,7 +413,7 @@ def _identify(case: Case, refine_camera: bool, seed: int, clock: Clock) -> Refin
 
 
 def _estimated(
-    drawing: Machine,
+    nominal: Machine,
     turns: RefinementResult,
     richer: tuple[RicherModel, ...],
     method: CalibrationMethod,
@@ -429,15 +429,15 @@ def _estimated(
     if holdout:
         from pkmcal.calibration.holdout import Holdout, chosen, estimate_without
 
-        region = chosen(drawing, turns.estimate, turns.measurements, holdout)
+        region = chosen(nominal, turns.estimate, turns.measurements, holdout)
         out = Holdout(region, turns.measurements)
-        turns = estimate_without(drawing, turns, region)
+        turns = estimate_without(nominal, turns, region)
     estimate = turns.estimate
     if method != "bundle":
         from pkmcal.papers.methods import by_paper
 
         clock.progress("Repeating the paper's method", 0.9)
-        estimate = by_paper(method, drawing, turns.measurements, estimate, seed)
+        estimate = by_paper(method, nominal, turns.measurements, estimate, seed)
     return _Identified(turns, estimate, richer, out)
 
 

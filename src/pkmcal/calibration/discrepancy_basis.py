@@ -348,7 +348,7 @@ def with_discrepancy(estimate: Estimate, problem: Problem, discrepancy: Discrepa
     return replace(
         estimate,
         joint_covariance=joint,
-        # what is left out may make a value less sure than the drawing alone has it
+        # what is left out may make a value less sure than the nominal model alone has it
         data_share=np.maximum(data_share(machine, estimate.state.theta, joint[:n, :n], gauge), 0.0),
         column_covariance=covariance,
     )

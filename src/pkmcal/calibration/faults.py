@@ -53,7 +53,7 @@ def wrong_scale(estimate: Estimate) -> float:
     length = np.array([unit == "m" and kind != "radius" for unit, kind in zip(
         table.units, table.kinds, strict=True)])  # fmt: skip
     shifted = length & (np.diag(estimate.covariance) > 0)
-    new, old = machine.values[shifted], table.drawing[shifted]
+    new, old = machine.values[shifted], table.nominal[shifted]
     weight = 1 / table.tolerance[shifted] ** 2
     if not np.any(new):
         return 1.0
@@ -211,7 +211,7 @@ def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) ->
     for leg in np.flatnonzero(layout.unsure_scales):
         k, column = layout.scale[leg], int(layout.actuated[leg])
         name = session.document["joints"]["columns"][column]
-        share = float(estimate.machine.values[k] / table.drawing[k] - 1)
+        share = float(estimate.machine.values[k] / table.nominal[k] - 1)
         sigma = float(np.sqrt(estimate.covariance[k, k]))
         if abs(share) > WRONG_SCALE_DEVIATIONS * sigma > 0 and name not in named:
             results[name] = share, sigma

@@ -517,7 +517,8 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
             expected="one place for each where its legs lie on edges of the picture far oftener"
             " than elsewhere",
             next_step="Check that these photographs show this machine's legs, large and sharp, that"
-            " each bears the name of its configuration, and that the drawing is this machine's",
+            " each bears the name of its configuration, and that the nominal model is this"
+            " machine's",
         )
     # new station numbers, and the parts of session, images, boards and scene
     retained = [k for k in range(len(session.stations)) if k not in lost]

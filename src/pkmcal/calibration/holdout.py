@@ -143,7 +143,7 @@ def _distances(points: Array, centres: Array) -> Array:
     return np.sum((points[:, None] - centres) ** 2, axis=-1)
 
 
-def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int) -> Neighbours:
+def chosen(nominal: Machine, whole: Estimate, measurements: Measurements, n: int) -> Neighbours:
     """Configurations of n poses to hold out, spread over the workspace.
 
     All configurations of a pose are held out, because one in use determines the readings of the
@@ -152,13 +152,13 @@ def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
     _check(n, first.size - n, first.size, "configurations held out")
-    points = points_of_poses(drawing, whole.state.T_base_platform[rows[at]])
+    points = points_of_poses(nominal, whole.state.T_base_platform[rows[at]])
     out = np.isin(pose, first[spread(points, n)])
     return Neighbours(rows[out], "spread over the workspace")
 
 
 def by_region(
-    drawing: Machine, whole: Estimate, measurements: Measurements, n: int
+    nominal: Machine, whole: Estimate, measurements: Measurements, n: int
 ) -> tuple[Neighbours, ...]:
     """Measured configurations in n regions of the workspace, all of a pose in the same region.
 
@@ -167,7 +167,7 @@ def by_region(
     rows, pose = _poses(whole, measurements)
     first, at = np.unique(pose, return_index=True)
     _check(n, first.size - first.size // n, first.size, "regions")
-    points = points_of_poses(drawing, whole.state.T_base_platform[rows[at]])
+    points = points_of_poses(nominal, whole.state.T_base_platform[rows[at]])
     return tuple(
         replace(region, rows=rows[np.isin(pose, region.rows)])
         for region in regions(points, first, n)
@@ -225,7 +225,7 @@ def select(measurements: Measurements, keep: Booleans) -> Measurements:
 
 
 def estimate_without(
-    drawing: Machine, turns: RefinementResult, out: Neighbours
+    nominal: Machine, turns: RefinementResult, out: Neighbours
 ) -> RefinementResult:
     """Result of the last measurement pass without the configurations of a region.
 
@@ -238,7 +238,7 @@ def estimate_without(
     return turns._replace(
         observation=replace(_without(turns.observation, keep), poses=measurements.poses),
         measurements=measurements,
-        estimate=bundle(drawing, measurements, turns.estimate.state),
+        estimate=bundle(nominal, measurements, turns.estimate.state),
     )
 
 

@@ -49,7 +49,7 @@ def check_observable(session: Session) -> None:
     visible = [station.name for station in session.stations if "legs" in station.observe]
     if visible and not any(leg.tubes for leg in session.machine.document.legs):
         raise InputError(
-            "no leg of the drawing has visible cylinders",
+            "no leg of the nominal model has visible cylinders",
             where=f"{session.document['mechanism']}, legs",
             expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
             next_step="Measure the legs' radii with calipers",
@@ -102,9 +102,9 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     """
     try:
         fk = session.machine.forward_result(session.joints)
-    except GeometryError as error:  # the drawing is the user's: it is at fault
+    except GeometryError as error:  # the nominal model is the user's: it is at fault
         raise error.as_input(session.document["mechanism"]) from None
-    # near the ends of its workspace a drawing that is right to its tolerance may not close
+    # near the ends of its workspace a nominal model that is right to its tolerance may not close
     near = fk.error < ALLOWED_LEG_MISS * session.machine.document.tolerance.center
     if near.all() or (most and near.mean() > LEAST_REACHED_SHARE):
         _check_turns(session, fk.T_base_platform, near)
@@ -112,11 +112,12 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]
     _check_columns(session, bad)
     raise InputError(
-        "the drawing's machine cannot take these readings: its legs do not meet the platform",
+        "the nominal model's machine cannot take these readings: its legs do not meet the platform",
         where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
         found=f"a gap of {float(fk.error.max()) * 1e3:.3g} mm",
         expected="readings at which all legs reach the platform",
-        next_step="Check these readings, the order of their columns, and the drawing's centres",
+        next_step="Check these readings, the order of their columns, and the nominal"
+        " model's centres",
     )
 
 

@@ -49,12 +49,12 @@ def _check_machine(saved: SavedCalibration, session: Session) -> None:
         )
     table = drawn.parameters
     values = table.unit_axes(drawn.values)[own]
-    before = saved.drawing[rows], machine.values[rows]
+    before = saved.nominal[rows], machine.values[rows]
     off = [np.abs(values - v) / table.tolerance[own] for v in before]
     if min(o.max(initial=0.0) for o in off) > OTHER_MACHINE_TOLERANCES:
         k = int(np.argmax(off[0]))
         raise _another(
-            f"{wanted[own[k]]} {before[0][k]:.6g} in its drawing",
+            f"{wanted[own[k]]} {before[0][k]:.6g} in its nominal model",
             f"{values[k]:.6g} in the session's, {off[0][k]:.0f} tolerances off",
         )
 
@@ -66,7 +66,7 @@ def _another(calibrated: str, text: str) -> InputError:
         where="session.yaml, mechanism",
         found=text,
         expected=calibrated,
-        next_step="Give the calibration of this machine, or the session's own drawing",
+        next_step="Give the calibration of this machine, or the session's own nominal model",
     )
 
 

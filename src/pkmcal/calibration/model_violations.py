@@ -231,7 +231,7 @@ def _reading_scales(
     """Readings of another scale."""
     del observation
     layout, document = estimate.machine.layout, session.document["joints"]
-    drawn = scales_of(layout, session.machine.parameters.drawing)
+    drawn = scales_of(layout, session.machine.parameters.nominal)
     present = scales_of(layout, estimate.machine.values) / drawn
     first = [int(np.argmax(layout.actuated == m)) for m in range(len(document["columns"]))]
     yield from readings.scale_columns(measured.joints, document["columns"], present[first])

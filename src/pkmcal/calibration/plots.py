@@ -73,8 +73,8 @@ def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None 
     ax.axvspan(-1, 1, color=QUIET_COLOUR, alpha=0.12, linewidth=0)
     ax.set_yticks(range(len(rows)), [estimates[k].name for k in rows], fontsize=7)
     ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.set_xlabel("calibrated less drawing ± 2σ, in tolerances of the drawing")
-    ax.set_title("Parameters: blue by the data, brown by the drawing", fontsize=10)
+    ax.set_xlabel("calibrated less nominal model ± 2σ, in tolerances of the nominal model")
+    ax.set_title("Parameters: blue by the data, brown by the nominal model", fontsize=10)
     return ax
 
 
@@ -87,7 +87,7 @@ def tool(error: ToolError, ax: Axes | None = None) -> Axes:
     order = finite[np.argsort(error.position[finite])]
     place = np.arange(len(order))
     for values, colour, name in (
-        (error.off_position, DRAWING_COLOUR, "the drawing's error"),
+        (error.off_position, DRAWING_COLOUR, "the nominal model's error"),
         (error.position, CALIBRATED_COLOUR, "calibrated, 1σ"),
     ):
         ax.plot(place, values[order] * 1e3, "o", ms=4, color=colour, label=name)

@@ -1,8 +1,8 @@
 """Observation and identification in turns: what is known so far predicts where to look.
 
-The drawing and the rough poses find the machine in the photographs; legs found to a pixel give a
-first estimate; that predicts edges to a pixel, whose sub-pixel positions give the next. Boards and
-tables of poses need no prediction: they are measured once.
+The nominal model and the rough poses find the machine in the photographs; legs found to a pixel
+give a first estimate; that predicts edges to a pixel, whose sub-pixel positions give the next.
+Boards and tables of poses need no prediction: they are measured once.
 """
 
 from __future__ import annotations
@@ -427,9 +427,9 @@ def _without_camera_changes(state: State) -> State:
 def initial_guess(machine: Machine, measurements: Measurements, prior_state: State) -> State:
     """``prior_state``, or [A]'s four steps on the edges where these explain the edges better.
 
-    The four steps need no first guess, so they find the way back when the drawing or an earlier
-    estimate has gone astray. Judged by the median misfit, which wrong edges do not move. Any
-    machine: the steps refuse in words where the data do not allow them, and ``prior_state``
+    The four steps need no first guess, so they find the way back when the nominal model or an
+    earlier estimate has gone astray. Judged by the median misfit, which wrong edges do not move.
+    Any machine: the steps refuse in words where the data do not allow them, and ``prior_state``
     remains.
     """
     from pkmcal.papers.four_step import four_step
@@ -468,7 +468,8 @@ def identify_poses(
 
 
 def _feasible_start(session: Session, measurements: Measurements, start: State) -> State:
-    """The start where the drawing cannot take all readings: from a first estimate by the rest.
+    """The start where the nominal model cannot take all readings: from a first estimate by the
+    rest.
 
     Raises `InputError` for readings that the machine so found cannot take either.
     """

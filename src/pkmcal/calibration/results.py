@@ -89,7 +89,7 @@ def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
         for name in standing
         if name not in CALIBRATION_RESULT_FILES and not CAMERA_FILE.fullmatch(name)
     ]
-    # A mechanism.yaml without the rest is somebody's drawing.
+    # A mechanism.yaml without the rest is somebody's nominal model.
     if foreign or (standing and CALIBRATION_DOCUMENT_FILE not in standing):
         raise InputError(
             "the output folder holds something other than a calibration",
@@ -244,7 +244,7 @@ def identifiability_of(findings: Findings) -> dict[str, Any]:
         "n_parameters": ranks.n_parameters,
         "n_frames": ranks.n_frames,
         "singular_values": ranks.singular_values,
-        "moves_platform_by_drawing": findings.by_drawing,
+        "moves_platform_by_drawing": findings.by_nominal,
         "unidentified": [asdict(sentence) for sentence in findings.unidentified],
         "weak": [asdict(sentence) for sentence in findings.weak],
         "conditions": [asdict(condition) for condition in findings.conditions],

@@ -98,7 +98,7 @@ class SavedCalibration(CalibrationSummary):
     """A calibration read from its file, in the frames that `gauge` names.
 
     machine : with the calibrated values.
-    drawing : (P,) nominal values.
+    nominal : (P,) nominal values.
     placed : the k stations whose covariance with the machine is stored; none in older files.
     joint_covariance : (P + 6 k, P + 6 k) of the parameters and then of these stations, (omega, tau)
         of T_camera_base, left perturbation, as in :class:`~pkmcal.identify.estimate.Estimate`.
@@ -112,7 +112,7 @@ class SavedCalibration(CalibrationSummary):
 
     path: Path
     machine: Machine
-    drawing: Array
+    nominal: Array
     placed: tuple[str, ...]
     joint_covariance: Array
     data_share: Array
@@ -155,7 +155,7 @@ class SavedCalibration(CalibrationSummary):
             method=self.method,
             machine=self.machine,
             verdict=self.verdict,
-            drawing=self.drawing,
+            nominal=self.nominal,
             covariance=self.covariance,
             data_share=self.data_share,
             poses=self.T_base_platform[self.used],
@@ -404,7 +404,7 @@ def load(source: Path | str) -> SavedCalibration:
     return SavedCalibration(
         path=document.path,
         machine=machine,
-        drawing=np.array([p.drawing for p in saved.parameters]),
+        nominal=np.array([p.drawing for p in saved.parameters]),
         placed=placed,
         joint_covariance=joint,
         data_share=np.array([p.data_share for p in saved.parameters], dtype=float),

@@ -29,7 +29,7 @@ class Overview:
     """Contents of a summary.
 
     source : the session's name.
-    drawing : (P,) nominal values.
+    nominal : (P,) nominal values.
     covariance : (P, P) of the parameters.
     data_share : (P,) 1 - posterior variance / prior variance.
     poses : T_base_platform (n, 4, 4) of the configurations in use.
@@ -43,7 +43,7 @@ class Overview:
     method: str
     machine: Machine
     verdict: Verdict
-    drawing: Array
+    nominal: Array
     covariance: Array
     data_share: Array
     poses: Array
@@ -73,10 +73,10 @@ class CalibrationSummary(ABC):
         """
         overview = self.overview()
         # the nominal values in a calibration's mechanism file are the calibrated ones
-        table = replace(overview.machine.parameters, drawing=overview.drawing)
+        table = replace(overview.machine.parameters, nominal=overview.nominal)
         machine = replace(overview.machine, parameters=table)
         return tool_error(
-            machine.with_values(overview.drawing),
+            machine.with_values(overview.nominal),
             machine,
             free_of_gauge(machine, overview.covariance),
             checked_poses(T_base_platform),
@@ -91,7 +91,7 @@ class CalibrationSummary(ABC):
         """
         overview = self.overview()
         return parameter_estimates(
-            overview.drawing, overview.machine, overview.covariance, overview.data_share
+            overview.nominal, overview.machine, overview.covariance, overview.data_share
         )
 
     def summary(self) -> str:
@@ -153,8 +153,8 @@ class CalibrationSummary(ABC):
                 )
         # what determines the parameters
         kinds = [row.decided_by for row in self.parameters]
-        parts = [f"{kinds.count(k)} by {text}" for k, text in
-                 (("data", "the data"), ("drawing", "the drawing")) if k in kinds]  # fmt: skip
+        deciders = {"data": "the data", "drawing": "the nominal model"}
+        parts = [f"{kinds.count(k)} by {text}" for k, text in deciders.items() if k in kinds]
         held = len(kinds) - kinds.count("data") - kinds.count("drawing")
         parts += [f"{held} held by frame or file"] if held else []
         out.append(("Parameters", f"{len(kinds)}: {', '.join(parts)}"))

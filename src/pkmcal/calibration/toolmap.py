@@ -118,7 +118,7 @@ def _summary(position: Array, orientation: Array) -> dict[str, Any]:
 
 
 def map_of(
-    drawing: Machine,
+    nominal: Machine,
     calibrated: Machine,
     covariance: Array,
     region: Region | None = None,
@@ -141,7 +141,7 @@ def map_of(
     table = calibrated.parameters
     root = table.free_matrix() * table.tolerances_free()
     after = tool_error(
-        drawing,
+        nominal,
         calibrated,
         free_of_gauge(calibrated, covariance),
         poses,

@@ -53,7 +53,7 @@ def outlines(session: Session, measurements: Measurements, estimate: Estimate) -
     usual = estimate.statistics.shading
     shift, sigma = estimate.line_shift, np.hypot(usual, estimate.line_shift_sigma)
     table, file = session.machine.parameters, session.document["mechanism"]
-    grown = estimate.machine.values - table.drawing
+    grown = estimate.machine.values - table.nominal
     station, leg, tube = keys[:, :3].T
     tubes = np.unique(keys[:, 1:3], axis=0)
     edge = float(np.max(estimate.column_sigma(EDGE_SHIFT), initial=0.0))

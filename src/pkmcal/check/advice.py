@@ -269,7 +269,7 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
         f" {sum(leg.variance for leg in forecast.legs):.0%} comes from the edges,"
         f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from what is"
         " known beforehand,"
-        " of the drawing and of shading."
+        " of the nominal model and of shading."
     ]
     for j in poor:
         mine = [leg for leg in forecast.legs if leg.leg == j]

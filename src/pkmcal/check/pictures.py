@@ -63,7 +63,9 @@ def with_pictures(inspection: Inspection) -> Part:
     html = page.filled_template(
         "overlay.html.j2", n_legs=inspection.session.machine.n_legs, pairs=pairs
     )
-    return Part("photographs", "The drawing over the photographs", html=html, menu="Photographs")
+    return Part(
+        "photographs", "The nominal model over the photographs", html=html, menu="Photographs"
+    )
 
 
 def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:

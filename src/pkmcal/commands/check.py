@@ -12,7 +12,7 @@ from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, write_outcome
 
 CHECK_FILES = {"check.html": PAGE_DESCRIPTION, "check.json": NUMBERS_DESCRIPTION}
-DRAWINGS_DESCRIPTION = "the drawing over each photograph"
+DRAWINGS_DESCRIPTION = "the nominal model over each photograph"
 
 
 def check(
@@ -20,7 +20,7 @@ def check(
     out: Annotated[Path | None, console.folder("Write a page with photographs there.")] = None,
     pictures: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write the drawing over each photograph, as PNG."),
+        typer.Option(metavar="DIR", help="Write the nominal model over each photograph, as PNG."),
     ] = None,
     repeat: Annotated[
         bool,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
-    "mechanism.yaml": "the drawing of your machine",
+    "mechanism.yaml": "the nominal model of your machine",
     "cameras/front.yaml": "the calibration of your camera",
     "board.yaml": "the board on the platform",
     "joints.csv": "one row of readings for each configuration",
@@ -34,7 +34,8 @@ PHOTOGRAPHS_DESCRIPTION = "where the photographs go"
 def new(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new or empty folder.")],
     machine: Annotated[
-        str | None, typer.Option(metavar="MACHINE", help="A built-in machine, or a drawing's file.")
+        str | None,
+        typer.Option(metavar="MACHINE", help="A built-in machine, or a nominal model's file."),
     ] = None,
     board: Annotated[bool, typer.Option("--board", help="A board on it is seen.")] = False,
     legs: Annotated[
@@ -48,7 +49,8 @@ def new(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A delta printer's printer.cfg, or config.g with M665: its drawing and heights.",
+            help="A delta printer's printer.cfg, or config.g with M665: its nominal model"
+            " and heights.",
         ),
     ] = None,
     probed: Annotated[
@@ -168,7 +170,7 @@ def _dialogue() -> tuple[str | None, ObservedChoice | None, int]:
         console.out().print("Its readings alone tell its geometry: no camera is needed.")
         return machine, None, 1
     else:
-        console.out().print("Its drawing has no visible cylinders, so a board is seen.")
+        console.out().print("Its nominal model has no visible cylinders, so a board is seen.")
     usual = 1 if what is None or what == "board" else 2
     places = IntPrompt.ask("In how many places does the camera stand", default=usual)
     return machine, what, min(max(places, 1), 20)

@@ -76,7 +76,7 @@ class MachineView:
     @cached_property
     def home(self) -> Array:
         """Home pose (4, 4) of the nominal model."""
-        return self.machine.with_values(self.machine.parameters.drawing).home()
+        return self.machine.with_values(self.machine.parameters.nominal).home()
 
 
 def machine_view(
@@ -103,9 +103,9 @@ def machine_view(
 
 def visible_tubes(machine: Machine, legs: Integers) -> Integers:
     """Number of the tube with the longest visible length at home, for each leg (s,)."""
-    home = machine.with_values(machine.parameters.drawing).home()
+    home = machine.with_values(machine.parameters.nominal).home()
     readings = machine.inverse(home[None])[0]
-    ends = limb_ends(machine.layout, machine.parameters.drawing, readings, home)
+    ends = limb_ends(machine.layout, machine.parameters.nominal, readings, home)
     length = np.sqrt(dot(ends.b - ends.a, ends.b - ends.a))
     chosen: list[int] = []
     for j in legs:

@@ -54,7 +54,7 @@ def load_plant(
             found=station or str(session),
             next_step="Name a calibration's folder, or give --camera alone",
         )
-    return _of_drawing(source, eye or demo_camera(), legs, seed)
+    return _of_nominal(source, eye or demo_camera(), legs, seed)
 
 
 def _of_calibration(
@@ -77,7 +77,7 @@ def _of_calibration(
     )
     return Plant(
         machine=saved.machine,
-        drawing=saved.drawing,
+        nominal=saved.nominal,
         uncertainty=Uncertainty(saved.covariance, place.sigma_rotation, place.sigma_translation),
         camera=eye,
         T_camera_base=inverse(place.T_base_camera),
@@ -112,7 +112,7 @@ def _station(
     return reference_values[0]
 
 
-def _of_drawing(
+def _of_nominal(
     source: MachineSource, eye: Camera, legs: tuple[int, ...] | None, seed: int
 ) -> Plant:
     """Plant with a random machine within the prior sigmas of its nominal model."""
@@ -131,7 +131,7 @@ def _of_drawing(
     )
     return Plant(
         machine=truth,
-        drawing=np.array(machine.values),
+        nominal=np.array(machine.values),
         uncertainty=Uncertainty(
             free @ free.T, np.full(3, CAMERA_ROTATION), np.full(3, CAMERA_POSITION)
         ),

@@ -81,7 +81,7 @@ class Belief:
 
 def estimates(
     true: MachineView,
-    drawing: Array,
+    nominal: Array,
     uncertainty: Uncertainty,
     runs: int,
     rng: np.random.Generator,
@@ -90,7 +90,7 @@ def estimates(
 ) -> tuple[Belief, ...]:
     """True geometry, identified geometry, fitted nominal model, and hand-measured nominal model.
 
-    true : the machine that is controlled. drawing : (P,) nominal values. Every run has its own
+    true : the machine that is controlled. nominal : (P,) nominal values. Every run has its own
     error of calibration, drawn from the uncertainty, and its own error of the hand-measured pose,
     of the given size in a random direction.
     """
@@ -98,7 +98,7 @@ def estimates(
     T_camera_base = np.broadcast_to(true.T_camera_base, (runs, 4, 4))
     values = np.broadcast_to(true.theta, (runs, true.theta.shape[-1]))
     repeated = replace(true, machine=true.machine.with_values(values), T_camera_base=T_camera_base)
-    drawn = true.machine.with_values(drawing)
+    drawn = true.machine.with_values(nominal)
     fitted = _fitted(drawn, identified)
     exact = _fitted(drawn, replace(true, T_camera_base=T_camera_base))
     by_hand = _placed_by_hand(exact, hand_position, hand_rotation, rng)
@@ -123,14 +123,14 @@ def _identified(
     return replace(true, machine=machine, T_camera_base=inverse(T_base_camera))
 
 
-def _fitted(drawing: Machine, view: MachineView) -> MachineView:
+def _fitted(nominal: Machine, view: MachineView) -> MachineView:
     """Nominal model with the camera pose that fits its base centres to the view's, [B] eq. 15."""
-    middle, poses = drawing.middle_readings(), np.eye(4)
-    here = limb_ends(drawing.layout, drawing.values, middle, poses).a
+    middle, poses = nominal.middle_readings(), np.eye(4)
+    here = limb_ends(nominal.layout, nominal.values, middle, poses).a
     there = limb_ends(view.machine.layout, view.theta, middle, poses).a
     target = apply(view.T_camera_base[..., None, :, :], there)
     T = register(np.broadcast_to(here, target.shape), target)
-    return replace(view, machine=drawing, T_camera_base=T)
+    return replace(view, machine=nominal, T_camera_base=T)
 
 
 def _placed_by_hand(
@@ -165,13 +165,13 @@ class Plan:
 class Plant:
     """Machine and camera under control.
 
-    drawing : (P,) nominal values. uncertainty : of the calibration. legs : seen legs, from 0; by
+    nominal : (P,) nominal values. uncertainty : of the calibration. legs : seen legs, from 0; by
     default all with tubes. origin : a sentence for people. station : the camera's station, None
     without a calibration. findings : findings on the source.
     """
 
     machine: Machine
-    drawing: Array
+    nominal: Array
     uncertainty: Uncertainty
     camera: Camera
     T_camera_base: Array
@@ -265,7 +265,7 @@ def study_servoing(
     starts, goals = _ways(eye, plan, np.random.default_rng(seeds[1]))
     # runs with each estimate
     beliefs = estimates(
-        eye.true, scene.drawing, scene.uncertainty, plan.runs, np.random.default_rng(seeds[2]),
+        eye.true, scene.nominal, scene.uncertainty, plan.runs, np.random.default_rng(seeds[2]),
         plan.hand_position, plan.hand_rotation,
     )  # fmt: skip
     outcomes: list[Trials] = []

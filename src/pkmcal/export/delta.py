@@ -365,7 +365,8 @@ def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
             f"{delta.program} cannot follow this machine: its parameters leave the tool off",
             found=f"{fit.largest:.2f} mm",
             expected=f"at most {MOST_TOOL_ERROR:g} mm over the workspace",
-            next_step="Set towers or arms nearer to the drawing, or export the machine with --to c",
+            next_step="Set towers or arms nearer to the nominal model, or export the"
+            " machine with --to c",
         )
     return fit
 

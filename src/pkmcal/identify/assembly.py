@@ -36,7 +36,7 @@ class Assembled:
     observed : (K,) configurations with at least one edge, link, or pose of a board on the platform,
     or all without a station; only these are in the problem. places : positions of the measurements
     of each kind among the observed configurations. priors : names of the kinds of the prior rows,
-    (c,): drawing, the code of an effect, mount, level or gauge.
+    (c,): nominal model, the code of an effect, mount, level or gauge.
     """
 
     problem: Problem
@@ -57,7 +57,7 @@ def assemble(
     measurements: Measurements,
     gauge: Gauge,
     *,
-    use_drawing: bool = True,
+    use_prior: bool = True,
     shading: float | Array = SHADING_SIGMA,
     share: float = 1.0,
 ) -> Assembled:
@@ -87,7 +87,7 @@ def assemble(
         gauge,
         unknowns,
         columns,
-        use_drawing=use_drawing,
+        use_prior=use_prior,
         on_platform=measurements.on_platform,
         level=measurements.level,
     )
@@ -95,7 +95,7 @@ def assemble(
     pose_blocks, pose_data = _poses(measurements, columns, poses)
     problem = Problem(
         layout=machine.layout,
-        drawing=machine.parameters.drawing,
+        nominal=machine.parameters.nominal,
         free=machine.parameters.free_matrix(),
         unknowns=unknowns,
         blocks=blocks,
@@ -136,7 +136,8 @@ def _check(machine: Machine, measurements: Measurements) -> None:
     if measurements.n_stations and not in_view:
         raise InputError(
             what="there is neither an edge nor a board's pose to calibrate from",
-            next_step="check the photographs, the stations' poses and the tubes of the drawing",
+            next_step="check the photographs, the stations' poses and the tubes of the"
+            " nominal model",
         )
     if joints.shape[-1] != machine.n_joints:
         raise InputError(
@@ -338,7 +339,7 @@ def prior_rows(
     unknowns: Unknowns,
     columns: Sequence[Column],
     *,
-    use_drawing: bool,
+    use_prior: bool,
     on_platform: Booleans,
     level: Booleans,
 ) -> tuple[Array, Array, tuple[str, ...]]:
@@ -356,7 +357,7 @@ def prior_rows(
     table, u = machine.parameters, unknowns
     first, tolerance = table.first_of_free(), table.tolerances_free()
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
-    held = np.flatnonzero(radius | use_drawing)
+    held = np.flatnonzero(radius | use_prior)
     moving = np.flatnonzero(on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
     upright = np.flatnonzero(level)
@@ -383,7 +384,7 @@ def prior_rows(
     size = machine_size(machine) if len(places) else 1.0
     add("mount", places, np.full(len(places), size))
     add("level", tilts, np.full(len(tilts), LEVEL_SIGMA))
-    if not use_drawing and freedoms(machine).shape[1]:
+    if not use_prior and freedoms(machine).shape[1]:
         c = frame_rows(machine, gauge) @ table.free_matrix() / float(np.mean(tolerance[~radius]))
         rows.append(np.pad(c, ((0, 0), (0, u.count - u.n_free))))
         targets.append(np.zeros(len(c)))

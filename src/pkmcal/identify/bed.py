@@ -43,11 +43,11 @@ class Bed:
 
     radius : of the disc, m. sigma : standard deviation (m, root mean square over the disc) of the
     platform's height above the bed, the bed's own height and tilt aside, tolerances of held values
-    included; by_drawing : the same by the drawing's tolerances alone. sideways : of its place along
-    the bed, frames aside. size : of how much larger or smaller all is along the bed, a share. z :
-    of the platform's origin, m, base frame, in the middle of the disc where the first table's
-    height is 0. touches : how many heights. unnoticed : m, as sigma, by which one wrong height,
-    the worst of them, bends the bed and is just not noticed; None where any would go unnoticed.
+    included; by_drawing : the same by the nominal model's tolerances alone. sideways : of its place
+    along the bed, frames aside. size : of how much larger or smaller all is along the bed, a share.
+    z : of the platform's origin, m, base frame, in the middle of the disc where the first table's
+    height is 0. touches : how many heights. unnoticed : m, as sigma, by which one wrong height, the
+    worst of them, bends the bed and is just not noticed; None where any would go unnoticed.
     """
 
     radius: float
@@ -97,12 +97,12 @@ def bed_of(measurements: Measurements, estimate: Estimate, uneven: Sequence[Colu
     stretch = xy.ravel() @ along / np.sum(xy**2)
     middle, state = poses[0], estimate.state
     there = state.T_camera_base[0] @ middle @ state.T_mount[0]
-    drawing = _drawing_root(machine, by)
-    off, root = _wider(measurements, estimate, drawing, uneven)
+    nominal = _nominal_root(machine, by)
+    off, root = _wider(measurements, estimate, nominal, uneven)
     return Bed(
         radius=float(np.linalg.norm(xy, axis=1).max()),
         sigma=_deviation(height, off, root, len(xy)),
-        by_drawing=_deviation(height, np.zeros(len(off)), drawing, len(xy)),
+        by_drawing=_deviation(height, np.zeros(len(off)), nominal, len(xy)),
         sideways=_deviation(along, off, root, len(xy)),
         size=_deviation(stretch[None], off, root, 1),
         z=float(middle[2, 3] - there[2, 3]),
@@ -135,9 +135,9 @@ def _less(rows: Array, reference_values: Array) -> Array:
     return rows - reference_values @ np.linalg.lstsq(reference_values, rows, rcond=None)[0]
 
 
-def _drawing_root(machine: Machine, by: Array) -> Array:
-    """R (P, m): the drawing's covariance R R^T of the free parameters, and of those held ones that
-    do something no free one does. by : (n, 3, P) how the parameters move the platform.
+def _nominal_root(machine: Machine, by: Array) -> Array:
+    """R (P, m): the nominal model's covariance R R^T of the free parameters, and of those held ones
+    that do something no free one does. by : (n, 3, P) how the parameters move the platform.
 
     What a free one stands for, as a tower's place for that of the rod's lower end, would count
     twice.
@@ -156,25 +156,26 @@ def _drawing_root(machine: Machine, by: Array) -> Array:
 
 
 def _wider(
-    measurements: Measurements, estimate: Estimate, drawing: Array, uneven: Sequence[Column]
+    measurements: Measurements, estimate: Estimate, nominal: Array, uneven: Sequence[Column]
 ) -> tuple[Array, Array]:
-    """Of the parameters in the model in which all vary that the drawing R (P, m) lets vary, and the
-    bed as ``uneven``: how far the best values are from the estimate's (P,), and a root (P, m) of
-    their covariance.
+    """Of the parameters in the model in which all vary that the nominal model R (P, m) lets vary,
+    and the bed as ``uneven``: how far the best values are from the estimate's (P,), and a root (P,
+    m) of their covariance.
     """
     rows, remainder = _rows_beside(measurements, estimate, uneven)
     table = estimate.machine.parameters
-    n, m = drawing.shape
-    at = np.zeros(m + rows.shape[1] - n)  # the estimate, in the drawing's deviations; a flat bed
+    n, m = nominal.shape
+    # the estimate, in deviations of the nominal model; a flat bed
+    at = np.zeros(m + rows.shape[1] - n)
     free = table.to_free(estimate.machine.values) / table.tolerances_free()
     at[: free.size] = free
     both = np.concatenate(
-        [np.concatenate([rows[:, :n] @ drawing, rows[:, n:]], axis=1), np.eye(len(at))]
+        [np.concatenate([rows[:, :n] @ nominal, rows[:, n:]], axis=1), np.eye(len(at))]
     )
     _, s, vt = np.linalg.svd(both, full_matrices=False)
     half = vt.T / s
     best = -half @ (half.T @ (both.T @ np.concatenate([remainder, at])))
-    return drawing @ best[:m], drawing @ half[:m]
+    return nominal @ best[:m], nominal @ half[:m]
 
 
 def _rows_beside(

@@ -1,7 +1,7 @@
 """The joint estimate: all unknowns from all measurements, maximum likelihood and robust.
 
 Machine parameters, stations, platform poses and edge shifts are estimated together from edges,
-readings and the drawing, each divided by its standard deviation.
+readings and the nominal model, each divided by its standard deviation.
 """
 
 from __future__ import annotations
@@ -371,7 +371,7 @@ def _shading_of(fit: BatchResult, least: Array) -> Array:
 
 @dataclass(frozen=True)
 class MarginalPrior:
-    """What measurements and the drawing told of a machine.
+    """What measurements and the nominal model told of a machine.
 
     free : (n,) its free unknowns; root : (n, n) of their information, ``root^T root`` the inverse
     of their covariance whatever the other unknowns are.
@@ -393,7 +393,7 @@ def bundle(
     measurements: Measurements,
     start: State,
     *,
-    use_drawing: bool = True,
+    use_prior: bool = True,
     marginal_prior: MarginalPrior | None = None,
     robust: bool = True,
     scale_noise: bool = True,
@@ -404,9 +404,10 @@ def bundle(
     """The joint estimate of one session.
 
     start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
-    use_drawing : take the drawing's values as measurements with their tolerances; radii
-        and edge shifts keep theirs in any case. marginal_prior : what other measurements told of
-        the machine, with the drawing in it, in the drawing's place, whether that is taken or not.
+    use_drawing : take the nominal model's values as measurements with their tolerances; radii and
+        edge shifts keep theirs in any case. marginal_prior : what other measurements told of the
+        machine, with the nominal model in it, in the nominal model's place, whether that is taken
+        or not.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
         ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each;
         scale_readings : and that of the readings, which may become less.
@@ -416,7 +417,7 @@ def bundle(
     """
     gauge = gauge or default_gauge(machine)
     assembled = assemble(
-        machine, measurements, gauge, use_drawing=use_drawing or marginal_prior is not None
+        machine, measurements, gauge, use_prior=use_prior or marginal_prior is not None
     )
     batch = batch_of(machine, assembled, start)
     problem = assembled.problem
@@ -473,7 +474,7 @@ def linearize_at_solution(
 def marginalize_to_machine(measurements: Measurements, estimate: Estimate) -> MarginalPrior:
     """What an estimate knows of the machine, for the estimate of other measurements.
 
-    The frames are as little known as by the drawing, about where the estimate has them.
+    The frames are as little known as by the nominal model, about where the estimate has them.
     """
     _, info = linearize_at_solution(measurements, estimate)
     rows, _ = reduced_rows(info, ("machine",), silent=())

@@ -28,15 +28,15 @@ class Centres:
 
     side : ``base`` or ``platform``.
     calibrated : (L, 3).
-    drawing : (L, 3) nominal centres, registered to them by ``T_calibrated_drawing``.
+    nominal : (L, 3) nominal centres, registered to them by ``T_calibrated_nominal``.
     T_calibrated_drawing : (4, 4).
     covariance : (3L, 3L) about the fit, m^2.
     """
 
     side: str
     calibrated: Array
-    drawing: Array
-    T_calibrated_drawing: Array
+    nominal: Array
+    T_calibrated_nominal: Array
     covariance: Array
 
     __repr__ = short_repr
@@ -44,7 +44,7 @@ class Centres:
     @property
     def change(self) -> Array:
         """Calibrated minus nominal, (L, 3) m."""
-        return self.calibrated - self.drawing
+        return self.calibrated - self.nominal
 
     @property
     def blocks(self) -> Array:
@@ -58,12 +58,12 @@ class Centres:
         return np.sqrt(np.maximum(np.einsum("iaa->i", self.blocks), 0) / 3)
 
 
-def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> tuple[Centres, ...]:
+def joint_centres(nominal: Machine, calibrated: Machine, covariance: Array) -> tuple[Centres, ...]:
     """Base and platform centres; covariance (P, P) as returned by :func:`free_of_gauge`."""
-    before, after = _ends(drawing), _ends(calibrated)
+    before, after = _ends(nominal), _ends(calibrated)
     sides = (
-        ("base", before.a, after.a, after.a_by, drawing.layout.a_index),
-        ("platform", before.b, after.b, after.b_by, drawing.layout.b_index),
+        ("base", before.a, after.a, after.a_by, nominal.layout.a_index),
+        ("platform", before.b, after.b, after.b_by, nominal.layout.b_index),
     )
     results: list[Centres] = []
     for side, old, new, by, index in sides:

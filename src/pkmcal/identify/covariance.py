@@ -1,7 +1,7 @@
 """How sure the estimate is: covariance, noise scale, rank. All from exact derivatives.
 
 The covariance is the inverse of the reduced information at the solution, told in a gauge. It
-covers the noise of edges and readings and the drawing's tolerances; it does not cover errors
+covers the noise of edges and readings and the nominal model's tolerances; it does not cover errors
 of the model (joint clearance, bending, a wrong lens).
 """
 
@@ -50,7 +50,8 @@ from pkmcal.solver.ranks import (
 from pkmcal.solver.search import take
 
 ROWS_RANK_TOLERANCE = 1e-12
-"""Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""
+"""Same, for the scaled rows with nominal model and gauge: below it a direction counts as unknown.
+"""
 
 
 @dataclass(frozen=True)
@@ -228,13 +229,13 @@ def prior_in_gauge(
 
 
 def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) -> Array:
-    """1 - posterior variance / drawing variance in the gauge, (P,); 0 where both vanish."""
+    """1 - posterior variance / nominal model variance in the gauge, (P,); 0 where both vanish."""
     table, free = machine.parameters, machine.parameters.free_matrix()
     change = projector(machine, theta, gauge)
     spread = free - generators(machine.layout, theta) @ (change @ free)
-    drawing = np.sum((spread * table.tolerances_free()) ** 2, axis=1)
-    above_limit = drawing > 1e-12 * table.tolerance**2
-    share = 1 - np.diag(covariance)[: len(table)] / np.where(above_limit, drawing, 1.0)
+    nominal = np.sum((spread * table.tolerances_free()) ** 2, axis=1)
+    above_limit = nominal > 1e-12 * table.tolerance**2
+    share = 1 - np.diag(covariance)[: len(table)] / np.where(above_limit, nominal, 1.0)
     return np.where(above_limit, share, 0.0)
 
 
@@ -242,9 +243,9 @@ def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) 
 class ParameterDirection:
     """A combination of parameters: names with weights, largest first, and how well known.
 
-    information : singular value of the data in units of the drawing's tolerance; 1 means that
-    the data know it as well as the drawing does. vector : (P,) the change of all parameters, m and
-    rad, with the largest entry one tolerance.
+    information : singular value of the data in units of the nominal model's tolerance; 1 means that
+    the data know it as well as the nominal model does. vector : (P,) the change of all parameters,
+    m and rad, with the largest entry one tolerance.
     """
 
     names: tuple[str, ...]
@@ -259,7 +260,7 @@ class Identifiability:
 
     n_parameters : free ones. n_frames : freedoms of the frames, and of hinges' beginnings.
     rank : directions the data fix. unidentified : directions that no amount of such data fixes.
-    weak : directions that the drawing knows better than the data.
+    weak : directions that the nominal model knows better than the data.
     """
 
     n_parameters: int
@@ -280,16 +281,17 @@ class Identifiability:
 
 
 def identifiability(info: Information, machine: Machine) -> Identifiability:
-    """Which combinations of parameters the data fix, drawing left out; the problem's first run.
+    """Which combinations of parameters the data fix, nominal model left out; the problem's first
+    run.
 
     Poses, stations, edge shifts and shading are eliminated, frames taken out, and the columns are
-    scaled by the drawing's tolerances.
+    scaled by the nominal model's tolerances.
     """
     problem, state = info.problem, info.state
     table, nz = machine.parameters, problem.unknowns.n_free
     tolerance = table.tolerances_free()
-    # what is known beforehand of cameras and shading is no drawing: without it, a shift of every
-    # line by itself would hide the tubes' radii
+    # what is known beforehand of cameras and shading is no nominal model: without it, a shift of
+    # every line by itself would hide the tubes' radii
     remainder = reduced_rows(info, ("machine",), silent=("machine", "mounts"))[0] * tolerance
     theta, moves = problem.theta(state)[0], conventions(machine)
     shifted = move_generators(machine.layout, theta) @ moves

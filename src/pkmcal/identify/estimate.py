@@ -51,7 +51,7 @@ class Statistics:
     stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
     1 when they were taken as they are. chi2_poses, n_poses : of poses, six numbers of a full one;
     pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
-    that each kind of residual has left; their sum and the drawing's is ``dof``. shading : px,
+    that each kind of residual has left; their sum and the nominal model's is ``dof``. shading : px,
     standard deviation of what the edges of one side of a tube at one station have in common.
     reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
     reading_range, pose_range : factors on the stated noise that the data allow, smallest and
@@ -115,8 +115,8 @@ class Estimate:
     tube of a leg; edge_trust : (N,) by how much more or less than on average each edge counts for
     its tails, see :mod:`pkmcal.identify.edge_noise`.
     joint_residuals : (K, m) in standard deviations.
-    data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
-        data decide; near 0, the value is the drawing's.
+    data_share : (P,) 1 - posterior variance / nominal model variance in the same gauge: near 1, the
+        data decide; near 0, the value is the nominal model's.
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
     link_residuals, link_weights : (N,) of measurements that link two configurations, those of one
     kind after the other.

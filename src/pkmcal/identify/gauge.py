@@ -76,7 +76,7 @@ class ThreeCentres:
         """C (12, P)."""
         legs = self.legs if max(self.legs) < machine.n_legs else (0, 1, 2)
         rows = [
-            _three_rows(machine.parameters.drawing, index[list(legs)])
+            _three_rows(machine.parameters.nominal, index[list(legs)])
             for index in centre_index(machine.layout)
         ]
         return np.concatenate(rows)
@@ -89,17 +89,17 @@ class BestFit:
     @property
     def name(self) -> str:
         """Name of the choice, for people."""
-        return "best fit of all centres to the drawing"
+        return "best fit of all centres to the nominal model"
 
     def constraints(self, machine: Machine) -> Array:
         """C (12, P): sum(A - D) = 0 and sum(D x A) = 0 at the least-squares fit, D nominal and
         centred.
         """
-        drawing = machine.parameters.drawing
+        nominal = machine.parameters.nominal
         rows = []
         for index in centre_index(machine.layout):
-            d = drawing[index] - drawing[index].mean(axis=0)
-            block = np.zeros((6, drawing.size))
+            d = nominal[index] - nominal[index].mean(axis=0)
+            block = np.zeros((6, nominal.size))
             for axis in range(3):
                 block[:3, index[:, axis]] = np.eye(3)[:, axis, None]
                 block[3:, index[:, axis]] = skew(d)[:, :, axis].T
@@ -118,17 +118,17 @@ def centre_index(layout: LimbLayout) -> tuple[Integers, Integers]:
     return out[0], out[1]
 
 
-def _three_rows(drawing: Array, index: Integers) -> Array:
+def _three_rows(nominal: Array, index: Integers) -> Array:
     """3-2-1 constraints of one body, (6, P); only the first three where all joints coincide."""
-    p1, p2, p3 = drawing[index]
+    p1, p2, p3 = nominal[index]
     if (p1 == p2).all() and (p1 == p3).all():
-        rows = np.zeros((6, drawing.size))
+        rows = np.zeros((6, nominal.size))
         rows[[0, 1, 2], index[0]] = 1.0
         return rows
     along = (p2 - p1) / np.linalg.norm(p2 - p1)
     normal = cross(along, p3 - p1)
     normal = normal / np.linalg.norm(normal)
-    rows = np.zeros((6, drawing.size))
+    rows = np.zeros((6, nominal.size))
     rows[[0, 1, 2], index[0]] = 1.0
     for row, leg, direction in ((3, 1, normal), (4, 1, cross(normal, along)), (5, 2, normal)):
         rows[row, index[leg]] = direction
@@ -136,10 +136,10 @@ def _three_rows(drawing: Array, index: Integers) -> Array:
     return rows
 
 
-def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -> Array:
+def generators(layout: LimbLayout, theta: Array, nominal: Array | None = None) -> Array:
     """Derivatives (..., P, 12) of the parameters by a frame change.
 
-    drawing : (P,) nominal values, where directions stay on the tangent planes of the nominal ones.
+    nominal : (P,) nominal values, where directions stay on the tangent planes of the nominal ones.
     """
     out = np.zeros((*theta.shape[:-1], theta.shape[-1] + 1, 12))
     for group in (*layout.base, *layout.platform):
@@ -151,8 +151,8 @@ def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -
             continue
         at = slice(6 * body, 6 * body + 3)
         out[..., axes, at] = -skew(theta[..., axes])
-        if drawing is not None:
-            along = drawing[axes][..., None, :] @ out[..., axes, at]
+        if nominal is not None:
+            along = nominal[axes][..., None, :] @ out[..., axes, at]
             out[..., axes, at] -= theta[..., axes, None] * along
     return out
 
@@ -199,11 +199,11 @@ def _floating(layout: LimbLayout) -> Integers:
     return np.concatenate(legs) if legs else np.zeros(0, dtype=int)
 
 
-def move_generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -> Array:
+def move_generators(layout: LimbLayout, theta: Array, nominal: Array | None = None) -> Array:
     """Derivatives (..., P, 12 + n) of the parameters by frame changes and the n other gauge
     freedoms.
     """
-    frames = generators(layout, theta, drawing)
+    frames = generators(layout, theta, nominal)
     if not other_moves(layout):
         return frames
     hinges = np.zeros((*theta.shape, 2 * layout.n_internal))
@@ -249,7 +249,7 @@ def freedoms(machine: Machine) -> Array:
     All twelve for a spatial machine without fixed parameters. Fixed or tied parameters remove some;
     a machine that moves in fewer directions keeps those that preserve its motion.
     """
-    shifted = generators(machine.layout, machine.parameters.drawing)
+    shifted = generators(machine.layout, machine.parameters.nominal)
     return _allowed(machine, shifted, respecting_motion(machine.layout.motion))
 
 
@@ -273,7 +273,7 @@ def _with_hinges(machine: Machine, frames: Array, n: int) -> Array:
     """Combinations of frame changes (12, g) and of the first n other changes that the model
     allows.
     """
-    shifted = move_generators(machine.layout, machine.parameters.drawing)
+    shifted = move_generators(machine.layout, machine.parameters.nominal)
     candidates = np.zeros((shifted.shape[1], frames.shape[1] + n))
     candidates[:12, : frames.shape[1]] = frames
     candidates[12 : 12 + n, frames.shape[1] :] = np.eye(n)
@@ -316,10 +316,10 @@ def default_gauge(machine: Machine) -> Gauge:
     if machine.n_legs < 3:
         return BestFit()
     base, platform = centre_index(machine.layout)
-    points = machine.parameters.drawing[platform]
+    points = machine.parameters.nominal[platform]
     meet = not machine.layout.motion[:3].any() and bool((points == points[0]).all())
     for index in (base,) if meet else (base, platform):
-        p1, p2, p3 = machine.parameters.drawing[index[list(legs)]]
+        p1, p2, p3 = machine.parameters.nominal[index[list(legs)]]
         sides = np.linalg.norm([p2 - p1, p3 - p1], axis=1)
         if np.linalg.norm(np.cross(p2 - p1, p3 - p1)) <= COLLINEAR_POINTS_SINE * sides.prod():
             return BestFit()
@@ -332,8 +332,8 @@ def frame_rows(machine: Machine, gauge: Gauge) -> Array:
     A machine with fewer frame changes than the gauge has constraints (planar, translational) cannot
     satisfy all of them; these rows are the combinations that it can.
     """
-    c, drawing = gauge.constraints(machine), machine.parameters.drawing
-    slope = c @ generators(machine.layout, drawing) @ freedoms(machine)
+    c, nominal = gauge.constraints(machine), machine.parameters.nominal
+    slope = c @ generators(machine.layout, nominal) @ freedoms(machine)
     return np.linalg.pinv(slope) @ c
 
 
@@ -360,7 +360,7 @@ def alignment(machine: Machine, state: State, gauge: Gauge) -> tuple[Array, Arra
     e, f, theta = np.eye(4), np.eye(4), state.theta
     for _ in range(30):
         change = projector(machine, theta, gauge)
-        y = -change @ (theta - machine.parameters.drawing)
+        y = -change @ (theta - machine.parameters.nominal)
         e, f = perturb(np.eye(4), y[:6]) @ e, perturb(np.eye(4), y[6:]) @ f
         theta = moved_centres(machine.layout, state.theta, e, f)
         if np.abs(y).max() < 1e-15:

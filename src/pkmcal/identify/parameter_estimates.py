@@ -32,7 +32,7 @@ ROUNDING_SIGMA = 1e-9
 
 
 def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> tuple[Decider, ...]:
-    """What decides each parameter: data, drawing (the nominal model), frame or fixed.
+    """What decides each parameter: data, nominal model (the nominal model), frame or fixed.
 
     frame : the value only defines the result's frames. fixed : the mechanism file fixes it.
 
@@ -53,8 +53,8 @@ def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> t
 class ParameterEstimate:
     """One parameter: m, rad, or 1 for components of a direction and for ratios.
 
-    drawing, value, sigma : nominal and calibrated value, and its standard deviation in the gauge of
-    the result.
+    nominal model, value, sigma : nominal and calibrated value, and its standard deviation in the
+    gauge of the result.
     data_share : share of the information that comes from the data; NaN where that is undefined.
     decided_by : see :func:`decided_by`.
     """
@@ -177,11 +177,11 @@ def _html_cells(kind: str, row: tuple[str, ...]) -> str:
 
 
 def parameter_estimates(
-    drawing: Array, machine: Machine, covariance: Array, data_share: Array
+    nominal: Array, machine: Machine, covariance: Array, data_share: Array
 ) -> ParameterEstimates:
     """Table of a machine's parameters.
 
-    drawing : (P,) nominal values.
+    nominal : (P,) nominal values.
     covariance : (P, P).
     data_share : (P,).
     """
@@ -192,7 +192,7 @@ def parameter_estimates(
         ParameterEstimate(
             name=name,
             unit=table.units[k],
-            drawing=float(drawing[k]),
+            drawing=float(nominal[k]),
             value=float(machine.values[k]),
             sigma=float(sigma[k]),
             data_share=float(data_share[k]),

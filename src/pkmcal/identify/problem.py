@@ -102,7 +102,8 @@ class _Evaluated(NamedTuple):
 class Problem:
     """The joint estimation of B runs; a :class:`~pkmcal.solver.search.Divisible`.
 
-    layout, drawing (P,) nominal values, free (P, nz) : the machine. unknowns : and their columns.
+    layout, nominal model (P,) nominal values, free (P, nz) : the machine. unknowns : and their
+    columns.
     blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns and prior_target : (c,). frames : (12 + n, g)
     changes of frames and of the hinges' origins that no measurement determines. pose_blocks,
@@ -113,7 +114,7 @@ class Problem:
     """
 
     layout: LimbLayout
-    drawing: Array
+    nominal: Array
     free: Array
     unknowns: Unknowns
     blocks: EdgeBlocks
@@ -133,7 +134,7 @@ class Problem:
     def __post_init__(self) -> None:
         """Keep the structure of a problem of the same measurements."""
         parts = (
-            self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames,
+            self.layout, self.nominal, self.free, self.unknowns, self.blocks, self.frames,
             self.link_blocks,
         )  # fmt: skip
         if self.structure_cache is None or not self.structure_cache.made_of(*parts):
@@ -260,7 +261,7 @@ class Problem:
 
         For derivatives by parameters that are fixed; z is then ``theta - nominal``.
         """
-        n, machine = self.drawing.size, self.unknowns.machine
+        n, machine = self.nominal.size, self.unknowns.machine
         prior = [self.prior[:, machine] @ self.structure.to_free, self.prior[:, machine.stop :]]
         problem = replace(
             self,
@@ -268,11 +269,11 @@ class Problem:
             unknowns=replace(self.unknowns, n_free=n),
             prior=np.concatenate(prior, axis=1),
         )
-        return problem, replace(state, z=self.theta(state) - self.drawing)
+        return problem, replace(state, z=self.theta(state) - self.nominal)
 
     def theta(self, state: BatchState) -> Array:
         """Machine parameters (B, P)."""
-        return self.drawing + state.z @ self.free.T
+        return self.nominal + state.z @ self.free.T
 
     def closure(self, state: BatchState) -> Closure:
         """The closure of all runs and configurations, (B, K, E)."""
@@ -398,7 +399,7 @@ class Problem:
         """Derivatives of the closures (B, K, E, n) by the structure's ``closure_index``, and by the
         own unknowns; zero where they are not finite.
         """
-        by_theta = dense(c, self.drawing.size) if self.layout.shares_motors else c.by_theta
+        by_theta = dense(c, self.nominal.size) if self.layout.shares_motors else c.by_theta
         out = self._by_noise(c, by_theta)
         lost = ~np.isfinite(out.sum(axis=-1))
         if lost.any():
@@ -540,7 +541,7 @@ class Problem:
         z = shared[:, u.machine]
         moves = z @ self.structure.moves_of.T
         y, slides = moves[:, :12], moves[:, 12:]
-        by_moves = move_generators(layout, self.theta(state), self.drawing) @ moves[..., None]
+        by_moves = move_generators(layout, self.theta(state), self.nominal) @ moves[..., None]
         motion = own @ layout.own_motion.T
         steps = (
             shared[:, u.stations].reshape(len(z), u.n_stations, 6),
@@ -573,10 +574,10 @@ class Problem:
         """The state after exact changes E and F of both frames (B, 2, 4, 4), and others (B, n)."""
         layout, (e, f), back = self.layout, frames.swapaxes(0, 1), inverse(frames)
         theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
-        theta = on_tangents(layout, theta, self.drawing)
+        theta = on_tangents(layout, theta, self.nominal)
         return replace(
             state,
-            z=(theta - self.drawing) @ self.structure.to_free.T,
+            z=(theta - self.nominal) @ self.structure.to_free.T,
             T_camera_base=state.T_camera_base @ back[:, :1],
             T_base_platform=e[:, None] @ state.T_base_platform @ back[:, 1:],
             T_mount=moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
@@ -629,7 +630,7 @@ class Problem:
         change = (after - before)[..., :3, :]
         turned = np.linalg.norm(change[..., :3], axis=(-2, -1)) / np.sqrt(2)
         direction = np.linalg.norm(change[..., 3], axis=-1) + self.structure.reach * turned
-        length = rod_lengths(layout, self.drawing, self.data.joints)
+        length = rod_lengths(layout, self.nominal, self.data.joints)
         bent = direction**2 > 2 * np.nanmin(length, axis=-1) * self.joint_noise[:, None]
         if bent.any():
             bent &= singularity_of(layout, scaled_rows(self.closure(state))) > NEAR_SINGULAR

@@ -105,7 +105,7 @@ def sentence(
     names = tuple(table.names[k] for k in rows)
     several = len(open_motion.legs) > 1
     reference_values, n = (
-        "known from the drawing only" if weak else "free",
+        "known from the nominal model only" if weak else "free",
         len(open_motion.numbers),
     )
     open_ = f"{'is' if n == 1 else 'are'} {reference_values}"
@@ -115,9 +115,9 @@ def sentence(
         "each": "each of " if several else "",
         "is": f"is {reference_values}",
         "are": f"are {reference_values}",
-        "open": "to the drawing" if weak else "free",
-        "better": " better than the drawing does" if weak else "",
-        "limited": ", which only the drawing limits" if weak else "",
+        "open": "to the nominal model" if weak else "free",
+        "better": " better than the nominal model does" if weak else "",
+        "limited": ", which only the nominal model limits" if weak else "",
         "n": in_full(n),
         "combinations": f"{in_full(n)} combination{'' if n == 1 else 's'}"
         f"{' each' if several and len(open_motion.motion.legs) == 1 else ''} {open_}",
@@ -130,7 +130,8 @@ def sentence(
     how_far = "This does not move the platform."
     if matters:
         how_far = (
-            f"Within the drawing's tolerances this moves the platform by {shifted * 1e3:.2g} mm"
+            "Within the nominal model's tolerances this moves the platform by"
+            f" {shifted * 1e3:.2g} mm"
             " (rms of its joints over these and nearby poses; what moves all poses alike, as other"
             " frames do, is not counted)."
         )
@@ -207,11 +208,11 @@ def advice_on(
         "turn": f"{take} configurations that turn these joints further, to both sides",
         "size": "Let a board be seen with the legs (observe: [legs, board]), whose squares tell the"
         " size, or check the readings over a long way against a measure",
-        "drawing": "Legs look the same however these axes lie: leave them to the drawing",
+        "drawing": "Legs look the same however these axes lie: leave them to the nominal model",
     }[open_motion.motion.advice]
-    decide = f"{held} if the drawing is sure of that"
+    decide = f"{held} if the nominal model is sure of that"
     if weak:
-        decide = "state smaller tolerances in the mechanism file if the drawing warrants them"
+        decide = "state smaller tolerances in the mechanism file if the nominal model warrants them"
     return f"{do}; or {decide}."
 
 
@@ -251,7 +252,7 @@ def _enough(around: Situation, motion: NamedChanges, names: tuple[str, ...]) -> 
         return names
     table = around.machine.parameters
     axes = [n for n in sorted(names) if ".axis." in n]
-    axes = [n for n in axes if abs(table.drawing[table.index(n)]) < ZERO_AXIS_COMPONENT]
+    axes = [n for n in axes if abs(table.nominal[table.index(n)]) < ZERO_AXIS_COMPONENT]
     return tuple(axes[:1]) or tuple(n for n in names if ".platform." in n) or names
 
 

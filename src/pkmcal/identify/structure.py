@@ -50,7 +50,7 @@ class Structure:
     """
 
     layout: LimbLayout
-    drawing: Array
+    nominal: Array
     free: Array
     unknowns: Unknowns
     blocks: EdgeBlocks
@@ -60,7 +60,7 @@ class Structure:
     def made_of(self, *parts: object) -> bool:
         """Whether its parts are these objects, in their order."""
         own = (
-            self.layout, self.drawing, self.free, self.unknowns, self.blocks, self.frames,
+            self.layout, self.nominal, self.free, self.unknowns, self.blocks, self.frames,
             self.link_blocks,
         )  # fmt: skip
         return all(mine is other for mine, other in zip(own, parts, strict=True))
@@ -97,14 +97,14 @@ class Structure:
         """Columns of an edge's row while it is written: the shared unknowns, one for each parameter
         where parameters are tied or are axes, and one for padding.
         """
-        return self.unknowns.count + 1 + (0 if self.choice is not None else self.drawing.size)
+        return self.unknowns.count + 1 + (0 if self.choice is not None else self.nominal.size)
 
     @cached_property
     def column(self) -> Integers:
         """Column of each parameter's derivatives, (P + 1,); the last is for padding."""
         if self.choice is None:
-            return self.unknowns.count + np.arange(self.drawing.size + 1)
-        out = np.full(self.drawing.size + 1, self.unknowns.count)
+            return self.unknowns.count + np.arange(self.nominal.size + 1)
+        out = np.full(self.nominal.size + 1, self.unknowns.count)
         out[self.choice] = np.arange(len(self.choice))
         return out
 
@@ -113,13 +113,13 @@ class Structure:
         """Frame changes and others (12 + n, nz) that explain most of a step of z, by least squares
         at the nominal model; the remainder is small and added linearly.
         """
-        by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
+        by_moves = self.to_free @ move_generators(self.layout, self.nominal, self.nominal)
         return self.frames @ np.linalg.pinv(by_moves @ self.frames)
 
     @cached_property
     def reach(self) -> float:
         """Largest nominal distance of a joint from the platform's origin, m."""
-        ends = platform_ends(self.layout, self.drawing, np.eye(4))
+        ends = platform_ends(self.layout, self.nominal, np.eye(4))
         return float(np.linalg.norm(ends.b, axis=-1).max())
 
     @cached_property
@@ -187,7 +187,7 @@ class Structure:
         each depends on the parameters of all.
         """
         if self.layout.shares_motors:
-            return np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
+            return np.tile(np.arange(self.nominal.size), (self.layout.n_equations, 1))
         return self.layout.closure_index
 
     @cached_property

@@ -174,7 +174,7 @@ def checked_poses(poses: Array) -> Array:
 
 
 def centres_and_tool(
-    drawing: Machine, estimate: Estimate, joints: Array
+    nominal: Machine, estimate: Estimate, joints: Array
 ) -> tuple[tuple[Centres, ...], ToolError]:
     """Joint centres of an estimate, and errors of the poses of the configurations in use,
     gauge-free; joints (K, m).
@@ -183,12 +183,12 @@ def centres_and_tool(
     covariance = free_of_gauge(machine, estimate.covariance)
     in_view = estimate.edge_weights.size > 0
     poses = estimate.state.T_base_platform[used]
-    tool = tool_error(drawing, machine, covariance, poses, joints[used], legs_observed=in_view)
-    return joint_centres(drawing, machine, covariance), tool
+    tool = tool_error(nominal, machine, covariance, poses, joints[used], legs_observed=in_view)
+    return joint_centres(nominal, machine, covariance), tool
 
 
 def tool_error(
-    drawing: Machine,
+    nominal: Machine,
     calibrated: Machine,
     covariance: Array,
     poses: Array,
@@ -220,7 +220,7 @@ def tool_error(
     jacobian = np.full((n, 6, theta.size), np.nan)
     jacobian[rows] = pose_by_parameters(calibrated, joints[rows], poses[rows])
     off = np.full((n, 6, 1), np.nan)
-    off[rows, :, 0] = _off(drawing, calibrated, joints[rows], poses[rows])
+    off[rows, :, 0] = _off(nominal, calibrated, joints[rows], poses[rows])
     # frames removed from both
     by, off = (
         without_frames(calibrated, poses, change, every=not legs_observed, fitted=fitted)
@@ -262,7 +262,7 @@ def without_frames(
     return change - frames @ np.linalg.lstsq(rows, flat, rcond=1e-9)[0]
 
 
-def _off(drawing: Machine, calibrated: Machine, joints: Array, poses: Array) -> Array:
+def _off(nominal: Machine, calibrated: Machine, joints: Array, poses: Array) -> Array:
     """Differences (n, 6) of the nominal from the calibrated poses, left perturbation; NaN where
     either machine has none.
 
@@ -272,10 +272,10 @@ def _off(drawing: Machine, calibrated: Machine, joints: Array, poses: Array) -> 
     """
     along = calibrated.layout.motion @ calibrated.layout.motion.T
     nothing = np.zeros((calibrated.values.size, calibrated.values.size))
-    centres = joint_centres(drawing, calibrated, nothing)
-    base, platform = (side.T_calibrated_drawing for side in centres)
+    centres = joint_centres(nominal, calibrated, nothing)
+    base, platform = (side.T_calibrated_nominal for side in centres)
     start = pose_difference(inverse(base) @ poses @ platform, poses) @ along
-    before = drawing.forward_result(joints, perturb(poses, start))
+    before = nominal.forward_result(joints, perturb(poses, start))
     after = calibrated.forward_result(joints, poses)
     shifted = base @ before.T_base_platform @ inverse(platform)
     difference = pose_difference(shifted, after.T_base_platform) @ along

@@ -91,7 +91,7 @@ class Findings:
     identifiability: Identifiability
     unidentified: tuple[Sentence, ...]
     weak: tuple[Sentence, ...]
-    by_drawing: float
+    by_nominal: float
     conditions: tuple[Condition, ...] = ()
     conventional: tuple[str, ...] = ()
     also_conventional: int = 0

@@ -103,7 +103,7 @@ def judge(
     if bed:
         undetermined = list(_bed_unknown(bed))
     elif not large:
-        undetermined = list(_platform_unknown(estimate, findings.by_drawing))
+        undetermined = list(_platform_unknown(estimate, findings.by_nominal))
     # all findings, in the order of the report
     every = (
         *_estimate_misfit(estimate, method),
@@ -160,8 +160,8 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
         )
     machine = estimate.machine
     covariance = free_of_gauge(machine, estimate.covariance)  # medians that favour no frame
-    drawing = machine.with_values(machine.parameters.drawing)
-    bodies = joint_centres(drawing, machine, covariance)
+    nominal = machine.with_values(machine.parameters.nominal)
+    bodies = joint_centres(nominal, machine, covariance)
     centre = float(np.median(np.concatenate([body.sigma for body in bodies])))
     offsets = np.diag(covariance)[machine.parameters.of_kind("offset")]
     offset = float(np.sqrt(np.median(offsets))) if offsets.size else 0.0
@@ -171,21 +171,21 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     )
 
 
-def no_gain(sigma: float, by_nominal: float) -> bool:
+def no_gain(sigma: float, by_drawing: float) -> bool:
     """Whether a result is no better than the nominal model, for data of any kind.
 
     sigma : standard deviation of the purpose of the result (the platform at given readings, or the
     tool's height above the bed).
-    by_nominal : the same by the prior sigmas alone, in the same unit.
+    by_drawing : the same by the prior sigmas alone, in the same unit.
     """
-    return not sigma <= NOMINAL_ERROR_SHARE * by_nominal
+    return not sigma <= NOMINAL_ERROR_SHARE * by_drawing
 
 
-def _platform_unknown(estimate: Estimate, by_nominal: float) -> Iterator[Finding]:
+def _platform_unknown(estimate: Estimate, by_drawing: float) -> Iterator[Finding]:
     """Wrong if measurements of the platform do not improve on the nominal model."""
     sigma = platform_sigma(estimate)
-    if no_gain(sigma, by_nominal):
-        yield wrong("platform.no_gain", sigma=sigma, nominal_sigma=by_nominal)
+    if no_gain(sigma, by_drawing):
+        yield wrong("platform.no_gain", sigma=sigma, nominal_sigma=by_drawing)
 
 
 def _bed_unknown(bed: Bed) -> Iterator[Finding]:
@@ -261,11 +261,11 @@ def _base_alone(estimate: Estimate) -> Finding:
     principal axes, the posterior has the variance v = e / (1 + e) where the edges' is e.
     """
     machine, table = estimate.machine, estimate.machine.parameters
-    drawing = machine.with_values(table.drawing)
+    nominal = machine.with_values(table.nominal)
     root = table.free_matrix() * table.tolerances_free()
     # covariances of the base centres after and before
     together, before = (
-        joint_centres(drawing, machine, free_of_gauge(machine, covariance))[0].covariance
+        joint_centres(nominal, machine, free_of_gauge(machine, covariance))[0].covariance
         for covariance in (estimate.covariance, root @ root.T)
     )
     # principal axes of the prior
@@ -277,10 +277,10 @@ def _base_alone(estimate: Estimate) -> Finding:
     # e, and back to metres
     by_edges = v / np.maximum(1 - v, EXACT_SHARE)
     alone = np.sum((unit @ axes) ** 2 * by_edges)
-    edges, nominal, both = (
+    edges, prior, both = (
         float(np.sqrt(x / len(before))) for x in (alone, np.trace(before), np.trace(together))
     )
-    return wrong("estimate.base_only", sigma=both, edges_sigma=edges, nominal_sigma=nominal)
+    return wrong("estimate.base_only", sigma=both, edges_sigma=edges, nominal_sigma=prior)
 
 
 def _poses_misfit(estimate: Estimate, richer: tuple[RicherModel, ...]) -> Iterator[Finding]:
@@ -325,7 +325,7 @@ def _unidentifiable_text(
     weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
     open_ = findings.unidentified + weak
     total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
-    if total <= UNIDENTIFIABLE * findings.by_drawing:
+    if total <= UNIDENTIFIABLE * findings.by_nominal:
         return (), open_
     # where other causes make more of the standard deviation, that deviation suffices
     if total <= np.sqrt(max(platform_sigma(estimate) ** 2 - total**2, 0.0)):
@@ -361,7 +361,7 @@ def _undecided(estimate: Estimate) -> list[str]:
 def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]:
     """Findings on values far from the nominal model, and on what increases standard deviations."""
     table = estimate.machine.parameters
-    change = np.abs(_from_drawing(estimate.machine))
+    change = np.abs(_from_nominal(estimate.machine))
     far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_NOMINAL]
     if far:
         yield doubtful(
@@ -381,14 +381,14 @@ def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]
         yield doubtful("edges.polished", value=float(shading.min()))
 
 
-def _from_drawing(machine: Machine) -> Array:
+def _from_nominal(machine: Machine) -> Array:
     """Changes (P,) of the parameters in prior sigmas, in the frames that make them least.
 
     Frames by three joints would add these joints' errors to all other parameters, axes above all.
     """
     table = machine.parameters
-    change = (machine.values - table.drawing) / table.tolerance
-    frames = generators(machine.layout, table.drawing) @ freedoms(machine)
+    change = (machine.values - table.nominal) / table.tolerance
+    frames = generators(machine.layout, table.nominal) @ freedoms(machine)
     frames = frames / table.tolerance[:, None]
     return change - frames @ np.linalg.lstsq(frames, change, rcond=None)[0]
 

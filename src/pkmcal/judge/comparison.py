@@ -94,10 +94,10 @@ class WeighedErrors:
 
 
 @dataclass(frozen=True)
-class BesideDrawing:
+class NominalComparison:
     """Calibrated and nominal machine compared on n configurations.
 
-    rows : (n,) their indices. calibrated, drawing : errors of both machines. before, after : (n,)
+    rows : (n,) their indices. calibrated, nominal : errors of both machines. before, after : (n,)
     root mean squares of each configuration's residuals by the nominal and by the calibrated
     machine, weighted by their observability in the images (:class:`Weights`), m or rad. floor :
     expected value by the noise of the images alone. ratio : of before to after. promise : test of
@@ -106,7 +106,7 @@ class BesideDrawing:
 
     rows: Integers
     calibrated: ReadingErrors
-    drawing: ReadingErrors
+    nominal: ReadingErrors
     before: Array
     after: Array
     floor: float
@@ -131,7 +131,7 @@ class BesideDrawing:
         """
         test = self.promise
         machines = {
-            "drawing": (self.drawing, self.before),
+            "drawing": (self.nominal, self.before),
             "calibrated": (self.calibrated, self.after),
         }
         return {
@@ -162,20 +162,20 @@ class BesideDrawing:
         }
 
 
-def compare_with_drawing(
-    drawing: Machine,
+def compare_with_nominal(
+    nominal: Machine,
     covariance: Array,
     measurements: Measurements,
     prediction: Prediction,
-    by_drawing: Prediction | None,
+    by_nominal: Prediction | None,
     rows: Integers,
-) -> BesideDrawing:
+) -> NominalComparison:
     """Compare the prediction of the calibrated machine with the nominal machine on configurations
     ``rows``.
 
-    covariance : (P, P) of the calibrated machine. by_drawing : prediction of the nominal machine
+    covariance : (P, P) of the calibrated machine. by_nominal : prediction of the nominal machine
     itself. The nominal machine is evaluated at its own poses or at those of the calibrated one,
-    whichever suits it better; at the latter without ``by_drawing``.
+    whichever suits it better; at the latter without ``by_nominal``.
     """
     observed = np.flatnonzero(prediction.observed)
     m = measurements.joints.shape[1]
@@ -186,18 +186,18 @@ def compare_with_drawing(
     weights = Weights.by(np.einsum("kikj->kij", noise.reshape(len(rows), m, len(rows), m)))
     # Errors of both machines.
     calibrated = prediction.errors.of(rows)
-    nominal = errors_on(
-        drawing, measurements.joints[observed], prediction.T_base_platform[observed]
+    before_errors = errors_on(
+        nominal, measurements.joints[observed], prediction.T_base_platform[observed]
     ).of(place)
-    if by_drawing is not None:
-        own = by_drawing.errors.of(rows)
-        if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(nominal.residuals)):
-            nominal = own
-    before, after = weights.of(nominal.residuals), weights.of(calibrated.residuals)
-    return BesideDrawing(
+    if by_nominal is not None:
+        own = by_nominal.errors.of(rows)
+        if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(before_errors.residuals)):
+            before_errors = own
+    before, after = weights.of(before_errors.residuals), weights.of(calibrated.residuals)
+    return NominalComparison(
         rows=rows,
         calibrated=calibrated,
-        drawing=nominal,
+        nominal=before_errors,
         before=before,
         after=after,
         floor=weights.floor,

@@ -158,12 +158,12 @@ def difference(
     # Correlation of two calibrations: common data, and a common nominal model.
     both = [side.saved for side in (one, other) if side.saved is not None]
     shared, share = _shared_data(both)
-    one_drawing = len(both) == 2 and _same_nominal_model(*both)
+    same_nominal = len(both) == 2 and _same_nominal_model(*both)
     change = machine_change(
         one.machine,
         other.machine,
         (one.covariance, other.covariance),
-        one_drawing=one_drawing,
+        same_nominal=same_nominal,
         shared=share,
     )
     legs_observed = all((saved.document.get("residuals") or {}).get("edges") for saved in both)
@@ -194,7 +194,7 @@ def difference(
         centres=joint_centres(one.machine, change.machine, free),
         tool=tool,
         shared=shared,
-        assumed=_assumptions(one, other, one_drawing, shared, share),
+        assumed=_assumptions(one, other, same_nominal, shared, share),
         verdict=Verdict(True, ""),
         changed=changed,
     )
@@ -223,14 +223,14 @@ def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
         + (f" ({listed(odd, 3)} not in both)" if odd else ""),
         expected=f"{a.machine.name}, {a.machine.n_legs} legs, {len(one)} parameters, as in"
         f" {a.name}",
-        next_step="Compare calibrations or drawings of one machine",
+        next_step="Compare calibrations or nominal models of one machine",
     )
 
 
 def _same_nominal_model(one: SavedCalibration, other: SavedCalibration) -> bool:
     """Whether two calibrations have the same nominal values and prior sigmas."""
     first, second = (saved.machine.parameters.tolerance for saved in (one, other))
-    same = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
+    same = np.allclose(one.nominal, other.nominal, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
     return same and np.allclose(first, second)
 
 
@@ -281,7 +281,7 @@ def _p_values(change: MachineChange) -> tuple[float, Array]:
 
 
 def _assumptions(
-    a: ComparedMachine, b: ComparedMachine, one_drawing: bool, shared: int, share: float
+    a: ComparedMachine, b: ComparedMachine, same_nominal: bool, shared: int, share: float
 ) -> tuple[str, ...]:
     """Assumptions of the change's standard deviations, in sentences."""
     out = [
@@ -290,19 +290,21 @@ def _assumptions(
     ]
     nominal = [side for side in (a, b) if side.saved is None]
     if len(nominal) == 2:
-        return (*out, "Drawings are taken at their word, so any difference is one.")
+        return (*out, "Nominal models are taken at their word, so any difference is one.")
     if nominal:
         return (
             *out,
-            f"The drawing {nominal[0].name} is taken at its word; the standard deviations are the"
+            f"The nominal model {nominal[0].name} is taken at its word; the standard"
+            " deviations are the"
             " calibration's.",
             UNMODELLED_CHANGES_TEXT,
         )
     out.append(
-        "Both calibrations lean on the same drawing: where that alone decides, they agree, and its"
+        "Both calibrations lean on the same nominal model: where that alone decides, they"
+        " agree, and its"
         " error is common to both."
-        if one_drawing
-        else "The calibrations lean on different drawings, whose errors are taken to be"
+        if same_nominal
+        else "The calibrations lean on different nominal models, whose errors are taken to be"
         " independent."
     )
     out.append(
@@ -340,7 +342,7 @@ def _with_verdict(d: MachineDifference) -> MachineDifference:
     elif d.change.dof:
         headline = f"Drawing and calibration differ by more than chance explains{_tool_clause(d)}."
     else:
-        headline = f"The drawings differ{_tool_clause(d)}."
+        headline = f"The nominal models differ{_tool_clause(d)}."
     named = (
         [_parameter_finding(d, k) for k in d.significant[:MOST_CHANGES_NAMED]] if d.changed else []
     )

@@ -140,7 +140,7 @@ def held_machine(machine: Machine, radii: bool) -> Machine:
     values = table.unit_axes(machine.values)
     table = replace(
         table,
-        drawing=values,
+        nominal=values,
         fixed=tuple(n for n in table.names if n not in free or n in table.fixed),
         tied=tuple(group for group, _ in groups),
         opposed=tuple(against for _, against in groups),

@@ -11,7 +11,7 @@ from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.holdout import Neighbours, by_region, select
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
-from pkmcal.judge.comparison import BesideDrawing, compare_with_drawing
+from pkmcal.judge.comparison import NominalComparison, compare_with_nominal
 from pkmcal.judge.prediction import predict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -26,8 +26,8 @@ class HoldOut:
 
     region: Neighbours
     estimate: Estimate
-    left_out: BesideDrawing
-    used: BesideDrawing
+    left_out: NominalComparison
+    used: NominalComparison
 
     def document(self, names: tuple[str, ...]) -> dict[str, Any]:
         """Document for programs. names : (K,) of the configurations."""
@@ -43,12 +43,12 @@ def holdout_of(calibration: Calibration) -> HoldOut | None:
     out = calibration.holdout
     if out is None:
         return None
-    drawing = calibration.session.machine
-    return judged_without(drawing, out.measurements, calibration.estimate, out.region)
+    nominal = calibration.session.machine
+    return judged_without(nominal, out.measurements, calibration.estimate, out.region)
 
 
 def hold_out(
-    drawing: Machine, measurements: Measurements, whole: Estimate, region: Neighbours
+    nominal: Machine, measurements: Measurements, whole: Estimate, region: Neighbours
 ) -> HoldOut:
     """Calibrate without a region's configurations and predict them.
 
@@ -57,12 +57,12 @@ def hold_out(
     """
     keep = np.ones(len(measurements.joints), dtype=bool)
     keep[region.rows] = False
-    estimate = bundle(drawing, select(measurements, keep), whole.state)
-    return judged_without(drawing, measurements, estimate, region)
+    estimate = bundle(nominal, select(measurements, keep), whole.state)
+    return judged_without(nominal, measurements, estimate, region)
 
 
 def judged_without(
-    drawing: Machine, measurements: Measurements, estimate: Estimate, region: Neighbours
+    nominal: Machine, measurements: Measurements, estimate: Estimate, region: Neighbours
 ) -> HoldOut:
     """Comparison of an estimate on the configurations of a region that it did not use, and on those
     that it used.
@@ -72,15 +72,15 @@ def judged_without(
     out = region.rows[prediction.observed[region.rows]]
     used = np.setdiff1d(np.flatnonzero(prediction.observed), out)
     both = (
-        compare_with_drawing(drawing, estimate.covariance, measurements, prediction, None, rows)
+        compare_with_nominal(nominal, estimate.covariance, measurements, prediction, None, rows)
         for rows in (out, used)
     )
     return HoldOut(region, estimate, *both)
 
 
 def by_regions(
-    drawing: Machine, measurements: Measurements, whole: Estimate, n: int
+    nominal: Machine, measurements: Measurements, whole: Estimate, n: int
 ) -> tuple[HoldOut, ...]:
     """Holdouts of n regions of the workspace, one after the other."""
-    regions = by_region(drawing, whole, measurements, n)
-    return tuple(hold_out(drawing, measurements, whole, region) for region in regions)
+    regions = by_region(nominal, whole, measurements, n)
+    return tuple(hold_out(nominal, measurements, whole, region) for region in regions)

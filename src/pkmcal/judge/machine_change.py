@@ -3,14 +3,14 @@
 Frames are conventions, so the two are told in those in which they differ least: by least squares
 over all free parameters, each in its tolerance. What is then left, y, has no frames in it.
 
-Both estimates lean on the same drawing where they have the same one, and on the same photographs
-as far as they share them. With the drawing's covariance 1 (in tolerances), and what the data of
-each add to it, I_a and I_b, their covariances are C = (1 + I)^-1, and
+Both estimates lean on the same nominal model where they have the same one, and on the same
+photographs as far as they share them. With the nominal model's covariance 1 (in tolerances), and
+what the data of each add to it, I_a and I_b, their covariances are C = (1 + I)^-1, and
 
     cov(y_b - y_a) = C_a + C_b - C_a J C_b - C_b J C_a,    J = 1 + I_shared,
 
-without the 1 where the drawings differ. Of data that tell unequally much of a direction, the shared
-part is no more than the lesser: an estimate by the same data, but not as good, differs by
+without the 1 where the nominal models differ. Of data that tell unequally much of a direction, the
+shared part is no more than the lesser: an estimate by the same data, but not as good, differs by
 C_a - C_b (Hausman, 1978).
 """
 
@@ -35,7 +35,8 @@ from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import numerical_rank
 
 NULL_VARIANCE_SHARE = 0.99
-"""Part of the drawing's variance that is left, from which on data say nothing of a direction."""
+"""Part of the nominal model's variance that is left, from which on data say nothing of a direction.
+"""
 SETTLED_ESTIMATE_SHARE = 0.01
 """Of a standard deviation: to which the search for an estimate settles, so that two from the same
 data are never held against a spread of nothing."""
@@ -48,8 +49,8 @@ class MachineChange:
     """Machine b less machine a, told in a's frames, in which they differ least.
 
     machine : a with b's values in these frames. change : (P,) of the parameters, m and rad.
-    covariance : (P, P) of that by chance alone; zeros between drawings. chi2, dof : of all that the
-    data tell of the change; dof is 0 between drawings.
+    covariance : (P, P) of that by chance alone; zeros between nominal models. chi2, dof : of all
+    that the data tell of the change; dof is 0 between nominal models.
     """
 
     machine: Machine
@@ -71,16 +72,16 @@ def machine_change(
     b: Machine,
     covariances: tuple[Array | None, Array | None],
     *,
-    one_drawing: bool = True,
+    same_nominal: bool = True,
     shared: float = 0.0,
 ) -> MachineChange:
     """What differs between two machines of the same parameters.
 
-    covariances : (P, P) of either's parameters in any frames; None for a drawing, which is taken
-    at its word. one_drawing : whether both calibrations lean on the same one. shared : of the data
-    of the one that has less, the share that the other saw as well.
+    covariances : (P, P) of either's parameters in any frames; None for a nominal model, which is
+    taken at its word. one_drawing : whether both calibrations lean on the same one. shared : of the
+    data of the one that has less, the share that the other saw as well.
     """
-    held = replace(a, parameters=replace(a.parameters, drawing=a.values))
+    held = replace(a, parameters=replace(a.parameters, nominal=a.values))
     table, layout = held.parameters, held.layout
     before = _state(table.unit_axes(b.values))
     e, f = alignment(held, before, BestFit())
@@ -102,7 +103,7 @@ def machine_change(
     invariant = rest.T @ inward
     y = invariant @ change
     spreads = [None if c is None else invariant @ c @ invariant.T for c in (cov_a, cov_b)]
-    spread, null_space = _spread(spreads, y.size, one_drawing, shared)
+    spread, null_space = _spread(spreads, y.size, same_nominal, shared)
     outward = table.free_matrix() * tolerance @ rest
     return MachineChange(
         machine=held.with_values(there),
@@ -119,7 +120,7 @@ def _state(theta: Array) -> State:
 
 
 def _spread(
-    spreads: Sequence[Array | None], size: int, one_drawing: bool, shared: float
+    spreads: Sequence[Array | None], size: int, same_nominal: bool, shared: float
 ) -> tuple[Array, Array]:
     """Covariance (r, r) of the difference by chance, and the directions (r, k) that data tell."""
     reference_values = [c for c in spreads if c is not None]
@@ -133,14 +134,14 @@ def _spread(
     inverse_one, inverse_other = np.linalg.inv(one), np.linalg.inv(other)
     lesser = _lesser(inverse_one, inverse_other)
     unit = np.eye(len(one))
-    joint = shared * (lesser - unit) + (unit if one_drawing else 0.0)
+    joint = shared * (lesser - unit) + (unit if same_nominal else 0.0)
     cross = one @ joint @ other
     spread = one + other - cross - cross.T + SETTLED_ESTIMATE_SHARE**2 * (one + other)
     return spread, null_vectors
 
 
 def _firm(covariance: Array) -> Array:
-    """A covariance in tolerances, no larger than the drawing's and no smaller than rounding."""
+    """Covariance in tolerances, no larger than the nominal model's, no smaller than rounding."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     return (vectors * np.clip(values, CHANGE_VARIANCE_FLOOR, 1.0)) @ vectors.T
 

@@ -70,7 +70,7 @@ def compare(
             "these are two different machines",
             found=f"{machine.name}, {machine.n_legs} legs, {len(machine.parameters)} parameters",
             expected=f"{known.name}, {known.n_legs} legs, {len(known.parameters)} parameters",
-            next_step="Compare machines of one drawing",
+            next_step="Compare machines of one nominal model",
         )
     # two exact machines: the covariances of centres and tool are not used
     joints = np.asarray(joints, dtype=float)
@@ -80,8 +80,8 @@ def compare(
     poses = known.forward(joints)
     tool = tool_error(machine, known, nothing, poses, joints, legs_observed=legs_observed)
     return MachineErrors(
-        T_base=base.T_calibrated_drawing,
-        T_platform=platform.T_calibrated_drawing,
+        T_base=base.T_calibrated_nominal,
+        T_platform=platform.T_calibrated_nominal,
         base=-base.change,
         platform=-platform.change,
         offset=(machine.values - known.values)[known.parameters.of_kind("offset")],

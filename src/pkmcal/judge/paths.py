@@ -25,7 +25,8 @@ class LinePath:
     """Straight path that the session names.
 
     n : number of points. seen : straightness in the images; None with fewer than three points.
-    drawing, calibrated : by forward kinematics of the readings; None if a machine does not close.
+    nominal model, calibrated : by forward kinematics of the readings; None if a machine does not
+    close.
     """
 
     name: str
@@ -53,14 +54,14 @@ def paths_of(session: Session) -> dict[str, list[int]]:
 
 
 def line_path(
-    name: str, rows: list[int], drawing: Machine, session: Session, prediction: Prediction
+    name: str, rows: list[int], nominal: Machine, session: Session, prediction: Prediction
 ) -> LinePath:
     """Straightness of the tool's path through the configurations ``rows``, observed and
     computed.
     """
     observed = prediction.T_base_platform[rows][prediction.observed[rows]]
     by: list[Straightness | None] = []
-    for machine in (drawing, prediction.machine):
+    for machine in (nominal, prediction.machine):
         fk = machine.forward_result(session.joints[rows])
         closes = bool(fk.converged.all())
         by.append(straightness(fk.T_base_platform[:, :3, 3]) if closes else None)

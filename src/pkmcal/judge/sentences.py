@@ -22,7 +22,7 @@ from pkmcal.judge.changes import (
     StationTest,
     Suspect,
 )
-from pkmcal.judge.comparison import BesideDrawing, Ratio, finite_rms, improvement_ratio
+from pkmcal.judge.comparison import NominalComparison, Ratio, finite_rms, improvement_ratio
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -67,7 +67,7 @@ def better(gain: Ratio) -> str:
 
 
 def validation_verdict(
-    judged: BesideDrawing | None,
+    judged: NominalComparison | None,
     holdouts: Sequence[HoldOut],
     machine: Machine,
     measurements: Measurements,
@@ -109,18 +109,19 @@ def _validation_headline(
 ) -> str:
     if gain.high < 1:
         core = (
-            f"The drawing predicts the readings{where} {factor(1 / gain.value)} times better than"
+            f"The nominal model predicts the readings{where} {factor(1 / gain.value)} times"
+            " better than"
             " the calibrated machine"
         )
     elif gain.better:
         core = (
             f"The calibrated machine predicts the readings{where} {better(gain)} times better than"
-            " the drawing"
+            " the nominal model"
         )
     else:
         core = (
             f"The calibrated machine is not shown to predict the readings{where} better than the"
-            f" drawing: {better(gain)} times"
+            f" nominal model: {better(gain)} times"
         )
     if unit is None:
         return core + "."
@@ -143,7 +144,7 @@ def _not_better(gain: Ratio) -> list[Finding]:
     return [wrong("validation.not_better", **facts, **words)]
 
 
-def _promise_findings(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[Finding]:
+def _promise_findings(groups: Sequence[NominalComparison], units: tuple[str, ...]) -> list[Finding]:
     """Finding on residuals larger than their standard deviations, of the first group with such."""
     for group in groups:
         if not group.promise.usual:
@@ -153,7 +154,7 @@ def _promise_findings(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -
     return []
 
 
-def _residual_finding(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+def _residual_finding(group: NominalComparison, units: tuple[str, ...]) -> Finding:
     one = len(set(units)) == 1
     return wrong(
         "validation.residuals_too_large",
@@ -165,13 +166,13 @@ def _residual_finding(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
     )
 
 
-def _unweighted_findings(group: BesideDrawing, units: tuple[str, ...]) -> list[Finding]:
+def _unweighted_findings(group: NominalComparison, units: tuple[str, ...]) -> list[Finding]:
     """Finding if unweighted root mean squares contradict the verdict, which weights by
     observability.
     """
-    by_drawing, by_calibrated = (group.figures(e) for e in (group.drawing, group.calibrated))
-    worse = by_calibrated.joint_rms > by_drawing.joint_rms
-    if not worse.any() and by_calibrated.position <= by_drawing.position:
+    by_nominal, by_calibrated = (group.figures(e) for e in (group.nominal, group.calibrated))
+    worse = by_calibrated.joint_rms > by_nominal.joint_rms
+    if not worse.any() and by_calibrated.position <= by_nominal.position:
         return []
     joint = int(np.argmax(np.where(worse, by_calibrated.joint_rms, -np.inf)))
     promised = float(group.promise.joint_rms[joint])
@@ -181,7 +182,7 @@ def _unweighted_findings(group: BesideDrawing, units: tuple[str, ...]) -> list[F
     return [doubtful("validation.hardly_seen", **facts)]
 
 
-def _offset_finding(group: BesideDrawing, units: tuple[str, ...]) -> Finding:
+def _offset_finding(group: NominalComparison, units: tuple[str, ...]) -> Finding:
     test = group.promise
     worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
     return wrong(

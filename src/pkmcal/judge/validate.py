@@ -20,7 +20,7 @@ from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.errors import PkmcalError
 from pkmcal.files import json_value
-from pkmcal.judge.comparison import BesideDrawing, compare_with_drawing
+from pkmcal.judge.comparison import NominalComparison, compare_with_nominal
 from pkmcal.judge.holdouts import HoldOut, by_regions
 from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data, repeated_rows
 from pkmcal.judge.paths import LinePath, line_path, paths_of
@@ -54,7 +54,7 @@ class Validation:
     calibration: SavedCalibration
     session: Session
     verdict: Verdict
-    judged: BesideDrawing | None
+    judged: NominalComparison | None
     calibrated: Booleans
     repeated: Booleans
     regions: tuple[HoldOut, ...]
@@ -115,7 +115,7 @@ def validate_calibration(
         data = estimate.stated_edge_noise(remeasured.measurements)
 
         report("Predicting the readings", 0.8)
-        nominal = drawing_of(saved)
+        nominal = nominal_of(saved)
         prediction = predict(saved.machine, data, estimate.state)
         if not regions:
             check_new(calibrated, prediction.observed, *NOT_INDEPENDENT)
@@ -124,14 +124,14 @@ def validate_calibration(
         new = np.flatnonzero(prediction.observed & ~calibrated)
         if new.size:
             try:
-                by_drawing = predict(nominal, data, estimate.state)
+                by_nominal = predict(nominal, data, estimate.state)
             except PkmcalError as error:
                 # the nominal machine is too far off for its poses to be found
-                by_drawing = None
+                by_nominal = None
                 why = str(error).rstrip(".")
                 failed = (note("validation.nominal_fails", why=why),)
-            judged = compare_with_drawing(
-                nominal, saved.covariance, data, prediction, by_drawing, new
+            judged = compare_with_nominal(
+                nominal, saved.covariance, data, prediction, by_nominal, new
             )
 
         report("Holding out regions", 0.9)
@@ -150,14 +150,14 @@ def validate_calibration(
         )
 
 
-def drawing_of(saved: SavedCalibration) -> Machine:
+def nominal_of(saved: SavedCalibration) -> Machine:
     """Nominal machine of a calibration.
 
     The machine of a loaded calibration has the calibrated values as its nominal ones; holdouts of
     regions must not use them as priors, because they depend on the held-out data.
     """
-    table = replace(saved.machine.parameters, drawing=saved.drawing.copy())
-    return replace(saved.machine, parameters=table, values=saved.drawing.copy())
+    table = replace(saved.machine.parameters, nominal=saved.nominal.copy())
+    return replace(saved.machine, parameters=table, values=saved.nominal.copy())
 
 
 def _has_image(session: Session) -> Booleans:

@@ -126,11 +126,11 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
             raise
         raise error.located(document.where(*keys, *_role_keys(checked, str(error)))) from None
     table = machine.parameters
-    lengths = np.where(np.array(table.units) == "m", np.abs(table.drawing), 0.0)
+    lengths = np.where(np.array(table.units) == "m", np.abs(table.nominal), 0.0)
     longest = int(np.argmax(lengths))
     if lengths[longest] > LARGEST_UNITLESS_LENGTH and not any_unit(document.data):
         raise InputError(
-            "the drawing's lengths look like millimetres",
+            "the nominal model's lengths look like millimetres",
             where=document.where(*keys),
             found=f"{table.names[longest]} of {lengths[longest]:g} m",
             expected=f"metres, at most {LARGEST_UNITLESS_LENGTH:g} where no value has a unit",

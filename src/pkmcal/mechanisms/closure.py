@@ -261,7 +261,8 @@ def stacked(first: Array, second: Array) -> Array:
 
 
 def skeletons(layout: LimbLayout, theta: Array, joint_value: Array) -> tuple[Array, ...]:
-    """Points along each leg's arm on the base, for drawings: L arrays (..., k, 3), m, base frame.
+    """Points along each leg's arm on the base, for nominal models: L arrays (..., k, 3), m, base
+    frame.
 
     Each begins where a motor holds the arm and ends at A; only A without an arm.
     joint_value : (..., L), see :func:`joint_values`.
@@ -283,7 +284,8 @@ class LimbEnds:
     internal : (..., n), None for zero.
     base, platform : the parts that depend on the readings, and on the pose.
 
-    Derivatives are evaluated on first use; a trial step of a search, or a drawing, needs none.
+    Derivatives are evaluated on first use; a trial step of a search, or a nominal model, needs
+    none.
     """
 
     layout: LimbLayout
@@ -482,18 +484,18 @@ def along(u: Array, by: Array) -> Array:
     return (u[..., None, :] @ by)[..., 0, :]
 
 
-def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:
+def on_tangents(layout: LimbLayout, theta: Array, nominal: Array) -> Array:
     """Parameters (..., P) with direction vectors rescaled to end on the tangent plane at the
     nominal directions.
 
-    drawing : (P,) nominal values; see
+    nominal : (P,) nominal values; see
         :meth:`pkmcal.mechanisms.parameters.ParameterTable.on_tangents`.
     """
     axes = np.concatenate(layout.turning)
     if not axes.size:
         return theta
     out = np.array(theta)
-    out[..., axes] = theta[..., axes] / dot(theta[..., axes], drawing[axes])[..., None]
+    out[..., axes] = theta[..., axes] / dot(theta[..., axes], nominal[axes])[..., None]
     return out
 
 

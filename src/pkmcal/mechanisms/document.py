@@ -176,7 +176,7 @@ TOLERANCE_RANGE = Field(ge=1e-12)
 the machine's size."""
 
 
-class DrawingTolerance(Schema):
+class NominalTolerance(Schema):
     """Prior sigmas of the nominal values: lengths in metres, axes and angles in radians, scales
     relative, where 0 is exact.
     """
@@ -239,7 +239,7 @@ class MechanismDocument(Schema):
     legs: Annotated[
         tuple[Leg, ...], Field(max_length=MOST_MACHINE_LEGS), AfterValidator(_check_legs)
     ]
-    tolerance: DrawingTolerance = DrawingTolerance()
+    tolerance: NominalTolerance = NominalTolerance()
     home: Home | None = None
     workspace_radius: (
         Annotated[

@@ -39,7 +39,7 @@ rounding of text."""
 PlaceInDocument: TypeAlias = Callable[..., str]
 
 
-def check_drawing(document: MechanismDocument, where: PlaceInDocument | None = None) -> None:
+def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = None) -> None:
     """Raise InputError for a nominal model whose joints and rods do not allow its motion.
 
     where : function that returns a field's location in the file from its keys.

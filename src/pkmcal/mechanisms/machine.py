@@ -28,7 +28,7 @@ from pkmcal.mechanisms.document import (
     MechanismDocument,
     PassiveLength,
 )
-from pkmcal.mechanisms.document_checks import check_drawing
+from pkmcal.mechanisms.document_checks import check_nominal
 from pkmcal.mechanisms.joints import JOINT_AXIS_KINDS, axes_in_use
 from pkmcal.mechanisms.layout import LimbLayout, layout_of
 from pkmcal.mechanisms.motors import (
@@ -230,7 +230,8 @@ class Machine:
                 what=f"mechanism {self.name!r} cannot be assembled with its legs at mid-range",
                 found=f"closure error {float(fk.error.min()) * 1e3:.3g} mm",
                 expected="a platform that all legs reach",
-                next_step="check the drawing's centres and ranges, or give home: {position: ...}",
+                next_step="check the nominal model's centres and ranges, or give home:"
+                " {position: ...}",
             )
         return fk.T_base_platform[good[0]]
 
@@ -420,7 +421,7 @@ class Machine:
         return limb_ends(self.layout, self.values, joints, T_base_platform, internal)
 
     def arms_at(self, joints: Array) -> tuple[Array, ...]:
-        """Points along each leg's arm on the base at readings (..., m), for drawings; see
+        """Points along each leg's arm on the base at readings (..., m), for nominal models; see
         :func:`~pkmcal.mechanisms.closure.skeletons`.
         """
         motions = joint_values(self.layout, self.values, joints)
@@ -440,7 +441,7 @@ def machine_from_document(
     where : function that returns a field's location in the file from its keys.
     Raises InputError if the nominal model is not a machine.
     """
-    check_drawing(document, where)
+    check_nominal(document, where)
     rows = list(_parameter_rows(document))
     ties = (*document.tied, *built_in_ties(document))
     # exact scales are no parameters
@@ -452,11 +453,11 @@ def machine_from_document(
         kinds=tuple(row.kind for row in rows),
         labels=tuple(row.label for row in rows),
         parts=tuple(row.part for row in rows),
-        drawing=np.array([row.nominal for row in rows]),
+        nominal=np.array([row.nominal for row in rows]),
         tolerance=np.array([row.prior_sigma for row in rows]),
     ).with_roles((*held, *built_in_fixed(document)), ties)
     positions = {name: k for k, name in enumerate(table.names)}
-    return Machine(document, table, layout_of(document, positions), table.drawing.copy())
+    return Machine(document, table, layout_of(document, positions), table.nominal.copy())
 
 
 def with_exact_scales(document: MechanismDocument) -> MechanismDocument:

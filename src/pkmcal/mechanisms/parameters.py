@@ -33,7 +33,7 @@ class ParameterTable:
     parts : part of the leg that a parameter changes: its ``base`` or ``platform`` joint, its
         ``rod``, the ``zero`` or the ``lead`` of its reading, or a part named by its carrier; empty
         for a tube's radius, which is no part of the mechanism.
-    drawing, tolerance : (P,) nominal values and their prior sigmas.
+    nominal model, tolerance : (P,) nominal values and their prior sigmas.
     fixed : names that keep their nominal value.
     tied : groups of names that change by the same amount.
     opposed : for each group, the names that change by the opposite amount.
@@ -44,7 +44,7 @@ class ParameterTable:
     kinds: tuple[str, ...]
     labels: tuple[str, ...]
     parts: tuple[str, ...]
-    drawing: Array
+    nominal: Array
     tolerance: Array
     fixed: tuple[str, ...] = ()
     tied: tuple[tuple[str, ...], ...] = ()
@@ -117,7 +117,7 @@ class ParameterTable:
         if len(whole) > 1:
             return whole
         k = self.index(entry)
-        if self.kinds[k] == "axis" and abs(self.drawing[k]) > PARALLEL_AXES_TOLERANCE:
+        if self.kinds[k] == "axis" and abs(self.nominal[k]) > PARALLEL_AXES_TOLERANCE:
             raise InputError(
                 what=f"{entry} cannot be held alone: an axis is one direction",
                 expected=f"the whole axis, {entry.rpartition('.')[0]!r}",
@@ -151,10 +151,10 @@ class ParameterTable:
 
     def _check_parallel(self, group: tuple[str, ...], members: list[list[tuple[str, int]]]) -> None:
         """Check that tied axes are whole and parallel in the nominal model."""
-        axes = np.array([[s * self.drawing[self.index(n)] for n, s in m] for m in members])
+        axes = np.array([[s * self.nominal[self.index(n)] for n, s in m] for m in members])
         if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > PARALLEL_AXES_TOLERANCE:
             raise InputError(
-                what="axes that differ in the drawing are tied",
+                what="axes that differ in the nominal model are tied",
                 found=", ".join(group),
                 expected="whole axes with the same direction in their bodies' frames",
             )
@@ -210,7 +210,7 @@ class ParameterTable:
         Fixed components leave only the rotation orthogonal to them.
         """
         # Orthogonal complement of the axis and the fixed components.
-        axis = self.drawing[first[0] : first[0] + 3]
+        axis = self.nominal[first[0] : first[0] + 3]
         held = [np.eye(3)[i] for k in first for i in range(3) if k + i in fixed]
         span = np.array([axis, *held])
         rank = int(np.linalg.matrix_rank(span, tol=PARALLEL_AXES_TOLERANCE))
@@ -236,7 +236,7 @@ class ParameterTable:
         if not self.axes.size:
             return values
         axis = values[..., self.axes]
-        size = np.sum(axis * self.drawing[self.axes], axis=-1, keepdims=True)
+        size = np.sum(axis * self.nominal[self.axes], axis=-1, keepdims=True)
         out = np.array(values, dtype=float)
         out[..., self.axes] = axis / np.where(size > 0.1, size, 1.0)
         return out
@@ -245,7 +245,7 @@ class ParameterTable:
         """Free unknowns z (..., n_free) of values (..., P) by least squares; deviations from fixed
         or tied parameters are dropped.
         """
-        change = self.on_tangents(values) - self.drawing
+        change = self.on_tangents(values) - self.nominal
         return change @ np.linalg.pinv(self._free).T
 
     def first_of_free(self) -> Integers:

@@ -141,7 +141,7 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
             else "Check"
         )
         + " that these photographs show this machine's legs, that each bears the name"
-        " of its configuration, and that the drawing is this machine's"
+        " of its configuration, and that the nominal model is this machine's"
         + ("" if worst.by_hand is not None else "; a pose by hand, right to 20 cm, may help"),
         code="station.not_recognised",
     )
@@ -435,7 +435,7 @@ def _two_legs(a: int, b: int) -> InputError:
         where="joints.csv",
         found="the photographs fit with these two columns exchanged",
         next_step=f"Exchange the columns of legs {a} and {b} in joints.csv, or the two legs in"
-        " the drawing",
+        " the nominal model",
         code="readings.exchanged",
     )
 
@@ -444,11 +444,11 @@ def _numbering(order: Integers) -> InputError:
     """The error about legs that are numbered differently; order : column of each leg, from 0."""
     rising = bool((order[1] - order[0]) % len(order) == 1)
     return InputError(
-        "the legs are numbered differently in the readings and in the drawing",
+        "the legs are numbered differently in the readings and in the nominal model",
         where="joints.csv",
         found=f"the photographs fit when leg 1 takes the readings of column {order[0] + 1},"
         f" leg 2 those of column {order[1] + 1}, and so on {'round' if rising else 'backwards'}",
-        next_step="Give the columns of joints.csv the order of the legs in the drawing",
+        next_step="Give the columns of joints.csv the order of the legs in the nominal model",
         code="readings.numbering_turned" if rising else "readings.numbering_reversed",
     )
 

@@ -83,23 +83,23 @@ class Spot:
     leg : from 1.
     end : base or platform.
     calibrated : pixel by the model of the overlay.
-    drawing : pixel by the nominal model, None without comparison.
+    nominal : pixel by the nominal model, None without comparison.
     labelled : whether the leg's number stands here.
     """
 
     leg: int
     end: str
     calibrated: tuple[float, float]
-    drawing: tuple[float, float] | None
+    nominal: tuple[float, float] | None
     labelled: bool
 
     @property
     def tip(self) -> str:
         """Tooltip: name of the joint, and distance between the two models."""
-        if self.drawing is None:
+        if self.nominal is None:
             return f"Leg {self.leg}, {self.end} joint"
-        away = float(np.hypot(*np.subtract(self.calibrated, self.drawing)))
-        return f"Leg {self.leg}, {self.end} joint: drawing {number(away, 1)} px away"
+        away = float(np.hypot(*np.subtract(self.calibrated, self.nominal)))
+        return f"Leg {self.leg}, {self.end} joint: nominal model {number(away, 1)} px away"
 
 
 @dataclass(frozen=True)

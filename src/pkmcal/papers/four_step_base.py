@@ -214,7 +214,7 @@ class Items(NamedTuple):
         return np.concatenate([self.centres_visible, self.directions_visible], axis=1)
 
     @property
-    def drawing(self) -> Array:
+    def nominal(self) -> Array:
         """All items of the nominal model, (L + D, 3) m."""
         return np.concatenate([self.drawn, self.lever * self.drawn_directions])
 
@@ -225,7 +225,7 @@ class Items(NamedTuple):
 
     def fixed(self) -> Booleans:
         """Views (V,) whose own items determine their pose."""
-        return fixes_pose(self.drawing, self.visible, self.n_directions)
+        return fixes_pose(self.nominal, self.visible, self.n_directions)
 
     def placed(self, items: Array) -> Array:
         """Poses (B, V, 4, 4) of the views that fit items (B, L + D, 3)."""
@@ -244,7 +244,7 @@ def base_by_registration(items: Items, gauge: Array) -> Base:
     measured, weight = items.measured, items.visible.astype(float)
     shape = measured[:, use].shape[:-1]
     weight = np.broadcast_to(weight[use], shape)
-    body = fit_body(measured[:, use], weight, gauge, items.drawing, directions=items.n_directions)
+    body = fit_body(measured[:, use], weight, gauge, items.nominal, directions=items.n_directions)
     return _base(items, body.points)
 
 
@@ -255,7 +255,7 @@ def base_by_products(items: Items, gauge: Array) -> Base:
     paper's count of C(n, 2) products shows. The vectors of a view run from its first visible centre
     to its others; axes are scaled by a length, which the paper does not specify.
     """
-    n = len(items.drawing)
+    n = len(items.nominal)
     to_p, to_q, view = [np.zeros((0, n))], [np.zeros((0, n))], [np.zeros(0, dtype=int)]
     for v, in_view in enumerate(items.visible):
         vectors = np.eye(n)[in_view]  # rows that give the view's vectors from its items
@@ -275,7 +275,7 @@ def base_by_products(items: Items, gauge: Array) -> Base:
         jac = by_p[..., None] * vq[:, :, None] + by_q[..., None] * vp[:, :, None]
         return dot(vp, vq) - above_limit[runs], jac
 
-    return _base(items, points_by(products, items.drawing, gauge, len(above_limit)))
+    return _base(items, points_by(products, items.nominal, gauge, len(above_limit)))
 
 
 def _base(items: Items, points: Array) -> Base:
@@ -317,7 +317,7 @@ def rough_rotations(machine: Machine, axes: Axes, items: Items, views: StationVi
 def _by_directions(machine: Machine, axes: Axes, views: StationViews) -> Array:
     """Rotations (B, V, 3, 3) that fit the nominal directions of the legs to the measured ones."""
     joints = axes.readings[..., machine.layout.actuated >= 0]
-    drawn = machine.with_values(machine.parameters.drawing)
+    drawn = machine.with_values(machine.parameters.nominal)
     poses = drawn.forward_result(joints, drawn.home()).T_base_platform
     b = poses[..., None, :3, :3] @ drawn.platform_centers()[:, :, None]
     d = b[..., 0] + poses[..., None, :3, 3] - drawn.base_centers()

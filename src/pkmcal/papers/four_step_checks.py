@@ -87,7 +87,7 @@ def stations_are_joined(items: Items, views: StationViews) -> None:
     if not free.shape[-1]:
         return
     in_view = items.visible[items.fixed()]
-    parts = parts_of(items.drawing, in_view, free, items.n_directions)
+    parts = parts_of(items.nominal, in_view, free, items.n_directions)
     a, b = (np.flatnonzero(part[: len(items.drawn)]) for part in parts)
     sees = [
         f"station {s + 1} sees {named(np.flatnonzero(items.centres_visible[view]))}"
@@ -107,7 +107,7 @@ def free_ways(items: Items) -> Array:
     """Unidentifiable directions (L + D, 3, f): motions of base joints against others in
     all views.
     """
-    return loose(items.drawing, items.visible[items.fixed()], items.n_directions)
+    return loose(items.nominal, items.visible[items.fixed()], items.n_directions)
 
 
 def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
@@ -212,7 +212,8 @@ def not_collapsed(legs: DrawnLegs, q0: Array) -> None:
             found=f"{1e3 * q0[short[0]]:.0f} mm",
             expected=f"about {1e3 * legs.rod[short[0]]:.0f} mm as drawn; at zero length both its "
             "joints fall together, which fits the photographs for a wrong reason",
-            next_step=f"check the drawing's length, add configurations, or {USE_JOINT_METHOD}",
+            next_step=f"check the nominal model's length, add configurations, or"
+            f" {USE_JOINT_METHOD}",
         )
 
 

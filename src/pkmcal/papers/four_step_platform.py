@@ -87,7 +87,7 @@ def joint_distance_deviations(
 
 
 def platform_by_registration(
-    b: Array, visible: Booleans, drawing: Array, gauge: Array, motion: Array = ANY_MOTION
+    b: Array, visible: Booleans, nominal: Array, gauge: Array, motion: Array = ANY_MOTION
 ) -> Array:
     """Step 4 corrected, [A] 16: platform centres (B, L, 3) from the centres in K frames.
 
@@ -95,11 +95,11 @@ def platform_by_registration(
     frame must determine its pose. motion : (6, d) of the platform in those frames.
     """
     weight = np.broadcast_to(visible, b.shape[:-1]).astype(float)
-    return fit_body(b, weight, gauge, drawing, motion=motion).points
+    return fit_body(b, weight, gauge, nominal, motion=motion).points
 
 
 def platform_by_distances(
-    b: Array, visible: Booleans, station: Integers, drawing: Array, gauge: Array
+    b: Array, visible: Booleans, station: Integers, nominal: Array, gauge: Array
 ) -> Array:
     """Step 4 as printed, [A] 16: centres with each station's mean distances.
 
@@ -123,7 +123,7 @@ def platform_by_distances(
         jac[:, row, g] = -v / distance[..., None]
         return distance - above_limit[runs], jac
 
-    return points_by(distances, drawing, gauge, len(b))
+    return points_by(distances, nominal, gauge, len(b))
 
 
 def platform_axes(
@@ -196,8 +196,8 @@ def universal_axes(
 
     count = np.maximum(visible.sum(axis=0), 5)
     start = np.zeros((len(u), u.shape[2], 4))
-    x, variance = _beside_drawing(rows, start, count, TORSION_NOISE_TOLERANCES * tolerance)
-    x, _ = _beside_drawing(rows, x, count, tolerance, variance)
+    x, variance = _compared_with_nominal(rows, start, count, TORSION_NOISE_TOLERANCES * tolerance)
+    x, _ = _compared_with_nominal(rows, x, count, tolerance, variance)
     return _tilted(drawn[0], x[..., :2])[0], _tilted(drawn[1], x[..., 2:])[0]
 
 
@@ -209,7 +209,7 @@ def _tilted(axis: Array, x: Array) -> tuple[Array, Array]:
     return shifted / size, across_directions(shifted / size) @ tangents / size[..., None]
 
 
-def _beside_drawing(
+def _compared_with_nominal(
     rows: Callable[[Array], tuple[Array, Array]],
     x: Array,
     count: Integers,

@@ -89,7 +89,7 @@ class _Rows(NamedTuple):
 class ImplicitProblem:
     """solver.LeastSquares of B runs with N poses each; stations' unknowns perturb T_base_camera.
 
-    layout, drawing (P,), free (P, nz) : the machine. station, mount : (N,), of n_stations and
+    layout, nominal model (P,), free (P, nz) : the machine. station, mount : (N,), of n_stations and
     n_mounts. T_camera_board : (B, N, 4, 4) and readings : (B, N, m). form : see the module.
     weigh : (B, N, r, r) of the rows, constant during the search. prior : (c, nz) rows on z.
     keep : (na,) False for fixed unknowns.
@@ -102,7 +102,7 @@ class ImplicitProblem:
     """
 
     layout: LimbLayout
-    drawing: Array
+    nominal: Array
     free: Array
     station: Integers
     mount: Integers
@@ -123,7 +123,7 @@ class ImplicitProblem:
 
     def theta(self, state: ImplicitState) -> Array:
         """Machine parameters (B, P)."""
-        return self.drawing + state.z @ self.free.T
+        return self.nominal + state.z @ self.free.T
 
     def residuals(self, state: ImplicitState) -> Values:
         """Weighted rows; NaN where the inverse kinematics has no solution."""
@@ -135,7 +135,7 @@ class ImplicitProblem:
         rows = self._rows(state)
         # closure rows are followed by the deviations, which do not depend on z and the hinges
         off = ((0, 0), (0, 0), (0, rows.taken.off.shape[-1]), (0, 0))
-        closures = rows.scale[..., None] * (dense(rows.closure, self.drawing.size) @ self.free)
+        closures = rows.scale[..., None] * (dense(rows.closure, self.nominal.size) @ self.free)
         stations, mounts = np.eye(self.n_stations)[self.station], np.eye(self.n_mounts)[self.mount]
         by_shared = np.concatenate([
             np.pad(closures, off),
@@ -280,7 +280,7 @@ def inverse_kinematic(machine: Machine, measurements: Measurements, start: State
     )
     noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)
     fit = fit_machine_to_poses(
-        machine, problem, state, noise, measurements.joint_noise, use_drawing=True
+        machine, problem, state, noise, measurements.joint_noise, use_prior=True
     )
     return _session_state(machine, measurements, start, fit)
 
@@ -313,7 +313,7 @@ def pose_problem(
     off = 6 - layout.motion.shape[1]  # rows of deviations, without weight as printed
     problem = ImplicitProblem(
         layout=layout,
-        drawing=table.drawing,
+        nominal=table.nominal,
         free=table.free_matrix(),
         station=measurements.poses.station,
         mount=measurements.poses.mount,
@@ -348,7 +348,7 @@ def fit_machine_to_poses(
     noise: Array | None,
     joint_noise: float,
     *,
-    use_drawing: bool,
+    use_prior: bool,
 ) -> PoseFit:
     """Estimate of B runs.
 
@@ -356,7 +356,7 @@ def fit_machine_to_poses(
     boards' axis of rotation is estimated first and fixed, [C] III.B. use_drawing : use the nominal
     values as measurements.
     """
-    if use_drawing:
+    if use_prior:
         problem = replace(problem, prior=np.diag(1 / machine.parameters.tolerances_free()))
     state = on_axis(problem, start)
     if noise is not None:

@@ -53,10 +53,10 @@ class DrawnLegs:
 
 def legs_as_drawn(machine: Machine) -> DrawnLegs:
     """Joints of the machine's nominal model."""
-    layout, drawing = machine.layout, machine.parameters.drawing
-    base, platform = (drawing[index] for index in centre_index(layout))
+    layout, nominal = machine.layout, machine.parameters.nominal
+    base, platform = (nominal[index] for index in centre_index(layout))
     base_axes, platform_axes = (
-        np.where(index >= 0, drawing[index], np.nan)
+        np.where(index >= 0, nominal[index], np.nan)
         for index in (layout.base_axis, layout.platform_axis)
     )
     angles = layout.angles
@@ -73,7 +73,7 @@ def legs_as_drawn(machine: Machine) -> DrawnLegs:
         base_revolute=having(angles.on_base & ~angles.on_platform),
         platform_revolute=having(angles.on_platform & ~angles.on_base),
         torsion=having(angles.on_base & angles.on_platform),
-        rod=np.where(closing, drawing[layout.rod], 0.0),
+        rod=np.where(closing, nominal[layout.rod], 0.0),
         closing=closing,
         constant=closing & (layout.actuated < 0),
         planar=machine.document.motion == "planar",

@@ -261,23 +261,23 @@ def solve_regressions(
     return a, w, inverse * sigma[..., None, None] ** 2
 
 
-def scale_ratio(points: Array, drawing: Array) -> float:
+def scale_ratio(points: Array, nominal: Array) -> float:
     """[B] 16 as printed: mean ratio of the distances; divide the points by it.
 
-    points, drawing : (n, 3). Close pairs dominate the mean, and their ratio is the noisiest.
+    points, nominal : (n, 3). Close pairs dominate the mean, and their ratio is the noisiest.
     """
     i, j = np.triu_indices(len(points), 1)
     measured = np.linalg.norm(points[i] - points[j], axis=-1)
-    return float(np.mean(measured / np.linalg.norm(drawing[i] - drawing[j], axis=-1)))
+    return float(np.mean(measured / np.linalg.norm(nominal[i] - nominal[j], axis=-1)))
 
 
-def procrustes_scale(points: Array, drawing: Array) -> float:
+def procrustes_scale(points: Array, nominal: Array) -> float:
     """Scale r of the similarity that fits the nominal model to the points; divide the points by it.
 
-    points, drawing : (n, 3). Maximum over rotations of the least-squares scale: sum of the singular
+    points, nominal : (n, 3). Maximum over rotations of the least-squares scale: sum of the singular
     values over the nominal model's sum of squares (Umeyama).
     """
-    p, d = points - points.mean(axis=0), drawing - drawing.mean(axis=0)
+    p, d = points - points.mean(axis=0), nominal - nominal.mean(axis=0)
     u, s, vt = np.linalg.svd(p.T @ d)
     s[-1] *= np.sign(np.linalg.det(u @ vt))
     return float(s.sum() / np.sum(d**2))

@@ -171,7 +171,7 @@ class _System:
     def theta(self, state: _State) -> Array:
         """All parameters, (P,)."""
         table = self.machine.parameters
-        return table.drawing + table.free_matrix() @ state.z
+        return table.nominal + table.free_matrix() @ state.z
 
     @property
     def believed(self) -> Integers:
@@ -247,16 +247,16 @@ def _registered(system: _System, centres: Array, valid: Booleans) -> _System:
     that is fitted to all legs. centres : (S, L, 3) leg by leg. valid : (S, L).
     """
     edges, start = system.edges, system.start
-    drawing = system.theta(start)[centre_index(system.machine.layout)[0]]
+    nominal = system.theta(start)[centre_index(system.machine.layout)[0]]
     best, least = start.T_camera_base.copy(), np.full(len(valid), np.inf)
     # all legs first, then every three legs
-    for legs in ((), *combinations(range(len(drawing)), 3)):
-        three = np.isin(np.arange(len(drawing)), legs) if legs else np.ones(len(drawing), bool)
+    for legs in ((), *combinations(range(len(nominal)), 3)):
+        three = np.isin(np.arange(len(nominal)), legs) if legs else np.ones(len(nominal), bool)
         for s, (a, there) in enumerate(zip(centres, valid & three, strict=True)):
             if there.sum() < 3 or (legs and not valid[s][list(legs)].all()):
                 continue
             trial = start.T_camera_base.copy()
-            trial[s] = register(drawing[there], a[there])
+            trial[s] = register(nominal[there], a[there])
             far = _distance(system, start._replace(T_camera_base=trial))
             cost = np.sum(
                 np.minimum(far, NO_WEIGHT_DISTANCE)[system.used & (edges.station == s)] ** 2

@@ -151,7 +151,7 @@ def _estimate(
     """
     gauge = default_gauge(machine)
     # whitened residuals of the state
-    assembled = assemble(machine, measurements, gauge, use_drawing=False)
+    assembled = assemble(machine, measurements, gauge, use_prior=False)
     batch = batch_of(machine, assembled, state)
     unweighted = assembled.problem.unweighted(batch)
     edges = np.nan_to_num(assembled.places.edges.taken(unweighted.edges[0]))

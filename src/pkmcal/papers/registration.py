@@ -43,7 +43,7 @@ class RegisteredBody(NamedTuple):
 class BodyProblem:
     """solver.LeastSquares for a rigid body; measured (B, K, n, 3), weight (B, K, n).
 
-    gauge : (c, 3 n) rows that fix the body's frame. drawing : (n, 3) their reference. shifts : (n,)
+    gauge : (c, 3 n) rows that fix the body's frame. nominal : (n, 3) their reference. shifts : (n,)
     1 for points, 0 for directions. motion : (6, d) of the body.
 
     Jacobian of frame k (own columns are eliminated by the Schur complement):
@@ -56,7 +56,7 @@ class BodyProblem:
     measured: Array
     weight: Array
     gauge: Array
-    drawing: Array
+    nominal: Array
     shifts: Array
     motion: Array
 
@@ -67,7 +67,7 @@ class BodyProblem:
         w = np.sqrt(self.weight)[..., None] / REGISTRATION_UNIT_SIGMA
         value = (turned + self.shifts[:, None] * shift - self.measured) * w
         value = np.where(w > 0, value, 0.0).reshape(*value.shape[:2], -1)
-        held = (state.points - self.drawing).reshape(len(value), -1) @ self.gauge.T
+        held = (state.points - self.nominal).reshape(len(value), -1) @ self.gauge.T
         return Values(value, held / REGISTRATION_UNIT_SIGMA)
 
     def linearize(self, state: RegisteredBody) -> Linear:
@@ -109,7 +109,7 @@ def fit_body(
     measured: Array,
     weight: Array,
     gauge: Array,
-    drawing: Array,
+    nominal: Array,
     *,
     directions: int = 0,
     motion: Array = ANY_MOTION,
@@ -118,16 +118,16 @@ def fit_body(
 
     measured : (B, K, n, 3) m. weight : (B, K, n), 0 where not visible; frames that leave their pose
     undetermined (fewer than three points of a spatial body) must be removed. gauge : (c, 3 n) rows
-    on the items. drawing : (n, 3) m, the start. directions : number of the last items that are
+    on the items. nominal : (n, 3) m, the start. directions : number of the last items that are
     directions. motion : (6, d) of the body in its frames.
     """
     measured = np.where(weight[..., None] > 0, measured, 0.0)
-    points = np.broadcast_to(drawing, (measured.shape[0], *drawing.shape)).copy()
-    shifts = (np.arange(len(drawing)) < len(drawing) - directions).astype(float)
+    points = np.broadcast_to(nominal, (measured.shape[0], *nominal.shape)).copy()
+    shifts = (np.arange(len(nominal)) < len(nominal) - directions).astype(float)
     start = RegisteredBody(
         points, poses_laying_items(points[:, None], measured, weight, directions, motion)
     )
-    return minimise(BodyProblem(measured, weight, gauge, drawing, shifts, motion), start).state
+    return minimise(BodyProblem(measured, weight, gauge, nominal, shifts, motion), start).state
 
 
 def poses_laying_items(
@@ -276,7 +276,7 @@ def minimise_dense(
 
 def points_by(
     criterion: Callable[[Array, Integers], tuple[Array, Array]],
-    drawing: Array,
+    nominal: Array,
     gauge: Array,
     n_runs: int,
 ) -> Array:
@@ -284,17 +284,17 @@ def points_by(
 
     gauge : (c, 3 n) rows that fix the points' frame. criterion : function of points (b, n, 3) and
     the runs' indices (b,), with values (b, r) in m (or m^2) and their derivatives (b, r, n, 3).
-    drawing : (n, 3), the start.
+    nominal : (n, 3), the start.
     """
 
     def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
-        value, jac = criterion(x.reshape(len(x), *drawing.shape), runs)
-        held = (x - drawing.ravel()) @ gauge.T
+        value, jac = criterion(x.reshape(len(x), *nominal.shape), runs)
+        held = (x - nominal.ravel()) @ gauge.T
         by_gauge = np.broadcast_to(gauge, (len(x), *gauge.shape))
-        jac = np.concatenate([jac.reshape(*value.shape, drawing.size), by_gauge], axis=1)
+        jac = np.concatenate([jac.reshape(*value.shape, nominal.size), by_gauge], axis=1)
         return np.concatenate(
             [value, held], axis=1
         ) / REGISTRATION_UNIT_SIGMA, jac / REGISTRATION_UNIT_SIGMA
 
-    start = np.broadcast_to(drawing.ravel(), (n_runs, drawing.size)).copy()
-    return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)
+    start = np.broadcast_to(nominal.ravel(), (n_runs, nominal.size)).copy()
+    return minimise_dense(rows, start).state.reshape(-1, *nominal.shape)

@@ -83,7 +83,7 @@ def as_it_stands(
     session: Session,
     after: SavedCalibration | Path | str | None = None,
     *,
-    from_drawing: bool = False,
+    from_nominal: bool = False,
     same_place: bool = False,
     anywhere: bool = False,
     edge: float = NOMINAL_EDGE_SIGMA,
@@ -93,7 +93,7 @@ def as_it_stands(
     """Subject of a session with its existing measurements.
 
     after : earlier calibration; by default the usable one in the session's folder, none with
-    ``from_drawing``. Others as for :func:`~pkmcal.planning.subject.subject_of_session`. Raises
+    ``from_nominal``. Others as for :func:`~pkmcal.planning.subject.subject_of_session`. Raises
     InputError if the given calibration is not usable, or if ``same_place`` is set without a
     calibration.
     """
@@ -101,7 +101,7 @@ def as_it_stands(
     saved: SavedCalibration | None = None
     if (
         after is None
-        and not from_drawing
+        and not from_nominal
         and (session.folder / LAST_CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
     ):
         after = load(session.folder / LAST_CALIBRATION_FOLDER)
@@ -207,7 +207,7 @@ def check_tubes(machine: Machine, where: str) -> None:
     if len(tubes_of(machine)):
         return
     raise InputError(
-        "no leg of the drawing has visible cylinders, so a camera sees none",
+        "no leg of the nominal model has visible cylinders, so a camera sees none",
         where=where,
         expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
         next_step="Measure the legs' radii with calipers, or plan with --board or --tracker",

@@ -27,7 +27,7 @@ CARRIAGE_MARGIN_BELOW = 5.0
 
 The bed may hang lower than the firmware's values place it.
 """
-PRINTER_DRAWING_TEXT = """\
+PRINTER_NOMINAL_TEXT = """\
 # {name}, a linear delta, by the values in {label}. A firmware knows only the difference
 # of the towers' radius and the tool's, so the rods' lower ends stand in the platform's origin, the
 # nozzle. Readings are the carriages' heights by these values, their range ends at the end switches.
@@ -143,7 +143,7 @@ def write_printer_session(
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     """Files by name of a session with a board on the tool, to be filled in by the user."""
     texts = session_texts("linear-delta", "board", places)
-    nominal = drawing_text(printer) + PLATFORM_FIXED_TEXT
+    nominal = nominal_text(printer) + PLATFORM_FIXED_TEXT
     document = parse_yaml(nominal, Path("mechanism.yaml"))
     machine = checked_machine(validated_document(document, MechanismDocument), document)
     heads = [f"{motor} [mm]" for motor in printer.motors]
@@ -227,13 +227,13 @@ def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
         "session.yaml": PROBED_SESSION_TEXT.format(
             n=len(names), origin=legible(touches.origin), to=to, **_resolution(printer)
         ),
-        "mechanism.yaml": drawing_text(printer, touches) + FIRMWARE_FIXED_TEXT,
+        "mechanism.yaml": nominal_text(printer, touches) + FIRMWARE_FIXED_TEXT,
         "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
         "poses.csv": csv_text(["z [mm]"], names, touches.heights[:, None]),
     }
 
 
-def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
+def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
     """Nominal model of the printer as a mechanism file, without its key ``fixed``.
 
     touches : probed points that the ranges of the carriages have to include.
@@ -252,7 +252,7 @@ def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
         PRINTER_LEG_TEXT.format(x=_mm(x), y=_mm(y), low=_mm(lowest), high=_mm(high), rod=_mm(rod))
         for (x, y), high, rod in zip(towers, printer.homed, printer.rod, strict=True)
     ]
-    return PRINTER_DRAWING_TEXT.format(
+    return PRINTER_NOMINAL_TEXT.format(
         name=printer.program.lower() + "-delta",
         label=legible(printer.label),
         legs="\n".join(legs),

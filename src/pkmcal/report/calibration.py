@@ -193,9 +193,10 @@ def calibration_cards(
     change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
     farthest = int(np.argmax(change))
     shifted = Figure(
-        "How far is the machine from its drawing?",
+        "How far is the machine from its nominal model?",
         ((brief(float(change.mean())), "mm"),),
-        "mean distance of the joint centres, drawing and result laid over each other; largest "
+        "mean distance of the joint centres, nominal model and result laid over each"
+        " other; largest "
         f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
     cards = (
@@ -273,9 +274,11 @@ def _flatness(bed: Bed, tool: ToolError) -> Figure:
         "How flat will the bed be?",
         ((brief(bed.sigma * 1e3), "mm"),),
         f"1σ of the tool's height over a disc of {brief(bed.radius * 1e3)} mm radius, the bed's"
-        f" own tilt and height aside; by the drawing's tolerances {brief(bed.by_drawing * 1e3)}"
-        f" mm. The drawing bent it by {brief(float(np.sqrt(np.mean(bent**2))) * 1e3)} mm where it"
-        f" was probed. Along x and y {brief(bed.sideways * 1e3)} mm, by the drawing",
+        " own tilt and height aside; by the nominal model's tolerances"
+        f" {brief(bed.by_drawing * 1e3)}"
+        f" mm. The nominal model bent it by {brief(float(np.sqrt(np.mean(bent**2))) * 1e3)}"
+        " mm where it"
+        f" was probed. Along x and y {brief(bed.sideways * 1e3)} mm, by the nominal model",
     )
 
 
@@ -288,9 +291,9 @@ def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figur
     used = np.flatnonzero(estimate.configurations)
     where = session.configurations[used[good][int(np.argmax(off))]]
     return Figure(
-        "What did the drawing do to the platform's pose?",
+        "What did the nominal model do to the platform's pose?",
         _pose_values(off.mean(), turn.mean()),
-        "mean error of the drawing's pose at the same readings; worst "
+        "mean error of the nominal model's pose at the same readings; worst "
         f"{brief(off.max() * 1e3)} mm (configuration {where}){_turn_text(float(turn.max()))}",
     )
 

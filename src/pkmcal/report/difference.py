@@ -220,7 +220,7 @@ def _joints(d: MachineDifference) -> Plot:
         "How far each joint moved",
         "Bars with lines: the standard deviation by chance."
         if d.change.dof
-        else "Joints of both drawings laid over each other.",
+        else "Joints of both nominal models laid over each other.",
         "Bars of how far each leg's base joint and platform joint moved, in millimetres; the table"
         " below has the numbers.",
         {"data": data, "layout": layout, "config": {}},

@@ -42,12 +42,12 @@ def directions_headline(findings: Findings) -> str:
     lost = possible - ranks.rank
     start = f"The data fix {ranks.rank} of {possible} directions ({frames})."
     if lost == 0 and not ranks.weak:
-        return f"{start} Each is known better from the data than from the drawing."
+        return f"{start} Each is known better from the data than from the nominal model."
     parts: list[str] = []
     if lost:
         parts.append(f"{count(lost, 'direction')} no amount of such data would fix")
     if ranks.weak:
-        parts.append(f"{count(len(ranks.weak), 'direction')} the drawing knows better")
+        parts.append(f"{count(len(ranks.weak), 'direction')} the nominal model knows better")
     return f"{start} {capital(joined(parts))}."
 
 
@@ -73,9 +73,9 @@ def spectrum(findings: Findings) -> BarChart | None:
         for words in [
             "the data do not determine it"
             if k >= findings.identifiability.rank
-            else f"the drawing knows it {brief(1 / ratio)} times better"
+            else f"the nominal model knows it {brief(1 / ratio)} times better"
             if ratio < 1
-            else f"the data know it {brief(ratio)} times better than the drawing"
+            else f"the data know it {brief(ratio)} times better than the nominal model"
         ]
     )
     # a tick for each decade
@@ -86,7 +86,7 @@ def spectrum(findings: Findings) -> BarChart | None:
         title="How well each direction is known",
         unit="directions of the parameters, best known first",
         alt=f"{len(bars)} directions; {findings.identifiability.rank} are fixed by the data and "
-        f"{len(findings.identifiability.weak)} of those are known better by the drawing",
+        f"{len(findings.identifiability.weak)} of those are known better by the nominal model",
         bars=bars,
         high=high,
         ticks=ticks,
@@ -111,7 +111,8 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
         verb, them = ("was", "it") if len(table.fixed) == 1 else ("were", "them")
         return (
             f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists {them}"
-            " under fixed, so the drawing's value counts as exact and no direction belongs to it."
+            " under fixed, so the nominal model's value counts as exact and no direction"
+            " belongs to it."
         )
     # some fixed parameters only choose frames, or repeat free ones
     others = [name for name in table.fixed if name not in names]
@@ -132,7 +133,7 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
         verb = "is" if len(others) == 1 else "are"
         parts.append(
             f"{_listed(table, tuple(others))} {verb} held by the model that the mechanism file"
-            " describes: the drawing's value counts as exact and no direction belongs to it."
+            " describes: the nominal model's value counts as exact and no direction belongs to it."
         )
     if findings.also_conventional:
         parts.append(

@@ -58,9 +58,9 @@ LATEX_SIGNS = {
 """Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
     "data": "the photographs decide",
-    "drawing": "the drawing decides more than the photographs",
+    "drawing": "the nominal model decides more than the photographs",
     "frame": "defines the frame",
-    "fixed": "kept at the drawing's value",
+    "fixed": "kept at the nominal model's value",
 }
 
 
@@ -78,7 +78,7 @@ class ParameterRow:
     leg: int | None
     label: str
     unit: str
-    drawing: str
+    nominal: str
     calibrated: str
     change: str
     sigma: str
@@ -143,10 +143,10 @@ def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
     signs = str.maketrans(LATEX_SIGNS)
     lines = [
         r"\begin{tabular}{rlrrrl}",
-        r"Leg & Parameter & Drawing & Calibrated & $\sigma$ & Unit \\ \hline",
+        r"Leg & Parameter & Nominal model & Calibrated & $\sigma$ & Unit \\ \hline",
     ]
     for row in (row for group in groups for row in group.rows):
-        cells = (str(row.leg or ""), row.label, row.drawing, row.calibrated, row.sigma, row.unit)
+        cells = (str(row.leg or ""), row.label, row.nominal, row.calibrated, row.sigma, row.unit)
         lines.append(" & ".join(cell.translate(signs) for cell in cells) + r" \\")
     return "\n".join([*lines, r"\end{tabular}"]) + "\n"
 
@@ -176,7 +176,7 @@ def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
         leg=split_name(one.name)[0],
         label=table.labels[k],
         unit=unit,
-        drawing=number(numbers[0], places),
+        nominal=number(numbers[0], places),
         calibrated=number(numbers[1], places),
         change=number(numbers[2], places, signed=True),
         sigma=number(numbers[3], places) if sigma else "–",

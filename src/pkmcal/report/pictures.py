@@ -308,7 +308,7 @@ class _ImageOverlays:
         session, state = self.calibration.session, self.calibration.estimate.state
         camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
         pose, joints = state.T_base_platform[configurations], session.joints[configurations]
-        base, platform = (side.T_calibrated_drawing for side in centres)
+        base, platform = (side.T_calibrated_nominal for side in centres)
         after = self.calibration.machine.ends_at(joints, pose)
         # pose of the nominal machine in its own frames
         old_pose = inverse(base) @ pose @ platform

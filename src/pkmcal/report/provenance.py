@@ -169,7 +169,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
         ("Frames", estimate.gauge),
         ("Noise of a joint reading", f"{session.joint_noise:.3g} {' or '.join(units)}"),
         (
-            "Drawing's tolerances, 1σ",
+            "Nominal model's tolerances, 1σ",
             f"centres {tolerance.center * 1e3:g} mm, offsets {tolerance.offset * 1e3:g} mm, "
             f"radii {tolerance.radius * 1e3:g} mm",
         ),

@@ -75,7 +75,10 @@ def recorded(calibration: Calibration) -> Iterator[Logged]:
 def _result(c: Calibration) -> Iterator[Logged]:
     """Records of verdict and parameters."""
     yield Logged(("result", "summary"), "text", {"text": f"```\n{c.summary()}\n```"})
-    rows = ["| parameter | unit | drawing | value | σ | decided by |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| parameter | unit | nominal model | value | σ | decided by |",
+        "|---|---|---|---|---|---|",
+    ]
     rows += [
         f"| {p.name} | {p.unit} | {p.drawing:.7g} | {p.value:.7g} | {p.sigma:.2g}"
         f" | {p.decided_by} |"
@@ -128,7 +131,7 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     yield Logged(("machine", "platform"), "transform", {"T": pose}, at)
     machine = c.estimate.machine
     # nominal machine in its own frames, then moved to the calibrated base frame
-    base, platform = (side.T_calibrated_drawing for side in centres)
+    base, platform = (side.T_calibrated_nominal for side in centres)
     old = inverse(base) @ pose @ platform
     for name, of, T, move in (
         ("calibrated", machine, pose, np.eye(4)),

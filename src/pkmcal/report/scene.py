@@ -40,7 +40,7 @@ class Joint:
     """Joint centre at home, base frame, m.
 
     leg : from 1.
-    drawing, displaced : (3,) by the nominal model, and with the enlarged error.
+    nominal model, displaced : (3,) by the nominal model, and with the enlarged error.
     spread : (3, 3) enlarged covariance.
     arm : (2, k, 3) nominal and enlarged; points from where a motor holds the arm to a base joint;
         a platform joint has only itself.
@@ -48,7 +48,7 @@ class Joint:
 
     leg: int
     side: str
-    drawing: Array
+    nominal: Array
     displaced: Array
     spread: Array
     tip: str
@@ -82,7 +82,7 @@ class JointMark:
 
     leg: int
     side: str
-    drawing: tuple[float, float]
+    nominal: tuple[float, float]
     displaced: tuple[float, float]
     ellipse: tuple[float, float, float]
     tip: str
@@ -124,7 +124,8 @@ def section(
                 "space",
                 "In space",
                 "Drag to turn, wheel or pinch to come nearer.",
-                "The machine in three dimensions: joint centres by the drawing and as calibrated."
+                "The machine in three dimensions: joint centres by the nominal model and"
+                " as calibrated."
                 " The two plane views show the same.",
                 figure_of(scene),
                 height=420,
@@ -143,7 +144,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
         home = estimate.state.T_base_platform[int(np.argmax(estimate.configurations))]
     # errors are enlarged to a fixed share of the machine's radius
     placed = {"base": np.eye(4), "platform": home}
-    size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
+    size = float(np.ptp(np.concatenate([c.nominal for c in centres]), axis=0).max()) / 2
     change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
     sigma = np.concatenate([c.sigma for c in centres])
     factor = enlargement(change, ENLARGED_ERROR_SHARE * size)
@@ -152,26 +153,26 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     before, after = (m.arms_at(m.middle_readings()) for m in (session.machine, estimate.machine))
     for side in centres:
         T = placed[side.side]
-        drawing = apply(T, side.drawing)
-        enlarged = drawing + factor * (apply(T, side.calibrated) - drawing)
+        nominal = apply(T, side.nominal)
+        enlarged = nominal + factor * (apply(T, side.calibrated) - nominal)
         spread = spread_factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
-        for j in range(len(drawing)):
+        for j in range(len(nominal)):
             dx, dy, dz = (number(float(v) * 1e3, 3, signed=True) for v in side.change[j])
             tip = (
-                f"Leg {j + 1}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
+                f"Leg {j + 1}, {side.side}: {dx}, {dy}, {dz} mm from the nominal model (x, y, z); "
                 f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
             )
-            arm = np.stack([drawing[j], enlarged[j]])[:, None]
+            arm = np.stack([nominal[j], enlarged[j]])[:, None]
             if side.side == "base":
-                old = apply(side.T_calibrated_drawing, before[j])
+                old = apply(side.T_calibrated_nominal, before[j])
                 arm = np.stack([old, old + factor * (after[j] - old)])
-            joints.append(Joint(j + 1, side.side, drawing[j], enlarged[j], spread[j], tip, arm))
+            joints.append(Joint(j + 1, side.side, nominal[j], enlarged[j], spread[j], tip, arm))
     return BeforeAfter(factor, spread_factor, tuple(joints))
 
 
 def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
     """Views from above, and from the side in which the base joints are best separated."""
-    base = np.array([joint.drawing for joint in scene.of_side("base")])
+    base = np.array([joint.nominal for joint in scene.of_side("base")])
     gaps = [np.diff(np.sort(base[:, axis])).min() for axis in (0, 1)]
     across = int(np.argmax(gaps))
     return (
@@ -183,7 +184,7 @@ def plane_projections(scene: BeforeAfter) -> tuple[Projection, Projection]:
 def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     """Projection of the scene onto two axes, the second one upwards."""
     pick = list(axes)
-    nominal = np.array([joint.drawing[pick] for joint in scene.joints])
+    nominal = np.array([joint.nominal[pick] for joint in scene.joints])
     displaced = np.array([joint.displaced[pick] for joint in scene.joints])
     arms = [joint.arm[0][:, pick] for joint in scene.joints]
     # scale and limits, so that all points fit into the width of a chart
@@ -208,14 +209,14 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     half = len(marks) // 2  # base joints come first, then the platform's
     return Projection(
         title=title,
-        alt=f"{title}: joint centres by the drawing and as calibrated, errors enlarged "
+        alt=f"{title}: joint centres by the nominal model and as calibrated, errors enlarged "
         f"{scene.factor:g} times",
         width=width,
         height=height,
         axes=(names[axes[0]], names[axes[1]]),
         marks=marks,
         limbs=tuple(
-            (*map(place, arm), end.drawing)
+            (*map(place, arm), end.nominal)
             for arm, end in zip(arms[:half], marks[half:], strict=True)
         ),
         grid=_grid(low, high, place),
@@ -255,9 +256,9 @@ def _labels(
     """
     placed: list[tuple[float, float, list[int]]] = []
     for mark in marks:
-        dx, dy = mark.drawing[0] - centre[0], mark.drawing[1] - centre[1]
+        dx, dy = mark.nominal[0] - centre[0], mark.nominal[1] - centre[1]
         away = max(math.hypot(dx, dy), 1e-6)
-        x, y = mark.drawing[0] + 13 * dx / away, mark.drawing[1] + 13 * dy / away
+        x, y = mark.nominal[0] + 13 * dx / away, mark.nominal[1] + 13 * dy / away
         near = [p for p in placed if math.hypot(p[0] - x, p[1] - y) < LABELS_MERGED_WITHIN]
         if near and mark.leg not in near[0][2]:
             near[0][2].append(mark.leg)
@@ -276,7 +277,7 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
     base, platform = scene.of_side("base"), scene.of_side("platform")
     legs = list(zip(base, platform, strict=True))
     data = [
-        line("Drawing", "--drawing", 4, [np.stack([*a.arm[0], b.drawing]) for a, b in legs]),
+        line("Drawing", "--drawing", 4, [np.stack([*a.arm[0], b.nominal]) for a, b in legs]),
         line(
             f"Calibrated, × {scene.factor:g}",
             "--calibrated",
@@ -288,12 +289,12 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
                 f"{side[0].side} outline",
                 "--quiet",
                 2,
-                [ring(np.array([joint.drawing for joint in side]))],
+                [ring(np.array([joint.nominal for joint in side]))],
                 showlegend=False,
             )
             for side in (base, platform)
         ),
-        line("Change", "--ink", 6, [np.stack([j.drawing, j.displaced]) for j in scene.joints]),
+        line("Change", "--ink", 6, [np.stack([j.nominal, j.displaced]) for j in scene.joints]),
         _ellipsoids(scene),
         _centres(base, platform),
     ]
@@ -326,8 +327,8 @@ def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, 
         "symbol": ["square"] * len(base) + ["circle"] * len(platform),
     }
     return markers(
-        "Joint centres, drawing",
-        np.array([joint.drawing for joint in joints]),
+        "Joint centres, nominal model",
+        np.array([joint.nominal for joint in joints]),
         style,
         mode="markers+text",
         showlegend=False,

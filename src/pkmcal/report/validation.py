@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, finite_rms
+from pkmcal.judge.comparison import NominalComparison, WeighedErrors, finite_rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.sentences import against, better, factor
@@ -19,9 +19,10 @@ VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
     " platform are estimated from the photographs; a configuration's own readings have no part in"
     " its pose, and where photographs leave open where a camera or a board is, the readings of the"
-    " other configurations decide. The readings are then predictions. The drawing is judged in the"
+    " other configurations decide. The readings are then predictions. The nominal model is"
+    " judged in the"
     " same way, frames laid over each other, on the poses that suit it best.",
-    "The uncertainty of “times better” is from drawing the configurations again at random"
+    "The uncertainty of “times better” is from nominal model the configurations again at random"
     " (bootstrap). Directions count by how well the photographs see them: one photograph"
     " determines depth poorly, and there any two machines look the same.",
     "The promise holds the calibration's covariance and the noise of these photographs and"
@@ -60,10 +61,10 @@ def outcome_of(v: Validation) -> Outcome:
     )
 
 
-def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
+def _cards(judged: NominalComparison, v: Validation) -> tuple[Figure, ...]:
     """Main numbers."""
     session, again = v.session, int(v.repeated[judged.rows].sum())
-    calibrated, nominal = judged.figures(judged.calibrated), judged.figures(judged.drawing)
+    calibrated, nominal = judged.figures(judged.calibrated), judged.figures(judged.nominal)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
     weighed = ""
     if unit:
@@ -73,7 +74,7 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
         )
     return (
         Figure(
-            "How many times better than the drawing?",
+            "How many times better than the nominal model?",
             ((better(gain), ""),),
             f"in predicting readings, 95 %: {factor(gain.low)} to {factor(gain.high)}{weighed}",
         ),
@@ -84,7 +85,7 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
                 for value, unit in ((calibrated.position, "m"), (calibrated.orientation, "rad"))
             ),
             "root mean square distance from where the photographs see it, their noise included; by"
-            f" the drawing {amount(nominal.position, 'm')} and"
+            f" the nominal model {amount(nominal.position, 'm')} and"
             f" {amount(nominal.orientation, 'rad')}",
         ),
         Figure(
@@ -101,9 +102,9 @@ def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
     )
 
 
-def _readings(judged: BesideDrawing, session: Session) -> Part:
+def _readings(judged: NominalComparison, session: Session) -> Part:
     """Section on readings and tool: charts, residuals as in [C] Table 3, and tool point errors."""
-    nominal, calibrated = judged.figures(judged.drawing), judged.figures(judged.calibrated)
+    nominal, calibrated = judged.figures(judged.nominal), judged.figures(judged.calibrated)
     test = judged.promise
     residuals = Table(
         "Readings: measured less predicted",
@@ -132,7 +133,8 @@ def _readings(judged: BesideDrawing, session: Session) -> Part:
             Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))
             for name, f in (("Drawing", nominal), ("Calibrated", calibrated))
         ),
-        "Root mean squares, frames laid over each other for the drawing. The photographs' own noise"
+        "Root mean squares, frames laid over each other for the nominal model. The"
+        " photographs' own noise"
         " is in both.",
     )
     pictures = charts.panels(_by_configuration(judged, session), _by_joint(judged, session))
@@ -184,9 +186,9 @@ def paths_table(paths: tuple[LinePath, ...]) -> Table:
     ]
     return Table(
         "Straight paths: distance of the tool points from the line through them, rms (largest), mm",
-        ("Path", "Points", "As seen", "By drawing", "By calibration"),
+        ("Path", "Points", "As seen", "By nominal model", "By calibration"),
         tuple(rows),
-        "As seen: where the photographs show the tool. By drawing and by calibration: forward"
+        "As seen: where the photographs show the tool. By nominal model and by calibration: forward"
         " kinematics of the readings, for a tool that was led along a ruler.",
     )
 
@@ -206,10 +208,11 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         held += f" of {count(poses, 'pose')}"
     sentence = (
         f"On {held} held out, the calibrated machine predicts the"
-        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{broken}"
+        f" readings {better(out.ratio)} times better than the nominal"
+        f" model{amounts}.{inside}{broken}"
     )
     in_use, held_out = used.figures(used.calibrated), out.figures(out.calibrated)
-    nominal = out.figures(out.drawing)
+    nominal = out.figures(out.nominal)
     rows = [
         Row(
             name,
@@ -229,7 +232,7 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         rows.append(Row(name, ("", cells[0], "", cells[1], cells[2])))
     table = Table(
         "Residuals of configurations in use and held out",
-        ("Joint", "In use, mean", "rms", "Held out, mean", "rms", "by the drawing, rms"),
+        ("Joint", "In use, mean", "rms", "Held out, mean", "rms", "by the nominal model, rms"),
         tuple(rows),
         "Readings measured less predicted from poses that the photographs show, weighed by how well"
         " each was seen; their noise is in all columns.",
@@ -267,7 +270,7 @@ def _magnitude(value: float, unit: str) -> str:
     return brief(value * DISPLAY_UNITS[unit][0])
 
 
-def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChart | None:
+def _by_configuration(judged: NominalComparison, session: Session) -> charts.BarChart | None:
     """Residuals of readings by configuration.
 
     Bars for the calibrated machine, a line for the nominal model.
@@ -279,7 +282,8 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
     bars = [
         charts.UprightBar(
             session.configurations[row],
-            f"{session.configurations[row]}: {amount(new, unit)}; drawing {amount(old, unit)}",
+            f"{session.configurations[row]}: {amount(new, unit)}; nominal model"
+            f" {amount(old, unit)}",
             new * scale,
         )
         for row, new, old in zip(
@@ -291,13 +295,13 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
         f"configurations; root mean square, {name}",
         bars,
         charts.ends_and_middle(bars),
-        f"Residuals of {count(len(bars), 'configuration')}, calibrated and by the drawing",
+        f"Residuals of {count(len(bars), 'configuration')}, calibrated and by the nominal model",
         tuple((k + 0.5, old * scale) for k, old in enumerate(judged.before.tolist())),
-        "bars: calibrated; line: by the drawing",
+        "bars: calibrated; line: by the nominal model",
     )
 
 
-def _by_joint(judged: BesideDrawing, session: Session) -> charts.RowChart | None:
+def _by_joint(judged: NominalComparison, session: Session) -> charts.RowChart | None:
     """Residuals of the calibrated machine, in predicted standard deviations."""
     normalized = judged.calibrated.residuals / judged.promise.expected
     boxes = [

@@ -24,7 +24,7 @@ WATCH_METHOD_TEXT = (
     " see.",
     "A camera's place costs six freedoms, unless it is stated to have been left in place: what"
     " moves all of the machine against its camera is not seen then. Directions in which a"
-    " change by the drawing's whole tolerance would make less than one standard deviation are"
+    " change by the nominal model's whole tolerance would make less than one standard deviation are"
     " left out.",
 )
 

@@ -38,8 +38,10 @@ LEAST_TURN_DRAWN = 1.0
 """Least range of a rotation that is drawn, degrees."""
 SLICES_READING_TEXT = (
     "Slices are at home's orientation, on one scale of colours; crosses are poses that were"
-    " measured, near the slice. By the drawing: how sure the platform would be by the drawing's"
-    " tolerances. Drawing's error: how far the drawing's pose is from the calibrated at the same"
+    " measured, near the slice. By the nominal model: how sure the platform would be by"
+    " the nominal model's"
+    " tolerances. Nominal model's error: how far the nominal model's pose is from the"
+    " calibrated at the same"
     " readings, frames laid over each other. Calibrated: one standard deviation that is left, of"
     " the geometry; the noise of single readings and what the model leaves out come on top."
 )
@@ -91,7 +93,7 @@ def _headline(tool_map: ToolMap) -> str:
     if not off.size:
         return f"{text}."
     return (
-        f"{text}; the drawing's was {brief(float(np.median(off)))} mm off, at worst"
+        f"{text}; the nominal model's was {brief(float(np.median(off)))} mm off, at worst"
         f" {brief(float(off.max()))} mm."
     )
 
@@ -102,8 +104,8 @@ def _table(tool_map: ToolMap) -> Table:
     rows: list[Row] = []
     turns = float(np.nanmax(before.orientation)) > NO_TURN
     kinds = (
-        ("By the drawing's tolerances, σ", before.position, before.orientation),
-        ("Drawing's error", after.off_position, after.off_orientation),
+        ("By the nominal model's tolerances, σ", before.position, before.orientation),
+        ("Nominal model's error", after.off_position, after.off_orientation),
         ("Calibrated, σ", after.position, after.orientation),
     )
     for name, place, turn in kinds:
@@ -133,8 +135,8 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
     if not tool_map.slices:
         return None
     quantities = (
-        ("By the drawing, σ", tool_map.before.position),
-        ("Drawing's error", tool_map.after.off_position),
+        ("By the nominal model, σ", tool_map.before.position),
+        ("Nominal model's error", tool_map.after.off_position),
         ("Calibrated, σ", tool_map.after.position),
     )
     single = len(tool_map.slices) == 1
@@ -170,7 +172,8 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
         "slices",
         "Before and after, slice by slice",
         "Point at a cell for its number.",
-        "Heat maps of how sure the platform's place is by the drawing, how far the drawing was"
+        "Heat maps of how sure the platform's place is by the nominal model, how far the"
+        " nominal model was"
         " off, and how sure it is as calibrated, in slices through the workspace. The table below"
         " has the figures over all of it.",
         {"data": data, "layout": layout, "config": {}},
@@ -380,7 +383,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
     hover = "<br>".join(f"{name}: %{{{k}:.3g}}" for k, name in zip("xyz", names, strict=True))
     hover += "<br>σ %{customdata[0]:.3g} mm"
     hover += ", %{customdata[2]:.2g}°" if turns else ""
-    hover += "<br>drawing's error %{customdata[1]:.3g} mm<extra></extra>"
+    hover += "<br>nominal model's error %{customdata[1]:.3g} mm<extra></extra>"
     # rotations count from home; without them home is not needed
     home = poses[0] if components.min() >= 3 else session.machine.home()
     used = np.flatnonzero(estimate.configurations)

@@ -202,13 +202,13 @@ def side_bars(machine: Machine) -> tuple[Integers, ...]:
     return tuple(np.flatnonzero(on == body) for body in range(on.max(initial=-1) + 1))
 
 
-def to_simulate(drawing: Machine, where: str) -> Machine:
+def to_simulate(nominal: Machine, where: str) -> Machine:
     """Nominal model with cylinders (:func:`with_forearms`), checked to assemble at home.
 
     where : source of the nominal model, for the message. Raises InputError.
     """
     try:
-        machine = with_forearms(drawing)
+        machine = with_forearms(nominal)
         machine.home()
     except PkmcalError as error:
         raise error.as_input(where) from None
@@ -232,7 +232,7 @@ def with_forearms(machine: Machine) -> Machine:
         raise InputError(
             f"mechanism {machine.name!r} cannot take its home pose: joint {joint} cannot reach it",
             expected="arms and rods that reach the platform at home",
-            next_step="Check the drawing's lengths and centres, and home",
+            next_step="Check the nominal model's lengths and centres, and home",
         )
     ends = machine.ends_at(readings, home)
     lengths = np.linalg.norm(ends.b - ends.a, axis=1)

@@ -42,7 +42,7 @@ HANDHELD_JPEG_QUALITY = 95
 
 def simulate_session(
     folder: Path | str,
-    drawing: Machine,
+    nominal: Machine,
     camera: Camera | Sequence[Camera],
     settings: Settings | None = None,
     *,
@@ -60,14 +60,14 @@ def simulate_session(
     settings = settings or Settings()
     folder = Path(folder)
     cameras = one_a_station(camera, settings.n_stations)
-    _check(folder, drawing)
-    truth = draw_truth(drawing, cameras, settings, seed)
+    _check(folder, nominal)
+    truth = draw_truth(nominal, cameras, settings, seed)
     lenses = cameras
     if truth.focal_scale is not None:
         pairs = zip(cameras, truth.focal_scale, strict=True)
         lenses = tuple(_breathed(one, float(scale)) for one, scale in pairs)
     with staged_folder(folder) as stage:
-        _write_texts(stage, drawing, cameras, settings, truth)
+        _write_texts(stage, nominal, cameras, settings, truth)
         _write_photographs(stage, lenses, settings, truth, workers, progress)
     return truth
 
@@ -159,7 +159,7 @@ class Studio:
         return render_light(scene, view, T_camera_base, rng)
 
 
-def _check(folder: Path, drawing: Machine) -> None:
+def _check(folder: Path, nominal: Machine) -> None:
     """Raise InputError before any work for a session that cannot be simulated."""
     if entries(folder):
         raise InputError(
@@ -168,20 +168,20 @@ def _check(folder: Path, drawing: Machine) -> None:
             expected="a new or empty folder",
             next_step="name another folder, or remove what is in this one",
         )
-    if not any(len(radii) for radii in drawing.radii()):
+    if not any(len(radii) for radii in nominal.radii()):
         raise InputError(
-            what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
+            what=f"mechanism {nominal.name!r} has no tubes, so its photographs would show no legs",
             expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
         )
-    check_drawable(drawing)
+    check_drawable(nominal)
     try:
-        drawing.home()
+        nominal.home()
     except GeometryError as error:  # the nominal model is input
         raise error.as_input("mechanism") from None
 
 
 def _write_texts(
-    stage: Path, drawing: Machine, cameras: Sequence[Camera], settings: Settings, truth: Truth
+    stage: Path, nominal: Machine, cameras: Sequence[Camera], settings: Settings, truth: Truth
 ) -> None:
     """Write all files but the images."""
     same = all(camera is cameras[0] for camera in cameras)
@@ -189,9 +189,9 @@ def _write_texts(
         name: "cameras/camera.yaml" if same else f"cameras/{name}.yaml" for name in truth.stations
     }
     texts = {
-        "mechanism.yaml": mechanism_text(drawing),
+        "mechanism.yaml": mechanism_text(nominal),
         "session.yaml": yaml_text(_session_document(settings, truth, files)),
-        "joints.csv": csv_text(drawing.joint_names, truth.configurations, truth.readings),
+        "joints.csv": csv_text(nominal.joint_names, truth.configurations, truth.readings),
         TRUTH_FILE: json.dumps(truth_document(truth), indent=1) + "\n",
     }
     if settings.board is not None:

@@ -143,33 +143,33 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed).spawn(len(RANDOM_STREAMS))[RANDOM_STREAMS.index(name)]
 
 
-def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Machine:
+def true_machine(nominal: Machine, scale: float, rng: np.random.Generator) -> Machine:
     """Random machine with normal deviations of ``scale`` prior sigmas from the nominal model.
 
     Fixed parameters keep their nominal values, tied ones have a common deviation; axes stay unit
     vectors.
     """
-    table = drawing.parameters
+    table = nominal.parameters
     tolerance = table.tolerances_free()
     step = table.free_matrix() @ (scale * tolerance * rng.standard_normal(len(tolerance)))
-    return drawing.with_values(table.unit_axes(drawing.values + step))
+    return nominal.with_values(table.unit_axes(nominal.values + step))
 
 
 def draw_truth(
-    drawing: Machine, cameras: tuple[Camera, ...], settings: Settings, seed: int
+    nominal: Machine, cameras: tuple[Camera, ...], settings: Settings, seed: int
 ) -> Truth:
     """Random true machine, stations, configurations and readings.
 
     cameras : one for each station; for hand-held images without their breathing.
     """
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in RANDOM_STREAMS}
-    machine = true_machine(drawing, settings.tolerance, rngs["machine"])
+    machine = true_machine(nominal, settings.tolerance, rngs["machine"])
     poses = settings.stations
     if settings.handheld:
-        poses = places_by_hand(drawing, cameras, rngs["stations"])
+        poses = places_by_hand(nominal, cameras, rngs["stations"])
     elif isinstance(poses, int):
         in_view = settings.board_on if settings.board is not None else None
-        poses = default_stations(drawing, cameras, rngs["stations"], in_view)
+        poses = default_stations(nominal, cameras, rngs["stations"], in_view)
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     rough = tuple(
         rough_pose(
@@ -182,7 +182,7 @@ def draw_truth(
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
     T_base_platform, joints, photographs = _configurations(
-        drawing, machine, cameras, T_camera_base, settings, rngs["configurations"]
+        nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
     )
     board = None
     if settings.board is not None:
@@ -226,7 +226,7 @@ def draw_truth(
 
 
 def _configurations(
-    drawing: Machine,
+    nominal: Machine,
     machine: Machine,
     cameras: tuple[Camera, ...],
     T_camera_base: Array,
@@ -239,12 +239,12 @@ def _configurations(
     reaches.
     """
     if settings.asked is not None:
-        return _at_requested(drawing, machine, settings.asked)
+        return _at_requested(nominal, machine, settings.asked)
     n, repeats = settings.configurations, settings.repeats
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
-    by_drawing = drawing.forward_result(joints)
-    reached = by_drawing.converged & platform_unfolded(drawing, by_drawing.T_base_platform)
+    by_nominal = nominal.forward_result(joints)
+    reached = by_nominal.converged & platform_unfolded(nominal, by_nominal.T_base_platform)
     poses, joints = poses[reached], joints[reached]
     in_view = np.stack(
         [
@@ -309,12 +309,12 @@ def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) 
 
 
 def _at_requested(
-    drawing: Machine, machine: Machine, request: RequestedConfigurations
+    nominal: Machine, machine: Machine, request: RequestedConfigurations
 ) -> tuple[Array, Array, Integers]:
     """Poses of the true machine at the requested readings, the readings and their pairs."""
-    by_drawing = drawing.forward_result(request.joints)
-    fk = machine.forward_result(request.joints, by_drawing.T_base_platform)
-    bad = np.flatnonzero(~(fk.converged & by_drawing.converged))
+    by_nominal = nominal.forward_result(request.joints)
+    fk = machine.forward_result(request.joints, by_nominal.T_base_platform)
+    bad = np.flatnonzero(~(fk.converged & by_nominal.converged))
     if bad.size:
         raise GeometryError(
             what="the machine cannot take a configuration that was asked for",
@@ -366,29 +366,29 @@ def truth_document(truth: Truth) -> dict[str, Any]:
     }
 
 
-def load_truth(folder: Path | str, drawing: Machine | None = None) -> Truth:
+def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
     """Read ``truth.json`` of a simulated session, for the evaluation of estimates.
 
-    drawing : the session's machine; read from the session by default. Measured readings and rough
+    nominal : the session's machine; read from the session by default. Measured readings and rough
     poses are in the session's files; here the exact values stand in for both.
     """
     path = Path(folder) / TRUTH_FILE
     data = json.loads(read_text(path))
     if data.get("pkmcal_truth") != 1:
         raise InputError("not the truth of a simulated session", where=str(path))
-    drawing = drawing or load_session(folder).machine
+    nominal = nominal or load_session(folder).machine
     reference_values = data["parameters"]
     # files from before readings had scales: the scale is one
     values = [
         reference_values[name] if name in reference_values or not name.endswith(".scale") else 1.0
-        for name in drawing.parameters.names
+        for name in nominal.parameters.names
     ]
     stations, configurations = tuple(data["stations"]), tuple(data["configurations"])
     joints = np.array([c["joints"] for c in data["configurations"].values()])
     T_camera_base = np.array([s["T_camera_base"] for s in data["stations"].values()])
     focal = [s["focal_scale"] for s in data["stations"].values() if "focal_scale" in s]
     return Truth(
-        machine=drawing.with_values(np.array(values)),
+        machine=nominal.with_values(np.array(values)),
         stations=stations,
         configurations=configurations,
         T_camera_base=T_camera_base,

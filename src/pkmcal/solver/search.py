@@ -59,7 +59,9 @@ class Stop(Enum):
         "readings belong to the photographs"
     )
     STEPS = "the step limit was reached before convergence; start nearer, or allow more steps"
-    NOT_FINITE = "nothing can be predicted at the start; check the stations' poses and the drawing"
+    NOT_FINITE = (
+        "nothing can be predicted at the start; check the stations' poses and the nominal model"
+    )
     RUNNING = "not finished"
 
 

@@ -25,7 +25,7 @@ OBSERVED_CHOICES: tuple[ObservedChoice, ...] = ("legs", "board", "both", "readin
 """Observations that a starter session can have."""
 SESSION_TEMPLATE_FOLDER = Path(__file__).parent / "session"
 TO_FILL = {
-    "mechanism.yaml": "write the drawing of your machine into it",
+    "mechanism.yaml": "write the nominal model of your machine into it",
     "cameras/front.yaml": "write the calibration of your camera into it",
     "session.yaml": "write down how good the readings are, and each place that the camera stood in",
     "joints.csv": "write one row of readings for each configuration into it",
@@ -124,10 +124,11 @@ def session_texts(
         has_tubes = any(leg.tubes for leg in model.document.legs)
         if not has_tubes and what in ("legs", "both"):
             raise InputError(
-                f"the drawing of {model.name} has no cylinders that a camera could see",
+                f"the nominal model of {model.name} has no cylinders that a camera could see",
                 where=machine,
                 expected="a board on the platform, or tubes on its legs",
-                next_step="Ask for a board alone, or give the legs of a copy of the drawing tubes",
+                next_step="Ask for a board alone, or give the legs of a copy of the"
+                " nominal model tubes",
             )
         if what is None and not has_tubes:
             what = "readings" if model.redundancy > 0 else "board"
@@ -171,7 +172,7 @@ def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> st
         name these; by default the joints' names.
     """
     poses = np.repeat(machine.home()[None], 2, axis=0)
-    lengths = machine.parameters.drawing[np.array(machine.parameters.units) == "m"]
+    lengths = machine.parameters.nominal[np.array(machine.parameters.units) == "m"]
     # Shift the second pose along the motion's last translation, by a part of the machine's size.
     motions = MOTION_DIRECTIONS[machine.document.motion]
     slide = next(c for c in motions.T[::-1] if not c[:3].any())[3:]

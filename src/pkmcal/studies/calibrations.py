@@ -228,7 +228,7 @@ class SimulatedCalibrations:
         # An axis is a unit vector: its largest component follows from the other two, and changes
         # only to second order when the axis turns.
         axes = machine.parameters.axes
-        largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
+        largest = np.argmax(np.abs(machine.parameters.nominal[axes]), axis=1)
         sigma[axes[np.arange(len(axes)), largest]] = np.nan
         off = tool_error_and_sigma(machine, theta, covariance, true, joints, every=every)
         return np.stack([theta - true_theta, sigma]), np.stack(off)
@@ -272,14 +272,14 @@ def tool_error_and_sigma(
     n = len(theta)
     # register the truth to the result rather than to the nominal model
     calibrated = replace(
-        machine, parameters=replace(machine.parameters, drawing=theta), values=theta
+        machine, parameters=replace(machine.parameters, nominal=theta), values=theta
     )
     registered = changed_frames(machine.layout, true, *alignment(calibrated, true, BestFit()))
     there = replace(true, theta=theta)
     keep = transformation(calibrated, there, BestFit())[:n, :n]
     # Forward kinematics of the result and of the truth at the same readings.
     home = np.broadcast_to(machine.home(), (len(joints), 4, 4))
-    nominal_fk = forward(machine.layout, machine.parameters.drawing, joints, home)
+    nominal_fk = forward(machine.layout, machine.parameters.nominal, joints, home)
     calibrated_fk = forward(
         machine.layout, theta, joints, nominal_fk.T_base_platform, nominal_fk.internal
     )
@@ -348,7 +348,7 @@ def _machines(
     for _ in range(TIMES_MACHINES_REDRAWN):
         # Draw the remaining machines, and keep those that close at all readings.
         step = tolerance * rng.standard_normal((len(remaining), len(tolerance)))
-        theta[remaining] = table.unit_axes(table.drawing + step @ free.T)
+        theta[remaining] = table.unit_axes(table.nominal + step @ free.T)
         fk = forward(
             machine.layout,
             theta[remaining, None],
@@ -361,7 +361,7 @@ def _machines(
         if not remaining.size:
             return theta, poses, internal
     raise ResultError(
-        "machines within the drawing's tolerances cannot take the readings of the plan",
+        "machines within the nominal model's tolerances cannot take the readings of the plan",
         found=f"{remaining.size} of {runs} machines, drawn {TIMES_MACHINES_REDRAWN} times",
         next_step="Look at the tolerances and ranges in the mechanism file",
     )

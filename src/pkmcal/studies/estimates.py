@@ -49,7 +49,7 @@ class Fitted:
 
 def nominal_estimate(machine: Machine, runs: int) -> Fitted:
     """Nominal parameters as an estimate."""
-    nominal = machine.parameters.drawing
+    nominal = machine.parameters.nominal
     return Fitted(np.broadcast_to(nominal, (runs, len(nominal))))
 
 

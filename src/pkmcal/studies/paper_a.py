@@ -50,14 +50,14 @@ from pkmcal.studies.simulated import (
 )
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
-PAPER_A_DRAWING, FOUR_STEPS_PRINTED, FOUR_STEPS_CORRECTED = (
+PAPER_A_NOMINAL, FOUR_STEPS_PRINTED, FOUR_STEPS_CORRECTED = (
     "drawing",
     "four steps as printed",
     "four steps",
 )
 PAPER_A_JOINT, PAPER_A_BOUND = "joint", "bound"
 PAPER_A_METHODS = (
-    PAPER_A_DRAWING,
+    PAPER_A_NOMINAL,
     FOUR_STEPS_PRINTED,
     FOUR_STEPS_CORRECTED,
     PAPER_A_JOINT,
@@ -134,7 +134,7 @@ class HexapodByAxes:
     legs_observed: int = 4
     noise: AxisNoise = field(default_factory=AxisNoise)
     joint_noise: float = 3e-6
-    drawing_error: float = 0.002
+    nominal_error: float = 0.002
     distance: float = 0.9
     height: float = 0.18
     extreme: bool = True
@@ -154,11 +154,11 @@ class HexapodByAxes:
         machine, rng = hexapod_with_held_radii(), batch.generator(0)
         table = machine.parameters
         # Uniform errors of all parameters but the radii, projected onto the gauge.
-        error = spread_evenly(rng, (batch.runs, len(table)), self.drawing_error)
+        error = spread_evenly(rng, (batch.runs, len(table)), self.nominal_error)
         error *= np.array(table.kinds) != "radius"
         held = ThreeCentres().constraints(machine)
         error -= error @ np.linalg.pinv(held) @ held
-        theta = table.drawing + error
+        theta = table.nominal + error
         readings = self._readings(machine, batch.runs, rng)
         start = machine.forward_result(readings.reshape(-1, 6)).T_base_platform
         start = start.reshape(*readings.shape[:2], 4, 4)
@@ -211,7 +211,7 @@ class HexapodByAxes:
             draws = batch.generator(START_ERROR_STREAM).uniform(
                 -1, 1, (batch.runs, len(machine.parameters))
             )
-            start = start_off_drawing(data, draws * self.start_error)
+            start = start_off_nominal(data, draws * self.start_error)
         return {**out, (PAPER_A_JOINT,): joint_from_readings(data, start)}
 
     def judge(
@@ -228,7 +228,7 @@ class HexapodByAxes:
             return effector_errors(data, theta, batch.generator(END_EFFECTOR_STREAM))
 
         out: dict[Key, Sample] = {}
-        for key, fit in {(PAPER_A_DRAWING,): nominal_estimate(machine, batch.runs), **fits}.items():
+        for key, fit in {(PAPER_A_NOMINAL,): nominal_estimate(machine, batch.runs), **fits}.items():
             errors = (fit.theta - data.theta) @ rows.T
             out[key] = _sample(machine, errors, effector(fit.theta), fit)
         root = root_of_bound(machine, joint_problem(machine, data, ThreeCentres()), data)
@@ -325,13 +325,13 @@ def hexapod_with_held_radii() -> Machine:
 class Thirty(NamedTuple):
     """The thirty parameters of [A] Fig. 4.
 
-    names : such as ``A2 x``. rows : (30, P) linear map from a machine's parameters. drawing : (30,)
+    names : such as ``A2 x``. rows : (30, P) linear map from a machine's parameters. nominal : (30,)
     nominal values, m.
     """
 
     names: tuple[str, ...]
     rows: Array
-    drawing: Array
+    nominal: Array
 
 
 def thirty(machine: Machine) -> Thirty:
@@ -340,7 +340,7 @@ def thirty(machine: Machine) -> Thirty:
     The origin is in the first centre, x points to the third, and the fifth is in the x-y plane. Six
     coordinates of each body vanish in these frames; twelve each remain, followed by the offsets.
     """
-    theta = machine.parameters.drawing
+    theta = machine.parameters.nominal
     held = {(0, 0), (0, 1), (0, 2), (2, 1), (2, 2), (4, 2)}
     names: list[str] = []
     rows: list[Array] = []
@@ -396,7 +396,7 @@ class Start(NamedTuple):
     T_camera_base: Array
 
 
-def start_off_drawing(data: SimulatedRuns, error: Array) -> Start:
+def start_off_nominal(data: SimulatedRuns, error: Array) -> Start:
     """Start of the joint estimate without the four steps.
 
     error : (B, P) offset of the free parameters from the nominal model. Stations are off by a few
@@ -406,7 +406,7 @@ def start_off_drawing(data: SimulatedRuns, error: Array) -> Start:
     free = np.any(table.free_matrix() != 0, axis=1)
     guess = perturb(data.view.T_camera_base, STATION_GUESS_OFFSET)
     return Start(
-        table.drawing + np.where(free, error, 0.0),
+        table.nominal + np.where(free, error, 0.0),
         np.broadcast_to(guess, (len(error), *guess.shape)),
     )
 

@@ -69,7 +69,7 @@ PROTOTYPE_POSES = {5: 0.169, 15: 0.091, 30: 0.060, 120: 0.029}
 MOST_DISPLACEMENT, MOST_ORIENTATION = 0.095, 0.015
 """Maximum errors of the joint estimate's end-effector, mm and degrees."""
 
-FOLLOWS_DRAWING = {
+FOLLOWS_NOMINAL = {
     ((FOUR_STEPS_PRINTED,), name)
     for name in ("base_z", "platform_z", "displacement", "orientation")
 }
@@ -87,7 +87,7 @@ chi2 by less.
 
 def tolerance(key: Key, quantity: str) -> float:
     """Accepted relative difference from one of the prototype's figures."""
-    return PAPER_A_OPEN_TOLERANCE if (key, quantity) in FOLLOWS_DRAWING else PAPER_A_TOLERANCE
+    return PAPER_A_OPEN_TOLERANCE if (key, quantity) in FOLLOWS_NOMINAL else PAPER_A_TOLERANCE
 
 
 def paper_a_figures(study: StudyResult[HexapodByAxes]) -> list[Compared]:
@@ -133,7 +133,7 @@ def paper_a_checks(study: StudyResult[HexapodByAxes]) -> tuple[Check, ...]:
         ),
         prototype_check(
             paper_a_figures(study),
-            f"within {PAPER_A_TOLERANCE:.0%}; what follows the drawing's error, within"
+            f"within {PAPER_A_TOLERANCE:.0%}; what follows the nominal model's error, within"
             f" {PAPER_A_OPEN_TOLERANCE:.0%}",
         ),
     )  # fmt: skip

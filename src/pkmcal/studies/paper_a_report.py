@@ -25,9 +25,9 @@ from pkmcal.studies.paper_a import (
     FOUR_STEPS_CORRECTED,
     FOUR_STEPS_PRINTED,
     PAPER_A_BOUND,
-    PAPER_A_DRAWING,
     PAPER_A_JOINT,
     PAPER_A_METHODS,
+    PAPER_A_NOMINAL,
     PAPER_A_PARAMETER_GROUPS,
     RADIAN_IN_DEGREES,
     HexapodByAxes,
@@ -37,7 +37,7 @@ from pkmcal.studies.paper_a import (
     thirty,
 )
 from pkmcal.studies.paper_a_expected import (
-    FOLLOWS_DRAWING,
+    FOLLOWS_NOMINAL,
     MEAN_ERRORS,
     PAPER_A_ERRORS_AFTER,
     PAPER_A_ERRORS_BEFORE,
@@ -63,12 +63,12 @@ from pkmcal.wording import joined, number
 if TYPE_CHECKING:
     from pkmcal.studies.paper_a_images import MeasuredNoise
 
-NARROW_DRAWING_ERROR = 0.002 / 3**0.5
+NARROW_NOMINAL_ERROR = 0.002 / 3**0.5
 """Standard deviation (m) of errors that are uniform within ± 2 mm, the other reading of "uniform
 noise with variance equal to 2 mm".
 """
 PAPER_A_METHOD_LABELS = {
-    PAPER_A_DRAWING: "the drawing, before",
+    PAPER_A_NOMINAL: "the nominal model, before",
     FOUR_STEPS_PRINTED: "four steps as printed",
     FOUR_STEPS_CORRECTED: "four steps corrected",
     PAPER_A_JOINT: "joint estimate",
@@ -83,7 +83,7 @@ PAPER_A_QUANTITY_LABELS = {
     "displacement": "displacement",
     "orientation": "orientation",
 }
-PAPER_A_REMARKS = ("printed", "before", "agree", "of_drawing", "others")
+PAPER_A_REMARKS = ("printed", "before", "agree", "of_nominal", "others")
 """Remarks of the report; the last two only if there are such differences."""
 ERROR_AXIS_TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3]
 """Ticks of logarithmic axes, mm."""
@@ -107,7 +107,7 @@ def reproduce(options: Options) -> Outcome:
         run(setting, options.runs, options.seed, options.within(begin, begin + share))
         for setting, begin in (
             (HexapodByAxes(), done),
-            (HexapodByAxes(drawing_error=NARROW_DRAWING_ERROR), done + share),
+            (HexapodByAxes(nominal_error=NARROW_NOMINAL_ERROR), done + share),
         )
     )
     done += 2 * share
@@ -193,7 +193,7 @@ def _words(
         return ratio_of_figures(s.of(method)["parameters"], s.of(other)["parameters"]).value
 
     apart = [f for f in figures if f.differs]
-    of_drawing = [f for f in apart if (f.key, f.quantity) in FOLLOWS_DRAWING]
+    of_nominal = [f for f in apart if (f.key, f.quantity) in FOLLOWS_NOMINAL]
     joint = s.samples[PAPER_A_JOINT,]
     inside = mean(covered(joint.values["parameters"], joint.sigma["parameters"])).times(100)
     return Words.of(
@@ -212,11 +212,11 @@ def _words(
         narrow_displacement=1e3 * narrow.of(FOUR_STEPS_PRINTED)["displacement"].value,
         drawing_error_asked=2
         * PAPER_A_ERRORS_BEFORE[0]
-        / s.of(PAPER_A_DRAWING)["displacement"].value,
+        / s.of(PAPER_A_NOMINAL)["displacement"].value,
         agree=len(figures) - len(apart),
         compared=len(figures),
-        of_drawing=_figures_text(of_drawing),
-        others=_figures_text([f for f in apart if f not in of_drawing]),
+        of_nominal=_figures_text(of_nominal),
+        others=_figures_text([f for f in apart if f not in of_nominal]),
         inside=inside.value,
         inside_error=inside.error,
         edge=measured.edge if measured else 0.0,
@@ -262,7 +262,7 @@ def _figure_part(words: Words, s: HexapodByAxesStudy) -> Part:
         summary.append(Row(_name(method), cells))
     every = [
         Row(name, (mm(float(value), 1), *(mm(float(errors[m][k])) for m in PAPER_A_METHODS)))
-        for k, (name, value) in enumerate(zip(params.names, params.drawing, strict=True))
+        for k, (name, value) in enumerate(zip(params.names, params.nominal, strict=True))
     ]
     heads = ("", "true value", *(_name(m) for m in PAPER_A_METHODS))
     return words.part(
@@ -275,7 +275,7 @@ def _figure_part(words: Words, s: HexapodByAxesStudy) -> Part:
         Table("All thirty, mm", heads, tuple(every), brief=False, folded=True),
         plots={
             "errors": {
-                "figure": figure_4(params.names, params.drawing, errors),
+                "figure": figure_4(params.names, params.nominal, errors),
                 "height": 560,
                 "width": 860,
             }
@@ -304,7 +304,7 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
             line={"color": "--ink", "width": 1.2},
         ),
         trace(
-            PAPER_A_METHOD_LABELS[PAPER_A_DRAWING], names, in_mm[PAPER_A_DRAWING], "--muted",
+            PAPER_A_METHOD_LABELS[PAPER_A_NOMINAL], names, in_mm[PAPER_A_NOMINAL], "--muted",
             "markers",
             marker={"symbol": "line-ew-open", "size": 22, "color": "--muted",
                     "line": {"width": 2, "color": "--muted"}},
@@ -376,7 +376,7 @@ def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Tab
     def row(name: str, s: HexapodByAxesStudy) -> Row:
         before, printed, joint = (
             s.of(m)["displacement"].value
-            for m in (PAPER_A_DRAWING, FOUR_STEPS_PRINTED, PAPER_A_JOINT)
+            for m in (PAPER_A_NOMINAL, FOUR_STEPS_PRINTED, PAPER_A_JOINT)
         )
         depth = mm(_depth_as_printed(s), 2)
         return Row(name, (mm(before, 2), mm(printed, 2), depth, mm(joint)))

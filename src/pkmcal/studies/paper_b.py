@@ -145,7 +145,7 @@ class HexapodByLegs:
         methods = PAPER_B_CASES[name].methods if name else (ROBUST_REGRESSION,)
         rng = batch.generator(1)
         centres = [solved(one, methods, rng) for one in data]
-        nominal = hexapod_with_cylinder_legs().parameters.drawing
+        nominal = hexapod_with_cylinder_legs().parameters.nominal
         theta = np.broadcast_to(nominal, (batch.runs, len(nominal)))
         return {
             (where, name or CONTROLLED_POPULATION, method): Fitted(

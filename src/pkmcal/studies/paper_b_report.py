@@ -80,7 +80,7 @@ EXAMPLE_RUNS = 0
 """Index of the run whose joints are plotted: the first, not the best."""
 CONTROL_CURVE_STYLES = {
     "true": ("True geometry", "--quiet", "dot"),
-    E1: ("E1: drawing, fitted", "--good", "dash"),
+    E1: ("E1: nominal model, fitted", "--good", "dash"),
     E2: ("E2: linear", "--drawing", "solid"),
     "hand": ("E3: by hand, 3 cm and 3°", "--calibrated", "solid"),
     "coarse": ("E3: 10 cm and 10°", "--leg7", "dash"),

@@ -54,14 +54,14 @@ from pkmcal.studies.simulated import (
 )
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
-PAPER_C_DRAWING, EQ3_AS_PRINTED, EQ5_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT, PAPER_C_BOUND = (
+PAPER_C_NOMINAL, EQ3_AS_PRINTED, EQ5_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT, PAPER_C_BOUND = (
     "drawing", "eq. 3", "eq. 5", "eq. 5 whitened", "joint", "bound",
 )  # fmt: skip
 ROTATION_AXIS_METHOD = "axis of rotation"
 METHODS_BY_TRUTH: dict[H4ModelKind, dict[H4ModelKind, tuple[str, ...]]] = {
     "design": {
         "design": (
-            PAPER_C_DRAWING,
+            PAPER_C_NOMINAL,
             EQ3_AS_PRINTED,
             EQ5_AS_PRINTED,
             EQ5_WHITENED,
@@ -71,7 +71,7 @@ METHODS_BY_TRUTH: dict[H4ModelKind, dict[H4ModelKind, tuple[str, ...]]] = {
         "calibration": (EQ5_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT),
     },
     "calibration": {
-        "design": (PAPER_C_DRAWING, EQ3_AS_PRINTED, PAPER_C_JOINT),
+        "design": (PAPER_C_NOMINAL, EQ3_AS_PRINTED, PAPER_C_JOINT),
         "calibration": (EQ3_AS_PRINTED, EQ5_AS_PRINTED, EQ5_WHITENED, PAPER_C_JOINT, PAPER_C_BOUND),
     },
     "rods": {
@@ -224,15 +224,15 @@ def _fits(
     machine, prior = model(name), name == "rods"
     begin = start(machine, data)
     out: dict[str, Fitted] = {}
-    if PAPER_C_DRAWING in methods:
-        out[PAPER_C_DRAWING] = nominal_estimate(machine, len(data.theta))
+    if PAPER_C_NOMINAL in methods:
+        out[PAPER_C_NOMINAL] = nominal_estimate(machine, len(data.theta))
     for method, form in PRINTED_EQUATION_FORMS.items():
         if method in methods:
             out[method] = estimate_of_pose_fit(at_poses(machine, data, begin, form, whitened=False))
-    whitened = at_poses(machine, data, begin, "implicit", whitened=True, use_drawing=prior)
+    whitened = at_poses(machine, data, begin, "implicit", whitened=True, use_prior=prior)
     if EQ5_WHITENED in methods:
         out[EQ5_WHITENED] = estimate_of_pose_fit(whitened, whitened=True)
-    out[PAPER_C_JOINT] = joint_from_pose_fit(machine, data, whitened, use_drawing=prior)
+    out[PAPER_C_JOINT] = joint_from_pose_fit(machine, data, whitened, use_prior=prior)
     if PAPER_C_BOUND in methods:
         out[PAPER_C_BOUND] = estimate_at_bound(machine, data, rng)
     return out
@@ -242,7 +242,7 @@ def start(machine: Machine, data: SimulatedRuns) -> State:
     """Starting state of every method, B runs: nominal parameters, camera and board by the closed
     form.
     """
-    n, nominal = data.count, machine.parameters.drawing
+    n, nominal = data.count, machine.parameters.nominal
     fk = forward(machine.layout, nominal, data.joints[:, :n], machine.home())
     pair = solve_pairs(fk.T_base_platform, data.T_camera_board[:, :n], size_of(machine))
     return State(
@@ -257,7 +257,7 @@ def start(machine: Machine, data: SimulatedRuns) -> State:
 
 def at_poses(
     machine: Machine, data: SimulatedRuns, begin: State, form: PoseFitForm, *,
-    whitened: bool, use_drawing: bool = False,
+    whitened: bool, use_prior: bool = False,
 ) -> PoseFit:  # fmt: skip
     """Fit by [C] eq. 3 or 5, as printed or whitened. begin : state by :func:`start`."""
     n, measured = data.count, data.T_camera_board
@@ -266,7 +266,7 @@ def at_poses(
     )
     noise = np.broadcast_to(np.diag(data.noise.pose**2), (n, 6, 6)) if whitened else None
     return fit_machine_to_poses(
-        machine, problem, state, noise, data.noise.reading, use_drawing=use_drawing
+        machine, problem, state, noise, data.noise.reading, use_prior=use_prior
     )
 
 
@@ -285,10 +285,10 @@ def estimate_of_pose_fit(fit: PoseFit, *, whitened: bool = False) -> Fitted:
 
 
 def joint_from_pose_fit(
-    machine: Machine, data: SimulatedRuns, begin: PoseFit, *, use_drawing: bool = False
+    machine: Machine, data: SimulatedRuns, begin: PoseFit, *, use_prior: bool = False
 ) -> Fitted:
     """Joint estimate, started from a fit at measured poses."""
-    problem = joint_problem(machine, data, default_gauge(machine), use_drawing=use_drawing)
+    problem = joint_problem(machine, data, default_gauge(machine), use_prior=use_prior)
     state = begin.solution.state
     poses = begin.problem.platform_poses(state)
     first = BatchState(
@@ -308,7 +308,7 @@ def estimate_at_bound(machine: Machine, data: SimulatedRuns, rng: np.random.Gene
     machine.
     """
     problem = joint_problem(machine, data, default_gauge(machine))
-    z = (data.theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
+    z = (data.theta - machine.parameters.nominal) @ np.linalg.pinv(problem.free).T
     runs, n = len(z), data.count
     state = BatchState(
         z,

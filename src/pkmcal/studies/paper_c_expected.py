@@ -12,8 +12,8 @@ from pkmcal.studies.paper_c import (
     EQ5_WHITENED,
     H4_MODEL_KINDS,
     PAPER_C_BOUND,
-    PAPER_C_DRAWING,
     PAPER_C_JOINT,
+    PAPER_C_NOMINAL,
     ROTATION_AXIS_METHOD,
     H4ByBoard,
     largest_side,
@@ -27,7 +27,7 @@ from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
 PAPER_C_METHOD_LABELS = {
-    PAPER_C_DRAWING: "a priori",
+    PAPER_C_NOMINAL: "a priori",
     EQ3_AS_PRINTED: "eq. 3 as printed",
     EQ5_AS_PRINTED: "eq. 5 as printed",
     EQ5_WHITENED: "eq. 5 whitened",
@@ -65,7 +65,7 @@ JOINT_MEANS = (9.4e-2, 3.6e-2, 7.6e-2, 8.5e-2)
 """Means of Table 3 "before" that follow from the two columns of Table 2, rad (errata)."""
 
 _PROTOTYPE: dict[Key, tuple[str, ...]] = {
-    ("design", "design", PAPER_C_DRAWING): ("4.5", "9.6"),
+    ("design", "design", PAPER_C_NOMINAL): ("4.5", "9.6"),
     ("design", "design", EQ3_AS_PRINTED): ("0.070", "0.24"),
     ("design", "design", PAPER_C_JOINT): ("0.052", "0.12"),
     ("design", "calibration", EQ5_AS_PRINTED): ("0.101", "0.37"),
@@ -127,8 +127,8 @@ def paper_c_figures(study: StudyResult[H4ByBoard]) -> list[Compared]:
 def paper_c_checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
     """Checks that must pass for the reproduction to succeed."""
     place, turn = start.shift, start.turn
-    before = study.values("control_mean", "design", "design", PAPER_C_DRAWING).mean(axis=0)
-    old = largest_side(study, ("design", PAPER_C_DRAWING))
+    before = study.values("control_mean", "design", "design", PAPER_C_NOMINAL).mean(axis=0)
+    old = largest_side(study, ("design", PAPER_C_NOMINAL))
     new = largest_side(study, ("design", EQ3_AS_PRINTED))
     every = ranks(study)
     measured_ranks = {key: every[key] for key in PAPER_C_RANKS}

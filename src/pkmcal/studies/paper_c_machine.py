@@ -21,7 +21,7 @@ H4ModelKind = Literal["design", "calibration", "rods"]
 MEASURED_VOLUME_MIDDLE = np.array([0.0, 0.0, -0.45])
 MEASURED_VOLUME_HALF = np.array([0.1, 0.1, 0.075, np.radians(20.0)])
 """Half sizes of the measured volume ([C] IV.A), m and rad."""
-ROD_DRAWING = 1e-3, 0.035
+ROD_NOMINAL = 1e-3, 0.035
 """Prior sigmas of lengths (m) and angles (rad, 2 degrees) of the machine with rods, which needs
 priors: about 59 of its parameters are better known than by this nominal model.
 """
@@ -74,7 +74,7 @@ def model(kind: H4ModelKind) -> Machine:
     if kind != "rods":
         return machine
     table = machine.parameters
-    length, angle = ROD_DRAWING
+    length, angle = ROD_NOMINAL
     tolerance = np.where(np.array(table.units) == "m", length, angle)
     return replace(machine, parameters=replace(table, tolerance=tolerance))
 
@@ -82,7 +82,7 @@ def model(kind: H4ModelKind) -> Machine:
 def table_2_values(machine: Machine, table: Table2) -> Array:
     """Parameters (P,) of the H4 by a column of Table 2; Q = q - q0, so ``angle`` is -q0."""
     names = machine.parameters.index
-    out = machine.parameters.drawing.copy()
+    out = machine.parameters.nominal.copy()
     for j, (s, _) in enumerate(NACELLE_CORNER_SIGNS):
         leg, alpha = f"legs[{j + 1}]", table.alpha[j]
         out[names(f"{leg}.platform.hinge.x")] = s * table.h
@@ -123,7 +123,7 @@ def true_values(kind: H4ModelKind, off: Deviations, runs: int, rng: np.random.Ge
         names = table.free_names()
         still = [".platform." in n or ".along" in n or ".axis" in n for n in names]
         sigma = np.where(still, 0.0, sigma)
-    theta = table.drawing + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
+    theta = table.nominal + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
     for leg, motor in enumerate(machine.layout.actuated, start=1):
         theta[:, table.index(f"legs[{leg}].base.angle")] = -IDENTIFIED_TABLE_2.q0[motor]
     return _with_paired_rods(machine, theta, off.rods, rng) if kind == "rods" else theta

@@ -17,8 +17,8 @@ from pkmcal.studies.paper_c import (
     LARGER_WORKSPACE_FACTOR,
     METHODS_BY_TRUTH,
     PAPER_C_BOUND,
-    PAPER_C_DRAWING,
     PAPER_C_JOINT,
+    PAPER_C_NOMINAL,
     ROTATION_AXIS_METHOD,
     H4ByBoard,
     largest_side,
@@ -48,7 +48,7 @@ TABLE_2_ANGLE_HEADS = ("α₁", "α₂", "α₃", "α₄", "q₀₁", "q₀₂",
 PAPER_C_REMARKS = ("models", "floor", "axis", "apart")
 """Remarks of the report; the last only if there are such differences."""
 VALIDATION_TABLE_ROWS = (
-    ("Before", ("design", PAPER_C_DRAWING), "before"),
+    ("Before", ("design", PAPER_C_NOMINAL), "before"),
     ("Model 12, eq. 3", ("design", EQ3_AS_PRINTED), "design"),
     ("Model 31, eq. 5", ("calibration", EQ5_AS_PRINTED), "calibration"),
 )
@@ -196,7 +196,7 @@ def _control_mean(s: H4ByBoardStudy, model_and_method: tuple[str, str]) -> Array
     After a calibration their signs are random, so these are root mean squares over the runs.
     """
     means = s.values("control_mean", "design", *model_and_method)
-    return means.mean(axis=0) if model_and_method[1] == PAPER_C_DRAWING else each_rms(means)
+    return means.mean(axis=0) if model_and_method[1] == PAPER_C_NOMINAL else each_rms(means)
 
 
 def _table_3(s: H4ByBoardStudy) -> Table:
@@ -238,7 +238,7 @@ def _table_4(s: H4ByBoardStudy) -> Table:
 
 def _square_table(s: H4ByBoardStudy) -> Table:
     """[C] IV.D."""
-    old = mm(largest_side(s, ("design", PAPER_C_DRAWING)), 2)
+    old = mm(largest_side(s, ("design", PAPER_C_NOMINAL)), 2)
     rows = [Row("The paper", (mm(SQUARE_BEFORE, 0), f"< {1e3 * SQUARE_AFTER:g}"), "paper")]
     rows += [
         Row(label, (old, mm(largest_side(s, which))))

@@ -71,7 +71,7 @@ def before() -> Before:
     machine = model("design")
     poses = workspace(ERROR_BEFORE_POSES, np.random.default_rng(0))
     readings = readings_at_poses(machine.layout, table_2_values(machine, IDENTIFIED_TABLE_2), poses)
-    fk = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform
+    fk = forward(machine.layout, machine.parameters.nominal, readings, poses).T_base_platform
     shift = np.linalg.norm(fk[:, :3, 3] - poses[:, :3, 3], axis=1)
     turn = rotation_vector(fk[:, :3, :3] @ poses[:, :3, :3].mT)
     return Before(float(shift.mean()), float(np.linalg.norm(turn, axis=1).mean()))

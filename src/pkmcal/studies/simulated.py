@@ -153,20 +153,20 @@ def _places_of_axes(view: Viewpoints) -> EdgeSet:
 
 
 def joint_problem(
-    machine: Machine, data: SimulatedRuns, gauge: Gauge, *, use_drawing: bool = False
+    machine: Machine, data: SimulatedRuns, gauge: Gauge, *, use_prior: bool = False
 ) -> Problem:
     """Joint problem of all runs with a model: that of a session, with the data of all runs.
 
     An axis is represented by two edges that are whitened together, [A] Table 1.
     """
     n = data.count
-    assembled = assemble(machine, measurements(data), gauge, use_drawing=use_drawing)
+    assembled = assemble(machine, measurements(data), gauge, use_prior=use_prior)
     template, at = assembled.problem, assembled.places.edges
     blocks, edge_data = template.blocks, replace(template.data, joints=data.joints[:, :n])
     if data.view.legs.size:
         # Each axis as two whitened edges.
         axis = data.axis.reshape(len(data.axis), -1, 4)
-        radius = machine.parameters.drawing[blocks.radius[at.row, at.place]]
+        radius = machine.parameters.nominal[blocks.radius[at.row, at.place]]
         whitened = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
         basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in whitened)
         basis[:, at.row, at.place], white[:, at.row, at.place] = whitened

@@ -71,8 +71,8 @@ DESIGN_NAMES_VARIED: Mapping[str, Varied] = {
     "corner_noise": Varied("deviation of a board's corner", "px", 1e-4, 100),
     "shading": Varied("deviation of a tube's side by its shading", "px", 0, 100),
     "reading_noise": Varied("deviation of a reading", "m or rad", 1e-12, 1),
-    "radius": Varied("tubes' radii, times the drawing's", "", 0.01, 100),
-    "size": Varied("the machine's size, times the drawing's", "", 0.001, 1000),
+    "radius": Varied("tubes' radii, times the nominal model's", "", 0.01, 100),
+    "size": Varied("the machine's size, times the nominal model's", "", 0.001, 1000),
     "tolerance": Varied("deviation of true machines, in tolerances", "", 0, 100),
     "extreme": Varied("share of configurations with legs near their ends", "", 0, 1),
     "observe": Varied("what is seen", words=("legs", "board", "legs+board")),
@@ -83,7 +83,7 @@ PAPER_NAMES_VARIED: Mapping[str, Varied] = {
     "legs": Varied("legs that each camera sees", "", 3, 6, whole=True),
     "axis_noise": Varied("noise of an axis, times Table 1", "", 1e-3, 1e3),
     "reading_noise": Varied("deviation of a reading", "m", 1e-12, 1),
-    "drawing_error": Varied("deviation of true machines from the drawing", "m", 0, 1),
+    "drawing_error": Varied("deviation of true machines from the nominal model", "m", 0, 1),
     "distance": Varied("from the camera to the machine's middle", "m", 0.1, 100),
     "height": Varied("of the cameras above the base", "m", -10, 10),
 }
@@ -281,9 +281,12 @@ def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> li
 def _paper_setting(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
     """Setting of [A] 4.3 with other values."""
     own: dict[str, Any] = {
-        {"configurations": "poses", "legs": "legs_observed", "reading_noise": "joint_noise"}.get(
-            name, name
-        ): value
+        {
+            "configurations": "poses",
+            "legs": "legs_observed",
+            "reading_noise": "joint_noise",
+            "drawing_error": "nominal_error",
+        }.get(name, name): value
         for name, value in values.items()
         if name != "axis_noise"
     }

@@ -216,6 +216,7 @@ def _agreement_text(
     # the search has a resolution of whole pixels
     off = f"{number(median, 1)} px" if median > legs.SEARCH_SIGMA / 2 else "less than half a pixel"
     return [
-        f"{verdict}: {text}, and the middle one lies {off} from the drawing. The drawing's"
+        f"{verdict}: {text}, and the middle one lies {off} from the nominal model. The"
+        " nominal model's"
         f" tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
     ]

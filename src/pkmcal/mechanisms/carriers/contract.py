@@ -316,8 +316,8 @@ class BaseCarrier(Carrier, ABC):
 
     @classmethod
     def skeleton(cls, parameters: Array, readings: Array) -> Array:
-        """Points (..., k, 3) along the arm that carries A, from the motor to A, for drawings; m,
-        base frame.
+        """Points (..., k, 3) along the arm that carries A, from the motor to A, for nominal models;
+        m, base frame.
 
         A rotary carrier's arm is drawn from its axis straight to A, by its chain. Others have no
         arm, only A, which is fixed or moves along a guide.
