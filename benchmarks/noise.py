@@ -46,7 +46,7 @@ def main() -> None:
             rng = np.random.default_rng(1000 + seed)
             edges, joints = simulate_edges(
                 truth.machine, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(),
-                rng, photographs=truth.photographs, joint_noise=true_noise,
+                rng, images=truth.images, joint_noise=true_noise,
             )  # fmt: skip
             given = Measurements(
                 edges, joints, stated, args.stations, np.zeros(args.stations, dtype=int)

@@ -167,7 +167,7 @@ def test_parameters_are_a_table(result, loaded):
     table = result.machine.parameters
     assert [row.name for row in value] == list(table.names)
     assert np.array_equal([row.value for row in value], result.machine.values)
-    assert np.array_equal([row.nominal for row in value], result.session.machine.values)
+    assert np.array_equal([row.drawing for row in value], result.session.machine.values)
     variance = np.diag(result.estimate.covariance)
     assert np.allclose([row.sigma**2 for row in value], variance, atol=1e-30)
     row = value["legs[2].base.center.x"]

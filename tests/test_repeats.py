@@ -366,7 +366,7 @@ def repeats(tmp_path_factory):
     return simulated(tmp_path_factory.mktemp("repeats") / "session", 4)
 
 
-def test_the_first_repeat_is_the_photograph_of_a_session_without(tmp_path):
+def test_the_first_repeat_is_the_image_of_a_session_without(tmp_path):
     single, repeats = (simulated(tmp_path / str(n), n, size=(120, 90)) for n in (1, 2))
     for path in sorted((single / "images" / "station1").iterdir()):
         first = repeats / "images" / "station1" / f"{path.stem}_1.png"
@@ -376,7 +376,7 @@ def test_the_first_repeat_is_the_photograph_of_a_session_without(tmp_path):
     assert "repeat" not in (single / "session.yaml").read_text()
     assert "repeats" not in (single / "truth.json").read_text()
     assert load_truth(repeats, load_session(repeats).machine).repeats == 2
-    assert len(load_session(repeats).stations[0].photographs) == 8
+    assert len(load_session(repeats).stations[0].images) == 8
 
 
 def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):

@@ -318,7 +318,7 @@ def test_rejections_are_grouped_by_reason(case):
     first, second = provenance.reasons(case.session, case.observation.rejected)
     assert (first.count, first.text) == (2, "seen over … mm only")
     assert first.cases[0] == ("front0 / c0", "leg 3 tube 2 right: seen over 3.5 mm only")
-    assert second.cases == (("front1 / c3", "whole photograph"),)
+    assert second.cases == (("front1 / c3", "whole image"),)
 
 
 def test_a_group_that_stands_out_is_named(case):

@@ -28,7 +28,7 @@ def joined(folder):
     return folder
 
 
-def test_legs_and_board_in_the_same_photographs(joined):
+def test_legs_and_board_in_the_same_images(joined):
     session = load_session(joined)
     assert session.warnings == ()
     assert (session.board, session.board_body) == (joined / "board.yaml", "base")

@@ -83,7 +83,7 @@ class Page:
         return self.request(f"/{token}/{path}", **headers)
 
     def post(self, what, content=None, **body):
-        text = json.dumps({"station": 0, "photograph": 0, **body}).encode()
+        text = json.dumps({"station": 0, "image": 0, **body}).encode()
         return self.request(f"/{TOKEN}/{what}", text if content is None else content)
 
     def ask(self, what, **body):
@@ -116,7 +116,7 @@ def test_the_page_opens_with_its_token(page):
     assert page.get(origin=f"http://127.0.0.1:{PORT}").status == 200
 
 
-@pytest.mark.parametrize("path", ["", "view.js", "photograph/0/0", "nowhere"])
+@pytest.mark.parametrize("path", ["", "view.js", "image/0/0", "nowhere"])
 @pytest.mark.parametrize("token", ["", "the-toke", "the-tokens", "é"])
 def test_without_the_token_nothing_is_told(page, path, token):
     answer = page.get(path, token)
@@ -138,7 +138,7 @@ def test_without_the_token_nothing_is_told(page, path, token):
 )
 def test_a_page_of_somebody_else_is_refused(page, headers):
     assert page.get(**headers).status == 403
-    query = b'{"station": 0, "photograph": 0}'
+    query = b'{"station": 0, "image": 0}'
     assert page.request(f"/{TOKEN}/save", query, **headers).status == 403
 
 
@@ -159,14 +159,14 @@ def test_the_page_asks_for_nothing_outside(page):
 # ------------------------------------------------------------------ what is shown
 
 
-def test_all_photographs_are_named(page, demo):
+def test_all_images_are_named(page, demo):
     text = Found(page.get().text).text
     session = page.subject.session
     assert all(name in text for name in (*session.configurations, *session.station_names))
 
 
-def test_a_photograph_is_sent(page):
-    image = cv2.imdecode(np.frombuffer(page.get("photograph/1/2").content, np.uint8), 0)
+def test_a_image_is_sent(page):
+    image = cv2.imdecode(np.frombuffer(page.get("image/1/2").content, np.uint8), 0)
     assert image.shape[::-1] == page.subject.station(1).camera.image_size
     assert np.abs(image.astype(int) - page.subject.image(1, 2)).mean() < 3
 
@@ -174,31 +174,31 @@ def test_a_photograph_is_sent(page):
 def test_nothing_is_decoded_before_it_is_looked_at(demo):
     opened = Page(demo.session)
     opened.get()
-    opened.get("photograph/0/1")
-    opened.ask("overlay", photograph=1)
+    opened.get("image/0/1")
+    opened.ask("overlay", image=1)
     assert opened.subject.image.cache_info().misses == 1
 
 
-def test_a_large_photograph_is_sent_at_the_screens_size(page, monkeypatch):
+def test_a_large_image_is_sent_at_the_screens_size(page, monkeypatch):
     monkeypatch.setattr("pkmcal.view.content.WIDEST_VIEWED_PICTURE", 100)
-    image = cv2.imdecode(np.frombuffer(page.get("photograph/0/0").content, np.uint8), 0)
+    image = cv2.imdecode(np.frombuffer(page.get("image/0/0").content, np.uint8), 0)
     assert image.shape[1] == 100
 
 
 def test_faults_are_told_in_words(page, session):
     (session / "images" / "station1").mkdir(exist_ok=True)
-    broken = load_session(session).stations[0].photographs[0].path
+    broken = load_session(session).stations[0].images[0].path
     broken.write_bytes(broken.read_bytes()[:-40])
-    answer = Page(session).get("photograph/0/0")
+    answer = Page(session).get("image/0/0")
     assert answer.status == 422
-    assert answer.json()["message"].startswith(f"{broken.relative_to(session)}: the photograph")
-    assert page.get("photograph/0/99").json()["found"] == "100"
+    assert answer.json()["message"].startswith(f"{broken.relative_to(session)}: the image")
+    assert page.get("image/0/99").json()["found"] == "100"
     for body, words in (
         ({"station": 9}, "there is no such station"),
         ({"pose": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "no rotation"),
         ({"gesture": {"kind": "jump", "start": [0, 0], "end": [1, 1]}}, "gesture.kind"),
         ({"pose": 7}, "the page, pose"),
-        ({"pins": [{"photograph": 0, "end": "base", "leg": 7, "pixel": [1, 2]}]}, "pins[1]"),
+        ({"pins": [{"image": 0, "end": "base", "leg": 7, "pixel": [1, 2]}]}, "pins[1]"),
     ):
         answer = page.post("overlay", **body)
         assert answer.status == 422
@@ -209,7 +209,7 @@ def test_faults_are_told_in_words(page, session):
 
 def test_a_defect_is_told_as_one(page, monkeypatch):
     monkeypatch.setattr(Viewed, "jpeg", lambda *_: 1 / 0)
-    answer = page.get("photograph/0/0")
+    answer = page.get("image/0/0")
     assert answer.status == 500
     assert "a defect of pkmcal" in answer.json()["message"]
 
@@ -230,16 +230,16 @@ def test_the_overlay_is_where_the_machine_is(page, truth):
 
 def test_a_joint_comes_to_where_it_is_pulled(page):
     """One joint, then another in a second image: both stay pinned."""
-    first = {"photograph": 0, "end": "platform", "leg": 2, "pixel": [300, 200]}
+    first = {"image": 0, "end": "platform", "leg": 2, "pixel": [300, 200]}
     answer = page.ask("overlay", pins=[first])
     shifted = next(j for j in answer["joints"] if (j["end"], j["leg"]) == ("platform", 2))
     assert (shifted["x"], shifted["y"]) == (300, 200)
-    base = page.ask("overlay", photograph=1, pose=answer["pose"])["joints"]
+    base = page.ask("overlay", image=1, pose=answer["pose"])["joints"]
     other = next(j for j in base if (j["end"], j["leg"]) == ("base", 5))
-    second = {"photograph": 1, "end": "base", "leg": 5, "pixel": [other["x"] + 20, other["y"] - 9]}
+    second = {"image": 1, "end": "base", "leg": 5, "pixel": [other["x"] + 20, other["y"] - 9]}
     answer = page.ask("overlay", pose=answer["pose"], pins=[first, second])
-    for photograph, pin in ((0, first), (1, second)):
-        joints = page.ask("overlay", photograph=photograph, pose=answer["pose"])["joints"]
+    for image, pin in ((0, first), (1, second)):
+        joints = page.ask("overlay", image=image, pose=answer["pose"])["joints"]
         at = next(j for j in joints if (j["end"], j["leg"]) == (pin["end"], pin["leg"]))
         np.testing.assert_allclose([at["x"], at["y"]], pin["pixel"], atol=0.051)
 
@@ -269,7 +269,7 @@ def test_no_pose_is_too_odd(page):
         for _ in range(4):
             T = pose(rotation(2 * rng.normal(size=3)), away * rng.normal(size=3)).tolist()
             start, end = rng.uniform(-800, 1600, (2, 2)).tolist()
-            pin = {"photograph": 0, "end": "base", "leg": 3, "pixel": end}
+            pin = {"image": 0, "end": "base", "leg": 3, "pixel": end}
             for more in (
                 {},
                 {"gesture": {"kind": "turn", "start": start, "end": end}},
@@ -318,7 +318,7 @@ def test_the_machine_is_found_from_nowhere(page, truth):
 def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
     loaded = load_session(session)
     rng = np.random.default_rng(3)
-    for photo in loaded.stations[0].photographs:
+    for photo in loaded.stations[0].images:
         image = cv2.imread(str(photo.path), 0)
         noise = rng.normal(128, 40, (image.shape[0] // 8, image.shape[1] // 8))
         cv2.imwrite(str(photo.path), cv2.resize(noise, image.shape[::-1]).clip(0, 255).astype("u1"))
@@ -510,7 +510,7 @@ def test_what_cannot_be_shown_is_told_before(demo, session, tmp_path):
     tracker = "{poses: poses.csv, noise: {position: 1.0e-5, rotation: 1.0e-5}}"
     (session / "session.yaml").write_text(f"{text}stations: {{t: {{tracker: {tracker}}}}}\n")
     done = run("view", session)
-    assert (done.code, "there are no photographs to be shown" in done.err) == (2, True)
+    assert (done.code, "there are no images to be shown" in done.err) == (2, True)
 
 
 # ------------------------------------------------------------------ in a browser

@@ -170,7 +170,7 @@ class CameraCalibration:
         }
 
 
-def calibrate_photographs(
+def calibrate_images(
     paths: Sequence[Path | str], board: Board, model: str = "auto"
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
@@ -248,7 +248,7 @@ def check_enough(used: Sequence[Any], taken: int) -> None:
     """Raise `InputError` if fewer than LEAST_VIEWS images show the board."""
     if len(used) < LEAST_VIEWS:
         raise InputError(
-            "too few photographs show the board",
+            "too few images show the board",
             found=f"{len(used)} of {taken}",
             expected=f"{LEAST_VIEWS} at least, better ten, with the board tilted differently",
         )
@@ -307,11 +307,11 @@ def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
         return
     tilt = tilts(fit.T_camera_board, views.points)
     raise ResultError(
-        "the photographs do not tell the focal length, because the board looks much the same in"
+        "the images do not tell the focal length, because the board looks much the same in"
         " all of them",
         found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
-        next_step="Take photographs with the board tilted by 20 to 45 degrees, each to another"
+        next_step="Take images with the board tilted by 20 to 45 degrees, each to another"
         " side, and near the picture's corners",
     )
 
@@ -344,7 +344,7 @@ def check_explained(rms: float, camera: Camera) -> None:
         found=f"an error of {rms:.2g} px on views left out ({camera.model} fits best)",
         expected=f"{limit:.2g} px at most, usually a tenth of that",
         next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
-        " photographs of two cameras",
+        " images of two cameras",
     )
 
 

@@ -117,7 +117,7 @@ def _top(
         ),
     ] = False,
 ) -> None:
-    """Calibrate parallel machines from photographs of their own legs."""
+    """Calibrate parallel machines from images of their own legs."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

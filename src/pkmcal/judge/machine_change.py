@@ -4,7 +4,7 @@ Frames are conventions, so the two are told in those in which they differ least:
 over all free parameters, each in its tolerance. What is then left, y, has no frames in it.
 
 Both estimates lean on the same nominal model where they have the same one, and on the same
-photographs as far as they share them. With the nominal model's covariance 1 (in tolerances), and
+images as far as they share them. With the nominal model's covariance 1 (in tolerances), and
 what the data of each add to it, I_a and I_b, their covariances are C = (1 + I)^-1, and
 
     cov(y_b - y_a) = C_a + C_b - C_a J C_b - C_b J C_a,    J = 1 + I_shared,

@@ -57,7 +57,7 @@ LATEX_SIGNS = {
 }  # fmt: skip
 """Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
-    "data": "the photographs decide",
+    "data": "the images decide",
     "drawing": "the nominal model decides more than the photographs",
     "frame": "defines the frame",
     "fixed": "kept at the nominal model's value",
@@ -124,7 +124,7 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
             ),
         },
         gauge=estimate.gauge,
-        told="heights" if only_heights(estimate) else "photographs" if visible else "readings",
+        told="heights" if only_heights(estimate) else "images" if visible else "readings",
     )
     return Part("parameters", "Parameters", html=html)
 

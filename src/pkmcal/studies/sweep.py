@@ -183,7 +183,7 @@ def _of_session(session: Session) -> StudySubject:
     given = [place for place in poses if place is not None]
     if len(given) < len(poses):
         findings.append(note("study.chosen_stations"))
-    by_station = [{p.configuration for p in station.photographs} for station in session.stations]
+    by_station = [{p.configuration for p in station.images} for station in session.stations]
     usual = Design.configurations
     if not any(by_station):
         findings.append(note("study.no_images", number=usual))

@@ -85,7 +85,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return endpoint
 
     # files and images by GET
-    async def photograph(request: Request) -> Response:
+    async def picture(request: Request) -> Response:
         s, k = request.path_params["s"], request.path_params["k"]
         return await _answered(lambda: Response(viewed.jpeg(s, k), media_type="image/jpeg"))
 
@@ -104,7 +104,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         Route("/", page),
         Route("/view.js", script),
         Route("/view.css", style),
-        Route("/photograph/{s:int}/{k:int}", photograph),
+        Route("/image/{s:int}/{k:int}", picture),
         *(
             Route(f"/{name}", answering(answer), methods=["POST"])
             for name, answer in (
@@ -167,9 +167,9 @@ def view_page_html(viewed: Viewed) -> str:
             "legs": "legs" in station.observe,
             "handheld": station.handheld,
             "posed": station.T_camera_base is not None,
-            "photographs": [
+            "images": [
                 " ".join([session.configurations[p.configuration], *filter(None, [p.repeat])])
-                for p in station.photographs
+                for p in station.images
             ],
         }
         for station in session.stations

@@ -63,7 +63,7 @@
     for (const plot of plots) {
       const frames = read("frames", plot);
       if (frames) await Plotly.addFrames(plot, frames);
-      // a point that stands for a photograph leads to it
+      // a point that stands for an image leads to it
       plot.on("plotly_click", ({ points }) => {
         const lead = points[0].customdata;
         if (typeof lead === "string" && lead.startsWith("#")) location.hash = lead;

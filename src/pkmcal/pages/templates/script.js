@@ -22,7 +22,7 @@
   addEventListener("scroll", hide, { passive: true });
 })();
 
-// Enlarged photographs; a click inside comes nearer still.
+// Enlarged images; a click inside comes nearer still.
 (() => {
   const dialog = document.getElementById("large");
   const frame = dialog.querySelector(".large-picture");

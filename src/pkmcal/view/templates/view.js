@@ -5,13 +5,13 @@ const state = JSON.parse($("state").textContent);
 const SVG = "http://www.w3.org/2000/svg";
 const STEP = 1.05; // the distance's change by one notch of the wheel, or one press
 const NOTCH = 100; // what browsers call one notch
-const ENOUGH = 2; // joints put to their places, after which the machine snaps to the photographs
+const ENOUGH = 2; // joints put to their places, after which the machine snaps to the images
 const PAUSE = 250; // ms without a turn of the wheel after which the next is another one
 
 const here = { s: 0, k: 0, shown: "drawing", kind: "aim" };
 // By station: the pose (null for the files' own), those before it, joints put to their places.
 const stations = state.stations.map(() => ({ pose: null, before: [], pins: [], changed: false }));
-let epoch = 0; // answers about a photograph that is not shown any more are let go
+let epoch = 0; // answers about an image that is not shown any more are let go
 const timings = []; // ms from a move of the mouse to the overlay that it asked for
 const held = () => here.shown === "calibration";
 const mine = () => stations[here.s];
@@ -32,7 +32,7 @@ async function post(what, body) {
 
 function request(more) {
   const pose = held() ? null : mine().pose;
-  return { station: here.s, photograph: here.k, shown: here.shown, pose, ...more };
+  return { station: here.s, image: here.k, shown: here.shown, pose, ...more };
 }
 
 // Of moves that come faster than answers, the latest wins.
@@ -81,7 +81,7 @@ function draw(answer) {
   for (const leg of answer.legs) element("path", { class: `edge ${colour(leg.leg)}${leg.quiet ? " axis" : ""}`, d: leg.d }, laid);
   joints.replaceChildren();
   for (const joint of answer.joints) {
-    const pinned = mine().pins.some((p) => p.photograph === here.k && p.end === joint.end && p.leg === joint.leg);
+    const pinned = mine().pins.some((p) => p.image === here.k && p.end === joint.end && p.leg === joint.leg);
     const at = { cx: joint.x, cy: joint.y }, group = element("g", { class: colour(joint.leg) }, joints);
     element("circle", { ...at, r: size / 110, class: "halo" }, group);
     element("circle", { ...at, r: size / 110, class: `ring${pinned && !held() ? " pinned" : ""}` }, group);
@@ -130,21 +130,21 @@ function say(text, kind = "") {
 
 function go(s, k, shown = here.shown) {
   const station = state.stations[s];
-  if (!station || !station.photographs[k]) return;
+  if (!station || !station.images[k]) return;
   Object.assign(here, { s, k, shown });
   epoch += 1;
   say("");
-  const [width, height] = station.size, picture = $("photograph"), name = station.photographs[k];
+  const [width, height] = station.size, picture = $("image"), name = station.images[k];
   $("shot").setAttribute("viewBox", `-0.5 -0.5 ${width} ${height}`);
   $("shot").style.setProperty("--ratio", width / height);
   $("shot").classList.toggle("held", held());
   picture.setAttribute("width", width);
   picture.setAttribute("height", height);
-  picture.setAttribute("href", `photograph/${s}/${k}`);
+  picture.setAttribute("href", `image/${s}/${k}`);
   for (const id of ["laid", "found", "missed", "corners", "joints"]) $(id).replaceChildren();
   $("where").textContent = `${station.name} / ${name}`;
   for (const button of document.querySelectorAll(".list button")) {
-    const current = +button.dataset.station === s && +button.dataset.photograph === k;
+    const current = +button.dataset.station === s && +button.dataset.image === k;
     button.toggleAttribute("aria-current", current);
     if (current) { button.setAttribute("aria-current", "true"); button.scrollIntoView({ block: "nearest", inline: "nearest" }); }
   }
@@ -156,7 +156,7 @@ function go(s, k, shown = here.shown) {
 }
 
 function walk(step) {
-  const count = state.stations.map((station) => station.photographs.length);
+  const count = state.stations.map((station) => station.images.length);
   let { s, k } = here;
   k += step;
   if (k < 0) { s -= 1; k = (count[s] ?? 0) - 1; }
@@ -165,11 +165,11 @@ function walk(step) {
 }
 
 // A picture that does not come has its reason in words.
-$("photograph").addEventListener("error", async () => {
-  const answer = await fetch($("photograph").getAttribute("href")).then((r) => r.json()).catch(() => null);
-  say(answer?.message ?? "The photograph does not come.", "bad");
+$("image").addEventListener("error", async () => {
+  const answer = await fetch($("image").getAttribute("href")).then((r) => r.json()).catch(() => null);
+  say(answer?.message ?? "The image does not come.", "bad");
 });
-$("photograph").addEventListener("load", () => { document.documentElement.dataset.picture ??= Math.round(performance.now()); });
+$("image").addEventListener("load", () => { document.documentElement.dataset.picture ??= Math.round(performance.now()); });
 
 // ---------------------------------------------------------------- moving
 
@@ -198,7 +198,7 @@ $("shot").addEventListener("pointerdown", (event) => {
   const joint = event.target.dataset?.end ? { end: event.target.dataset.end, leg: +event.target.dataset.leg } : null;
   const kind = event.shiftKey ? "turn" : event.altKey ? "roll" : here.kind;
   remember();
-  const others = mine().pins.filter((p) => !(joint && p.photograph === here.k && p.end === joint.end && p.leg === joint.leg));
+  const others = mine().pins.filter((p) => !(joint && p.image === here.k && p.end === joint.end && p.leg === joint.leg));
   pull = { joint: kind === "aim" ? joint : null, kind, start: pixel(event), pose: mine().pose, others, moved: false };
   $("shot").setPointerCapture(event.pointerId);
   $("shot").classList.add("pulling");
@@ -207,7 +207,7 @@ $("shot").addEventListener("pointermove", (event) => {
   if (!pull) return;
   pull.moved = true;
   const end = pixel(event);
-  mine().pins = pull.joint ? [...pull.others, { ...pull.joint, photograph: here.k, pixel: end }] : [];
+  mine().pins = pull.joint ? [...pull.others, { ...pull.joint, image: here.k, pixel: end }] : [];
   overlay({ pose: pull.pose, ...(pull.joint ? { pins: mine().pins } : { gesture: { kind: pull.kind, start: pull.start, end } }) });
 });
 async function release() {
@@ -274,7 +274,7 @@ async function save() {
 
 document.querySelector(".list").addEventListener("click", (event) => {
   const button = event.target.closest("button");
-  if (button) go(+button.dataset.station, +button.dataset.photograph);
+  if (button) go(+button.dataset.station, +button.dataset.image);
 });
 for (const button of document.querySelectorAll("[data-shown]")) button.addEventListener("click", () => go(here.s, here.k, button.dataset.shown));
 for (const button of document.querySelectorAll("[data-kind]")) {
@@ -300,9 +300,9 @@ addEventListener("keydown", (event) => {
 });
 addEventListener("beforeunload", (event) => { if (stations.some((station) => station.changed)) event.preventDefault(); });
 
-// An address names its photograph, and a page that is loaded again comes back to it.
+// An address names its image, and a page that is loaded again comes back to it.
 const [s0, k0, shown0] = location.hash.slice(1).split("/");
-const first = state.stations.findIndex((station) => station.photographs.length);
-if (first < 0) say("The session has no photographs.", "bad");
-else if (state.stations[s0 - 1]?.photographs[k0 - 1]) go(s0 - 1, k0 - 1, state.calibrated && shown0 === "calibration" ? shown0 : "drawing");
+const first = state.stations.findIndex((station) => station.images.length);
+if (first < 0) say("The session has no images.", "bad");
+else if (state.stations[s0 - 1]?.images[k0 - 1]) go(s0 - 1, k0 - 1, state.calibrated && shown0 === "calibration" ? shown0 : "drawing");
 else go(first, 0);
