@@ -99,7 +99,7 @@ def main() -> None:
         if args.parts:
             print(f"  {'step':44} {'cpu (s)':>8} {'clock':>8} {'MB then':>8} {'MB most':>8}")
             for images, session in sessions:
-                print(f"{images} photographs", flush=True)
+                print(f"{images} images", flush=True)
                 subprocess.run([sys.executable, "-c", PARTS, str(session)], check=False)
             return
         alone = cost([sys.executable, "-c", IMPORTS])

@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, nargs="*", default=list(range(len(CASES))))
     args = parser.parse_args()
     nominal, camera = load_mechanism("gough-stewart"), demo_camera()
-    print(f"{args.runs} sessions, {args.stations} x {args.configurations} photographs")
+    print(f"{args.runs} sessions, {args.stations} x {args.configurations} images")
     print("true, stated (um)   told  factor   tool (mm)  stated    z")
     for true_noise, stated in (CASES[k] for k in args.cases):
         rows, factors, off, sigma, z = [], [], [], [], []

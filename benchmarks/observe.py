@@ -52,7 +52,7 @@ def main() -> None:
         paths = [p.path for s in session.stations for p in s.images]
         plain = best_of(lambda: decode_and_canny(paths))
     observation = parts["decode"] + parts["observe"]
-    print(f"{len(paths)} photographs")
+    print(f"{len(paths)} images")
     print(f"start-up (imports)          {start_up:6.2f} s")
     for name, seconds in parts.items():
         print(f"{name:27} {seconds:6.2f} s")

@@ -253,10 +253,10 @@ MISTAKES: dict[str, Mistake] = {
     "numbering backwards": Mistake(
         lambda f, _: readings(f, lambda row: row[::-1]), "readings.numbering_reversed"
     ),
-    "photographs exchanged": Mistake(
+    "images exchanged": Mistake(
         lambda f, rng: renamed(f, lambda paths: _exchanged(paths, rng)), "image.exchanged"
     ),
-    "photographs shifted": Mistake(
+    "images shifted": Mistake(
         lambda f, _: renamed(f, lambda paths: paths[1:] + paths[:1]), "image.shifted"
     ),
     "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), "image.mirrored"),
@@ -325,7 +325,7 @@ def main() -> None:
     parser.add_argument("--mistakes", action="store_true")
     parser.add_argument("--sessions", type=int, default=5, help="of each mistake")
     parser.add_argument("--no-pose", action="store_true", help="mistakes: drop the rough poses")
-    parser.add_argument("--keep", type=Path, help="folder for the photographs")
+    parser.add_argument("--keep", type=Path, help="folder for the images")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         keep = options.keep or Path(temporary)

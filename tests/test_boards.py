@@ -319,7 +319,7 @@ def test_no_board_anywhere(tmp_path, pictures):
     for k, path in enumerate(paths):
         noise = np.random.default_rng(k).normal(90, 5, (180, 240))
         cv2.imwrite(str(path), noise.astype(np.uint8))
-    with pytest.raises(InputError, match="in none of the photographs") as caught:
+    with pytest.raises(InputError, match="in none of the images") as caught:
         detect_boards(paths, pictures["charuco"][0])
     assert caught.value.found == "none of the board's markers is recognised"
 

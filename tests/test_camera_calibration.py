@@ -354,7 +354,7 @@ def fitted_once(wide_pool, monkeypatch):
 def test_a_model_that_does_not_fit(wide_views):
     with pytest.raises(InputError) as caught:
         calibrate_camera(wide_views, BOARD, "pinhole")
-    assert caught.value.what == "the model pinhole does not fit the photographs"
+    assert caught.value.what == "the model pinhole does not fit the images"
     assert caught.value.expected.split(",")[0] in ("unified", "fisheye")
 
 

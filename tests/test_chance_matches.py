@@ -54,7 +54,7 @@ def test_few_edges_of_the_right_machine_are_no_chance():
 
 def test_edges_of_a_machine_that_is_elsewhere_are():
     (why,) = chance_match_reason(turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)))
-    assert "may not be the machine in the photographs" in why.text
+    assert "may not be the machine in the images" in why.text
     in_view = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)).observation
     hidden = sum(r.reason == OUT_OF_SIGHT_REASON for r in in_view.rejected)
     in_sight = len(in_view.edges) + len(in_view.rejected) - hidden

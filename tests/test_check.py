@@ -116,7 +116,7 @@ def test_a_station_whose_images_are_all_broken(session):
 
 
 def test_of_many_broken_images_some_are_named(session, monkeypatch):
-    monkeypatch.setattr(check, "BROKEN_PHOTOGRAPHS_NAMED", 1)
+    monkeypatch.setattr(check, "BROKEN_IMAGES_NAMED", 1)
     for path in (session / "images" / "station1").iterdir():
         path.write_bytes(path.read_bytes()[:-300])
     first, others = texts(check_session(session), Level.WRONG)

@@ -103,7 +103,7 @@ def test_three_images_of_one_station(alone):
     # from one place the line of sight is determined badly
     assert rows.second < rows.position
     text = outcome_of(check).parts[-1].terminal_text
-    assert "by the edges of 3 photographs" in text[0]
+    assert "by the edges of 3 images" in text[0]
 
 
 def test_no_forecast_where_a_station_is_not_recognised(found):
@@ -316,7 +316,7 @@ def test_the_command_writes_page_and_pictures(alone, tmp_path, monkeypatch):
     assert len(list((tmp_path / "drawn").iterdir())) == 3
     assert all(Path(path).exists() for path in done.json["files"].values())
     page = (tmp_path / "out" / "check.html").read_text()
-    assert "The nominal model over the photographs" in page
+    assert "The nominal model over the images" in page
     assert "What a full capture would give" in page
     # again, over the same; but not beside what is somebody's
     assert run("check", alone, "--pictures", tmp_path / "drawn").code == done.code
@@ -330,7 +330,7 @@ def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr("pkmcal.check.pictures.drawing_over_photograph", never)
+    monkeypatch.setattr("pkmcal.check.pictures.nominal_over_image", never)
     before = sorted(alone.rglob("*"))
     assert run("check", alone).code < 2
     assert sorted(alone.rglob("*")) == before

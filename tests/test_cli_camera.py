@@ -82,7 +82,7 @@ def test_a_sessions_board_images(boards, tmp_path):
 def test_faults_are_sentences(boards, tmp_path):
     cases = {
         ("camera", tmp_path / "nowhere"): "there is no such image or folder",
-        ("camera", tmp_path): "the folder holds no photographs",
+        ("camera", tmp_path): "the folder holds no images",
         ("camera", boards, "--board", tmp_path / "b.yaml"): "the file does not exist",
     }
     for words, sentence in cases.items():

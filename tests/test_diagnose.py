@@ -113,7 +113,7 @@ def test_two_columns_exchanged(pair, by_hand, seed):
     error = said(pictures(count), readings_with(order, count), by_hand=given(by_hand), seed=seed)
     a, b = pair
     assert str(error) == (
-        f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the photographs"
+        f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the images"
         f" fit with these two columns exchanged. Exchange the columns of legs {a + 1} and {b + 1}"
         " in joints.csv, or the two legs in the nominal model."
     )
@@ -176,7 +176,7 @@ def test_images_shifted_by_one(step, words, by_hand):
 @pytest.mark.parametrize("by_hand", [True, also(False)])
 def test_two_images_exchanged(by_hand):
     error = said(pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(by_hand))
-    assert "photographs of front bear each other's names" in str(error)
+    assert "images of front bear each other's names" in str(error)
     assert "images/front/b.png fits configuration b" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
 
@@ -214,7 +214,7 @@ def test_two_images_exchanged_at_the_station_that_is_recognised_most_surely():
         for station, name, by_chance in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
     ]
     error = mistake(stations, rng)
-    assert "photographs of front bear each other's names" in str(error)
+    assert "images of front bear each other's names" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
 
 

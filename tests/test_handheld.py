@@ -173,7 +173,7 @@ def test_a_pose_of_a_camera_by_hand(folder):
 def test_a_board_alone_by_hand(folder):
     replaced(folder / "session.yaml", "observe: legs", "observe: board")
     replaced(folder / "session.yaml", "stations:", "board: cameras/phone.yaml\nstations:")
-    assert "photographs by hand of a board alone tell nothing of the machine" in fault(
+    assert "images by hand of a board alone tell nothing of the machine" in fault(
         load_session, folder
     )
 

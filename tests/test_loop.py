@@ -342,7 +342,7 @@ def test_a_refused_calibration_does_not_control(demo, tmp_path):
     document["verdict"]["usable"] = False
     document["verdict"]["reasons"] = ["Too few images."]
     (tmp_path / "calibration.json").write_text(json.dumps(document))
-    with pytest.raises(PkmcalError, match="refused: Too few photographs"):
+    with pytest.raises(PkmcalError, match="refused: Too few images"):
         VisualServo.from_calibration(tmp_path, "station1", HOME)
     (tmp_path / "calibration.json").write_text(text)
     with pytest.raises(InputError, match="camera file was not found"):

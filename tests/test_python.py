@@ -172,7 +172,7 @@ def test_parameters_are_a_table(result, loaded):
     assert np.allclose([row.sigma**2 for row in value], variance, atol=1e-30)
     row = value["legs[2].base.center.x"]
     assert row == value[table.index("legs[2].base.center.x")]
-    assert row.change == row.value - row.nominal
+    assert row.change == row.value - row.drawing
     assert [r.value for r in loaded.parameters] == [r.value for r in value]
     assert [r.decided_by for r in loaded.parameters] == [r.decided_by for r in value]
     with pytest.raises(InputError, match=r"such as 'legs\[2\].base.center.x'"):

@@ -349,7 +349,7 @@ def test_two_edges_of_a_leg_say_nothing_of_its_motion(machine, poses):
 def test_repeats_without_an_edge_in_common_are_no_accuracy():
     (finding,) = _findings(())
     assert finding.level is Level.DOUBTFUL
-    assert finding.text.startswith("No edge shows in two photographs")
+    assert finding.text.startswith("No edge shows in two images")
 
 
 # whole sessions
@@ -484,7 +484,7 @@ def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypa
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     values = run("check", demo.session, "--repeat")
     assert values.code == 2
-    assert "the session has no repeated photographs" in values.err
+    assert "the session has no repeated images" in values.err
     assert "images/station1/{configuration}_{repeat}.png" in values.err
     assert "images/station1/0001_1.png" in values.err
 

@@ -299,7 +299,7 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
 def test_as_many_pictures_are_shown_as_there_is_room_for(case, monkeypatch):
     monkeypatch.setattr(pictures, "MOST_PAGE_IMAGES", 7)
     html = str(pictures.section(case.session, album_of(case)).html)
-    assert "Here are 7 of 15 photographs" in html
+    assert "Here are 7 of 15 images" in html
     assert html.count('<figure class="picture"') == html.count("data-large=") == 7
     whole = sum(len(shot.jpeg) + len(shot.large) for shot in album_of(case).pictures)
     small = sum(len(shot.jpeg) for shot in album_of(case).pictures)

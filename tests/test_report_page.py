@@ -135,7 +135,7 @@ def test_hostile_names_stay_text(tmp_path):
 def test_a_scale_of_long_numbers_has_room():
     """Digits are less than 7 px wide; those of 0.005 px began outside."""
     bars = [UprightBar("one", "one", 0.0074)]
-    chart = bar_chart("Errors", "photographs; px", bars, (), "bars")
+    chart = bar_chart("Errors", "images; px", bars, (), "bars")
     assert chart is not None
     assert all(7 * len(text) <= chart.left for _, text in chart.ticks)
     assert chart.x(0) == chart.left

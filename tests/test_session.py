@@ -483,6 +483,6 @@ def test_one_stations_images_under_two_names(folder):
 def test_images_of_another_ending_are_told(folder):
     for path in (folder / "images" / "front").iterdir():
         path.rename(path.with_suffix(".JPG"))
-    assert "Photographs there end in .JPG: write images/front/{configuration}.JPG." in fault(
+    assert "Images there end in .JPG: write images/front/{configuration}.JPG." in fault(
         load_session, folder
     )

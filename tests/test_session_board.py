@@ -58,7 +58,7 @@ def test_a_board_on_the_base_joins_two(joined):
         ("observe: [legs, board]", "observe: {legs: board}", ["no station can observe this"]),
         ("observe: [board, legs]", "observe: board",
          ["stations.left.observe: the board is fixed to the base, which does not move, and station"
-          " left observes no legs; found board, expected [legs, board], in the same photographs",
+          " left observes no legs; found board, expected [legs, board], in the same images",
           "write board: {file: board.yaml, fixed_to: platform}"]),
         ("fixed_to: base", "fixed_to: table",
          ["line 2, board.fixed_to", "found 'table', expected 'base' or 'platform'"]),

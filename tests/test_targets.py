@@ -181,7 +181,7 @@ def test_one_mirrored_image_is_named_alone(board):
         seen(board, value)
     assert caught.value.where == "0001.png"
     assert "Flip this image alone" in str(caught.value)
-    assert "2 other photographs" in str(caught.value)
+    assert "2 other images" in str(caught.value)
 
 
 def test_corners_that_are_not_this_boards(board):
@@ -304,7 +304,7 @@ def test_a_board_that_never_stood_still(board):
     moves = {k: (0, 0, 0, 2e-3 * k, 0, 0) for k in (1, 3, 5)}
     with pytest.raises(InputError, match="did not stand still") as caught:
         standing_board(seen(board, still(board, moves=moves)))
-    assert caught.value.found.startswith("3 of 8 photographs")
+    assert caught.value.found.startswith("3 of 8 images")
 
 
 def test_all_camera_models_see_a_still_board(board):

@@ -470,7 +470,7 @@ def test_calibrate_with_some_held_out(kept):
         names = [Path(image).stem for image in station["photographs"]]
         used = len(names) - len({*names} & {*unused})
         values = f"{used} of {len(names)}" if used < len(names) else f"{used}"
-        assert f"{station['camera']}, pinhole, {values} photographs" in report
+        assert f"{station['camera']}, pinhole, {values} images" in report
     assert (
         "held out, the calibrated machine predicts"
         in (kept.folder / "c" / "report.html").read_text()

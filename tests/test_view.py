@@ -298,7 +298,7 @@ def test_the_machine_snaps_to_its_place(page, truth):
     assert off(rough, true)[1] > 50
     value = page.ask("fit", pose=rough.tolist())
     assert value["recognised"]
-    assert value["said"].startswith("Recognised in 4 photographs")
+    assert value["said"].startswith("Recognised in 4 images")
     angle, distance = off(value["pose"], true)
     assert angle < 1.0
     assert distance < 15

@@ -150,7 +150,7 @@ def test_the_calibrations_own_session(demo, session):
     done = run("watch", demo.calibration, session)
     assert done.code == 2
     assert "there is nothing new in this session" in done.err
-    assert "Take five or more new photographs" in done.err
+    assert "Take five or more new images" in done.err
 
 
 def test_a_calibration_that_was_refused(again, calibration):

@@ -78,7 +78,7 @@ def same(edges, other):
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 @pytest.mark.parametrize("window", [1, 4])
 def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", window)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", window)
     images, visible, fresh = many()
     look(images, visible)
     assert fresh.most == window
@@ -91,14 +91,14 @@ def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
 def test_windows_change_nothing(monkeypatch, name):
     images, visible, _ = many()
     whole = LOOKS[name](images, visible)
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", 4)
     value = LOOKS[name](images, visible)
     same(value, whole)
 
 
 def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypatch):
     images, visible, _ = many()
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", 4)
     few = images.spread(4)
     assert few.tolist() == [0, 5, 11, 17]
     of_few = LOOKS["measure"](images.select(few), visible[few]).blur
@@ -140,7 +140,7 @@ def stations():
     ],
 )
 def test_stations_of_one_camera_share_windows(monkeypatch, most, expected):
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", most)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", most)
     counted = [np.unique(w.station, return_counts=True) for w in windows(stations())]
     assert [dict(zip(*map(np.ndarray.tolist, c), strict=True)) for c in counted] == expected
 
@@ -156,7 +156,7 @@ def test_images_that_are_looked_at_otherwise_do_not(other):
 @pytest.mark.parametrize("most", [8, 32])
 @pytest.mark.parametrize("known", [{}, {2: 0.7, 5: 0.55, 7: 0.8}], ids=["blur", "known"])
 def test_together_stations_are_seen_as_each_alone(monkeypatch, known, most):
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", most)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", most)
     drawn = redrawn(0, 0.0005)
     coarse, fine = search_stations(stations(), drawn), measure_stations(stations(), drawn, known)
     for (p, T, in_view), whole, exact in zip(stations(), coarse, fine, strict=True):

@@ -190,7 +190,7 @@ def test_a_leg_nobody_sees_stands_on_its_readings():
     assert [s.text.split(";")[0] for s in sentences] == ["Leg 3 is in no image"]
     assert sentences[0].dimensions == len(rows.unidentified) == 5
     assert sentences[0].matters
-    assert sentences[0].advice.startswith("Photograph leg 3")
+    assert sentences[0].advice.startswith("Take images of leg 3")
     assert all(name.startswith("legs[3]") for name in sentences[0].parameters)
 
 

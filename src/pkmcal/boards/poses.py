@@ -231,7 +231,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
         raise InputError(
             "the images are mirror images",
             where=listed(mirrored, 3),
-            expected="photographs in which the board's markers are not reversed",
+            expected="images in which the board's markers are not reversed",
             next_step="Flip all images of this camera, and calibrate the camera from flipped ones",
         )
 

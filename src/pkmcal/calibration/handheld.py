@@ -53,7 +53,7 @@ whatever their score by the image alone: a wrong pose corrupts the estimate."""
 RESCORING_GROWTH = 1.25
 """Ratio by which the number of images that determine the machine must grow before the poses of
 an image are scored anew."""
-EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
+EDGES_DISAGREE_REASON = "too few of its edges agree with the other images"
 """Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
 CAMERA_TURNED_REASON = "all images together turn its camera by more than ten degrees"
 """Reason for rejecting an image that has a single candidate pose and does not belong there."""
@@ -185,7 +185,7 @@ def search_by_hand(
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = (len(clearer) + 1) // 2
-        step(f"Asking the {half} clearest of {len(by_hand)} photographs", 0.25)
+        step(f"Asking the {half} clearest of {len(by_hand)} images", 0.25)
         rescore(clearer[:half])
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
         step(f"Asking the others, with {len(so_far.placed)} images placed", 0.25)

@@ -374,7 +374,7 @@ def locate_stations(
         rngs = rng.spawn(len(images) + 1)
         progress = progress or (lambda _text, _share: None)
         count = sum(len(p.images) for p in images)
-        progress(f"Recognising the machine in {count} photographs", 0.2)
+        progress(f"Recognising the machine in {count} images", 0.2)
         value = recognise(session, images, poses, rngs[1:], boards, start_poses)
         progress("Comparing with what is often mixed up", 0.3)
         mixed_up = mistake_in(session, images, value, rngs[0])

@@ -413,7 +413,7 @@ def _counted(
     def done(more: int) -> None:
         with lock:  # stations are looked at beside one another
             done_count[0] += more
-            progress(f"{text}: {done_count[0]} of {total} photographs", share)
+            progress(f"{text}: {done_count[0]} of {total} images", share)
 
     return done
 
@@ -624,7 +624,7 @@ def _edges(passes: list[legs.StationEdges]) -> EdgeSet:
     edges = concatenate([station_edges.edges for station_edges in passes])
     if len(edges) < FEWEST_EDGES_TO_IDENTIFY:
         raise ResultError(
-            f"only {len(edges)} edges of legs were found in all photographs",
+            f"only {len(edges)} edges of legs were found in all images",
             expected=f"at least {FEWEST_EDGES_TO_IDENTIFY}",
             next_step="Look whether the images show the legs sharply and brightly enough",
         )

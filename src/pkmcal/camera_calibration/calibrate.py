@@ -258,10 +258,10 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
     """Error about a model for which no starting value gives finite pixels."""
     other = min(pool, key=lambda c: c.left_out) if pool else None
     return InputError(
-        f"the model {model} does not fit the photographs",
+        f"the model {model} does not fit the images",
         expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
         if other
-        else "photographs of one flat board by one camera",
+        else "images of one flat board by one camera",
     )
 
 
@@ -274,7 +274,7 @@ def check_model(model: str, chosen: Candidate, best: Candidate) -> list[Finding]
     ratio = chosen.left_out / best.left_out
     if ratio > UNFIT_MODEL_RATIO:
         raise InputError(
-            f"the model {model} does not fit the photographs",
+            f"the model {model} does not fit the images",
             found=f"an error of {chosen.left_out:.2g} px on views left out",
             expected=f"{best.model}, with {best.left_out:.2g} px",
         )
@@ -340,7 +340,7 @@ def check_explained(rms: float, camera: Camera) -> None:
     if rms <= limit:
         return
     raise ResultError(
-        "no camera model explains these photographs",
+        "no camera model explains these images",
         found=f"an error of {rms:.2g} px on views left out ({camera.model} fits best)",
         expected=f"{limit:.2g} px at most, usually a tenth of that",
         next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"

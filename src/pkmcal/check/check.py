@@ -89,7 +89,7 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
     except PkmcalError as error:
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
-    progress("Reading photographs", 0.1)
+    progress("Reading images", 0.1)
     images, broken = _decode_images(session)
     progress("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
@@ -183,7 +183,7 @@ def _more_broken_error(session: Session, number: int, count: int) -> InputError:
     """Error on the broken images of a station that are not reported individually."""
     name = session.stations[number].name
     return InputError(
-        "photographs cannot be decoded",
+        "images cannot be decoded",
         where=f"session.yaml, stations.{name}",
         found=f"{count} more of this station",
         expected="whole PNG or JPEG files",

@@ -61,7 +61,7 @@ def with_pictures(inspection: Inspection) -> Part:
     html = page.filled_template(
         "overlay.html.j2", n_legs=inspection.session.machine.n_legs, pairs=pairs
     )
-    return Part("photographs", "The nominal model over the photographs", html=html, menu="Images")
+    return Part("photographs", "The nominal model over the images", html=html, menu="Images")
 
 
 def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:

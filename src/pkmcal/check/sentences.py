@@ -187,7 +187,7 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         command="check",
         title=f"Check of {name}",
         subject=f"{name}: {check.machine}, {check.n_legs} legs,"
-        f" {check.configurations} configurations, {images} photographs"
+        f" {check.configurations} configurations, {images} images"
         if check.machine
         else "",
         verdict=Verdict(code == 0, headlines[2 if refused else code], check.advice),

@@ -72,7 +72,7 @@ def camera(
     check_writable(default_output(out) if out == CAMERA_FOLDER else out)
     others = [(OTHER_CAMERA_FILES[form.value], form.value) for form in to or []]
     with console.progress(as_json) as progress:
-        progress(f"Looking for the board in {len(paths)} photographs", 0.1)
+        progress(f"Looking for the board in {len(paths)} images", 0.1)
         calibration = calibrate_images(paths, described, model)
         progress("Writing the report", 0.9)
         outcome = outcome_of(calibration, paths, others)
@@ -139,7 +139,7 @@ def image_files(images: list[Path]) -> list[Path]:
             inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_FILE_ENDINGS)
             if not inside:
                 raise InputError(
-                    "the folder holds no photographs",
+                    "the folder holds no images",
                     where=str(path),
                     expected=f"some in it ({', '.join(sorted(IMAGE_FILE_ENDINGS))}), or a"
                     " session.yaml that names them",

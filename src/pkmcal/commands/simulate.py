@@ -36,13 +36,13 @@ def simulate(
     ] = 3,
     configurations: Annotated[
         int,
-        console.number_option("simulate", "configurations", "N", "Photographs from each place."),
+        console.number_option("simulate", "configurations", "N", "Images from each place."),
     ] = 15,
     shared: Annotated[
         bool, typer.Option("--shared", help="The same configurations from all places.")
     ] = False,
     repeats: Annotated[
-        int, console.number_option("simulate", "repeats", "N", "Photographs of each configuration.")
+        int, console.number_option("simulate", "repeats", "N", "Images of each configuration.")
     ] = 1,
     tolerance: Annotated[
         float,

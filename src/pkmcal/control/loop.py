@@ -98,7 +98,7 @@ class VisualServo:
     """Controller of a calibrated machine by its legs in one camera, [B] III with the errata.
 
     machine : with calibrated values. camera : required for images only. T_camera_base : (4, 4).
-    goal : a platform pose (4, 4), edges (s, 2, 3) of the seen legs, or a :class:`GoalPhotograph`.
+    goal : a platform pose (4, 4), edges (s, 2, 3) of the seen legs, or a :class:`GoalImage`.
     law : "edges" or "directions". gain : 1/s; less than the inverse of the time between samples,
     delay included. rate_limits : largest velocity of all motors, or (m,) of each. legs : (s,) seen
     legs from 0, by default all with tubes. start : (4, 4) a pose near the machine's first pose, by

@@ -188,7 +188,7 @@ def require_repeats(session: Session) -> None:
     name = next((s.name for s in session.stations if not s.handheld), None)
     if name is None:
         raise InputError(
-            "the session has no repeated photographs",
+            "the session has no repeated images",
             where="session.yaml, stations",
             found="no camera that stands in one place",
             expected="a station from which configurations were imaged several times",
@@ -196,7 +196,7 @@ def require_repeats(session: Session) -> None:
             " moving nothing in between",
         )
     raise InputError(
-        "the session has no repeated photographs",
+        "the session has no repeated images",
         where=f"session.yaml, stations.{name}.images",
         found=f"{session.document['stations'][name]['images']}, one image a configuration",
         expected=f"a pattern such as images/{name}/{{configuration}}_{{repeat}}.png",
@@ -532,9 +532,7 @@ def part_of(study: RepeatStudy) -> Part:
     paper = (_degrees(noise.psi), _degrees(noise.theta), _mm(noise.x), _mm(noise.z))
     rows.append(Row("[A] Table 1", ("", "", *paper, "", ""), "paper"))
     columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
-    table = Table(
-        "Scatter of repeated photographs", columns, tuple(rows), legend=REPEATS_TABLE_LEGEND
-    )
+    table = Table("Scatter of repeated images", columns, tuple(rows), legend=REPEATS_TABLE_LEGEND)
     return Part("repeats", "Repeats", tables=(table,))
 
 

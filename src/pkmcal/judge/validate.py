@@ -34,8 +34,8 @@ from pkmcal.session.load import Session
 
 VALIDATION_FORMAT = 1
 NOT_INDEPENDENT = (
-    "the session is not independent: the calibration was made from these photographs",
-    "photographs that the calibration did not see",
+    "the session is not independent: the calibration was made from these images",
+    "images that the calibration did not see",
     "Take new images, calibrate with --holdout N, or hold out regions of this session with"
     " --regions N",
 )

@@ -470,7 +470,7 @@ def _misnamed(station: SuspectStation, images: Integers, fitting: Integers) -> I
     files = [station.files[k] for k in images]
     fit = [station.configurations[k] for k in fitting]
     return InputError(
-        f"photographs of {station.name} bear each other's names",
+        f"images of {station.name} bear each other's names",
         where=files[0],
         found="; ".join(f"{f} fits configuration {c}" for f, c in zip(files, fit, strict=True)),
         next_step="Give these images, or the rows of joints.csv, the right names",

@@ -157,7 +157,7 @@ def _too_dark(label: str, highest: int) -> InputError:
 
 
 class LazyPictures(Sequence[Integers], ABC):
-    """Photographs as grey levels (height, width), none of which is looked at before it is asked
+    """Images as grey levels (height, width), none of which is looked at before it is asked
     for.
     """
 
@@ -190,7 +190,7 @@ class Selected(LazyPictures):
 
 
 class Pictures(LazyPictures):
-    """Photographs of one camera, each decoded when it is looked at.
+    """Images of one camera, each decoded when it is looked at.
 
     paths, labels : of all of them. cache : those that stay decoded, by their number.
     """

@@ -121,7 +121,7 @@ def spread_over(
     them.
 
     configuration : (n,) of the images. most : maximum for each station; the maximum for all
-    stations together is in the ratio of FIRST_PHOTOGRAPHS_MEASURED to FIRST_PHOTOGRAPHS_A_STATION
+    stations together is in the ratio of FIRST_IMAGES_MEASURED to FIRST_IMAGES_A_STATION
     to it.
     """
     most = min(most, -(-most * FIRST_IMAGES_MEASURED // (FIRST_IMAGES_A_STATION * n_stations)))

@@ -89,7 +89,7 @@ def outcome_of(
             ),
             Part(
                 "images",
-                "Photographs",
+                "Images",
                 html=page.filled_template(
                     "corners.html.j2",
                     pictures=_images(c, [Path(path) for path in paths], factor),
@@ -164,7 +164,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "How sure is the focal length?",
             ((brief(share), "%"),),
-            f"1σ, from {count(len(c.views), 'photograph')}; "
+            f"1σ, from {count(len(c.views), 'image')}; "
             + (
                 f"the views disagree by {c.spread:.1f} times the corners' noise, which is in it"
                 if c.spread > 1
@@ -288,7 +288,7 @@ def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
         for name, out, own in zip(c.views, c.held_out.by_view, fitted, strict=True)
     ]
     return charts.bar_chart(
-        "Held-out error of each image", "photographs; root mean square, px", bars, (),
+        "Held-out error of each image", "images; root mean square, px", bars, (),
         f"Bars of {len(bars)} images, the middle one {brief(middle)} px",
     )  # fmt: skip
 

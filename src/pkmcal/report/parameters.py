@@ -58,7 +58,7 @@ LATEX_SIGNS = {
 """Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
     "data": "the images decide",
-    "drawing": "the nominal model decides more than the photographs",
+    "drawing": "the nominal model decides more than the images",
     "frame": "defines the frame",
     "fixed": "kept at the nominal model's value",
 }

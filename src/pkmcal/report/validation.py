@@ -69,7 +69,7 @@ def _cards(judged: NominalComparison, v: Validation) -> tuple[Figure, ...]:
     weighed = ""
     if unit:
         weighed = (
-            f"; {against(judged.after, judged.before, unit)}, weighed by how well the photographs"
+            f"; {against(judged.after, judged.before, unit)}, weighed by how well the images"
             " see each direction"
         )
     return (
@@ -127,7 +127,7 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
         " noise let one expect. In common: what all configurations are off alike.",
     )
     tool = Table(
-        "Tool point: forward kinematics of the readings against the photographs",
+        "Tool point: forward kinematics of the readings against the images",
         ("Machine", "Position, mm", "Orientation, °"),
         tuple(
             Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))

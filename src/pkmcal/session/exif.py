@@ -60,7 +60,7 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
             "the images of one camera tell different focal lengths or sizes",
             where=second,
             found=f"{_description(*other)}, where {first} has {_description(*one)}",
-            expected="one lens, not zoomed, and uncropped photographs",
+            expected="one lens, not zoomed, and uncropped images",
             next_step="Give images by another lens a station of their own",
         )
     size = max(sizes, key=sizes.count)  # the others are rotated by 90 degrees

@@ -188,7 +188,7 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
         where=where,
         found=content,
         expected=f"files {pattern}",
-        next_step=f"Photographs there end in {others[0]}: write"
+        next_step=f"Images there end in {others[0]}: write"
         f" {pattern.removesuffix(suffix)}{others[0]}"
         if others
         else None,

@@ -474,7 +474,7 @@ def _check_base_board(document: Document, schema: SessionDocument, users: list[s
         f"the board is fixed to the base, which does not move, and {who}",
         where=document.where("stations", alone[0], "observe"),
         found="board",
-        expected="[legs, board], in the same photographs",
+        expected="[legs, board], in the same images",
         next_step="If the board is on the platform, write board: {file: "
         f"{schema.board.file if schema.board else 'board.yaml'}, fixed_to: platform}}",
     )
@@ -554,7 +554,7 @@ def _stations(
     )  # fmt: skip
     if not station.handheld:
         return [whole]
-    check_count(len(images), MOST_HANDHELD_IMAGES, "photographs by hand", where)
+    check_count(len(images), MOST_HANDHELD_IMAGES, "images by hand", where)
     return [
         replace(whole, name="-".join(filter(None, called)), images=(image,))
         for image in images
@@ -575,7 +575,7 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
         )
     if "legs" not in station.observe:
         raise InputError(
-            "photographs by hand of a board alone tell nothing of the machine",
+            "images by hand of a board alone tell nothing of the machine",
             where=document.where(*keys, "observe"),
             found="board",
             expected="legs, or [legs, board]: only the legs tell where the board or the camera is",
@@ -707,7 +707,7 @@ def _unmeasured(
         raise InputError(
             "only one configuration was measured"
             if trackers or links
-            else "only one configuration has photographs",
+            else "only one configuration has images",
             where=table.label,
             found=table.names[min(measured)],
             expected="two at least; one cannot tell a joint's place from its offset",

@@ -80,7 +80,7 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
     else:
         text = (
             f"Not recognised in {shots} about this pose. Bring two or three joints to their places"
-            " and try again, or check whether nominal model, readings and photographs"
+            " and try again, or check whether nominal model, readings and images"
             " belong together."
         )
     return pose.T_camera_base, pose.good, text
