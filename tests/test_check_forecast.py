@@ -253,14 +253,14 @@ def test_pictures_of_large_images_are_binned(found):
 
 def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
     """Under its lines the image changes; under those at the rough pose, which are off, less."""
-    from pkmcal.check.pictures import drawing_over_image
+    from pkmcal.check.pictures import nominal_over_image
 
     def strength(T_camera_base, k):
         image = station.images.images[k].astype(np.float32)
         slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))
         slope = cv2.dilate(slope, np.ones((5, 5)))
         mask = np.zeros(image.shape, np.uint8)
-        for edge in drawing_over_image(
+        for edge in nominal_over_image(
             found.look, station, station.images.camera, T_camera_base, k
         )[0]:
             cv2.polylines(mask, [np.rint(edge.points).astype(np.int32)], False, 255)
@@ -271,11 +271,11 @@ def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
 
 
 def test_each_number_stands_once_and_apart(found):
-    from pkmcal.check.pictures import drawing_over_image
+    from pkmcal.check.pictures import nominal_over_image
 
     station = found.look.stations[0]
     eye = station.images.camera
-    _, spots = drawing_over_image(found.look, station, eye, station.T_camera_base, 0)
+    _, spots = nominal_over_image(found.look, station, eye, station.T_camera_base, 0)
     numbered = [spot for spot in spots if spot.labelled]
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 

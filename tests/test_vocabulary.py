@@ -34,9 +34,16 @@ NO_WORDS = frozenset(
         "departed",
         "byhand",
         "closely",
+        "drawing",
+        "drawings",
+        "photograph",
+        "photographs",
+        "photographed",
     }
 )
-"""Words that are no part of an identifier: they do not name a quantity."""
+"""Words that are no part of an identifier: they do not name a quantity, or the glossary has another
+word for it.
+"""
 NO_NAMES = NO_WORDS | {"left", "way", "looks", "says", "tells", "ask", "tell"}
 """No identifier by itself; as a part they have a meaning (``left_margin``, ``half_way``)."""
 ALLOWED = {
@@ -47,6 +54,13 @@ ALLOWED = {
     "asked": "an argument of `pkmcal.simulate`",
     "shown": "a key of the requests of the page of `view`",
     "left": "the opposite of right",
+    "drawing": "a column of the public table of parameters, and keys of documents",
+    "by_drawing": "a key of calibration.json",
+    "chi2_drawing": "a key of calibration.json",
+    "n_drawing": "a key of calibration.json",
+    "from_drawing": "an option of `pkmcal plan`",
+    "rejected_photographs": "a key of calibration.json",
+    "DRAWING_COLOUR": "a colour of the pages' style sheet",
 }
 """Names that are part of a file, of the command line or of Python's public interface."""
 

@@ -43,7 +43,7 @@ def with_pictures(inspection: Inspection) -> Part:
             pictures: list[Picture] = []
             for text, T_camera_base in poses_of(station):
                 eye = station.images.camera
-                edges, spots = drawing_over_image(inspection, station, eye, T_camera_base, int(k))
+                edges, spots = nominal_over_image(inspection, station, eye, T_camera_base, int(k))
                 pictures.append(
                     Picture(
                         station=station.name,
@@ -71,7 +71,7 @@ def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
     return *by_hand, (after, station.T_camera_base)
 
 
-def drawing_over_image(
+def nominal_over_image(
     inspection: Inspection, station: StationInspection, camera: Camera, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
     """Visible silhouettes of the nominal tubes in image k, and the joint centres.
@@ -122,7 +122,7 @@ def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:
     panes: list[Any] = []
     for words, T_camera_base in poses_of(station):
         pane: Any = cv2.cvtColor(np.asarray(small.images[0]), cv2.COLOR_GRAY2BGR)
-        edges, spots = drawing_over_image(inspection, station, small.camera, T_camera_base, k)
+        edges, spots = nominal_over_image(inspection, station, small.camera, T_camera_base, k)
         _draw(pane, edges, spots)
         bar = np.full((CAPTION_BAR_HEIGHT, pane.shape[1], 3), 32, dtype=np.uint8)
         text = f"{station.name} / {name}: {words}"

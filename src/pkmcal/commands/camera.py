@@ -116,7 +116,7 @@ def session_board_images(folder: Path) -> tuple[list[Path], Path]:
             where=session.where("stations"),
             found=listed(cameras),
             expected="one camera at a time",
-            next_step="Name one camera's photographs: pkmcal camera IMAGES... --board FILE",
+            next_step="Name one camera's images: pkmcal camera IMAGES... --board FILE",
         )
     patterns = [glob.escape(station.images) for station in observers]
     wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]

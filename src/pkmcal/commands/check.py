@@ -12,7 +12,7 @@ from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, write_outcome
 
 CHECK_FILES = {"check.html": PAGE_DESCRIPTION, "check.json": NUMBERS_DESCRIPTION}
-DRAWINGS_DESCRIPTION = "the nominal model over each image"
+OVERLAYS_DESCRIPTION = "the nominal model over each image"
 
 
 def check(
@@ -57,7 +57,7 @@ def check(
             names = picture_names(check.look).values()
             check_own_folder(pictures, names, "pictures of a check", "an earlier check's")
             write_pictures(check.look, pictures)
-            files[str(pictures)] = DRAWINGS_DESCRIPTION
+            files[str(pictures)] = OVERLAYS_DESCRIPTION
         if out is not None:
             if check.look:
                 from pkmcal.check.pictures import with_pictures

@@ -76,7 +76,7 @@ def demo(
     outcome = replace(
         outcome,
         subject=f"A {calibration.machine.name}, not built quite as drawn, in {n_images}"
-        f" simulated photographs: {session}",
+        f" simulated images: {session}",
         summary={
             **(outcome.summary or {}),
             "session": session,

@@ -200,7 +200,7 @@ def require_repeats(session: Session) -> None:
         where=f"session.yaml, stations.{name}.images",
         found=f"{session.document['stations'][name]['images']}, one image a configuration",
         expected=f"a pattern such as images/{name}/{{configuration}}_{{repeat}}.png",
-        next_step="Photograph some configurations several times, moving nothing in between, and"
+        next_step="Take several images of some configurations, moving nothing in between, and"
         f" name the images images/{name}/0001_1.png, images/{name}/0001_2.png and so on",
     )
 

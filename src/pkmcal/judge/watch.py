@@ -40,7 +40,7 @@ WATCH_ALPHA = 0.01
 """False-alarm rate: share of unchanged machines that are flagged."""
 NOTHING_NEW = (
     "there is nothing new in this session: the calibration was made from it",
-    "photographs, or poses, that were taken after the calibration",
+    "images, or poses, that were taken after the calibration",
     "Take five or more new images from one place, with their readings",
 )
 

@@ -284,7 +284,7 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
     for repeat, picture in enumerate(studio.images(index, settings.shake)):
         ok, data = cv2.imencode(".png", picture)
         if not ok:
-            raise OSError(f"photograph {index} could not be encoded as PNG")
+            raise OSError(f"image {index} could not be encoded as PNG")
         name = f"{truth.configurations[k]}{_repeat_part(settings, str(repeat + 1))}.png"
         (folder / name).write_bytes(data.tobytes())
 
