@@ -59,6 +59,7 @@ ALLOWED = {
     "chi2_drawing": "a key of calibration.json",
     "n_drawing": "a key of calibration.json",
     "from_drawing": "an option of `pkmcal plan`",
+    "photographs": "a key of the documents of `check`",
     "rejected_photographs": "a key of calibration.json",
     "DRAWING_COLOUR": "a colour of the pages' style sheet",
 }

@@ -65,7 +65,7 @@ def _second_station(forecast: Forecast | None) -> list[Finding]:
     return [
         note(
             "images.second_place",
-            number=forecast.images,
+            number=forecast.photographs,
             tool_sigma=forecast.second,
             tool_sigma_before=forecast.position,
         )
@@ -194,7 +194,7 @@ def _sheet(station: StationInspection) -> str:
 def forecast_figure(forecast: Forecast) -> Figure:
     """Key figure of the forecast."""
     return Figure(
-        f"What would {forecast.images} such images a station give?",
+        f"What would {forecast.photographs} such images a station give?",
         ((brief(forecast.position * 1e3), "mm"), (brief(math.degrees(forecast.orientation)), "°")),
         "1σ of the platform's pose at given readings, mean over the joints' ranges",
     )
@@ -258,7 +258,7 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
     """Sentences on the forecast, and on the legs with the least information and their causes."""
     images = sum(len(edges.images) for edges in forecast.edges)
     out = [
-        f"{forecast.images} such images a station, over the joints' ranges, would"
+        f"{forecast.photographs} such images a station, over the joints' ranges, would"
         " tell the"
         f" platform's position to {brief(forecast.position * 1e3)} mm and its orientation to"
         f" {brief(math.degrees(forecast.orientation))}° (standard deviations at given"

@@ -397,7 +397,7 @@ def _station_check(station: Station, what: Quality, recognised: bool) -> Station
     blur = what.blur[np.isfinite(what.blur)]
     return StationCheck(
         name=station.name,
-        images=len(station.images),
+        photographs=len(station.images),
         recognised=recognised,
         legs=float(what.legs.sum(axis=1).mean()) if some else 0.0,
         saturated=float(what.saturated.mean()) if some else math.nan,

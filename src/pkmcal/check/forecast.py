@@ -57,7 +57,7 @@ class LegForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Predicted accuracy with ``images`` images at each station.
+    """Predicted accuracy with ``photographs`` images at each station.
 
     position, orientation : standard deviations of the platform's pose at given readings, mean over
     poses, m and rad, as `calibrate` states them. readings, drawing : shares of the position's
@@ -66,7 +66,7 @@ class Forecast:
     camera. edges : by station, for advice.
     """
 
-    images: int
+    photographs: int
     position: float
     orientation: float
     readings: float
@@ -101,7 +101,7 @@ def forecast(inspection: Inspection, images: int = CONFIGURATIONS_A_CAPTURE) -> 
     if len(stations) == 1 and view_angle(one.camera) < PANORAMIC_HALF_VIEW:
         second = _capture_information(_with_second_station(capture)).position
     return Forecast(
-        images=images,
+        photographs=images,
         position=information.position,
         orientation=information.orientation,
         readings=information.readings,

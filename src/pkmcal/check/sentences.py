@@ -182,7 +182,7 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         )
     if check.forecast:
         parts = (*parts, forecast_part(check.forecast))
-    images = sum(station.images for station in check.stations)
+    images = sum(station.photographs for station in check.stations)
     return Outcome(
         command="check",
         title=f"Check of {name}",
@@ -211,7 +211,7 @@ def _stations_table(check: SessionCheck) -> Table:
         motion = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
         finite = station.recognised and math.isfinite(station.legs)
         cells = (
-            str(station.images),
+            str(station.photographs),
             _number(station.by_chance, "{:.0e}"),
             motion if math.isfinite(station.moved) else "–",
             f"{station.legs:.1f}/{check.n_legs}" if finite else "–",
@@ -229,7 +229,7 @@ def _boards_table(check: SessionCheck) -> Table:
         Row(
             station.name,
             (
-                f"{board.found} of {station.images}",
+                f"{board.found} of {station.photographs}",
                 f"{board.corners:.0f}/{board.corners_of}",
                 f"{board.rms:.3f} px",
                 _number(board.scatter, "{:.3f} px"),

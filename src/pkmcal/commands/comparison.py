@@ -47,7 +47,7 @@ class AgainstTruth:
     deviations of the truth.
     """
 
-    nominal: Errors
+    drawing: Errors
     calibrated: Errors
     count: int
     within: int
@@ -59,7 +59,7 @@ def compare_with_truth(calibration: Calibration, session_folder: Path) -> Agains
     truth = load_truth(session_folder, nominal)
     off = _in_sigmas(calibration, truth)
     return AgainstTruth(
-        nominal=_errors(nominal, truth),
+        drawing=_errors(nominal, truth),
         calibrated=_errors(calibration.machine, truth),
         count=off.size,
         within=int(np.sum(off < WITHIN_TRUTH_SIGMAS)),

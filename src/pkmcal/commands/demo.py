@@ -119,7 +119,7 @@ def _print_comparison(out: Console, value: AgainstTruth) -> None:
     """Print errors before and after, and the share of values within two standard deviations."""
     from pkmcal.outcome import Row, Table
 
-    before, after = value.nominal, value.calibrated
+    before, after = value.drawing, value.calibrated
     rows: list[Row] = []
     for what, old, new, unit in (
         ("joint centres", before.centre * 1e3, after.centre * 1e3, " mm"),

@@ -32,7 +32,7 @@ def diff(
     ] = False,
     as_json: console.Json = False,
 ) -> int:
-    """Two calibrations or nominal models, and what differs at the tool."""
+    """Difference of two calibrations or nominal models at the tool."""
     from threadpoolctl import threadpool_limits
 
     from pkmcal.calibration.archive import keep_earlier

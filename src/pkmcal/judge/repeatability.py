@@ -89,7 +89,7 @@ class LegScatter:
     shift: float
     tilt: float
     promised: float
-    images: int
+    photographs: int
     freedom: int
 
 
@@ -105,7 +105,7 @@ class StationScatter:
     """
 
     station: str
-    images: int
+    photographs: int
     configurations: int
     shift: float
     promised: float
@@ -357,7 +357,7 @@ def _station_row(station_edges: _StationEdges, station: str) -> StationScatter:
     photo = groups_of(station_edges.photo)
     return StationScatter(
         station=station,
-        images=len(photo.first),
+        photographs=len(photo.first),
         configurations=len(np.unique(edges.configuration[same.first[same.count > 1]])),
         shift=float(shift[0]),
         promised=rms(promised),
@@ -518,7 +518,7 @@ def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
         shift=quantile("shift"),
         tilt=quantile("tilt"),
         promised=quantile("promised"),
-        images=sum(row.images for row in rows),
+        photographs=sum(row.photographs for row in rows),
         freedom=sum(row.freedom for row in rows),
     )
 
@@ -540,7 +540,7 @@ def _cells(row: LegScatter) -> tuple[str, ...]:
     """Cells of a row: number of images, axis and edges."""
     axis = (_degrees(row.psi), _degrees(row.theta), _mm(row.x), _mm(row.z))
     edges = (f"{v:.3f} px" if math.isfinite(v) else "–" for v in (row.shift, row.tilt))
-    return str(row.images), *axis, *edges
+    return str(row.photographs), *axis, *edges
 
 
 def _degrees(value: float) -> str:
