@@ -33,13 +33,13 @@ def main() -> int:
     words = parser.parse_args()
     try:
         result = pkmcal.load_result(words.calibration)
-        drawing = pkmcal.load_session(words.session).machine
+        nominal = pkmcal.load_session(words.session).machine
         truth = load_truth(words.session)
     except pkmcal.errors.PkmcalError as error:
         print(error, file=sys.stderr)
         return 2
     print(f"{'':10}{'joint centres':>16}{'platform, mean':>16}{'at most':>16}{'turned':>16}")
-    for name, machine in (("drawing", drawing), ("calibrated", result.machine)):
+    for name, machine in (("drawing", nominal), ("calibrated", result.machine)):
         off = pkmcal.compare(machine, truth.machine, truth.joints)
         position, turn = 1e3 * off.position, np.degrees(off.orientation)
         cells = cell(1e3 * off.centre, "mm"), cell(position, "mm"), cell(position, "mm", np.max)

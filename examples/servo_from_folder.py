@@ -1,9 +1,9 @@
-"""What control by the legs would do in every photograph of a session, in a table.
+"""What control by the legs would do in every image of a session, in a table.
 
     python examples/servo_from_folder.py SESSION CALIBRATION [--station NAME] [--goal CONFIGURATION]
 
 The goal is the pose that the calibration found for one configuration of the session. Nothing
-moves: each photograph is one sample, and its line says which way the motors would go.
+moves: each image is one sample, and its line says which way the motors would go.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("session", type=Path)
     parser.add_argument("calibration", type=Path)
-    parser.add_argument("--station", help="whose photographs; the first unless given")
+    parser.add_argument("--station", help="whose images; the first unless given")
     parser.add_argument("--goal", help="configuration to go to; the station's last unless given")
     parser.add_argument("--law", default="edges", help="edges (the default) or directions")
     parser.add_argument("--gain", type=float, default=1.0, help="1/s (default 1)")
@@ -38,7 +38,7 @@ def main() -> None:
     if name not in names:
         raise InputError("no such station", found=name, expected=" or ".join(names))
     station = session.stations[names.index(name)]
-    rows = [photograph.configuration for photograph in station.photographs]
+    rows = [entry.configuration for entry in station.images]
     goal = options.goal or session.configurations[rows[-1]]
     if goal not in saved.configurations:
         raise InputError("no such configuration in the calibration", found=goal)
@@ -49,11 +49,11 @@ def main() -> None:
     )  # fmt: skip
     unit = {"m": ("mm/s", 1e3), "rad": ("mrad/s", 1e3)}[session.machine.joint_units[0]]
     print(f"{name}, towards {goal}, joint velocities in {unit[0]}, error in mrad")
-    for photograph in station.photographs:
-        image = decode(photograph.path, station.camera.image_size, photograph.path.name)
-        step = servo.step_image(image, session.joints[photograph.configuration])
+    for entry in station.images:
+        image = decode(entry.path, station.camera.image_size, entry.path.name)
+        step = servo.step_image(image, session.joints[entry.configuration])
         velocities = "".join(f"{v * unit[1]:9.3f}" for v in step.joint_velocities)
-        label = session.configurations[photograph.configuration]
+        label = session.configurations[entry.configuration]
         print(f"{label:>8}{velocities}{step.error * 1e3:9.2f}  {step.sentence}")
         for warning in step.warnings:
             print(f"{'':8}{warning}")

@@ -97,7 +97,7 @@ def test_charts_lead_to_images_that_are_there(page, case):
     results = Found(page)
     links = [str(a["href"]) for tag, a in results.tags if tag == "a" and "download" not in a]
     names = {f"#{a['id']}" for _, a in results.tags if "id" in a}
-    leading = [link for link in links if link.startswith("#photograph-")]
+    leading = [link for link in links if link.startswith("#image-")]
     # a bar a configuration, a box a leg, station, joint and kind of edge, and cells
     assert len(leading) > 5 + 6 + 3 + 6 + 20
     assert set(leading) <= names
@@ -276,8 +276,8 @@ def test_page_runs_in_a_browser(page, tmp_path):
     large = re.search(r'data-large="([^"]+)"', page)
     assert large is not None
     assert f"base64,{large[1]}" in display
-    assert str(root["data-bar"]).startswith("#photograph-")
-    assert root["data-point"] == "#photograph-1-2"
+    assert str(root["data-bar"]).startswith("#image-")
+    assert root["data-point"] == "#image-1-2"
     assert root["data-paper"] == "672"
     assert float(str(root["data-low"])) == pytest.approx(0.78)  # as the style has it on paper
     assert root["data-screen"] == root["data-again"] != "672"

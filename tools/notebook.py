@@ -23,7 +23,7 @@ SAY, DO = "markdown", "code"
 CELLS = (
     (
         SAY,
-        "# A calibration in Python\n\nA simulated hexapod, built a little off its drawing, is"
+        "# A calibration in Python\n\nA simulated hexapod, built a little off its nominal model, is"
         " imaged and calibrated. With your own machine, `pkmcal new DIR` makes a session to"
         " fill in, `pkmcal.load_session(DIR)` loads it, and all the rest is the same.",
     ),
@@ -51,7 +51,11 @@ CELLS = (
     ),
     (DO, "result.plot_residuals();"),
     (DO, "result.plot_tool();"),
-    (SAY, "How sure the tool is at poses of your own, and how far off the drawing was there, mm:"),
+    (
+        SAY,
+        "How sure the tool is at poses of your own, and how far off the nominal model was"
+        " there, mm:",
+    ),
     (
         DO,
         "poses = result.machine.forward(session.joints[:3])\ntool = result.tool_error(poses)\n"

@@ -154,7 +154,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
     def _cells(self) -> list[tuple[str, ...]]:
         """Heading and all rows as text, with as many digits as the standard deviations warrant."""
         out: list[tuple[str, ...]] = [
-            ("parameter", "drawing", "calibrated", "sigma", "unit", "decided by")
+            ("parameter", "nominal", "calibrated", "sigma", "unit", "decided by")
         ]
         for row in self.rows:
             places = decimals(row.sigma) if row.sigma else LARGEST_DECIMALS

@@ -27,7 +27,7 @@ class Links:
     @classmethod
     def of(cls, places: Iterable[Place]) -> Links:
         """Links to images in the page's order."""
-        anchors = {(s, k): f"photograph-{s + 1}-{k + 1}" for s, k in places}
+        anchors = {(s, k): f"image-{s + 1}-{k + 1}" for s, k in places}
         return cls(anchors, {k: name for (_, k), name in reversed([*anchors.items()])})
 
     def to_configuration(self, k: int) -> str:
