@@ -478,7 +478,7 @@ def test_results_do_not_depend_on_the_gauge(gauge):
     scene = make_scene(rng)
     m = scene.measurements(rng)
     start = start_state(scene.machine, m, scene.T_camera_base)
-    options = {"use_drawing": False, "robust": False, "scale_noise": False}
+    options = {"use_prior": False, "robust": False, "scale_noise": False}
     reference = bundle(scene.machine, m, start, **options)
     other = bundle(scene.machine, m, start, gauge=gauge, **options)
     assert registered_error(scene.machine, other.state.theta, reference.state.theta) < 1e-11

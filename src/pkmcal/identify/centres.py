@@ -29,7 +29,7 @@ class Centres:
     side : ``base`` or ``platform``.
     calibrated : (L, 3).
     nominal : (L, 3) nominal centres, registered to them by ``T_calibrated_nominal``.
-    T_calibrated_drawing : (4, 4).
+    T_calibrated_nominal : (4, 4).
     covariance : (3L, 3L) about the fit, m^2.
     """
 

@@ -78,7 +78,7 @@ def machine_change(
     """What differs between two machines of the same parameters.
 
     covariances : (P, P) of either's parameters in any frames; None for a nominal model, which is
-    taken at its word. one_drawing : whether both calibrations lean on the same one. shared : of the
+    taken at its word. same_nominal : whether both calibrations lean on the same one. shared : of the
     data of the one that has less, the share that the other saw as well.
     """
     held = replace(a, parameters=replace(a.parameters, nominal=a.values))
