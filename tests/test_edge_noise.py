@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from pkmcal.identify import line_shading
 from pkmcal.identify.assembly import assemble
-from pkmcal.identify.bundle import bundle, linearize_at_solution, solve_batch
+from pkmcal.identify.bundle import bundle, solve_batch
 from pkmcal.identify.error_correlation import covariance_of_correlated
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.line_shading import common_shading
@@ -289,7 +289,7 @@ def test_what_was_found_is_what_counts_afterwards():
     scene = shaded(rng, 0.15, runs=1)
     measurements = scene.measurements(rng)
     estimate = bundle(scene.machine, measurements, scene.state())
-    assembled, info = linearize_at_solution(measurements, estimate)
+    assembled, info = estimate.linearized
     solution = minimise(assembled.problem, info.state).state
     rows = assembled.places.edges.taken(assembled.problem.unweighted(solution).edges[0])
     np.testing.assert_allclose(rows, estimate.edge_residuals, atol=0.02)

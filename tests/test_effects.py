@@ -9,7 +9,7 @@ import pytest
 
 from pkmcal.errors import InputError
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.score import FALSE_ALARM, ScoreTests
 from pkmcal.identify.start import start_state
@@ -88,7 +88,7 @@ def test_an_effect_without_a_prior_is_detected(scene, effect, number):
         start = start_state(scene.machine, data, scene.T_camera_base)
         estimate = bundle(scene.machine, data, start, scale_noise=False, robust=False)
         listed = [one for one in columns_of_effects(data) if one.prior is None]
-        tests = ScoreTests(*linearize_at_solution(data, estimate), listed)
+        tests = ScoreTests(*estimate.linearized, listed)
         assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == found
         if found:
             fit = tests.fitted(found)[0]

@@ -9,7 +9,7 @@ import pytest
 
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
@@ -36,7 +36,7 @@ def judged(scene, *views):
     observation = Observation(
         edges, (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
-    values = identifiability(linearize_at_solution(measurements, estimate)[1], estimate.machine)
+    values = identifiability(estimate.linearized.info, estimate.machine)
     observed = observed_legs(edges, estimate.edge_weights, measurements.n_stations, machine.n_legs)
     findings = explain(values, estimate, observed, conditions(machine, observed))
     return observation, estimate, findings, judge(observation, estimate, findings)

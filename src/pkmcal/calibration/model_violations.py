@@ -25,9 +25,7 @@ from pkmcal.calibration.discrepancy_basis import (
     with_discrepancy,
 )
 from pkmcal.calibration.tube_outlines import Outline, outlines
-from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.covariance import Information
 from pkmcal.identify.discrepancy import discrepancy_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import (
@@ -118,14 +116,13 @@ def model_violations(
     observation: Observation,
     measurements: Measurements,
     estimate: Estimate,
-    ended: tuple[Assembled, Information],
 ) -> ModelViolations:
     """Deviations of the data from the model, with and without names.
 
     A violation is named only if it explains more than the discrepancy does: those that are detected
-    first are tested once more beside the discrepancy. ended : the estimate's problem at its end,
-    :func:`pkmcal.identify.bundle.linearize_at_solution`.
+    first are tested once more beside the discrepancy.
     """
+    ended = estimate.linearized
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
     tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
@@ -136,7 +133,7 @@ def model_violations(
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
     reference_values = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
-    in_view = np.flatnonzero(ended[0].observed)
+    in_view = np.flatnonzero(estimate.configurations)
 
     def declared(k: int) -> Column:
         if k < len(listed):
@@ -170,7 +167,7 @@ def model_violations(
     if discrepancy.scales and value:
         tests, value = tested(discrepancy.random)
     before = tool_of(session, estimate)
-    estimate = with_discrepancy(estimate, ended[1].problem, discrepancy)
+    estimate = with_discrepancy(estimate, discrepancy)
     tool = tool_of(session, estimate) if discrepancy.scales else before
     surface = None
     if any(one.code == UNEVEN_BED for one in discrepancy.scales):

@@ -45,7 +45,6 @@ from pkmcal.check.sentences import (
 )
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
@@ -509,7 +508,6 @@ def _height_findings(settled: Settled) -> list[Finding]:
         fit.observation,
         fit.measurements,
         fit.estimate,
-        linearize_at_solution(fit.measurements, fit.estimate),
     )
     return [
         *(replace(one.finding, level=Level.DOUBTFUL) for one in tested.violations),

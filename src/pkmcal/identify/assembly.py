@@ -9,11 +9,11 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.link_rows import LinkBlocks, LinkData
 from pkmcal.identify.places import Places
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.measurements import SHADING_SIGMA, Column, Measurements
 from pkmcal.measurements.edges import EdgeBlocks, EdgeData

@@ -23,7 +23,7 @@ from pkmcal.identify.covariance import (
 )
 from pkmcal.identify.edge_noise import edge_noise
 from pkmcal.identify.error_correlation import covariance_of_correlated
-from pkmcal.identify.estimate import Estimate, State, Statistics
+from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.external_reliability import covariance_of_undetected
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.innovation_test import innovations
@@ -46,6 +46,7 @@ from pkmcal.identify.noise import (
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
 from pkmcal.identify.scatter import EdgeScatter
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.effects import SHADING, SHIFT_SIGMA
@@ -404,7 +405,7 @@ def bundle(
     """The joint estimate of one session.
 
     start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
-    use_drawing : take the nominal model's values as measurements with their tolerances; radii and
+    use_prior : take the nominal model's values as measurements with their tolerances; radii and
         edge shifts keep theirs in any case. marginal_prior : what other measurements told of the
         machine, with the nominal model in it, in the nominal model's place, whether that is taken
         or not.
@@ -451,32 +452,12 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
-def linearize_at_solution(
-    measurements: Measurements, estimate: Estimate
-) -> tuple[Assembled, Information]:
-    """The problem of an estimate at its end, with its weights, noise scales and the lines' shading
-    as it found them, and what it says at its state there, but for the shading: as far as anything
-    is from its best value a linear step tells.
-    """
-    machine, measurements = estimate.machine, estimate.stated_edge_noise(measurements)
-    shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
-    assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
-    statistics = estimate.statistics
-    weights = Kinds(
-        estimate.edge_weights * estimate.edge_trust,
-        estimate.pose_weights / statistics.pose_scale**2,
-        estimate.link_weights / statistics.link_scale**2,
-    )
-    assembled = replace(assembled, problem=assembled.trusting(weights))
-    return assembled, Information(assembled.problem, batch_of(machine, assembled, estimate.state))
-
-
-def marginalize_to_machine(measurements: Measurements, estimate: Estimate) -> MarginalPrior:
+def marginalize_to_machine(estimate: Estimate) -> MarginalPrior:
     """What an estimate knows of the machine, for the estimate of other measurements.
 
     The frames are as little known as by the nominal model, about where the estimate has them.
     """
-    _, info = linearize_at_solution(measurements, estimate)
+    info = estimate.linearized.info
     rows, _ = reduced_rows(info, ("machine",), silent=())
     root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
     return MarginalPrior(info.state.z[0], root)
@@ -529,6 +510,7 @@ def _estimate(
         configurations=assembled.observed,
         statistics=_statistics(result, assembled, value, measurements.imputation_covariance),
         gauge=gauge.name,
+        problem=assembled,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
         link_residuals=residuals.links[:, 0],

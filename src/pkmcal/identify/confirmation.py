@@ -29,7 +29,6 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.identify.assembly import Assembled
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.problem import Problem
@@ -145,7 +144,7 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
     if not units:
         return Rejections()
     # problem at the solution, with wider priors
-    assembled, info = linearize_at_solution(measurements, estimate)
+    assembled, info = estimate.linearized
     drawn = np.array(assembled.priors) == "drawing"
     wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
     problem, state = info.problem, info.state

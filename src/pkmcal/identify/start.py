@@ -7,9 +7,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.robust import norms
+from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 

@@ -30,7 +30,6 @@ from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference,
 from pkmcal.identify.assembly import Assembled, assemble, state_of
 from pkmcal.identify.bundle import BatchResult, counts, solve_batch
 from pkmcal.identify.covariance import machine_covariance
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
     BestFit,
     Gauge,
@@ -42,6 +41,7 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.identify.parameter_estimates import ROUNDING_SIGMA
 from pkmcal.identify.start import middle_pose
+from pkmcal.identify.state import State
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
