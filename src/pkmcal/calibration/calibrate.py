@@ -260,12 +260,12 @@ def calibrate_measurements(
     from where the estimate starts. Raises ResultError where there is no estimate.
     """
     clock = Clock(progress)
-    start = start_state(session.machine, measurements, T_camera_base)
+    start = start_state(session.machine, measurements, T_camera_base, session.forward)
     estimate = bundle(session.machine, measurements, start)
     turns = RefinementResult(
         observation, measurements, estimate, refinement_of(session, False), start=start
     )
-    scene = PriorScene.as_drawn(session.machine, T_camera_base, session.joints)
+    scene = PriorScene.as_drawn(session, T_camera_base)
     case = Case(session, [], Boards(), scene)
     return _judge(case, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
 

@@ -453,9 +453,8 @@ def identify_poses(
     progress("Identifying", 0.6)
     machine = session.machine
     measurements = measurements_of(session, boards, None, cameras)
-    start = _feasible_start(
-        session, measurements, start_state(machine, measurements, T_camera_base)
-    )
+    start = start_state(machine, measurements, T_camera_base, session.forward)
+    start = _feasible_start(session, measurements, start)
     estimate = bundle(machine, measurements, start)
     for turn in range(1, MOST_MEASUREMENT_PASSES if cameras.active else 1):
         progress("Identifying with the cameras", 0.6 + 0.3 * turn / MOST_MEASUREMENT_PASSES)
@@ -472,7 +471,7 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
 
     Raises `InputError` for readings that the machine so found cannot take either.
     """
-    drawn = session.machine.forward_result(session.joints).converged
+    drawn = session.forward.converged
     if drawn.all():
         return start
     poses = measurements.poses
@@ -501,11 +500,16 @@ def _first_estimate(
     first look has put them.
     """
     session, photographs, boards, reference_values = case
+    begin = partial(
+        start_state,
+        reference_values.machine,
+        T_camera_base_guess=reference_values.T_camera_base,
+        forward=session.forward if reference_values.machine is session.machine else None,
+    )
     if all(p.station in reference_values.edges for p in photographs):
         placed = of_stations({p.station: reference_values.edges[p.station] for p in photographs})
         measurements = measurements_of(session, boards, placed)
-        start = start_state(reference_values.machine, measurements, reference_values.T_camera_base)
-        return bundle(session.machine, measurements, start)
+        return bundle(session.machine, measurements, begin(measurements))
     start: State | None = None
     for text, reach, share in (
         ("Finding the legs", legs.LEG_SEARCH_REACH, 0.35),
@@ -516,9 +520,7 @@ def _first_estimate(
         passes = _search_pass(photographs, search)
         measurements = measurements_of(session, boards, _edges(passes))
         lap("observe")
-        start = start or start_state(
-            reference_values.machine, measurements, reference_values.T_camera_base
-        )
+        start = start or begin(measurements)
         estimate = bundle(session.machine, measurements, start)
         lap("identify")
         if _share_agreeing(passes, measurements.edges, estimate) > NEARLY_ALL:

@@ -209,8 +209,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematic
     there.
     """
     try:
-        poses = platform_poses(session, most=not legs_stations(session))
-        fk = session.machine.forward_result(session.joints, poses)
+        poses, fk = platform_poses(session, most=not legs_stations(session)), session.forward
         first = session.joints[0]
         # an overdetermined machine does not close at readings with errors
         if session.machine.layout.overdetermined:
