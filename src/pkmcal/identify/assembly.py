@@ -203,27 +203,30 @@ def _by_measurement(
     count: int,
     numbers_each: int,
     columns: Sequence[Column],
-    parts: Sequence[tuple[Array | None, Integers | None]],
+    parts: Sequence[tuple[Array | None, Integers | None, Integers | None]],
 ) -> tuple[Integers, Array]:
     """Numbers (N, w) of the columns that move each of N measurements, -1 for none, and the
     derivatives (N, d, w) by these; numbers_each : d. parts : each column's derivatives (n, d, k),
-    and measurements (n,).
+    measurements (n,), and numbers (n, k) where these are not all of the column.
+
+    The numbers do not depend on the derivatives: where these are zero, the number is an unknown
+    that the data do not determine, and keeps its place.
     """
     of, number, by = list[Integers](), list[Integers](), list[Array]()
     first = 0
-    for column, (values, rows) in zip(columns, parts, strict=True):
-        numbers = first + np.arange(column.count)
-        first += column.count
-        if values is not None and values.size:
+    for column, (values, rows, own) in zip(columns, parts, strict=True):
+        if values is not None:
             rows = np.arange(count) if rows is None else rows
-            of.append(np.repeat(rows, len(numbers)))
-            number.append(np.tile(numbers, len(rows)))
+            own = np.arange(column.count)[None] if own is None else own
+            own = np.broadcast_to(first + own, (len(rows), own.shape[1]))
+            of.append(np.repeat(rows, own.shape[1]))
+            number.append(own.ravel())
             by.append(values.swapaxes(1, 2).reshape(-1, values.shape[1]))
+        first += column.count
     if not by:
         return np.zeros((count, 0), int), np.zeros((count, numbers_each, 0))
     of, number, by = np.concatenate(of), np.concatenate(number), np.concatenate(by)
-    used = np.flatnonzero(np.any(by != 0, axis=1))
-    order = used[np.lexsort((number[used], of[used]))]
+    order = np.lexsort((number, of))
     of, number, by = of[order], number[order], by[order]
     slot = np.arange(len(of)) - np.searchsorted(of, of)
     width = int(slot.max(initial=-1)) + 1
@@ -254,7 +257,7 @@ def _edges(
     """The edges at their positions, and the readings of the observed configurations."""
     edges, (keys, line) = measurements.edges, lines(measurements)
     radius = machine.layout.radius_of(edges.leg, edges.tube)
-    parts = [(one.edges, one.edge_rows) for one in columns]
+    parts = [(one.edges, one.edge_rows, one.edge_numbers) for one in columns]
     column, by_columns = _by_measurement(len(edges), 2, columns, parts)
     side = np.unique(keys[:, [0, 1, 3]], axis=0, return_inverse=True)[1].reshape(-1)
     own, alone, crowded = np.zeros((3, len(edges)))
@@ -299,7 +302,7 @@ def _poses(
 ) -> tuple[PoseBlocks, PoseData]:
     """The poses at their positions."""
     poses = measurements.poses
-    parts = [(one.poses, one.pose_rows) for one in columns]
+    parts = [(one.poses, one.pose_rows, None) for one in columns]
     column, by_columns = _by_measurement(len(poses), 6, columns, parts)
     blocks = PoseBlocks(
         station=at.filled(poses.station),
