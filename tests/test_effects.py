@@ -11,7 +11,7 @@ from pkmcal.errors import InputError
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.score import FALSE_ALARM, ScoreTests
+from pkmcal.identify.score import ScoreTests
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Column
 from pkmcal.measurements.effects import EDGE_SHIFT, columns_of_effects
@@ -89,7 +89,7 @@ def test_an_effect_without_a_prior_is_detected(scene, effect, number):
         estimate = bundle(scene.machine, data, start, scale_noise=False, robust=False)
         listed = [one for one in columns_of_effects(data) if one.prior is None]
         tests = ScoreTests(*estimate.linearized, listed)
-        assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == found
+        assert [k for k, _ in tests.significant()] == found
         if found:
             fit = tests.fitted(found)[0]
             assert abs(fit.value[0] - number) < 4 * fit.sigma[0]

@@ -1,8 +1,8 @@
 """Model violations of a session: readings, cameras, boards, stations, tubes.
 
 Each violation is a column (:mod:`pkmcal.measurements.columns`) that is made beside its subject,
-with its derivatives and the facts of its finding. Here all of them are score-tested at one
-false-alarm level (:mod:`pkmcal.identify.score`).
+with its derivatives and the facts of its finding. Here all of them are score-tested at the
+false-alarm level of the session (:mod:`pkmcal.identify.score`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import discrepancy_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import (
-    FALSE_ALARM,
     MOST_VIOLATIONS_SOUGHT,
     OneStepUpdate,
     Score,
@@ -153,7 +152,7 @@ def model_violations(
             beside=beside,
             variance=1 + measurements.imputation_covariance,
         )
-        value = tests.tests_beyond(FALSE_ALARM, [k for k, _ in reference_values])
+        value = tests.significant([k for k, _ in reference_values])
         return tests, [*value, *reference_values]
 
     tests, value = tested(())
