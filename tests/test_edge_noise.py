@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from pkmcal.identify import line_shading
 from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import bundle, solve_batch
 from pkmcal.identify.error_correlation import covariance_of_correlated
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.line_shading import common_shading
+from pkmcal.identify.line_shading import LineShadingOptions, common_shading
 from pkmcal.measurements import (
     OWN_SHADING,
     SHADING_CORRELATION_ANGLE,
@@ -242,9 +241,9 @@ def integrated(shift, covariance, sigma, least):
 
 
 @pytest.mark.parametrize(("told", "n"), [(0.01, 60), (0.3, 5)])
-def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
+def test_the_lines_deviation_is_its_mean(told, n):
     """Near the true value if the data determine it; if hardly, well above the least."""
-    monkeypatch.setattr(line_shading, "SHADING_FREEDOM", 1e9)
+    normal = LineShadingOptions(freedom=1e9)
     rng = np.random.default_rng(14)
     true = rng.normal(0, 0.1, n)
     root = rng.normal(size=(n, n)) / np.sqrt(n)
@@ -253,7 +252,7 @@ def test_the_lines_deviation_is_its_mean(told, n, monkeypatch):
     sigma = np.full(n, 0.2)
     covariance = np.linalg.inv(np.linalg.inv(noise) + np.diag(1 / sigma**2))
     shift = covariance @ np.linalg.solve(noise, measured)
-    values = common_shading(shift[None], covariance[None], np.eye(n), sigma[None], 0.03)[0]
+    values = common_shading(shift[None], covariance[None], np.eye(n), sigma[None], 0.03, normal)[0]
     np.testing.assert_allclose(values, integrated(shift, covariance, sigma, 0.03), rtol=0.02)
     if told < 0.1:
         np.testing.assert_allclose(values, 0.1, rtol=0.2)

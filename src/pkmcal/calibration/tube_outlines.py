@@ -17,7 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
-from pkmcal.identify.line_shading import SHADING_FREEDOM
+from pkmcal.identify.line_shading import LINE_SHADING
 from pkmcal.identify.score import Score
 from pkmcal.measurements import Column, Measurements
 from pkmcal.measurements.effects import EDGE_SHIFT, lines
@@ -94,7 +94,9 @@ def outlines(
         column = Column("tube.radius", name, "tube radius", edges=by, edge_rows=own, facts=facts)
         yield Outline(column, score, value, scale)
     z = np.abs(shift) / sigma
-    chance = np.where(np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(SHADING_FREEDOM, -z))
+    chance = np.where(
+        np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(LINE_SHADING.freedom, -z)
+    )
     for k in np.argsort(chance, kind="stable").tolist():
         adjusted = float(false_alarm.adjusted(chance[k], 2 * len(keys)))
         if adjusted > false_alarm.level:

@@ -44,7 +44,7 @@ from pkmcal.identify.start import middle_pose
 from pkmcal.identify.state import State
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.identify.verdict import TOO_NOISY
+from pkmcal.identify.verdict import VERDICT
 from pkmcal.measurements import OWN_SHADING, SHADING_CORRELATION_ANGLE, SHADING_SIGMA
 from pkmcal.measurements.edges import EdgeData
 from pkmcal.measurements.effects import SHIFT_SIGMA, lines
@@ -182,7 +182,7 @@ class SimulatedCalibrations:
                     "chi2": fit.solution.cost / dof,
                     "scale": scale,
                     "steps": fit.solution.steps.astype(float),
-                    "failed": 1.0 - (good & (scale <= TOO_NOISY)),
+                    "failed": 1.0 - (good & (scale <= VERDICT.too_noisy)),
                 },
                 covariance=np.array([covariance for _, covariance in parameters]),
             )
