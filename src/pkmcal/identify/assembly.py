@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -70,6 +71,9 @@ def assemble(
     _check(machine, measurements)
     observed = observed_configurations(measurements)
     columns = _unknown_columns(measurements)
+    codes = Counter[str]()
+    for column in columns:
+        codes[column.code] += column.count
     edges = _places(measurements.edges.configuration, observed, measurements.edges.leg)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     one = np.zeros(len(measurements.poses), dtype=int)
@@ -78,7 +82,7 @@ def assemble(
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
-        codes=_codes(columns),
+        codes=tuple(codes.items()),
         n_mounts=len(measurements.mounts),
         n_linked=len(link_blocks.linked) * machine.layout.own_motion.shape[1],
     )
@@ -189,14 +193,6 @@ def _unknown_columns(measurements: Measurements) -> list[Column]:
                 next_step="state what it does to edges, poses or readings, or leave its prior out",
             )
     return columns
-
-
-def _codes(columns: Sequence[Column]) -> tuple[tuple[str, int], ...]:
-    """Codes of columns, and how many numbers each has."""
-    number = dict.fromkeys((one.code for one in columns), 0)
-    for one in columns:
-        number[one.code] += one.count
-    return tuple(number.items())
 
 
 def _by_measurement(

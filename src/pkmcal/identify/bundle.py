@@ -35,8 +35,8 @@ from pkmcal.identify.kinds import (
 )
 from pkmcal.identify.line_shading import LINE_SHADING, LineShadingOptions, common_shading
 from pkmcal.identify.noise import (
-    LARGEST_NOISE_STEP,
     LEAST_NOISE_FREEDOM,
+    NOISE,
     Components,
     NoiseShares,
     components,
@@ -81,7 +81,7 @@ class BatchOptions:
     # how far it goes: at most by how much further
     furthest_noise_pace: float = 3.0
     # logarithm of a step of that noise that was not cut short
-    uncut_noise_log_step: float = 0.99 * float(np.log(LARGEST_NOISE_STEP))
+    uncut_noise_log_step: float = 0.99 * float(np.log(NOISE.largest_step))
     # rounds in which the tails of the edges' noise are chosen; they are steps, and two that are
     # alike would take turns for ever
     free_rounds: int = 6
@@ -274,7 +274,11 @@ def _settle(
             options.nearly_solved,
         )
         nearly = True
-    return _to_the_end(fit) if nearly else fit
+    if not nearly:
+        return fit
+    # what the search of the last round has left to go
+    solution, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
+    return replace(fit, solution=solution, info=info)
 
 
 def _readings_step(
@@ -340,12 +344,6 @@ def _solved(
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
     solution, info = _searched(used, state, steps, tolerance)
     return BatchResult(solution, weight, scale, info, edges, irls_weight, stated)
-
-
-def _to_the_end(fit: BatchResult) -> BatchResult:
-    """The same with what a round's search has left to go."""
-    solution, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
-    return replace(fit, solution=solution, info=info)
 
 
 def _searched(

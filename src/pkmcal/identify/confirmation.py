@@ -226,7 +226,8 @@ class _Cases(NamedTuple):
     ) -> _Cases:
         """Terms of an estimate's problem."""
         # normal equations of the estimate
-        base = _prior(problem, state)
+        value, rows = problem.prior_values(state)[0] - problem.prior_target, problem.prior
+        base = _Normal((rows.T @ rows)[None], (rows.T @ value)[None], np.sum(value**2)[None])
         for cut in divisions(*problem.extent):
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
@@ -304,10 +305,3 @@ def _normal_equations(problem: Problem, state: BatchState) -> _Normal:
     reduced = Information(problem, state).reduced
     rows, value = reduced.rows[0], reduced.value[0]
     return _Normal(rows.mT @ rows, (rows.mT @ value[..., None])[..., 0], np.sum(value**2, axis=-1))
-
-
-def _prior(problem: Problem, state: BatchState) -> _Normal:
-    """Normal equations of the prior."""
-    value = problem.prior_values(state)[0] - problem.prior_target
-    rows = problem.prior
-    return _Normal((rows.T @ rows)[None], (rows.T @ value)[None], np.sum(value**2)[None])

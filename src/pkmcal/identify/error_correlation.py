@@ -63,17 +63,14 @@ def covariance_of_correlated(
         return info.covariance
     out = info.covariance.copy()
     for run in range(len(out)):
-        one = info if len(out) == 1 else _of_run(info, run)  # of many edges no copy is made
+        one = info
+        if len(out) > 1:  # a single run, of many edges, is not copied
+            at = np.array([run])
+            normal = None if info.normal is None else info.normal[at]
+            one = Information(info.problem.select(at), take(info.state, at), normal)
         half = one.root[0]
         out[run] += half @ _beside(one, options) @ half.T
     return out
-
-
-def _of_run(info: Information, run: int) -> Information:
-    """Information of a single run."""
-    at = np.array([run])
-    normal = None if info.normal is None else info.normal[at]
-    return Information(info.problem.select(at), take(info.state, at), normal)
 
 
 def _beside(info: Information, options: ErrorCorrelationOptions) -> Array:

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 
 Search = Literal["violations", "outlines", "discrepancy", "poses"]
 
@@ -33,7 +33,7 @@ class FalseAlarm:
         """Level of each of the tests of one search."""
         return self.level / (len(self.searches) * max(tests, 1))
 
-    def adjusted(self, chance: Array | float, tests: Array | int) -> Array:
+    def adjusted(self, chance: Array | float, tests: Array | Integers | int) -> Array:
         """P-values among all tests of a session, from the p-values of tests and the number of tests
         that share the level of their search.
         """

@@ -63,6 +63,12 @@ class VerdictOptions:
     # share of such readings that is a reason: two in a billion normal errors are so large
     reading_residual: float = 6.0
     contradicted_share: float = 0.02
+    # edges of a leg, relative to the median of all legs, below which the leg is seldom in view
+    few_edges_share: float = 0.3
+    # factor on the edges' stated noise that is worth a warning: the standard deviations contain it
+    edge_scatter: float = 1.5
+    # configurations below which a note says that they are few
+    few_configurations: int = 10
     # heights of a bed, where a wrong one moves the tool by little more than its standard deviation
     # before it is detected (benchmarks/heights.py)
     enough_touches: int = 15
@@ -125,9 +131,9 @@ def judge(
         *_singular(estimate, options),
         *_readings_misfit(estimate, options),
         *(() if explained else _poses_misfit(estimate, richer, options)),
-        *_warnings(observation, estimate),
+        *_warnings(observation, estimate, options),
         *(_touch_unnoticed(bed, options) if bed else ()),
-        *_few_configurations(estimate),
+        *_few_configurations(estimate, options),
         *(_not_by_heights(bed, findings) if bed else ()),
         *others,
         *(_undetermined(s, Level.DOUBTFUL) for s in matter),
@@ -378,7 +384,9 @@ def _undecided(estimate: Estimate) -> list[str]:
     return [name for name, kind, by in named if by == "drawing" and kind != "radius"]
 
 
-def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]:
+def _warnings(
+    observation: Observation, estimate: Estimate, options: VerdictOptions
+) -> Iterator[Finding]:
     """Findings on values far from the nominal model, and on what increases standard deviations."""
     table = estimate.machine.parameters
     change = np.abs(_from_nominal(estimate.machine))
@@ -392,9 +400,9 @@ def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]
             most=float(change.max()),
         )
     in_view = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
-    for leg in np.flatnonzero(in_view < 0.3 * np.median(in_view)).tolist():
+    for leg in np.flatnonzero(in_view < options.few_edges_share * np.median(in_view)).tolist():
         yield doubtful("edges.leg_seldom_seen", f"leg {leg + 1}", leg=leg + 1)
-    if estimate.statistics.noise_scale > 1.5:
+    if estimate.statistics.noise_scale > options.edge_scatter:
         yield doubtful("edges.scatter", scale=estimate.statistics.noise_scale)
     shading = estimate.edge_noise.shading if observation.edges.leg.size else np.zeros(1)
     if shading.min() > POLISHED_SHADING:
@@ -413,8 +421,8 @@ def _from_nominal(machine: Machine) -> Array:
     return change - frames @ np.linalg.lstsq(frames, change, rcond=None)[0]
 
 
-def _few_configurations(estimate: Estimate) -> Iterator[Finding]:
-    """Note if fewer than ten configurations are in use."""
+def _few_configurations(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
+    """Note if few configurations are in use."""
     used = int(np.sum(estimate.configurations))
-    if used < 10 and not only_heights(estimate):
+    if used < options.few_configurations and not only_heights(estimate):
         yield note("configurations.few", number=used)
