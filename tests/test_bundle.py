@@ -247,7 +247,7 @@ def test_starts_far_away_find_the_same_answer():
         np.testing.assert_allclose(far.solution.state.z, near.solution.state.z, atol=3e-6)
 
 
-def test_configurations_that_nobody_photographed():
+def test_configurations_that_nobody_imaged():
     """Configurations without inliers do not enter the estimate; their poses follow from the
     readings.
     """

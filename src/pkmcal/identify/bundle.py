@@ -566,7 +566,7 @@ def _estimate(
 def _with_unseen_poses(
     machine: Machine, measurements: Measurements, assembled: Assembled, state: State
 ) -> State:
-    """Poses of the configurations that no photograph shows: by the readings alone."""
+    """Poses of the configurations that no image shows: by the readings alone."""
     unseen = ~assembled.observed
     if not unseen.any():
         return state
