@@ -31,7 +31,7 @@ from solver import most_megabytes
 import pkmcal
 from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
@@ -68,7 +68,7 @@ def of_edges(count: int) -> Iterator[Step]:
         made["estimate"] = bundle(machine, measurements, begin)
 
     def report() -> None:
-        _, info = linearize_at_solution(measurements, made["estimate"])
+        info = made["estimate"].linearized.info
         identifiability(info, made["estimate"].machine)
 
     yield "edges: assemble", assembled

@@ -296,7 +296,6 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
 
     from pkmcal import calibrate
     from pkmcal.errors import PkmcalError
-    from pkmcal.identify.bundle import linearize_at_solution
     from pkmcal.identify.kinds import READING_ROWS_KIND
     from pkmcal.identify.noise import noise_shares
 
@@ -330,7 +329,7 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
         "rejected": [f"{lost} of {result.estimate.pose_weights.size} measured poses"] * (lost > 0),
         "other": list(verdict.warnings),
     }
-    _, info = linearize_at_solution(result.measurements, result.estimate)
+    info = result.estimate.linearized.info
     low, high = noise_shares(info, READING_ROWS_KIND).interval(INTERVAL_MISS)
     scale = statistics.reading_scale
     return Outcome(

@@ -36,7 +36,7 @@ from scipy.optimize import least_squares
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import NEARLY_SOLVED_DISTANCE, bundle
+from pkmcal.identify.bundle import BATCH, bundle
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.start import start_state
@@ -249,7 +249,7 @@ def measured(what: str, count: int) -> dict[str, float]:
         machine, measurements, state, problem, start = session(count)
         per = 1
         if what.startswith("solve"):
-            tolerance = NEARLY_SOLVED_DISTANCE if what == "solve-nearly" else STEP_TOLERANCE
+            tolerance = BATCH.nearly_solved if what == "solve-nearly" else STEP_TOLERANCE
 
             def work() -> Any:
                 return minimise(problem, start, tolerance=tolerance)

@@ -13,7 +13,6 @@ from pkmcal.geometry.rigid import apply, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of, state_of
 from pkmcal.identify.bundle import (
     bundle,
-    linearize_at_solution,
     marginalize_to_machine,
     solve_batch,
 )
@@ -338,7 +337,7 @@ def test_what_is_told_of_a_machine_stands_for_what_told_it():
     start = start_state(scene.machine, both, guess(rng, scene.T_camera_base))
     plain = {"robust": False, "scale_noise": False}
     before = bundle(scene.machine, one, start, **plain)
-    information = marginalize_to_machine(one, before)
+    information = marginalize_to_machine(before)
     start = replace(start, theta=before.state.theta)
     fit = bundle(scene.machine, other, start, marginal_prior=information, **plain)
     together = bundle(scene.machine, all_, start, **plain)
@@ -357,7 +356,7 @@ def test_what_is_told_of_a_machine_stands_for_what_told_it():
     )
     np.testing.assert_array_equal(without.state.theta, fit.state.theta)
     # a motion below its standard deviation changes nothing; by the nominal model alone it did
-    after = marginalize_to_machine(all_, together)
+    after = marginalize_to_machine(together)
     assert after.like(after)
     assert not after.like(replace(information, free=np.zeros_like(information.free)))
 
@@ -409,7 +408,7 @@ def test_what_cannot_be_identified_is_named():
     assert [d.names for d in results.unidentified] == [("legs[4].tubes[2].radius",)]
     result = estimate(scene, part, rng)
     radius = scene.machine.parameters.index("legs[4].tubes[2].radius")
-    _, info = linearize_at_solution(part, result)
+    info = result.linearized.info
     assert identifiability(info, result.machine).unidentified[0].names == (
         "legs[4].tubes[2].radius",
     )

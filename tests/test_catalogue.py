@@ -17,9 +17,9 @@ from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.start import start_state
+from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import (
     MechanismDocument,

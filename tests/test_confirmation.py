@@ -10,7 +10,6 @@ import pytest
 import printers
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.identify.bed import bed_by_parameters
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.confirmation import FAR_FROM_NOMINAL, rejections_of
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE
 from pkmcal.measurements.rows import Kinds
@@ -39,7 +38,7 @@ def test_hypotheses_weigh_as_their_solutions_do(found):
     """Solutions of each hypothesis, not to first order, with prior sigmas five times as wide."""
     measurements, estimate = found.measurements, found.estimate
     assert np.flatnonzero(estimate.pose_weights < 0.5).tolist() == [WRONG]
-    assembled, info = linearize_at_solution(measurements, estimate)
+    assembled, info = estimate.linearized
     drawn = np.array(assembled.priors) == "drawing"
     wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
     problem = replace(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pkmcal.geometry.rigid import perturb, pose
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import alignment, changed_frames, default_gauge, freedoms
+from pkmcal.identify.state import State
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import closure
 from pose_sessions import estimated, measured

@@ -19,7 +19,7 @@ from pkmcal.calibration.discrepancy_basis import (
 from pkmcal.calibration.faults import WRONG_MODEL_READING_SCALE, noise_fault
 from pkmcal.calibration.model_violations import model_violations
 from pkmcal.geometry.cylinders import line_through, tangent_basis
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import Component, discrepancy_of
 from pkmcal.identify.kinds import READING_ROWS_KIND
@@ -59,7 +59,7 @@ def scales_in_use(estimate):
 
 def discrepancy_in(data, estimate, named=()):
     return discrepancy_of(
-        *linearize_at_solution(data, estimate),
+        *estimate.linearized,
         discrepancy_components(data, estimate),
         named,
         scales_in_use(estimate),
@@ -85,12 +85,10 @@ def test_scale_and_covariance_are_those_of_dense_algebra():
     """Against the restricted likelihood of all rows at once, and the gain of least squares."""
     rng = np.random.default_rng(5)
     functions = rng.standard_normal((FEW, 6, 3))
-    _, data, estimate, _ = session_estimate(
+    _, _, estimate, _ = session_estimate(
         5, lambda _: 3e-4 * functions @ [0.5, -1.0, 0.4], count=FEW
     )
-    data = replace(data, joint_noise=estimate.statistics.reading_scale * data.joint_noise)
-    estimate = replace(estimate, statistics=replace(estimate.statistics, reading_scale=1.0))
-    assembled, info = linearize_at_solution(data, estimate)
+    assembled, info = estimate.linearized
     root = np.array([[1.0, 0, 0], [0.5, 1, 0], [0, 0, 2.0]])
     one = Component(Column("functions", readings=functions), (root,))
     result = discrepancy_of(assembled, info, [one])
@@ -123,7 +121,7 @@ def test_scale_and_covariance_are_those_of_dense_algebra():
 def test_scores_beside_random_effects_are_those_of_correlated_noise():
     rng = np.random.default_rng(6)
     _, data, estimate, _ = session_estimate(6, lambda q: 2e-3 * q * (np.arange(6) == 1), count=FEW)
-    assembled, info = linearize_at_solution(data, estimate)
+    assembled, info = estimate.linearized
     root = 2e-4 * np.array([[1.0, 0.0], [0.3, 0.7]])
     random = Column("random", readings=rng.standard_normal((FEW, 6, 2)), prior=root)
     tests = [Column("test", readings=by) for by in scales(data)[:2]]
@@ -167,7 +165,7 @@ def test_legs_that_give_way_are_found_and_contained():
     estimate = bundle(nominal, data, right.state)
     result = discrepancy_in(data, estimate)
     assert result.scales[0].code == "readings.workspace"
-    contained = with_discrepancy(estimate, linearize_at_solution(data, estimate)[1].problem, result)
+    contained = with_discrepancy(estimate, result)
     before, after = (tool_in_sigmas(truth, x, true) for x in (estimate, contained))
     assert before > 3
     assert after < 3
@@ -206,7 +204,7 @@ def test_noisy_readings_are_noise_and_hardly_more():
     _, data, estimate, _ = session_estimate(9, lambda q: 3e-5 * rng.standard_normal(q.shape))
     assert estimate.statistics.reading_scale > 3
     result = discrepancy_in(data, estimate)
-    contained = with_discrepancy(estimate, linearize_at_solution(data, estimate)[1].problem, result)
+    contained = with_discrepancy(estimate, result)
     offsets = estimate.machine.parameters.of_kind("offset")
     more, before = (np.diag(x.covariance)[offsets].sum() for x in (contained, estimate))
     assert more < 2 * before
@@ -251,8 +249,7 @@ def through_lens(calibrated, change, stations):
     measurements = replace(calibrated.measurements, edges=edges)
     estimate = bundle(session.machine, measurements, calibrated.estimate.state)
     observation = replace(observation, edges=edges)
-    end = linearize_at_solution(measurements, estimate)
-    return model_violations(session, observation, measurements, estimate, end)
+    return model_violations(session, observation, measurements, estimate)
 
 
 def test_pixels_that_are_not_square_are_named(calibrated):

@@ -9,9 +9,9 @@ import pytest
 
 from pkmcal.errors import InputError
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.score import FALSE_ALARM, ScoreTests
+from pkmcal.identify.score import ScoreTests
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Column
 from pkmcal.measurements.effects import EDGE_SHIFT, columns_of_effects
@@ -88,8 +88,8 @@ def test_an_effect_without_a_prior_is_detected(scene, effect, number):
         start = start_state(scene.machine, data, scene.T_camera_base)
         estimate = bundle(scene.machine, data, start, scale_noise=False, robust=False)
         listed = [one for one in columns_of_effects(data) if one.prior is None]
-        tests = ScoreTests(*linearize_at_solution(data, estimate), listed)
-        assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == found
+        tests = ScoreTests(*estimate.linearized, listed)
+        assert [k for k, _ in tests.significant()] == found
         if found:
             fit = tests.fitted(found)[0]
             assert abs(fit.value[0] - number) < 4 * fit.sigma[0]
@@ -125,3 +125,49 @@ def test_a_prior_needs_effects_on_measurements(scene):
     data = replace(scene.measurements(np.random.default_rng(5)), effects=(effect,))
     with pytest.raises(InputError, match=r"test\.motion"):
         assemble(scene.machine, data, ThreeCentres())
+
+
+def without_derivatives(prior):
+    """A made-up effect that moves nothing where it is linearized."""
+
+    def effect(measurements):
+        own = np.flatnonzero(measurements.edges.station == 1)
+        yield Column("test.none", edges=np.zeros((len(own), 2, 1)), edge_rows=own, prior=prior)
+
+    return effect
+
+
+def test_structure_does_not_depend_on_the_values_of_derivatives(scene):
+    """A column of zeros has the places of one with values; its number keeps its prior, and nothing
+    else changes.
+    """
+    measurements = scene.measurements(np.random.default_rng(6))
+    prior = np.full((1, 1), PRIOR)
+    zero, other = (
+        replace(measurements, effects=(effect(prior),)) for effect in (without_derivatives, tilted)
+    )
+    one, two = (assemble(scene.machine, data, ThreeCentres()).problem for data in (zero, other))
+    np.testing.assert_array_equal(one.blocks.column, two.blocks.column)
+    assert one.data.columns.shape == two.data.columns.shape
+    start = start_state(scene.machine, measurements, scene.T_camera_base)
+    estimate, without = (bundle(scene.machine, data, start) for data in (zero, measurements))
+    assert estimate.state.columns["test.none"] == pytest.approx(0, abs=1e-12)
+    assert estimate.column_sigma("test.none") == pytest.approx(PRIOR, rel=1e-6)
+    np.testing.assert_allclose(estimate.state.theta, without.state.theta, atol=1e-12)
+
+
+def test_lines_keep_their_places_where_edges_do_not_shift(scene):
+    """Each edge depends on the numbers of its camera and of its line, whatever its derivative."""
+    measurements = scene.measurements(np.random.default_rng(6))
+    edges = measurements.edges
+    still = replace(edges, shift=np.zeros_like(edges.shift))
+    shaded, zero = (replace(measurements, edges=one, shaded=True) for one in (edges, still))
+    one, two = (assemble(scene.machine, data, ThreeCentres()).problem for data in (shaded, zero))
+    np.testing.assert_array_equal(one.blocks.column, two.blocks.column)
+    assert one.blocks.column.shape[-1] == 2
+    (many,) = (
+        column for column in columns_of_effects(shaded) if column.subject == "station 1, leg 0"
+    )
+    whole = many.edges_of(len(edges))
+    assert np.count_nonzero(whole.any(axis=1), axis=1).max() == 1
+    np.testing.assert_array_equal(whole.sum(axis=2)[many.edge_rows], many.edges[..., 0])

@@ -16,9 +16,9 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import centre_index, default_gauge, in_gauge
 from pkmcal.identify.start import edge_misfit, start_state
+from pkmcal.identify.state import State
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import (
     Machine,

@@ -7,7 +7,6 @@ import pytest
 
 from pkmcal.geometry.rigid import perturb, rotation_vector
 from pkmcal.identify.assembly import assemble
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
@@ -285,9 +284,7 @@ def test_what_the_rods_can_tell():
     machine = load_mechanism("h4-rods")
     case = papers_case(with_rods(rng), rng)
     estimate = estimated(machine, case, rng)
-    values = identifiability(
-        linearize_at_solution(case.measurements, estimate)[1], estimate.machine
-    )
+    values = identifiability(estimate.linearized.info, estimate.machine)
     assert values.n_parameters - 4 == 78
     assert values.n_frames == 12 + 4
     assert values.rank == 66
@@ -404,7 +401,5 @@ def test_where_a_board_sits_is_no_knowledge_of_the_machine():
     places = np.flatnonzero(rows.any(axis=0)) - problem.unknowns.mounts.start
     assert places.tolist() == [3, 4, 5]
     estimate = estimated(machine, case, rng)
-    values = identifiability(
-        linearize_at_solution(case.measurements, estimate)[1], estimate.machine
-    )
+    values = identifiability(estimate.linearized.info, estimate.machine)
     assert values.rank + len(values.unidentified) == values.n_parameters - values.n_frames

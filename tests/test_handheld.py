@@ -307,7 +307,7 @@ def at_truth(monkeypatch, folder, off=2e-3):
     def place(session, images, boards, _rng, _told):
         truth = load_truth(folder, session.machine).T_camera_base
         near = perturb(truth, off * rng.normal(size=(len(truth), 6)))
-        scene = PriorScene.as_drawn(session.machine, near, session.joints)
+        scene = PriorScene.as_drawn(session, near)
         return Case(session, images, boards, scene)
 
     monkeypatch.setattr("pkmcal.calibration.calibrate.localize_case", place)
@@ -666,7 +666,7 @@ def test_a_image_in_a_wrong_place_is_found_out(breathed):
         2: CAMERA_TURNED_REASON
     }
     images = read_images(session)
-    scene = PriorScene.as_drawn(session.machine, T, session.joints)
+    scene = PriorScene.as_drawn(session, T)
     case = Case(session, images, Boards(), scene)
     rest = without_misplaced(case, wrong, edges, estimate)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]

@@ -15,11 +15,11 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import Information, identifiability
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, freedoms, generators, in_gauge
 from pkmcal.identify.start import start_state
+from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import explain, observed_legs
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
@@ -78,7 +78,7 @@ def verdict(measurements, value):
     observed = observed_legs(
         measurements.edges, value.edge_weights, measurements.n_stations, value.machine.n_legs
     )
-    values = identifiability(linearize_at_solution(measurements, value)[1], value.machine)
+    values = identifiability(value.linearized.info, value.machine)
     return judge(observation, value, explain(values, value, observed))
 
 

@@ -11,7 +11,6 @@ from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import Information, machine_covariance
-from pkmcal.identify.estimate import estimated_unknowns
 from pkmcal.identify.gauge import (
     BestFit,
     ThreeCentres,
@@ -25,6 +24,7 @@ from pkmcal.identify.gauge import (
     station_generators,
     transformation,
 )
+from pkmcal.identify.state import estimated_unknowns
 from pkmcal.mechanisms.closure import closure
 from test_identify_scene import make_scene
 

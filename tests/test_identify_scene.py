@@ -13,8 +13,8 @@ import numpy as np
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.identify.assembly import Assembled, assemble
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.measurements.effects import EDGE_SHIFT, SHADING

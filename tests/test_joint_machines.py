@@ -11,9 +11,9 @@ from pkmcal.cameras import camera_models
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.start import start_state
+from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements, Mount, PoseSet
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.simulation import EdgeNoise, Settings, draw_truth, simulate_edges

@@ -21,8 +21,9 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import Information
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.score import FALSE_ALARM, ScoreTests, columns_of
+from pkmcal.identify.score import ScoreTests, columns_of
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Column, EdgeSet, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
@@ -100,7 +101,7 @@ def plays(data):
 def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate():
     nominal, data, where = measured(1, scale=(2, 2e-3))
     estimate, tests = score_tests(nominal, data, where, scales(data), False)
-    value = tests.tests_beyond(FALSE_ALARM)
+    value = tests.significant()
     assert value[0][0] == 2
     fit = tests.fitted([2])[0]
     assert abs(fit.value[0] - 2e-3) < 4 * fit.sigma[0]
@@ -125,7 +126,7 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
     nominal = load_mechanism("gough-stewart")
     nominal, data, where = measured(1, scale=(2, 1e-2), machine=nominal)
     estimate, tests = score_tests(nominal, data, where, scales(data), False)
-    assert tests.tests_beyond(FALSE_ALARM)[0][0] == 2
+    assert tests.significant()[0][0] == 2
     fit = tests.fitted([2])[0]
     row = nominal.parameters.index("legs[3].scale")
     present = estimate.machine.values[row]
@@ -138,12 +139,12 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
 def test_play_and_a_pushed_camera_are_told_from_each_other():
     nominal, data, where = measured(2, play=(4, 4e-4))
     _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
-    assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == [6 + 4]
+    assert [k for k, _ in tests.significant()] == [6 + 4]
     assert tests.fitted([10])[0].value[0] == pytest.approx(4e-4, rel=0.2)
     step = np.array([0.0, 0.0, 0.0, 6e-4, -5e-4, 4e-4])
     nominal, data, where = measured(3, turned=step)
     _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
-    assert [k for k, _ in tests.tests_beyond(FALSE_ALARM)] == [12]
+    assert [k for k, _ in tests.significant()] == [12]
     fit = tests.fitted([12])[0]
     off = fit.value - step
     assert np.all(np.abs(off) < 4 * fit.sigma + 0.05 * np.abs(step))
@@ -152,7 +153,7 @@ def test_play_and_a_pushed_camera_are_told_from_each_other():
 def test_two_departures_are_found_one_after_the_other():
     nominal, data, where = measured(4, scale=(0, 4e-3), play=(3, 5e-4))
     _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
-    assert {k for k, _ in tests.tests_beyond(FALSE_ALARM)} == {0, 6 + 3}
+    assert {k for k, _ in tests.significant()} == {0, 6 + 3}
     one, other = tests.fitted([0, 9])
     assert one.value[0] == pytest.approx(4e-3, rel=0.3)
     assert other.value[0] == pytest.approx(5e-4, rel=0.3)
@@ -161,7 +162,7 @@ def test_two_departures_are_found_one_after_the_other():
 def test_nothing_is_found_twice():
     nominal, data, where = measured(7, scale=(1, 6e-3))
     _, tests = score_tests(nominal, data, where, scales(data)[1:3], False, [0, 1])
-    results = [k for k, _ in tests.tests_beyond(FALSE_ALARM)]
+    results = [k for k, _ in tests.significant()]
     assert results[0] == 0
     assert len(results) == len(set(results))
 
@@ -231,7 +232,7 @@ def false_alarms(seeds):
 
 def test_right_sessions_have_chances_like_dice():
     chances = false_alarms(range(100, 112))
-    assert chances.min() > FALSE_ALARM / chances.shape[1] / 10
+    assert chances.min() > SESSION_FALSE_ALARM.level / chances.shape[1] / 10
     assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
 
 
@@ -248,8 +249,8 @@ def test_errors_of_whole_configurations_are_no_departure():
         data = replace(data, joints=wrong)
         _, tests = score_tests(nominal, data, where, scales(data)[2:3], False)
         named += (
-            tests.scores()[0].adjusted < FALSE_ALARM,
-            len(tests.tests_beyond(FALSE_ALARM)),
+            tests.scores()[0].adjusted < SESSION_FALSE_ALARM.level,
+            len(tests.significant()),
         )
         assert tests.fitted([0])[0].sigma[0] > 3e-4  # 5e-3 of twenty, as far as edges see it
     assert named[0] >= 3
@@ -260,7 +261,7 @@ def test_errors_of_whole_configurations_are_no_departure():
 def test_right_sessions_have_chances_like_dice_often():
     chances = false_alarms(range(500))
     count = chances.shape[1]
-    alarms = np.mean(chances.min(axis=1) < FALSE_ALARM / count)
+    alarms = np.mean(chances.min(axis=1) < SESSION_FALSE_ALARM.level / count)
     assert alarms < 0.015
     assert abs(np.mean(chances < 0.1) - 0.1) < 0.02
 
@@ -273,7 +274,7 @@ def test_what_no_data_see_is_not_tested():
     offset[:, 1] = 1.0
     _, tests = score_tests(nominal, data, where, [nothing, offset], False)
     assert [score.dof for score in tests.scores()] == [0, 1]
-    assert tests.tests_beyond(FALSE_ALARM) == []
+    assert tests.significant() == []
     none, some = tests.fitted([0, 1])
     assert none.sigma[0] == np.inf
     offsets = np.flatnonzero(nominal.parameters.of_kind("offset"))

@@ -15,7 +15,7 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.kinds import LINK_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.noise import (
     LEAST_NOISE_FREEDOM,
-    NOISE_CONTRADICTION_CHANCE,
+    NOISE,
     NoiseShares,
     components,
     noise_shares,
@@ -96,7 +96,7 @@ def test_intervals_hold_the_truth_as_often_as_they_state(configurations, true):
     share, low, _ = coverage(configurations, true, 0.05, 400)
     assert share > 0.92
     assert share < (0.98 if low > 0.5 else 1.0)
-    assert coverage(configurations, true, NOISE_CONTRADICTION_CHANCE, 400)[0] > 0.985
+    assert coverage(configurations, true, NOISE.contradiction_chance, 400)[0] > 0.985
 
 
 def test_noise_of_edges_that_poses_take_up_is_not_that_of_readings():

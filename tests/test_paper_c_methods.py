@@ -167,7 +167,7 @@ def test_whitened_rows_have_unit_variance():
 
 def replace_start(machine, truth):
     """State with the true poses of camera and board, to evaluate rows, not to estimate."""
-    from pkmcal.identify.estimate import State
+    from pkmcal.identify.state import State
 
     return State(
         machine.parameters.nominal,

@@ -17,7 +17,7 @@ from document_keys import assert_keys
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.covariance import machine_covariance
 from pkmcal.identify.gauge import default_gauge
@@ -82,7 +82,7 @@ def stated_by(rig, measurements, work):
     if rig.T_mount is not None and len(rig.mounts):
         start = replace(start, T_mount=rig.T_mount)
     estimate = bundle(machine, measurements, start, scale_noise=False)
-    assembled, info = linearize_at_solution(measurements, estimate)
+    assembled, info = estimate.linearized
     gauge = default_gauge(machine)
     by_itself = machine_covariance(
         assembled.problem, machine, estimate.state, info.covariance[0], gauge

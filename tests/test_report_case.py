@@ -10,11 +10,14 @@ from pkmcal.calibration.calibrate import Calibration
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.cylinders import contour_point, edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import look_at, perturb
+from pkmcal.identify.assembly import Assembled, assemble
 from pkmcal.identify.covariance import Identifiability
-from pkmcal.identify.estimate import Estimate, State, Statistics
+from pkmcal.identify.estimate import Estimate, Statistics
+from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.scatter import EdgeScatter
+from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import Findings
-from pkmcal.measurements import EdgeSet, Observation, Rejection
+from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
@@ -145,6 +148,13 @@ def make_session(folder, nominal, joints, T, station, prefix) -> Session:
     )
 
 
+def no_problem(machine) -> Assembled:
+    """The problem of a machine without measurements."""
+    none = np.zeros(0, dtype=int)
+    measurements = Measurements(EdgeSet.empty(), machine.joint_ranges[:, :1].T, 3e-6, 0, none)
+    return assemble(machine, measurements, default_gauge(machine))
+
+
 def make_estimate(machine, poses, T, edges, rng) -> Estimate:
     n, count, k = len(machine.parameters), len(edges), len(poses)
     sigma = np.full(n, 4e-5)
@@ -168,4 +178,5 @@ def make_estimate(machine, poses, T, edges, rng) -> Estimate:
         configurations=np.ones(k, bool),
         statistics=Statistics(900.0, 1000.0, 800.0, 960, 60.0, 30, 40.0, 54, 7, "converged", 1.25),
         gauge="three centres: legs 1, 3, 5",
+        problem=no_problem(machine),
     )

@@ -19,7 +19,7 @@ from pkmcal.report.identifiability import (
     spectrum,
     tied,
 )
-from test_report_case import make_case, report_html
+from test_report_case import make_case, no_problem, report_html
 from test_report_page import Found
 from test_words import heaved, make, told_of
 
@@ -43,7 +43,7 @@ def make_estimate_stub():
     empty = load_mechanism("gough-stewart")
     return Estimate(
         empty, make("gough-stewart", n=1).state(), none, none, none, none,
-        EdgeScatter(none, none, none), none, none, none, none, statistics, "",
+        EdgeScatter(none, none, none), none, none, none, none, statistics, "", no_problem(empty),
     )  # fmt: skip
 
 

@@ -12,8 +12,8 @@ from pkmcal.calibration.toolmap import map_of
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, laid_over
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres, in_gauge
+from pkmcal.identify.state import State
 from pkmcal.identify.tool import tool_error
 from pkmcal.judge.machine_errors import compare
 from pkmcal.mechanisms import catalogue, load_mechanism

@@ -9,12 +9,12 @@ import pytest
 
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, explain, observed_legs
-from pkmcal.identify.verdict import NOMINAL_ERROR_SHARE, UNIDENTIFIABLE, judge, no_gain
+from pkmcal.identify.verdict import VERDICT, judge, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.conditions import conditions
@@ -36,7 +36,7 @@ def judged(scene, *views):
     observation = Observation(
         edges, (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
-    values = identifiability(linearize_at_solution(measurements, estimate)[1], estimate.machine)
+    values = identifiability(estimate.linearized.info, estimate.machine)
     observed = observed_legs(edges, estimate.edge_weights, measurements.n_stations, machine.n_legs)
     findings = explain(values, estimate, observed, conditions(machine, observed))
     return observation, estimate, findings, judge(observation, estimate, findings)
@@ -126,7 +126,7 @@ def sentence(moves, *names, matters=True):
 
 def test_the_share_of_the_drawings_error_decides(whole):
     observation, estimate, findings, _ = whole
-    least = UNIDENTIFIABLE * findings.by_nominal
+    least = VERDICT.undetermined_share * findings.by_nominal
 
     def verdict(*open_):
         return judge(observation, estimate, replace(findings, unidentified=open_))
@@ -147,7 +147,7 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
     it.
     """
     observation, estimate, findings, _ = whole
-    open_ = (sentence(2 * UNIDENTIFIABLE * findings.by_nominal),)
+    open_ = (sentence(2 * VERDICT.undetermined_share * findings.by_nominal),)
     findings = replace(findings, unidentified=open_)
     assert not judge(observation, estimate, findings).usable
     unsure = replace(estimate, joint_covariance=1e3 * estimate.joint_covariance)
@@ -159,7 +159,7 @@ def test_a_result_that_is_no_gain_is_refused(whole):
     observation, estimate, findings, _ = whole
     sigma = platform_sigma(estimate)
     for share, usable in ((0.9, True), (1.1, False)):
-        factor = share * NOMINAL_ERROR_SHARE * findings.by_nominal / sigma
+        factor = share * VERDICT.nominal_error_share * findings.by_nominal / sigma
         unsure = replace(estimate, joint_covariance=factor**2 * estimate.joint_covariance)
         value = judge(observation, unsure, findings)
         assert value.usable == usable

@@ -56,8 +56,8 @@ from pkmcal.calibration.summary import CalibrationSummary, Overview
 from pkmcal.calibration.tube_radii import check_radii
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, quoted, resolved
-from pkmcal.identify.bundle import bundle, linearize_at_solution
-from pkmcal.identify.covariance import Information, identifiability
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
@@ -258,12 +258,12 @@ def calibrate_measurements(
     from where the estimate starts. Raises ResultError where there is no estimate.
     """
     clock = Clock(progress)
-    start = start_state(session.machine, measurements, T_camera_base)
+    start = start_state(session.machine, measurements, T_camera_base, session.forward)
     estimate = bundle(session.machine, measurements, start)
     turns = RefinementResult(
         observation, measurements, estimate, refinement_of(session, False), start=start
     )
-    scene = PriorScene.as_drawn(session.machine, T_camera_base, session.joints)
+    scene = PriorScene.as_drawn(session, T_camera_base)
     case = Case(session, [], Boards(), scene)
     return _judge(case, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
 
@@ -455,17 +455,16 @@ def _judge(
     """
     clock.progress("Judging", 0.95)
     session, turns = _as_measured(case.session, value.turns), value.turns
-    ended = linearize_at_solution(turns.measurements, value.estimate)
     detections: tuple[DetectedViolation, ...] = ()
     errors: tuple[ModelError, ...] = ()
     uneven: tuple[Column, ...] = ()
     without = value.estimate
     if method == "bundle":  # the papers' methods end at no minimum of the joint problem
         detections, errors, estimate, uneven = model_violations(
-            session, turns.observation, turns.measurements, value.estimate, ended
+            session, turns.observation, turns.measurements, value.estimate
         )
         value = value._replace(estimate=estimate)
-    findings = _findings(turns.measurements, without, ended[1], uneven)
+    findings = _findings(turns.measurements, without, uneven)
     others = (
         *_findings_of_estimate(session, value, findings, detections, errors, method == "bundle"),
         *numbering_note(session),
@@ -554,11 +553,11 @@ def _findings_of_estimate(
 
 
 def _findings(
-    measurements: Measurements, estimate: Estimate, info: Information, uneven: tuple[Column, ...]
+    measurements: Measurements, estimate: Estimate, uneven: tuple[Column, ...]
 ) -> Findings:
     """Identifiability of the machine's parameters, in words, and the papers' conditions.
 
-    info : linearized problem at the estimate. uneven : the model discrepancy, which bends a bed.
+    uneven : the model discrepancy, which bends a bed.
     """
     observed = observed_legs(
         measurements.edges,
@@ -568,13 +567,13 @@ def _findings(
     )
     if not len(measurements.edges):  # of no leg can be said that it was not seen
         observed = np.ones_like(observed)
-    values = identifiability(info, estimate.machine)
+    values = identifiability(estimate.linearized.info, estimate.machine)
     counted = conditions(estimate.machine, observed) if len(measurements.edges) else ()
     bed: Bed | None = None
     if only_heights(estimate):
         from pkmcal.identify.bed import bed_of
 
-        bed = bed_of(measurements, estimate, uneven)
+        bed = bed_of(estimate, uneven)
     return explain(values, estimate, observed_by_boards(observed, measurements), counted, bed)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, evenly
 from pkmcal.cameras.response import OTHER_RESPONSE, Response
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import ScoreTests
 from pkmcal.identify.verdict import POLISHED_SHADING
@@ -224,7 +224,7 @@ def _scored(
     effects = [Column("camera.response", edges=turn) for turn in turns]
     if not effects:
         return {}, {}
-    tests = ScoreTests(*linearize_at_solution(measurements, estimate), effects)
+    tests = ScoreTests(*estimate.linearized, effects)
     gains = [score.chi2 for score in tests.scores()]
     deviations = [float(freed.sigma[0]) for freed in tests.fitted(range(len(effects)))]
     return dict(zip(other, gains, strict=True)), dict(zip(other, deviations, strict=True))

@@ -36,12 +36,12 @@ class PriorScene(NamedTuple):
     findings: tuple[Finding, ...] = ()
 
     @classmethod
-    def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> PriorScene:
-        """Scene of the nominal model at the joint readings.
+    def as_drawn(cls, session: Session, T_camera_base: Array) -> PriorScene:
+        """Scene of the nominal model at the session's readings.
 
         Where the nominal model does not close exactly, the nearest platform pose is used.
         """
-        return cls(machine, T_camera_base, machine.forward_result(joints).T_base_platform)
+        return cls(session.machine, T_camera_base, session.forward.T_base_platform)
 
 
 class Case(NamedTuple):

@@ -25,7 +25,6 @@ from pkmcal.identify.discrepancy import Component, Discrepancy
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
-from pkmcal.identify.problem import Problem
 from pkmcal.identify.score import prior_root
 from pkmcal.identify.tool import ToolError
 from pkmcal.identify.unidentified import only_heights
@@ -334,10 +333,11 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
     yield Component(Column("legs.shape", edges=effect), (np.eye(effect.shape[-1]),))
 
 
-def with_discrepancy(estimate: Estimate, problem: Problem, discrepancy: Discrepancy) -> Estimate:
-    """The estimate whose covariances contain the discrepancy; problem : as the estimate ended."""
+def with_discrepancy(estimate: Estimate, discrepancy: Discrepancy) -> Estimate:
+    """The estimate whose covariances contain the discrepancy."""
     if not discrepancy.scales:
         return estimate
+    problem = estimate.problem.problem
     machine, shared, u = estimate.machine, discrepancy.shared, problem.unknowns
     gauge = default_gauge(machine)
     more = machine_covariance(problem, machine, estimate.state, shared, gauge)

@@ -115,7 +115,7 @@ def localize(
     places: dict[int, PoseHypotheses] = {}
     if search.error is not None:
         return Localization(search.recognition, places, search.error)
-    scene = PriorScene.as_drawn(session.machine, search.T_camera_base, session.joints)
+    scene = PriorScene.as_drawn(session, search.T_camera_base)
     # hand-held images, and the reasons of those without a pose or with a contradictory one
     lost: dict[int, str] = {}
     if len(fixed) < len(images):

@@ -21,7 +21,6 @@ from pkmcal.calibration.refinement import RefinementResult
 from pkmcal.cameras import Camera
 from pkmcal.cameras.contract import CENTER
 from pkmcal.cameras.files import written_camera
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.score import ScoreTests
 from pkmcal.measurements import Column
 from pkmcal.outcome.finding import Finding, doubtful, note
@@ -90,9 +89,7 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, 
         changed.of_stations(Column("image.turn"), entries == entry, attempt[:, None])
         for entry, attempt in ways.items()
     ]
-    fits = ScoreTests(*linearize_at_solution(turns.measurements, turns.estimate), effects).fitted(
-        range(len(effects))
-    )
+    fits = ScoreTests(*turns.estimate.linearized, effects).fitted(range(len(effects)))
     out = list[UpsideDown]()
     for file, camera in dict(cameras.values()).items():
         own = [k for k, (mine, _) in enumerate(cameras.values()) if mine == file]

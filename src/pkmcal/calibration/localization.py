@@ -15,6 +15,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
 from pkmcal.measurements.contract import LinkKind, kinds_of
+from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.hypotheses import SuspectStation, mistake
@@ -101,7 +102,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     that names the configurations without a pose.
     """
     try:
-        fk = session.machine.forward_result(session.joints)
+        fk = session.forward
     except GeometryError as error:  # the nominal model is the user's: it is at fault
         raise error.as_input(session.document["mechanism"]) from None
     # near the ends of its workspace a nominal model that is right to its tolerance may not close
@@ -128,10 +129,10 @@ def _check_columns(session: Session, bad: list[str]) -> None:
     if error := frozen_in(session):
         raise error
     machine = session.machine
-    now = _taken(session, session.joints)
+    now = _taken(session, session.forward)
     for column, name in enumerate(session.document["joints"]["columns"]):
         turned = session.joints * np.where(np.arange(machine.n_joints) == column, -1.0, 1.0)
-        if _taken(session, turned) > max(ALMOST_ALL, now):
+        if _taken(session, machine.forward_result(turned)) > max(ALMOST_ALL, now):
             raise InputError(
                 f"the readings of {name} have the wrong sign",
                 where=f"{session.document['joints']['file']}, column {name}",
@@ -142,9 +143,8 @@ def _check_columns(session: Session, bad: list[str]) -> None:
             )
 
 
-def _taken(session: Session, joints: Array) -> float:
-    """Share of the readings (K, m) that the nominal machine can take."""
-    fk = session.machine.forward_result(joints)
+def _taken(session: Session, fk: ForwardResult) -> float:
+    """Share of readings that the nominal machine can take, by its forward kinematics there."""
     turn = _turn(fk.T_base_platform)
     return float(np.mean(fk.converged & ~(np.abs(turn) > session.machine.most_turn[0])))
 
@@ -431,7 +431,7 @@ def _tracker_starts(session: Session) -> list[Array | None]:
     if not session.trackers and not session.links:
         return []
     try:
-        fk = session.machine.forward_result(session.joints)
+        fk = session.forward
     except GeometryError:
         return [None] * len(session.trackers)
     poses = np.where(fk.converged[:, None, None], fk.T_base_platform, np.nan)

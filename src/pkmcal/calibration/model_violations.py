@@ -1,8 +1,8 @@
 """Model violations of a session: readings, cameras, boards, stations, tubes.
 
 Each violation is a column (:mod:`pkmcal.measurements.columns`) that is made beside its subject,
-with its derivatives and the facts of its finding. Here all of them are score-tested at one
-false-alarm level (:mod:`pkmcal.identify.score`).
+with its derivatives and the facts of its finding. Here all of them are score-tested at the
+false-alarm level of the session (:mod:`pkmcal.identify.score`).
 """
 
 from __future__ import annotations
@@ -25,13 +25,10 @@ from pkmcal.calibration.discrepancy_basis import (
     with_discrepancy,
 )
 from pkmcal.calibration.tube_outlines import Outline, outlines
-from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.covariance import Information
 from pkmcal.identify.discrepancy import discrepancy_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import (
-    FALSE_ALARM,
     MOST_VIOLATIONS_SOUGHT,
     OneStepUpdate,
     Score,
@@ -118,14 +115,13 @@ def model_violations(
     observation: Observation,
     measurements: Measurements,
     estimate: Estimate,
-    ended: tuple[Assembled, Information],
 ) -> ModelViolations:
     """Deviations of the data from the model, with and without names.
 
     A violation is named only if it explains more than the discrepancy does: those that are detected
-    first are tested once more beside the discrepancy. ended : the estimate's problem at its end,
-    :func:`pkmcal.identify.bundle.linearize_at_solution`.
+    first are tested once more beside the discrepancy.
     """
+    ended = estimate.linearized
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     families = [list(family(session, observation, measurements, estimate)) for family in TESTED]
     tubes = list(islice(outlines(session, measurements, estimate), MOST_VIOLATIONS_SOUGHT))
@@ -136,7 +132,7 @@ def model_violations(
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
     reference_values = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
-    in_view = np.flatnonzero(ended[0].observed)
+    in_view = np.flatnonzero(estimate.configurations)
 
     def declared(k: int) -> Column:
         if k < len(listed):
@@ -156,7 +152,7 @@ def model_violations(
             beside=beside,
             variance=1 + measurements.imputation_covariance,
         )
-        value = tests.tests_beyond(FALSE_ALARM, [k for k, _ in reference_values])
+        value = tests.significant([k for k, _ in reference_values])
         return tests, [*value, *reference_values]
 
     tests, value = tested(())
@@ -170,7 +166,7 @@ def model_violations(
     if discrepancy.scales and value:
         tests, value = tested(discrepancy.random)
     before = tool_of(session, estimate)
-    estimate = with_discrepancy(estimate, ended[1].problem, discrepancy)
+    estimate = with_discrepancy(estimate, discrepancy)
     tool = tool_of(session, estimate) if discrepancy.scales else before
     surface = None
     if any(one.code == UNEVEN_BED for one in discrepancy.scales):

@@ -15,7 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import FALSE_ALARM
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.outcome.finding import Finding, doubtful
@@ -53,7 +53,7 @@ def outlier_explanations(
     if usual > MOST_USUAL_MISFIT**2:
         return
     noise = usual * noise
-    odd = _chance(m, chi2 / usual) < FALSE_ALARM / len(which)
+    odd = _chance(m, chi2 / usual) < SESSION_FALSE_ALARM.of_test(len(which))
     odd = np.flatnonzero(odd & (estimate.pose_weights[which] < 0.5))
     # rows of the table that say what the machine did in each odd one, (n, K)
     every = np.broadcast_to(poses[odd, None], (len(odd), len(joints), 4, 4)).reshape(-1, 4, 4)

@@ -27,8 +27,9 @@ from pkmcal.calibration.localization import frozen_in
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import middle_pose, start_state
+from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import identified, only_heights
 from pkmcal.identify.verdict import RicherModel
 from pkmcal.measurements import Measurements

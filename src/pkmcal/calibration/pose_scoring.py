@@ -103,9 +103,7 @@ def register_images(
         near = {k: updated_scene.T_camera_base[k] for k in near}
         n_passes -= 1
         if not n_passes:
-            return updated_scene._replace(
-                prior=marginalize_to_machine(last.measurements, last.estimate)
-            )
+            return updated_scene._replace(prior=marginalize_to_machine(last.estimate))
 
 
 def evaluate_pose(

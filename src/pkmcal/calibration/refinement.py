@@ -25,13 +25,14 @@ from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.localization import CalibrationProgress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.assembly import state_of
-from pkmcal.identify.bundle import bundle, linearize_at_solution
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.confirmation import rejected_units
 from pkmcal.identify.covariance import covariance_by_noise, machine_covariance
-from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import edge_misfit, start_state
+from pkmcal.identify.state import State
 from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import (
     EdgeSet,
@@ -213,7 +214,7 @@ def refine_alternating(
         last = turn + 1 >= MOST_MEASUREMENT_PASSES
         if usual or last:
             away = (estimate.state.theta - before.state.theta)[None]
-            change = float(np.sqrt(_variance(away, measurements, estimate)))
+            change = float(np.sqrt(_variance(away, estimate)))
             if change < (SETTLED_MACHINE_CHANGE if last else SETTLED_AT_ONCE):
                 finer = _binned(session, images, blur, more=False)
                 if not finer or turn + 1 == MOST_BAD_PASSES:
@@ -246,7 +247,7 @@ def imputation_variance(
         return turns
     offsets: list[Array] = []
     failures: list[str] = []
-    for number, drawn in enumerate(_as_likely(session, turns.measurements, estimate, rng)):
+    for number, drawn in enumerate(_as_likely(session, estimate, rng)):
         progress(f"Looking by a machine as likely: {number + 1} of {IMPUTATION_PASSES}", 0.87)
         cameras = turns.cameras.updated(drawn)
         images = [replace(p, camera=cameras.at_station(p.station)) for p in turns.images]
@@ -263,21 +264,19 @@ def imputation_variance(
     variance = 1.0  # as much again as noise, where hardly a look ends
     if len(offsets) > 1:
         apart = np.stack(offsets) - np.mean(offsets, axis=0)
-        variance = (
-            _variance(apart, turns.measurements, estimate) * len(offsets) / (len(offsets) - 1)
-        )
+        variance = _variance(apart, estimate) * len(offsets) / (len(offsets) - 1)
     measurements = replace(turns.measurements, imputation_covariance=variance)
     again = bundle(session.machine, measurements, turns.start)
     return turns._replace(measurements=measurements, estimate=again, failures=tuple(failures))
 
 
 def _as_likely(
-    session: Session, measurements: Measurements, estimate: Estimate, rng: np.random.Generator
+    session: Session, estimate: Estimate, rng: np.random.Generator
 ) -> Iterator[Estimate]:
     """Estimates as likely as one, in pairs to both sides of it: machine, stations, cameras, and
     platforms as the readings then have them.
     """
-    assembled, info = linearize_at_solution(measurements, estimate)
+    assembled, info = estimate.linearized
     problem, half = info.problem, info.root[0]
     still = np.zeros((1, assembled.observed.sum(), problem.layout.own_motion.shape[1]))
     for step in rng.normal(size=(IMPUTATION_PASSES // 2, half.shape[1])) @ half.T:
@@ -294,12 +293,12 @@ def _as_likely(
             yield replace(estimate, machine=other, state=there)
 
 
-def _variance(changes: Array, measurements: Measurements, estimate: Estimate) -> float:
+def _variance(changes: Array, estimate: Estimate) -> float:
     """Mean square of changes (N, P) of the machine's parameters, in the variance that the noise
     gives them.
     """
     machine, n = estimate.machine, len(estimate.machine.values)
-    info = linearize_at_solution(measurements, estimate)[1]
+    info = estimate.linearized.info
     shared = covariance_by_noise(info)[0]
     gauge = default_gauge(machine)
     noise = machine_covariance(info.problem, machine, estimate.state, shared, gauge)[:n, :n]
@@ -454,9 +453,8 @@ def identify_poses(
     progress("Identifying", 0.6)
     machine = session.machine
     measurements = measurements_of(session, boards, None, cameras)
-    start = _feasible_start(
-        session, measurements, start_state(machine, measurements, T_camera_base)
-    )
+    start = start_state(machine, measurements, T_camera_base, session.forward)
+    start = _feasible_start(session, measurements, start)
     estimate = bundle(machine, measurements, start)
     for turn in range(1, MOST_MEASUREMENT_PASSES if cameras.active else 1):
         progress("Identifying with the cameras", 0.6 + 0.3 * turn / MOST_MEASUREMENT_PASSES)
@@ -473,7 +471,7 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
 
     Raises `InputError` for readings that the machine so found cannot take either.
     """
-    drawn = session.machine.forward_result(session.joints).converged
+    drawn = session.forward.converged
     if drawn.all():
         return start
     poses = measurements.poses
@@ -502,11 +500,16 @@ def _first_estimate(
     first look has put them.
     """
     session, images, boards, reference_values = case
+    begin = partial(
+        start_state,
+        reference_values.machine,
+        T_camera_base_guess=reference_values.T_camera_base,
+        forward=session.forward if reference_values.machine is session.machine else None,
+    )
     if all(p.station in reference_values.edges for p in images):
         placed = of_stations({p.station: reference_values.edges[p.station] for p in images})
         measurements = measurements_of(session, boards, placed)
-        start = start_state(reference_values.machine, measurements, reference_values.T_camera_base)
-        return bundle(session.machine, measurements, start)
+        return bundle(session.machine, measurements, begin(measurements))
     start: State | None = None
     for text, reach, share in (
         ("Finding the legs", legs.LEG_SEARCH_REACH, 0.35),
@@ -517,9 +520,7 @@ def _first_estimate(
         passes = _search_pass(images, search)
         measurements = measurements_of(session, boards, _edges(passes))
         lap("observe")
-        start = start or start_state(
-            reference_values.machine, measurements, reference_values.T_camera_base
-        )
+        start = start or begin(measurements)
         estimate = bundle(session.machine, measurements, start)
         lap("identify")
         if _share_agreeing(passes, measurements.edges, estimate) > NEARLY_ALL:

@@ -16,8 +16,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.line_shading import SHADING_FREEDOM
-from pkmcal.identify.score import FALSE_ALARM, Score
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
+from pkmcal.identify.line_shading import LINE_SHADING
+from pkmcal.identify.score import Score
 from pkmcal.measurements import Column, Measurements
 from pkmcal.measurements.effects import EDGE_SHIFT, lines
 from pkmcal.observe.predict import legs_in_camera
@@ -42,8 +43,16 @@ class Outline(NamedTuple):
     sigma: float
 
 
-def outlines(session: Session, measurements: Measurements, estimate: Estimate) -> Iterator[Outline]:
-    """Tubes of another radius than drawn, then single lines that are off, the surest first."""
+def outlines(
+    session: Session,
+    measurements: Measurements,
+    estimate: Estimate,
+    false_alarm: FalseAlarm = SESSION_FALSE_ALARM,
+) -> Iterator[Outline]:
+    """Tubes of another radius than drawn, then single lines that are off, the surest first.
+
+    Tubes and lines have half of the search's level each.
+    """
     from scipy.special import ndtr, stdtr
 
     keys, number = lines(measurements)
@@ -69,12 +78,12 @@ def outlines(session: Session, measurements: Measurements, estimate: Estimate) -
         scale = float(np.hypot(own, edge * np.median(size[mine])))
         z = float(abs(value) / np.hypot(scale, table.tolerance[radius]))
         chance = float(2 * ndtr(-z))
-        score = Score(z**2, 1, chance, min(2 * len(tubes) * chance, 1.0))
+        score = Score(z**2, 1, chance, float(false_alarm.adjusted(chance, 2 * len(tubes))))
         # as told: lines of one tube can be as unlike as its light and what covers it
         spread = OF_MEDIAN * OF_MIDDLE * np.median(np.abs(each - value)) / np.sqrt(len(mine))
         results.append((score, mine, value, float(max(scale, spread))))
     thick = sorted(
-        (one for one in results if one[0].adjusted < FALSE_ALARM), key=lambda x: x[0].chance
+        (one for one in results if one[0].adjusted < false_alarm.level), key=lambda x: x[0].chance
     )
     outlined: list[int] = []
     for score, mine, value, scale in thick:
@@ -85,10 +94,12 @@ def outlines(session: Session, measurements: Measurements, estimate: Estimate) -
         column = Column("tube.radius", name, "tube radius", edges=by, edge_rows=own, facts=facts)
         yield Outline(column, score, value, scale)
     z = np.abs(shift) / sigma
-    chance = np.where(np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(SHADING_FREEDOM, -z))
+    chance = np.where(
+        np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(LINE_SHADING.freedom, -z)
+    )
     for k in np.argsort(chance, kind="stable").tolist():
-        adjusted = 2 * len(keys) * float(chance[k])
-        if adjusted > FALSE_ALARM:
+        adjusted = float(false_alarm.adjusted(chance[k], 2 * len(keys)))
+        if adjusted > false_alarm.level:
             break
         score = Score(float(z[k] ** 2), 1, float(chance[k]), adjusted)
         j, t, of = int(leg[k]), int(tube[k]), session.station_names[station[k]]

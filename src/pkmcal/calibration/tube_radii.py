@@ -20,7 +20,7 @@ from pkmcal.calibration.handheld import localize_case
 from pkmcal.calibration.refinement import refine_alternating
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.verdict import TOO_NOISY
+from pkmcal.identify.verdict import VERDICT
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.document import Leg
 from pkmcal.mechanisms.machine import machine_from_document
@@ -28,8 +28,8 @@ from pkmcal.observe.hypotheses import diameters
 from pkmcal.outcome.finding import Finding, note
 
 SUSPECT_NOISE_SHARE = 0.5
-"""Part of TOO_NOISY by which edges have to scatter for other radii to be tried, and below which
-these explain the edges."""
+"""Part of ``VerdictOptions.too_noisy`` by which edges have to scatter for other radii to be tried,
+and below which these explain the edges."""
 
 
 def check_radii(
@@ -42,7 +42,7 @@ def check_radii(
     chance matches, which agree with anything. refine_camera : whether the cameras were estimated.
     seed : for the localization of the stations.
     """
-    agree = SUSPECT_NOISE_SHARE * TOO_NOISY
+    agree = SUSPECT_NOISE_SHARE * VERDICT.too_noisy
     bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
     if not bad or not case.images:
         return ()

@@ -45,7 +45,6 @@ from pkmcal.check.sentences import (
 )
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
@@ -210,8 +209,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematic
     there.
     """
     try:
-        poses = platform_poses(session, most=not legs_stations(session))
-        fk = session.machine.forward_result(session.joints, poses)
+        poses, fk = platform_poses(session, most=not legs_stations(session)), session.forward
         first = session.joints[0]
         # an overdetermined machine does not close at readings with errors
         if session.machine.layout.overdetermined:
@@ -509,7 +507,6 @@ def _height_findings(settled: Settled) -> list[Finding]:
         fit.observation,
         fit.measurements,
         fit.estimate,
-        linearize_at_solution(fit.measurements, fit.estimate),
     )
     return [
         *(replace(one.finding, level=Level.DOUBTFUL) for one in tested.violations),

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.arrays import Array, rms
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
+from pkmcal.identify.state import State
 from pkmcal.judge.machine_errors import compare as machine_errors
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation import Truth, load_truth

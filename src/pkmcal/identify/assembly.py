@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -9,11 +10,11 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.link_rows import LinkBlocks, LinkData
 from pkmcal.identify.places import Places
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.measurements import SHADING_SIGMA, Column, Measurements
 from pkmcal.measurements.edges import EdgeBlocks, EdgeData
@@ -70,6 +71,9 @@ def assemble(
     _check(machine, measurements)
     observed = observed_configurations(measurements)
     columns = _unknown_columns(measurements)
+    codes = Counter[str]()
+    for column in columns:
+        codes[column.code] += column.count
     edges = _places(measurements.edges.configuration, observed, measurements.edges.leg)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     one = np.zeros(len(measurements.poses), dtype=int)
@@ -78,7 +82,7 @@ def assemble(
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
-        codes=_codes(columns),
+        codes=tuple(codes.items()),
         n_mounts=len(measurements.mounts),
         n_linked=len(link_blocks.linked) * machine.layout.own_motion.shape[1],
     )
@@ -190,39 +194,34 @@ def _unknown_columns(measurements: Measurements) -> list[Column]:
     return columns
 
 
-def _codes(columns: Sequence[Column]) -> tuple[tuple[str, int], ...]:
-    """Codes of columns, and how many numbers each has."""
-    number = dict.fromkeys((one.code for one in columns), 0)
-    for one in columns:
-        number[one.code] += one.count
-    return tuple(number.items())
-
-
 def _by_measurement(
     count: int,
     numbers_each: int,
     columns: Sequence[Column],
-    parts: Sequence[tuple[Array | None, Integers | None]],
+    parts: Sequence[tuple[Array | None, Integers | None, Integers | None]],
 ) -> tuple[Integers, Array]:
     """Numbers (N, w) of the columns that move each of N measurements, -1 for none, and the
     derivatives (N, d, w) by these; numbers_each : d. parts : each column's derivatives (n, d, k),
-    and measurements (n,).
+    measurements (n,), and numbers (n, k) where these are not all of the column.
+
+    The numbers do not depend on the derivatives: where these are zero, the number is an unknown
+    that the data do not determine, and keeps its place.
     """
     of, number, by = list[Integers](), list[Integers](), list[Array]()
     first = 0
-    for column, (values, rows) in zip(columns, parts, strict=True):
-        numbers = first + np.arange(column.count)
-        first += column.count
-        if values is not None and values.size:
+    for column, (values, rows, own) in zip(columns, parts, strict=True):
+        if values is not None:
             rows = np.arange(count) if rows is None else rows
-            of.append(np.repeat(rows, len(numbers)))
-            number.append(np.tile(numbers, len(rows)))
+            own = np.arange(column.count)[None] if own is None else own
+            own = np.broadcast_to(first + own, (len(rows), own.shape[1]))
+            of.append(np.repeat(rows, own.shape[1]))
+            number.append(own.ravel())
             by.append(values.swapaxes(1, 2).reshape(-1, values.shape[1]))
+        first += column.count
     if not by:
         return np.zeros((count, 0), int), np.zeros((count, numbers_each, 0))
     of, number, by = np.concatenate(of), np.concatenate(number), np.concatenate(by)
-    used = np.flatnonzero(np.any(by != 0, axis=1))
-    order = used[np.lexsort((number[used], of[used]))]
+    order = np.lexsort((number, of))
     of, number, by = of[order], number[order], by[order]
     slot = np.arange(len(of)) - np.searchsorted(of, of)
     width = int(slot.max(initial=-1)) + 1
@@ -253,7 +252,7 @@ def _edges(
     """The edges at their positions, and the readings of the observed configurations."""
     edges, (keys, line) = measurements.edges, lines(measurements)
     radius = machine.layout.radius_of(edges.leg, edges.tube)
-    parts = [(one.edges, one.edge_rows) for one in columns]
+    parts = [(one.edges, one.edge_rows, one.edge_numbers) for one in columns]
     column, by_columns = _by_measurement(len(edges), 2, columns, parts)
     side = np.unique(keys[:, [0, 1, 3]], axis=0, return_inverse=True)[1].reshape(-1)
     own, alone, crowded = np.zeros((3, len(edges)))
@@ -298,7 +297,7 @@ def _poses(
 ) -> tuple[PoseBlocks, PoseData]:
     """The poses at their positions."""
     poses = measurements.poses
-    parts = [(one.poses, one.pose_rows) for one in columns]
+    parts = [(one.poses, one.pose_rows, None) for one in columns]
     column, by_columns = _by_measurement(len(poses), 6, columns, parts)
     blocks = PoseBlocks(
         station=at.filled(poses.station),

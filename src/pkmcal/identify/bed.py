@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import columns_of, eliminated_beside, prior_root
 from pkmcal.identify.tool import pose_by_parameters
-from pkmcal.measurements import Column, Measurements
+from pkmcal.measurements import Column
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.solver.elimination import divisions, rows_on_shared
 from pkmcal.solver.ranks import column_space
@@ -84,7 +83,7 @@ def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
     return poses, by, _less(by[:, 2] - np.einsum("i,nip->np", slope, by[:, :2]), plane)
 
 
-def bed_of(measurements: Measurements, estimate: Estimate, uneven: Sequence[Column]) -> Bed:
+def bed_of(estimate: Estimate, uneven: Sequence[Column]) -> Bed:
     """The bed of an estimate from heights alone; uneven : the model discrepancy found."""
     machine = estimate.machine
     poses, by, height = _bent(estimate)
@@ -98,7 +97,7 @@ def bed_of(measurements: Measurements, estimate: Estimate, uneven: Sequence[Colu
     middle, state = poses[0], estimate.state
     there = state.T_camera_base[0] @ middle @ state.T_mount[0]
     nominal = _nominal_root(machine, by)
-    off, root = _wider(measurements, estimate, nominal, uneven)
+    off, root = _wider(estimate, nominal, uneven)
     return Bed(
         radius=float(np.linalg.norm(xy, axis=1).max()),
         sigma=_deviation(height, off, root, len(xy)),
@@ -107,7 +106,7 @@ def bed_of(measurements: Measurements, estimate: Estimate, uneven: Sequence[Colu
         size=_deviation(stretch[None], off, root, 1),
         z=float(middle[2, 3] - there[2, 3]),
         touches=len(estimate.pose_residuals),
-        unnoticed=_unnoticed(measurements, estimate, height),
+        unnoticed=_unnoticed(estimate, height),
     )
 
 
@@ -155,14 +154,12 @@ def _nominal_root(machine: Machine, by: Array) -> Array:
     )
 
 
-def _wider(
-    measurements: Measurements, estimate: Estimate, nominal: Array, uneven: Sequence[Column]
-) -> tuple[Array, Array]:
+def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tuple[Array, Array]:
     """Of the parameters in the model in which all vary that the nominal model R (P, m) lets vary,
     and the bed as ``uneven``: how far the best values are from the estimate's (P,), and a root (P,
     m) of their covariance.
     """
-    rows, remainder = _rows_beside(measurements, estimate, uneven)
+    rows, remainder = _rows_beside(estimate, uneven)
     table = estimate.machine.parameters
     n, m = nominal.shape
     # the estimate, in deviations of the nominal model; a flat bed
@@ -178,14 +175,12 @@ def _wider(
     return nominal @ best[:m], nominal @ half[:m]
 
 
-def _rows_beside(
-    measurements: Measurements, estimate: Estimate, uneven: Sequence[Column]
-) -> tuple[Array, Array]:
+def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, Array]:
     """What the heights say of all parameters and of the l random effects, these in their prior
     deviations: rows (r, P + l) and residuals (r,). Poses, the bed's place and all other unknowns
     are eliminated; nothing that is known beforehand of the parameters is in them.
     """
-    assembled, info = linearize_at_solution(measurements, estimate)
+    assembled, info = estimate.linearized
     problem, state = info.problem.opened(info.state)
     columns = columns_of(replace(assembled, problem=problem), state, uneven)
     root = prior_root(uneven)
@@ -208,9 +203,9 @@ def _rows_beside(
     return rows - q @ (q.T @ rows), remaining - q @ (q.T @ remaining)
 
 
-def _unnoticed(measurements: Measurements, estimate: Estimate, height: Array) -> float | None:
+def _unnoticed(estimate: Estimate, height: Array) -> float | None:
     """How far one wrong height may bend the bed unnoticed, ``Bed.unnoticed``; height : (n, P)."""
-    _, info = linearize_at_solution(measurements, estimate)
+    info = estimate.linearized.info
     problem, state = info.problem, info.state
     rows = rows_on_shared(info.linear, info.reduced)[0][0]
     scale = np.linalg.norm(rows, axis=0)

@@ -21,9 +21,9 @@ from pkmcal.identify.covariance import (
     machine_covariance,
     reduced_rows,
 )
-from pkmcal.identify.edge_noise import edge_noise
+from pkmcal.identify.edge_noise import EDGE_NOISE, EdgeNoiseOptions, edge_noise
 from pkmcal.identify.error_correlation import covariance_of_correlated
-from pkmcal.identify.estimate import Estimate, State, Statistics
+from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.external_reliability import covariance_of_undetected
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.innovation_test import innovations
@@ -33,10 +33,10 @@ from pkmcal.identify.kinds import (
     POSE_ROWS_KIND,
     READING_ROWS_KIND,
 )
-from pkmcal.identify.line_shading import common_shading
+from pkmcal.identify.line_shading import LINE_SHADING, LineShadingOptions, common_shading
 from pkmcal.identify.noise import (
-    LARGEST_NOISE_STEP,
     LEAST_NOISE_FREEDOM,
+    NOISE,
     Components,
     NoiseShares,
     components,
@@ -44,8 +44,16 @@ from pkmcal.identify.noise import (
     noise_shares,
 )
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.robust import LEAST_SCALE, norms, robust_start, settled_weights
+from pkmcal.identify.robust import (
+    LEAST_SCALE,
+    ROBUST,
+    RobustOptions,
+    norms,
+    robust_start,
+    settled_weights,
+)
 from pkmcal.identify.scatter import EdgeScatter
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.effects import SHADING, SHIFT_SIGMA
@@ -54,27 +62,42 @@ from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import rank_of_normal
 from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
 
-NEARLY_SOLVED_DISTANCE = 1e-3
-"""Standard deviations, of all fitted values together, that a round's solution may have left to go,
-mostly after two steps: far less than the next round's weights and deviations change. Only where
-these have settled is it brought to its end."""
-MOST_BUNDLE_ROUNDS = 30
-SCATTER_PACE, FIRST_PACED_ROUND = 1.6, 2
-"""A round of weights, deviations and solution brings the deviations of shading and of the edges a
-part of the way only; from this one on, as they go on as they began, they go by so much further."""
-FURTHEST_NOISE_PACE, UNCUT_NOISE_LOG_STEP = 3.0, 0.99 * float(np.log(LARGEST_NOISE_STEP))
-"""The same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
-how far it goes: at most by how much further, and the logarithm of a step that was not cut short."""
-FREE_ROUNDS = 6
-"""Rounds in which the tails of the edges' noise are chosen; they are steps, and two that are alike
-would take turns for ever."""
-SCALE_CHANGE = 1e-3
-"""Relative change of a noise scale below which it counts as found."""
-LEAST_SHADING_SHARE = 0.1
-"""Part of the usual deviation of the lines' shading below which it is not looked for."""
-SHADING_CHANGE = 0.02
-"""Change of the shading's deviation, in times of it and no less than of what is usual, below which
-it counts as found; and of the edges' noise."""
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Constants of the alternation of weights, noise and solution."""
+
+    # standard deviations, of all fitted values together, that a round's solution may have left to
+    # go, mostly after two steps: far less than the next round's weights and deviations change. Only
+    # where these have settled is it brought to its end
+    nearly_solved: float = 1e-3
+    # largest number of rounds
+    most_rounds: int = 30
+    # a round brings the deviations of shading and of the edges a part of the way only; from this
+    # round on, as they go on as they began, they go by so much further
+    scatter_pace: float = 1.6
+    first_paced_round: int = 2
+    # the same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
+    # how far it goes: at most by how much further
+    furthest_noise_pace: float = 3.0
+    # logarithm of a step of that noise that was not cut short
+    uncut_noise_log_step: float = 0.99 * float(np.log(NOISE.largest_step))
+    # rounds in which the tails of the edges' noise are chosen; they are steps, and two that are
+    # alike would take turns for ever
+    free_rounds: int = 6
+    # relative change of a noise scale below which it has converged
+    scale_change: float = 1e-3
+    # part of the usual deviation of the lines' shading below which it is not estimated
+    least_shading_share: float = 0.1
+    # change of the deviations of the shading and of the edges' noise, relative to them and no less
+    # than to what is usual, below which they have converged
+    shading_change: float = 0.02
+    robust: RobustOptions = ROBUST
+    edge_noise: EdgeNoiseOptions = EDGE_NOISE
+    line_shading: LineShadingOptions = LINE_SHADING
+
+
+BATCH = BatchOptions()
 
 
 @dataclass(frozen=True)
@@ -136,6 +159,7 @@ def solve_batch(
     scale_noise: bool = True,
     scale_readings: bool = True,
     hopeless: float = np.inf,
+    options: BatchOptions = BATCH,
 ) -> BatchResult:
     """All runs of a problem from their starts; see :func:`bundle` for the options.
 
@@ -151,19 +175,21 @@ def solve_batch(
     # Begun with as much as a whole camera's shift may be: a prior that is too narrow would make
     # outliers of the edges that speak against it.
     n_lines = problem.shading.shape[1]
-    least = LEAST_SHADING_SHARE * problem.shading[:, :1]
+    least = options.least_shading_share * problem.shading[:, :1]
     if scale_noise and n_lines:
         problem = problem.shaded(np.full((n_runs, n_lines), SHIFT_SIGMA))
     state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)
     if robust:
-        value = robust_start(problem, start, scaled=scale_noise)
+        value = robust_start(problem, start, scaled=scale_noise, options=options.robust)
         state, weight, steps = value.state, value.weight, steps + value.steps
         scale = value.scale if scale_noise else ones
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
     irls_weight, stated = np.ones_like(every.edges), problem.joint_noise
     fit = _solved(problem, state, weight, scale, steps, begin, irls_weight, stated, STEP_TOLERANCE)
     if robust or scale_noise:
-        settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
+        settle = partial(
+            _settle, robust=robust, scale_noise=scale_noise, least=least, options=options
+        )
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
         if scale_noise and scale_readings and fit.scale.poses.min() <= hopeless:
             by_data = _readings_speak(fit)
@@ -180,6 +206,7 @@ def _settle(
     scale_noise: bool,
     least: Array,
     hopeless: float,
+    options: BatchOptions,
 ) -> BatchResult:
     """Weights, noise and solution in turns until none changes any more.
 
@@ -190,7 +217,7 @@ def _settle(
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.n_effective.any())
     previous_factor = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
     nearly = False
-    for number in range(MOST_BUNDLE_ROUNDS):
+    for number in range(options.most_rounds):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, edges, irls_weight = fit.scale, fit.edges, fit.robust_weight
         if scale_noise:
@@ -201,15 +228,15 @@ def _settle(
             )
             if scale.poses.min() > hopeless:
                 return replace(fit, scale=scale)
-            edges = _edges(fit, by_tube, number)
+            edges = _edges(fit, by_tube, number, options)
             problem = replace(problem, data=edges.applied(problem.blocks, problem.data))
-            previous_factor, made = _readings_step(fit, by_data, previous_factor, made)
+            previous_factor, made = _readings_step(fit, by_data, previous_factor, made, options)
         shading = problem.shading
         if estimates_shading:
-            shading = _shading_of(fit, least)
-        if number >= FIRST_PACED_ROUND:
+            shading = _shading_of(fit, least, options.line_shading)
+        if number >= options.first_paced_round:
             shading = np.maximum(
-                problem.shading * (shading / problem.shading) ** SCATTER_PACE, least
+                problem.shading * (shading / problem.shading) ** options.scatter_pace, least
             )
         if robust:
             rows = problem.unweighted(state)
@@ -219,14 +246,16 @@ def _settle(
             if by_tube:
                 irls_weight = edges.irls_weight(problem.blocks, np.sum(rows.edges**2, axis=-1))
         change = (shading - problem.shading) / np.maximum(problem.shading, SHADING_SIGMA)
-        shading_free = np.abs(change).max(initial=0.0) < SHADING_CHANGE
+        shading_free = np.abs(change).max(initial=0.0) < options.shading_change
         readings = problem.joint_noise
         if by_data.any():
             readings = problem.joint_noise_times(np.where(by_data, np.exp(made), 1.0), state)
-        readings_free = np.abs(readings / problem.joint_noise - 1).max() < SCALE_CHANGE
-        edges_free = edges.close_to(fit.edges, SHADING_CHANGE if by_tube else SCALE_CHANGE)
+        readings_free = np.abs(readings / problem.joint_noise - 1).max() < options.scale_change
+        edges_free = edges.close_to(
+            fit.edges, options.shading_change if by_tube else options.scale_change
+        )
         all_free = shading_free and readings_free and edges_free
-        if all_free and _settled(scale, fit.scale, weight, fit.weight):
+        if all_free and _settled(scale, fit.scale, weight, fit.weight, options.scale_change):
             break
         if estimates_shading:
             state = problem.with_shading_units(state, shading)
@@ -242,14 +271,18 @@ def _settle(
             edges,
             irls_weight,
             fit.stated,
-            NEARLY_SOLVED_DISTANCE,
+            options.nearly_solved,
         )
         nearly = True
-    return _to_the_end(fit) if nearly else fit
+    if not nearly:
+        return fit
+    # what the search of the last round has left to go
+    solution, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
+    return replace(fit, solution=solution, info=info)
 
 
 def _readings_step(
-    fit: BatchResult, by_data: Booleans, before: Array, made: Array
+    fit: BatchResult, by_data: Booleans, before: Array, made: Array, options: BatchOptions
 ) -> tuple[Array, Array]:
     """The step of the readings' noise that the data ask for, and the one to make, after which they
     will ask for none: by the secant through this and what they asked for before the last step that
@@ -262,10 +295,10 @@ def _readings_step(
     shrinks = (
         (log_factor * before > 0)
         & (np.abs(log_factor) < np.abs(before))
-        & (np.abs(before) < UNCUT_NOISE_LOG_STEP)
+        & (np.abs(before) < options.uncut_noise_log_step)
     )
     pace = np.where(shrinks, made / np.where(shrinks, before - log_factor, 1.0), 1.0)
-    return log_factor, log_factor * np.clip(pace, 1.0, FURTHEST_NOISE_PACE)
+    return log_factor, log_factor * np.clip(pace, 1.0, options.furthest_noise_pace)
 
 
 def _readings_speak(fit: BatchResult) -> Booleans:
@@ -278,15 +311,19 @@ def _readings_speak(fit: BatchResult) -> Booleans:
 
 
 def _settled(
-    scale: Kinds[Array], old_scale: Kinds[Array], weight: Kinds[Array], old_weight: Kinds[Array]
+    scale: Kinds[Array],
+    old_scale: Kinds[Array],
+    weight: Kinds[Array],
+    old_weight: Kinds[Array],
+    most: float,
 ) -> bool:
-    """Whether scales change by less than a thousandth, and weights by less than a hundredth."""
+    """Whether scales change by less than ``most``, relative, and weights by less than ten times."""
     change = [np.abs(new / old - 1).max() for new, old in zip(scale, old_scale, strict=True)]
     change += [
         0.1 * np.abs(new - old).max(initial=0.0)
         for new, old in zip(weight, old_weight, strict=True)
     ]
-    return max(change) < SCALE_CHANGE
+    return max(change) < most
 
 
 def _solved(
@@ -309,12 +346,6 @@ def _solved(
     return BatchResult(solution, weight, scale, info, edges, irls_weight, stated)
 
 
-def _to_the_end(fit: BatchResult) -> BatchResult:
-    """The same with what a round's search has left to go."""
-    solution, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
-    return replace(fit, solution=solution, info=info)
-
-
 def _searched(
     problem: Problem, state: BatchState, steps: Integers, tolerance: float
 ) -> tuple[Solution, Information]:
@@ -324,16 +355,26 @@ def _searched(
     return solution, Information(problem, solution.state, solution.normal)
 
 
-def _edges(fit: BatchResult, by_tube: bool, number: int) -> EdgeScatter:
+def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) -> EdgeScatter:
     """The edges' noise: of each tube where light moves edges; else their errors are normal, as
     stated but for one factor of all, which makes their chi2 equal its degrees of freedom. That is
     what the likelihood would say too, but for the edges that it counts as stated; and tails would
     take for their own what readings stated wrong do to some edges. number : of the round.
     """
     if by_tube:
-        late = number >= FREE_ROUNDS
-        edges = edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
-        return edges.beyond(fit.edges, SCATTER_PACE) if number >= FIRST_PACED_ROUND else edges
+        late = number >= options.free_rounds
+        edges = edge_noise(
+            fit.info,
+            fit.weight.edges,
+            fit.edges,
+            same_tails=late,
+            options=options.edge_noise,
+        )
+        return (
+            edges.beyond(fit.edges, options.scatter_pace)
+            if number >= options.first_paced_round
+            else edges
+        )
     scale, components = fit.scale.edges[:, None] * fit.edges.scale, fit.components
     chi2, freedom = (
         components.chi2[:, EDGE_ROWS_KIND, None],
@@ -357,7 +398,7 @@ def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
     return np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
 
 
-def _shading_of(fit: BatchResult, least: Array) -> Array:
+def _shading_of(fit: BatchResult, least: Array, options: LineShadingOptions) -> Array:
     """The fit's :func:`common_shading`."""
     problem, unit = fit.info.problem, fit.info.problem.shading
     lines = problem.unknowns.of_code(SHADING)
@@ -366,7 +407,7 @@ def _shading_of(fit: BatchResult, least: Array) -> Array:
     prior = problem.prior[:, lines]
     correlation = np.linalg.inv(prior.T @ prior)
     shift = unit * problem.lines_of(fit.info.state)
-    return common_shading(shift, covariance, correlation, unit, least)
+    return common_shading(shift, covariance, correlation, unit, least, options)
 
 
 @dataclass(frozen=True)
@@ -400,6 +441,7 @@ def bundle(
     scale_readings: bool = True,
     gauge: Gauge | None = None,
     hopeless: float = np.inf,
+    options: BatchOptions = BATCH,
 ) -> Estimate:
     """The joint estimate of one session.
 
@@ -439,6 +481,7 @@ def bundle(
         scale_noise=scale_noise,
         scale_readings=scale_readings,
         hopeless=hopeless,
+        options=options,
     )
     if result.scale.poses[0] > hopeless:
         raise ResultError(
@@ -451,32 +494,12 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
-def linearize_at_solution(
-    measurements: Measurements, estimate: Estimate
-) -> tuple[Assembled, Information]:
-    """The problem of an estimate at its end, with its weights, noise scales and the lines' shading
-    as it found them, and what it says at its state there, but for the shading: as far as anything
-    is from its best value a linear step tells.
-    """
-    machine, measurements = estimate.machine, estimate.stated_edge_noise(measurements)
-    shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
-    assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
-    statistics = estimate.statistics
-    weights = Kinds(
-        estimate.edge_weights * estimate.edge_trust,
-        estimate.pose_weights / statistics.pose_scale**2,
-        estimate.link_weights / statistics.link_scale**2,
-    )
-    assembled = replace(assembled, problem=assembled.trusting(weights))
-    return assembled, Information(assembled.problem, batch_of(machine, assembled, estimate.state))
-
-
-def marginalize_to_machine(measurements: Measurements, estimate: Estimate) -> MarginalPrior:
+def marginalize_to_machine(estimate: Estimate) -> MarginalPrior:
     """What an estimate knows of the machine, for the estimate of other measurements.
 
     The frames are as little known as by the nominal model, about where the estimate has them.
     """
-    _, info = linearize_at_solution(measurements, estimate)
+    info = estimate.linearized.info
     rows, _ = reduced_rows(info, ("machine",), silent=())
     root: Array = np.asarray(np.linalg.qr(rows, mode="r"))
     return MarginalPrior(info.state.z[0], root)
@@ -529,6 +552,7 @@ def _estimate(
         configurations=assembled.observed,
         statistics=_statistics(result, assembled, value, measurements.imputation_covariance),
         gauge=gauge.name,
+        problem=assembled,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
         link_residuals=residuals.links[:, 0],

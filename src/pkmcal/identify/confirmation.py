@@ -29,7 +29,6 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.identify.assembly import Assembled
-from pkmcal.identify.bundle import linearize_at_solution
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.problem import Problem
@@ -145,7 +144,7 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
     if not units:
         return Rejections()
     # problem at the solution, with wider priors
-    assembled, info = linearize_at_solution(measurements, estimate)
+    assembled, info = estimate.linearized
     drawn = np.array(assembled.priors) == "drawing"
     wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
     problem, state = info.problem, info.state
@@ -227,7 +226,8 @@ class _Cases(NamedTuple):
     ) -> _Cases:
         """Terms of an estimate's problem."""
         # normal equations of the estimate
-        base = _prior(problem, state)
+        value, rows = problem.prior_values(state)[0] - problem.prior_target, problem.prior
+        base = _Normal((rows.T @ rows)[None], (rows.T @ value)[None], np.sum(value**2)[None])
         for cut in divisions(*problem.extent):
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
@@ -305,10 +305,3 @@ def _normal_equations(problem: Problem, state: BatchState) -> _Normal:
     reduced = Information(problem, state).reduced
     rows, value = reduced.rows[0], reduced.value[0]
     return _Normal(rows.mT @ rows, (rows.mT @ value[..., None])[..., 0], np.sum(value**2, axis=-1))
-
-
-def _prior(problem: Problem, state: BatchState) -> _Normal:
-    """Normal equations of the prior."""
-    value = problem.prior_values(state)[0] - problem.prior_target
-    rows = problem.prior
-    return _Normal((rows.T @ rows)[None], (rows.T @ value)[None], np.sum(value**2)[None])

@@ -15,7 +15,6 @@ from typing import cast
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
-from pkmcal.identify.estimate import State, estimated_unknowns
 from pkmcal.identify.gauge import (
     Gauge,
     alignment,
@@ -29,6 +28,7 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.solver.elimination import (
@@ -192,7 +192,7 @@ def machine_covariance(
     problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
 ) -> Array:
     """Covariance (n, n) of parameters, stations and mounts, told in the gauge; n = P + 6 S + 6 M,
-    in the order of :func:`~pkmcal.identify.estimate.estimated_unknowns`.
+    in the order of :func:`~pkmcal.identify.state.estimated_unknowns`.
 
     before : the solution as the solver left it. shared : (na, na) covariance there.
     """

@@ -51,9 +51,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import Information
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.score import (
-    FALSE_ALARM,
     columns_of,
     eliminated_beside,
     shared_basis,
@@ -72,8 +72,8 @@ by this factor, in the same memory."""
 class DiscrepancyOptions:
     """Constants of the search."""
 
-    # chance at which any component is found in a session that has none
-    false_alarm: float = FALSE_ALARM
+    # level of the session, of which the components share that of their search
+    false_alarm: FalseAlarm = SESSION_FALSE_ALARM
     # factor on a stated noise from which the discrepancy may be what enlarged it
     enlarged: float = 1.2
     # factors tried then, from what was stated to what is in use
@@ -95,7 +95,7 @@ class DiscrepancyOptions:
         """
         from scipy.special import chdtri
 
-        return float(chdtri(1.0, 2 * self.false_alarm / max(components, 1)))
+        return float(chdtri(1.0, 2 * self.false_alarm.of_test(components)))
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ by their number.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pkmcal.arrays import Array
@@ -33,20 +35,33 @@ from pkmcal.identify.scatter import (
     t_variance,
 )
 
-TAILS_TRIED = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
-"""Degrees of freedom that are tried; the last is close to the normal distribution."""
-STATED_NOISE_WORTH = 5.0
-"""Weight of the stated noise as prior of the scale, in edges."""
-MOST_EDGE_NOISE_ROUNDS = 60
-"""Largest number of scoring steps."""
-VARIANCE_CHANGE = 1e-4
-"""Relative change of a variance below which the iteration has converged."""
-LARGEST_VARIANCE_FACTOR = 4.0
-"""Largest factor on a variance in one step."""
+
+@dataclass(frozen=True)
+class EdgeNoiseOptions:
+    """Constants of the estimate of the edges' noise."""
+
+    # degrees of freedom that are tried; the last is close to the normal distribution
+    tails: tuple[float, ...] = (1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0)
+    # weight of the stated noise as prior of the scale, in edges
+    stated_noise_worth: float = 5.0
+    # largest number of scoring steps
+    most_rounds: int = 60
+    # relative change of a variance below which the iteration has converged
+    converged: float = 1e-4
+    # largest factor on a variance in one step, so that scoring does not overshoot
+    largest_factor: float = 4.0
+
+
+EDGE_NOISE = EdgeNoiseOptions()
 
 
 def edge_noise(
-    info: Information, weight: Array, before: EdgeScatter, *, same_tails: bool = False
+    info: Information,
+    weight: Array,
+    before: EdgeScatter,
+    *,
+    same_tails: bool = False,
+    options: EdgeNoiseOptions = EDGE_NOISE,
 ) -> EdgeScatter:
     """Noise of the edges, tube by tube, at a solution.
 
@@ -65,9 +80,9 @@ def edge_noise(
             )
             continue
         begin = before.scale[:, number], before.shading[:, number]
-        tails = before.dof[None, :, number] if same_tails else TAILS_TRIED[:, None]
+        tails = before.dof[None, :, number] if same_tails else np.array(options.tails)[:, None]
         squares = along[:, own], rest[:, own], size[:, own]
-        results.append(_student(*squares, weight[:, own], *begin, tails))
+        results.append(_student(*squares, weight[:, own], *begin, tails, options))
     scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*results, strict=True))
     return EdgeScatter(scale, shading, tails)
 
@@ -102,6 +117,7 @@ def _student(
     scale: Array,
     shading: Array,
     tried: Array,
+    options: EdgeNoiseOptions,
 ) -> tuple[Array, Array, Array]:
     """Scale, shading and degrees of freedom (B,) of n edges with the highest likelihood.
 
@@ -130,28 +146,29 @@ def _student(
         remainder = (irls_weight * along - s) * of_s
         # gradient by the variances a (scale) and b (shading); the stated noise is a prior
         by_a = np.sum(remainder, axis=-1) + (total(irls_weight, of_rest) - count * a) / a**2
-        by_a += STATED_NOISE_WORTH * (1 - a) / a**2
+        by_a += options.stated_noise_worth * (1 - a) / a**2
         by_b = total(remainder, size)
         # Fisher information
-        aa, ab = np.sum(of_s, axis=-1) + (count + STATED_NOISE_WORTH) / a**2, total(of_s, size)
+        aa = np.sum(of_s, axis=-1) + (count + options.stated_noise_worth) / a**2
+        ab = total(of_s, size)
         bb = total(of_s, square) + EDGE_SCATTER_FLOOR
         det = aa * bb - ab**2
         det = np.where(det > EDGE_SCATTER_FLOOR * aa * bb, det, np.inf)
         new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
         # where the shading is at its lower bound, only the scale is updated
         new_a = np.where(new_b > least, new_a, a + (by_a + (b - least) * ab) / aa)
-        new_a = np.clip(new_a, a / LARGEST_VARIANCE_FACTOR, a * LARGEST_VARIANCE_FACTOR)
+        new_a = np.clip(new_a, a / options.largest_factor, a * options.largest_factor)
         return new_a, np.maximum(
-            np.clip(new_b, b / LARGEST_VARIANCE_FACTOR, b * LARGEST_VARIANCE_FACTOR), least
+            np.clip(new_b, b / options.largest_factor, b * options.largest_factor), least
         )
 
     # variances for each number of degrees of freedom
     a = scale**2 / norm
     b = np.broadcast_to(shading**2 / norm, a.shape)
-    for _ in range(MOST_EDGE_NOISE_ROUNDS):
+    for _ in range(options.most_rounds):
         before, (a, b) = (a, b), scored(a, b)
         change = max(np.abs(new / old - 1).max() for new, old in zip((a, b), before, strict=True))
-        if change < VARIANCE_CHANGE:
+        if change < options.converged:
             break
     s, t = a[..., None] + b[..., None] * size, a[..., None]
     # likelihood of each number of degrees of freedom, and the best

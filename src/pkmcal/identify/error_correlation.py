@@ -26,6 +26,7 @@ information about it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -37,16 +38,23 @@ from pkmcal.identify.scatter import NUMBERS_AN_EDGE, shift_squares
 from pkmcal.measurements.line_cells import LineCells
 from pkmcal.solver.search import take
 
-MOST_TILTS_COMPARED = 800
-"""Largest number of edges whose tilts are compared, of configurations evenly among all: c then has
-a standard deviation of a few hundredths."""
-LEAST_TILT_INFORMATION = 1e-9
-"""Information of pairs of tilts, or a probability, below which it is rounding."""
-UNINFORMED_CORRELATED_SHARE = 0.5
-"""Mean of c without data."""
+
+@dataclass(frozen=True)
+class ErrorCorrelationOptions:
+    """Constants of the estimate of correlated errors."""
+
+    # largest number of edges whose tilts are compared, of configurations evenly among all: c then
+    # has a standard deviation of a few hundredths
+    most_tilts: int = 800
+    # information of pairs of tilts, or a probability, below which it is rounding
+    rounding: float = 1e-9
+    # mean of c without data
+    uninformed_share: float = 0.5
 
 
-def covariance_of_correlated(info: Information) -> Array:
+def covariance_of_correlated(
+    info: Information, options: ErrorCorrelationOptions = ErrorCorrelationOptions()
+) -> Array:
     """Covariance (B, na, na) of the shared unknowns at a solution, with correlated errors of edges.
 
     A direction that is not determined has a huge variance.
@@ -55,26 +63,23 @@ def covariance_of_correlated(info: Information) -> Array:
         return info.covariance
     out = info.covariance.copy()
     for run in range(len(out)):
-        one = info if len(out) == 1 else _of_run(info, run)  # of many edges no copy is made
+        one = info
+        if len(out) > 1:  # a single run, of many edges, is not copied
+            at = np.array([run])
+            normal = None if info.normal is None else info.normal[at]
+            one = Information(info.problem.select(at), take(info.state, at), normal)
         half = one.root[0]
-        out[run] += half @ _beside(one) @ half.T
+        out[run] += half @ _beside(one, options) @ half.T
     return out
 
 
-def _of_run(info: Information, run: int) -> Information:
-    """Information of a single run."""
-    at = np.array([run])
-    normal = None if info.normal is None else info.normal[at]
-    return Information(info.problem.select(at), take(info.state, at), normal)
-
-
-def _beside(info: Information) -> Array:
+def _beside(info: Information, options: ErrorCorrelationOptions) -> Array:
     """``F^T J^T (S - 1) J F`` (na, na) of one run, F the root of the covariance."""
     half, cells = info.root, info.problem.blocks.cells
     na = half.shape[-1]
     out, tilts = np.zeros((2, na, na))
     sums = np.zeros((NUMBERS_AN_EDGE, len(cells.count) + 1, na))  # the last: edges in no cell
-    every = -(-int(cells.count.sum()) // MOST_TILTS_COMPARED)
+    every = -(-int(cells.count.sum()) // options.most_tilts)
     compared = list[_Tilts]()
     for piece in reduced_edges(info):
         blocks, data, (row, place) = piece.problem.blocks, piece.problem.data, piece.at
@@ -111,7 +116,7 @@ def _beside(info: Information) -> Array:
         out += shift.T @ shift_correlation @ shift
         by_tilts += tilt.T @ tilt_correlation @ tilt
     every_tilt = _Tilts(*(np.concatenate(part) for part in zip(*compared, strict=True)))
-    return out + every_tilt.correlated_share(cells) * by_tilts
+    return out + every_tilt.correlated_share(cells, options) * by_tilts
 
 
 class _Tilts(NamedTuple):
@@ -129,14 +134,14 @@ class _Tilts(NamedTuple):
     configuration: Integers
     cell: Integers
 
-    def correlated_share(self, cells: LineCells) -> float:
+    def correlated_share(self, cells: LineCells, options: ErrorCorrelationOptions) -> float:
         """Estimate of c, see the module's docstring."""
         from scipy.special import ndtr
 
         together = self.configuration[:, None] == self.configuration
         taken = self.shared @ self.shared.T + np.where(together, self.own @ self.own.T, 0.0)
         rest = np.eye(len(self.value)) - taken
-        square = self.value @ self.value / max(np.trace(rest), LEAST_TILT_INFORMATION)
+        square = self.value @ self.value / max(np.trace(rest), options.rounding)
         pairs = np.zeros_like(rest)
         for own, _, correlation in cells.correlated_groups():
             mine = np.flatnonzero((self.cell >= own.start) & (self.cell < own.stop))
@@ -144,13 +149,13 @@ class _Tilts(NamedTuple):
             pairs[np.ix_(mine, mine)] = correlation[np.ix_(place, place)] - np.eye(len(mine))
         product = pairs @ rest
         information = np.sum(product * product.T)
-        if square == 0 or information <= LEAST_TILT_INFORMATION:
-            return UNINFORMED_CORRELATED_SHARE
+        if square == 0 or information <= options.rounding:
+            return options.uninformed_share
         values = (self.value @ pairs @ self.value / square - np.trace(product)) / information
         sigma = np.sqrt(2 / information)
         low, high = -values / sigma, (1 - values) / sigma
         density = np.exp(-(np.array([low, high]) ** 2) / 2) / np.sqrt(2 * np.pi)
         within = ndtr(high) - ndtr(low)
-        if within < LEAST_TILT_INFORMATION:
+        if within < options.rounding:
             return float(np.clip(values, 0.0, 1.0))
         return float(values + sigma * (density[0] - density[1]) / within)

@@ -1,44 +1,23 @@
-"""State and result of an estimate: plain, frozen data."""
+"""Result of an estimate: values, covariance, statistics, and the problem that it solves."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
+from pkmcal.identify.assembly import Assembled, batch_of
+from pkmcal.identify.covariance import Information
 from pkmcal.identify.scatter import EdgeScatter
+from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
-
-
-@dataclass(frozen=True)
-class State:
-    """Values of all unknowns.
-
-    theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
-    columns : numbers (n,) of the effects on measurements by their code, change from where the
-    measurements were made; zero where a code is missing. T_mount : (M, 4, 4) boards in the frame of
-    what they are fixed to, T_base_board or T_platform_board by ``on_platform`` (M,). internal :
-    (K, n) hinges of an articulated platform.
-    """
-
-    theta: Array
-    T_camera_base: Array
-    T_base_platform: Array
-    columns: Mapping[str, Array] = field(default_factory=dict)
-    T_mount: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
-
-    __repr__ = short_repr
-
-
-def estimated_unknowns(state: State) -> Unknowns:
-    """Unknowns of results: all parameters, stations and mounts."""
-    return Unknowns(state.theta.size, len(state.T_camera_base), n_mounts=len(state.T_mount))
 
 
 @dataclass(frozen=True)
@@ -102,6 +81,15 @@ class Statistics:
         return chi2 / self.dof if self.dof > 0 else float("nan")
 
 
+class Linearization(NamedTuple):
+    """The problem of an estimate with its final weights and noise, and its residuals and Jacobian
+    at the solution.
+    """
+
+    assembled: Assembled
+    info: Information
+
+
 @dataclass(frozen=True)
 class Estimate:
     """Result of an estimate, in the frames that ``gauge`` names.
@@ -125,6 +113,7 @@ class Estimate:
         known. Lines are numbered by :func:`~pkmcal.measurements.effects.lines`.
     configurations : (K,) True where the configuration was seen and its pose estimated.
     gauge : its name for people.
+    problem : the problem as assembled, with the stated noise and unit weights.
     """
 
     machine: Machine
@@ -140,6 +129,7 @@ class Estimate:
     configurations: Booleans
     statistics: Statistics
     gauge: str
+    problem: Assembled
     pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
     link_residuals: Array = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -149,6 +139,29 @@ class Estimate:
     line_shift_sigma: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = short_repr
+
+    @cached_property
+    def linearized(self) -> Linearization:
+        """The stored problem with this estimate's weights and noise, linearized at its state.
+
+        The lines' shading is zero in that state: a linear step covers it, as it covers whatever is
+        not at its minimum. Rows are evaluated when first used, and kept.
+        """
+        statistics, problem = self.statistics, self.problem.problem
+        edges = self.edge_noise.batch().applied(problem.blocks, problem.data)
+        noise = problem.joint_noise * statistics.reading_scale
+        problem = replace(problem, data=edges, joint_noise=noise)
+        if len(self.line_shading):
+            problem = problem.shaded(self.line_shading[None])
+        weights = Kinds(
+            self.edge_weights * self.edge_trust,
+            self.pose_weights / statistics.pose_scale**2,
+            self.link_weights / statistics.link_scale**2,
+        )
+        assembled = replace(self.problem, problem=problem)
+        assembled = replace(assembled, problem=assembled.trusting(weights))
+        start = batch_of(self.machine, assembled, self.state)
+        return Linearization(assembled, Information(assembled.problem, start))
 
     def stated_edge_noise(self, measurements: Measurements) -> Measurements:
         """Measurements of the estimate, all or some, with the estimated noise of readings and

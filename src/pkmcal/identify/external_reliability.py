@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.reduced_edges import ReducedEdges, reduced_edges
 from pkmcal.identify.scatter import NUMBERS_AN_EDGE, shift_squares
@@ -64,7 +64,11 @@ def covariance_of_undetected(info: Information, weight: Array) -> Array:
     for piece in reduced_edges(info):
         inliers = weight[:, piece.first : piece.first + len(piece.problem.blocks.present)]
         most, own_share = _deviations(piece)
-        kinds, inliers = _kinds(piece), np.repeat(inliers[:, *piece.at], NUMBERS_AN_EDGE, axis=-1)
+        # number (N, r) of each shift or tilt by tube: two for each tube
+        tube = piece.problem.blocks.tube[*piece.at][..., None]
+        kinds = NUMBERS_AN_EDGE * tube + np.arange(NUMBERS_AN_EDGE)
+        kinds = kinds.reshape(len(kinds), NUMBERS_AN_EDGE * tube.shape[1])
+        inliers = np.repeat(inliers[:, *piece.at], NUMBERS_AN_EDGE, axis=-1)
         for cut, shared in piece.shared(half):
             # rows t = F^T J, largest errors, variance ratios and weights of these edges
             taken = shared.swapaxes(1, 2).reshape(n_runs, na, kinds[cut].size)
@@ -121,10 +125,3 @@ def _deviations(piece: ReducedEdges) -> tuple[Array, Array]:
     numbers = len(place), NUMBERS_AN_EDGE * place.shape[1]
     most, shares = (np.where(there, part[:, row, place], 0.0) for part in (most, shares))
     return most.reshape(len(most), *numbers), shares.reshape(len(shares), *numbers)
-
-
-def _kinds(piece: ReducedEdges) -> Integers:
-    """Number (N, r) of each shift or tilt by tube: two for each tube."""
-    tube = piece.problem.blocks.tube[*piece.at][..., None]
-    kind = NUMBERS_AN_EDGE * tube + np.arange(NUMBERS_AN_EDGE)
-    return kind.reshape(len(kind), NUMBERS_AN_EDGE * tube.shape[1])

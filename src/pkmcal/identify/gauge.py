@@ -28,7 +28,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
-from pkmcal.identify.estimate import State, estimated_unknowns
+from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.layout import LimbLayout
 

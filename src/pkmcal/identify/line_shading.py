@@ -9,22 +9,38 @@ larger, and honest (Gelman 2006).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.measurements.effects import SHIFT_SIGMA
 
-SHADING_FREEDOM = 4.0
-"""Degrees of freedom of Student's distribution of the lines' shading: with four, a line that is
-some five standard deviations off loses its weight, and clean lines lose little."""
-SHADING_WEIGHINGS = 2
-"""Rounds of weights and their common deviation, before the next solution."""
-SHADINGS_TRIED = np.geomspace(1.0, 1000.0, 72)
-"""Deviations that are tried, in times of the least: a tenth apart."""
+
+@dataclass(frozen=True)
+class LineShadingOptions:
+    """Constants of the estimate of the lines' shading."""
+
+    # degrees of freedom of Student's distribution of the lines' shading: with four, a line that is
+    # some five standard deviations off loses its weight, and clean lines lose little
+    freedom: float = 4.0
+    # rounds of weights and their common deviation, before the next solution
+    weighings: int = 2
+    # deviations that are tried: the largest, in times of the least, and their number, a tenth apart
+    largest_factor: float = 1000.0
+    factors: int = 72
+
+
+LINE_SHADING = LineShadingOptions()
 
 
 def common_shading(
-    shift: Array, covariance: Array, correlation: Array, sigma: Array, least: Array | float
+    shift: Array,
+    covariance: Array,
+    correlation: Array,
+    sigma: Array,
+    least: Array | float,
+    options: LineShadingOptions = LINE_SHADING,
 ) -> Array:
     """Standard deviation (B, n) px of each line's shading, estimated from the data.
 
@@ -37,9 +53,9 @@ def common_shading(
     ``|R + s^2 D|^-1/2 exp(h^T (D + R / s^2)^-1 h / 2)``. s^2 is its mean over a half-Cauchy
     distribution of s, whose scale is what a whole camera's shift may be.
 
-    Shifts have Student's distribution with SHADING_FREEDOM degrees: most lines are shaded alike,
+    Shifts have Student's distribution with F, ``freedom``, degrees: most lines are shaded alike,
     and some show a highlight's border for their own, pixels off. Each line's variance is s^2 / w
-    with its weight w = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + x^2 / s^2) (Lange, Little, Taylor
+    with its weight w = (F + 1) / (F + x^2 / s^2) (Lange, Little, Taylor
     1989), x^2 the square expected of its shift.
     """
     total_information = np.linalg.inv(covariance)
@@ -49,11 +65,11 @@ def common_shading(
     )
     root = np.linalg.cholesky(correlation)
     expected = shift**2 + np.diagonal(covariance, axis1=-2, axis2=-1)
-    tried = SHADINGS_TRIED * least
+    tried = np.geomspace(1.0, options.largest_factor, options.factors) * least
     common = np.median(sigma, axis=1, keepdims=True) ** 2
     weight = np.ones_like(shift)
-    for _ in range(SHADING_WEIGHINGS):
-        weight = (SHADING_FREEDOM + 1) / (SHADING_FREEDOM + expected / common)
+    for _ in range(options.weighings):
+        weight = (options.freedom + 1) / (options.freedom + expected / common)
         unit = root / np.sqrt(weight)[..., None]
         common = _mean_variance(unit.mT @ information @ unit, unit.mT @ slope[..., None], tried)
     return np.maximum(np.sqrt(common / weight), least)

@@ -36,32 +36,51 @@ from pkmcal.identify.kinds import KindRows, kind_rows
 from pkmcal.identify.problem import Problem
 from pkmcal.measurements.rows import Kinds
 
-NOISE_CONTRADICTION_CHANCE = 0.01 / 3
-"""Probability of contradicting a noise that is stated correctly: one in a hundred, shared by the
-three kinds of rows."""
 LEAST_NOISE_FREEDOM = 5.0
 """Degrees of freedom below which a sum of squares determines no noise."""
-LARGEST_NOISE_STEP = 10.0
-"""Largest factor on a noise in one step, beyond which the linear model no longer holds."""
-LARGEST_GROUP = 400
-"""Rows whose residuals are made independent together. If there are more, they are handled in groups
-of configurations: each has its exact variance, but the correlation between groups, by the few
-shared unknowns, is neglected."""
-LEAST_RESIDUAL_SHARE = 1e-10
-"""Eigenvalue of M below which it is rounding: the unknowns absorb the whole direction."""
-LOG_VARIANCES_TRIED = np.linspace(-20.0, 20.0, 41)
-"""Logarithms of s^2 that are tried; the smallest stands for zero."""
-LEAST_VARIANCE = float(np.exp(LOG_VARIANCES_TRIED[0]))
-"""Lower bound of a variance."""
-LOG_OTHERS_TRIED = np.linspace(-14.0, 14.0, 15)
-"""Logarithms of t^2 that are tried first for each s^2."""
-LOG_OTHERS_STEPS = 1.0, 0.25, 0.0625
-"""Step sizes of the refinement of the best of them."""
-INTERVAL_HALVINGS = 8
-"""Number of bisections of an interval of log s^2."""
-HALVINGS_AT_ONCE = 4
-"""Bisections of one interval whose points are evaluated together: the likelihood of fifteen points
-takes hardly longer than that of one."""
+
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """Constants of the restricted likelihood of a noise."""
+
+    # probability of contradicting a noise that is stated correctly: one in a hundred, shared by the
+    # three kinds of rows
+    contradiction_chance: float = 0.01 / 3
+    # largest factor on a noise in one step, beyond which the linear model no longer holds
+    largest_step: float = 10.0
+    # rows whose residuals are made independent together. If there are more, they are handled in
+    # groups of configurations: each has its exact variance, but the correlation between groups, by
+    # the few shared unknowns, is neglected
+    largest_group: int = 400
+    # eigenvalue of M below which it is rounding: the unknowns absorb the whole direction
+    rounding: float = 1e-10
+    # logarithms of s^2 that are tried, from minus this one, which stands for zero, and their number
+    largest_log_variance: float = 20.0
+    variances: int = 41
+    # the same of t^2, which are tried first for each s^2, and the steps that refine the best
+    largest_log_others: float = 14.0
+    others: int = 15
+    others_steps: tuple[float, ...] = (1.0, 0.25, 0.0625)
+    # bisections of an interval of log s^2
+    halvings: int = 8
+    # of which so many are evaluated together: the likelihood of fifteen points takes hardly longer
+    # than that of one
+    halvings_at_once: int = 4
+
+    @property
+    def log_variances(self) -> Array:
+        """Logarithms of s^2 that are tried."""
+        end = self.largest_log_variance
+        return np.linspace(-end, end, self.variances)
+
+    @property
+    def least_variance(self) -> float:
+        """Lower bound of a variance."""
+        return float(np.exp(-self.largest_log_variance))
+
+
+NOISE = NoiseOptions()
 
 
 @dataclass(frozen=True)
@@ -112,6 +131,7 @@ class NoiseShares:
     own: Array
     others: Array
     fixed: Array
+    options: NoiseOptions = NOISE
 
     @property
     def best(self) -> Array:
@@ -125,7 +145,8 @@ class NoiseShares:
         value, and a noise of zero would promise too much.
         """
         low, high = self.interval()
-        step = np.clip(self.best, 1 / LARGEST_NOISE_STEP, LARGEST_NOISE_STEP)
+        most = self.options.largest_step
+        step = np.clip(self.best, 1 / most, most)
         return np.where((low == 0) & (high >= 1), 1.0, step)
 
     def freedom(self, s: Array) -> Array:
@@ -134,13 +155,14 @@ class NoiseShares:
         """
         return self._freedom((s**2)[:, None])[:, 0]
 
-    def interval(self, chance: float = NOISE_CONTRADICTION_CHANCE) -> tuple[Array, Array]:
+    def interval(self, chance: float | None = None) -> tuple[Array, Array]:
         """Smallest and largest factor (B,) on the kind's noise that the data allow at the level 1 -
-        ``chance``; 0 and infinity where there is no bound.
+        ``chance``, by default that of a contradiction; 0 and infinity where there is no bound.
 
         By the likelihood ratio. The lower end is 0 where too few residuals determine the best
         factor, and the upper end is at least the factor that enough residuals would determine.
         """
+        chance = self.options.contradiction_chance if chance is None else chance
         if chance not in self._intervals:
             self._intervals[chance] = self._interval(chance)
         return self._intervals[chance]
@@ -162,7 +184,7 @@ class NoiseShares:
         n_runs, n = self.z.shape
         if not n:
             return np.zeros(n_runs), np.full(n_runs, np.inf)
-        (best, least), tried = self._best, LOG_VARIANCES_TRIED
+        (best, least), tried = self._best, self.options.log_variances
         level = least + chdtri(1, chance)
         inside = self._grid <= level[:, None]
         with np.errstate(divide="ignore"):
@@ -183,7 +205,7 @@ class NoiseShares:
 
         inside, outside : (B, G) logarithms of s^2 below and above the level.
         """
-        for _ in range(INTERVAL_HALVINGS):
+        for _ in range(self.options.halvings):
             middle = (inside + outside) / 2
             below = self._profile(np.exp(middle))[0] <= level[:, None]
             inside, outside = np.where(below, middle, inside), np.where(below, outside, middle)
@@ -192,15 +214,16 @@ class NoiseShares:
     @cached_property
     def _least_determined(self) -> Array:
         """Smallest s^2 (B,) that enough residuals would determine, infinite for none."""
-        low, high = (np.full(len(self.z), end) for end in LOG_VARIANCES_TRIED[[0, -1]])
+        low, high = (np.full(len(self.z), end) for end in self.options.log_variances[[0, -1]])
         enough_at_all = self._freedom(np.exp(high)[:, None])[:, 0] > LEAST_NOISE_FREEDOM
         # bisection, all points of several halvings in one evaluation
-        parts = 2**HALVINGS_AT_ONCE
-        for _ in range(2 * INTERVAL_HALVINGS // HALVINGS_AT_ONCE):
+        at_once = self.options.halvings_at_once
+        parts = 2**at_once
+        for _ in range(2 * self.options.halvings // at_once):
             tried = np.linspace(low, high, parts + 1, axis=1)
             enough = self._freedom(np.exp(tried[:, 1:-1])) > LEAST_NOISE_FREEDOM
             run, at = np.arange(len(low)), np.zeros(len(low), dtype=int)
-            for half in (parts >> k for k in range(1, HALVINGS_AT_ONCE + 1)):
+            for half in (parts >> k for k in range(1, at_once + 1)):
                 at = np.where(enough[run, at + half - 1], at, at + half)
             low, high = tried[run, at], tried[run, at + 1]
         return np.where(enough_at_all, np.exp(high), np.inf)
@@ -210,21 +233,23 @@ class NoiseShares:
         others = np.exp(self._profile(square)[1])[..., None]
         own = square[..., None] * self.own[:, None]
         variance = own + others * self.others[:, None] + self.fixed[:, None]
-        return np.sum((own / np.maximum(variance, LEAST_VARIANCE)) ** 2, axis=-1)
+        return np.sum((own / np.maximum(variance, self.options.least_variance)) ** 2, axis=-1)
 
     @cached_property
     def _grid(self) -> Array:
         """-2 log likelihood (B, G) of the values of s^2 tried, the first of which is zero."""
-        return self._profile(_variances_tried(len(self.z)))[0]
+        tried = np.exp(self.options.log_variances)
+        tried[0] = 0.0
+        return self._profile(np.broadcast_to(tried, (len(self.z), len(tried))))[0]
 
     @cached_property
     def _best(self) -> tuple[Array, Array]:
         """s^2 (B,) of the highest likelihood, and -2 log likelihood there."""
         run, at = np.arange(len(self.z)), np.argmin(self._grid, axis=1)
-        last = len(LOG_VARIANCES_TRIED) - 1
-        log, value = LOG_VARIANCES_TRIED[at], self._grid[run, at]
-        step = LOG_VARIANCES_TRIED[1] - LOG_VARIANCES_TRIED[0]
-        for _ in range(INTERVAL_HALVINGS):
+        tried = self.options.log_variances
+        last, step = len(tried) - 1, tried[1] - tried[0]
+        log, value = tried[at], self._grid[run, at]
+        for _ in range(self.options.halvings):
             step /= 2
             near = np.stack([log - step, log + step], axis=1)
             values = self._profile(np.exp(near))[0]
@@ -238,16 +263,18 @@ class NoiseShares:
         """-2 log profile likelihood (B, G) of s^2 (B, G), and the best log t^2."""
         own = square[..., None] * self.own[:, None] + self.fixed[:, None]
         others, squares = self.others[:, None], np.square(self.z)[:, None]
+        options = self.options
 
         def value(log: Array) -> Array:
             """-2 log likelihood (B, G) at log t^2 (B, G)."""
-            variance = np.maximum(own + np.exp(log)[..., None] * others, LEAST_VARIANCE)
+            variance = np.maximum(own + np.exp(log)[..., None] * others, options.least_variance)
             return np.sum(np.log(variance) + squares / variance, axis=-1)
 
-        tried = [np.full(square.shape, log) for log in LOG_OTHERS_TRIED]
-        values = np.stack([value(log) for log in tried])
-        best, log = values.min(axis=0), LOG_OTHERS_TRIED[values.argmin(axis=0)]
-        for step in LOG_OTHERS_STEPS:
+        end = options.largest_log_others
+        tried = np.linspace(-end, end, options.others)
+        values = np.stack([value(np.full(square.shape, log)) for log in tried])
+        best, log = values.min(axis=0), tried[values.argmin(axis=0)]
+        for step in options.others_steps:
             middle, centre = best, log
             a, b = value(centre - step), value(centre + step)
             # vertex of the parabola through the three points, at most a step away
@@ -262,37 +289,36 @@ class NoiseShares:
         return best, log
 
 
-def noise_shares(info: Information, kind: int) -> NoiseShares:
+def noise_shares(info: Information, kind: int, options: NoiseOptions = NOISE) -> NoiseShares:
     """Independent residuals of the readings, poses or links at a solution."""
     rows, half = kind_rows(info.problem, info.state, kind), info.root
     in_prior = info.problem.prior @ half
-    fixed = in_prior.mT @ in_prior
+    of_prior = in_prior.mT @ in_prior
     runs = [
-        _of_run(KindRows(*(part[run] for part in rows)), half[run], fixed[run])
+        _of_run(KindRows(*(part[run] for part in rows)), half[run], of_prior[run], options)
         for run in range(len(half))
     ]
     most = max(len(run[0]) for run in runs)
     padding = 0.0, 0.0, 0.0, 1.0
-    return NoiseShares(
-        *(
-            np.stack(
-                [np.pad(run[k], (0, most - len(run[k])), constant_values=fill) for run in runs]
-            )
-            for k, fill in enumerate(padding)
-        )
+    z, own, others, fixed = (
+        np.stack([np.pad(run[k], (0, most - len(run[k])), constant_values=fill) for run in runs])
+        for k, fill in enumerate(padding)
     )
+    return NoiseShares(z, own, others, fixed, options)
 
 
-def _of_run(rows: KindRows, half: Array, fixed: Array) -> tuple[Array, Array, Array, Array]:
+def _of_run(
+    rows: KindRows, half: Array, fixed: Array, options: NoiseOptions
+) -> tuple[Array, Array, Array, Array]:
     """z, own, others and fixed (n,) of one run."""
     n_configurations, n = rows.value.shape
     used = (rows.value != 0) | rows.own.any(axis=-1) | rows.shared.any(axis=-1)
     shared = rows.shared @ half
     every = shared.reshape(-1, shared.shape[-1])
     across = every.T @ every
-    size = max(LARGEST_GROUP // max(n, 1), 1)
+    size = max(options.largest_group // max(n, 1), 1)
     parts = [
-        _independent(rows.own[cut], shared[cut], rows.value[cut], used[cut], across, fixed)
+        _independent(rows.own[cut], shared[cut], rows.value[cut], used[cut], across, fixed, options)
         for cut in (slice(k, k + size) for k in range(0, n_configurations, size))
     ]
     z, own, others, fixed = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -300,7 +326,13 @@ def _of_run(rows: KindRows, half: Array, fixed: Array) -> tuple[Array, Array, Ar
 
 
 def _independent(
-    own: Array, shared: Array, value: Array, used: Booleans, across: Array, fixed: Array
+    own: Array,
+    shared: Array,
+    value: Array,
+    used: Booleans,
+    across: Array,
+    fixed: Array,
+    options: NoiseOptions,
 ) -> tuple[Array, Array, Array, Array]:
     """z, own, others and fixed (n,) of the rows of some configurations.
 
@@ -322,7 +354,7 @@ def _independent(
     by_own = d @ d - ds @ s.T - s @ ds.T + s @ across @ s.T
     # directions u with u^T M u = 1
     size, turn = np.linalg.eigh(residual)
-    some = size > LEAST_RESIDUAL_SHARE
+    some = size > options.rounding
     unit = turn[:, some] / np.sqrt(size[some])
     # that diagonalize M M
     of_own, turn = np.linalg.eigh(unit.T @ by_own @ unit)
@@ -333,10 +365,3 @@ def _independent(
         np.sum(reference_values * (fixed @ reference_values), axis=0), 0.0, 1.0 - of_own
     )
     return unit.T @ r, of_own, 1.0 - of_own - of_fixed, of_fixed
-
-
-def _variances_tried(n_runs: int) -> Array:
-    """s^2 (B, G), the first none."""
-    tried = np.exp(LOG_VARIANCES_TRIED)
-    tried[0] = 0.0
-    return np.broadcast_to(tried, (n_runs, len(tried)))

@@ -14,6 +14,7 @@ change of a parameter within its prior is likelier than many wrong measurements.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,29 +33,39 @@ from pkmcal.solver.search import minimise, put, take
 
 CLEAN_TAIL_SHARE = float(np.exp(-(FULL_WEIGHT_DISTANCE**2) / 2))
 """Share of inliers with two residuals beyond FULL_WEIGHT_DISTANCE, where weights begin to fall."""
-POSE_STEPS = 10
-"""Solver steps of a stage where there are poses: against readings a hundred times sharper they
-allow short steps only at first, and after a single refused step the scales would seem settled."""
-MOST_ANNEALING_STAGES = 30
-"""Largest number of stages of the annealing."""
-GEMAN_MCCLURE_SCALE = 4.0
-"""Geman-McClure scale in units of the residuals' robust scale."""
-
-
 LEAST_SCALE = 1.0
 """Lower bound of the noise scale of poses, and of edges without shading. An error that several
 measurements share (a lens) is partly absorbed by the parameters, so residuals are smaller than
 errors: a smaller scale would promise too much."""
-SCALES_TRIED = 2.0 ** np.arange(13)
-"""Factors on LEAST_SCALE that are tried as a kind's noise scale."""
-SCALE_STEPS, MOST_REWEIGHTINGS = 5, 8
-"""Fixed-point steps to a kind's noise scale after that, and largest number of rounds of weights and
-solution from a start."""
-LOSS_CHANGE = 1e-2
-"""Change of the robust cost, in squared standard deviations, below which weights have converged."""
-ROUGHLY_SOLVED_DISTANCE = 1e-2
-"""Step tolerance of such a round: remaining change of all fitted values together, in standard
-deviations."""
+
+
+@dataclass(frozen=True)
+class RobustOptions:
+    """Constants of the search for a robust start."""
+
+    # solver steps of a stage of the annealing where there are poses: against readings a hundred
+    # times sharper they allow short steps only at first, and after a single refused step the scales
+    # would seem settled
+    pose_steps: int = 10
+    # largest number of stages of the annealing, each of which divides the scale by up to four
+    most_stages: int = 30
+    # Geman-McClure scale in units of the residuals' robust scale: an inlier at two of these keeps
+    # two thirds of its weight
+    geman_mcclure_scale: float = 4.0
+    # factors on LEAST_SCALE that are tried as a kind's noise scale: powers of two up to this one
+    largest_power: int = 12
+    # fixed-point steps to a kind's noise scale after that
+    scale_steps: int = 5
+    # largest number of rounds of weights and solution from the start by least squares
+    most_reweightings: int = 8
+    # change of the robust cost, in squared standard deviations, below which weights have converged
+    loss_change: float = 1e-2
+    # step tolerance of such a round: remaining change of all fitted values together, in standard
+    # deviations
+    roughly_solved: float = 1e-2
+
+
+ROBUST = RobustOptions()
 
 
 class RobustStart(NamedTuple):
@@ -133,7 +144,7 @@ def settled_weights(distance: Kinds[Array], scale: Kinds[Array]) -> Kinds[Array]
 
 
 def robust_cost(
-    problem: Problem, state: BatchState, *, scaled: bool = True
+    problem: Problem, state: BatchState, *, scaled: bool = True, options: RobustOptions = ROBUST
 ) -> tuple[Array, Kinds[Array], Kinds[Array]]:
     """-2 log of the posterior density (B,) at a state, up to a constant; with each kind's weights
     (B, K, G) and most likely noise scale (B,), which is 1 unless ``scaled``.
@@ -152,7 +163,8 @@ def robust_cost(
         d, n_runs = distance[:, there], len(cost)
         own, scale = np.zeros(n_runs), np.ones(n_runs)
         if there.any():
-            own, scale = _kind_cost(d, kind.count[there], as_pairs(kind)[there], scaled=scaled)
+            unit = as_pairs(kind)[there]
+            own, scale = _kind_cost(d, kind.count[there], unit, options, scaled=scaled)
         weight = np.zeros(distance.shape)
         weight[:, there] = final_weights(d / scale[:, None])
         cost = cost + own
@@ -161,7 +173,9 @@ def robust_cost(
     return cost, Kinds(*weights), Kinds(*scales)
 
 
-def _kind_cost(d: Array, count: Integers, unit: Array, *, scaled: bool) -> tuple[Array, Array]:
+def _kind_cost(
+    d: Array, count: Integers, unit: Array, options: RobustOptions, *, scaled: bool
+) -> tuple[Array, Array]:
     """Smallest cost (B,) of one kind's norms over the noise scale, and that scale (B,).
 
     d : (B, n) norms, as those of pairs.
@@ -180,10 +194,10 @@ def _kind_cost(d: Array, count: Integers, unit: Array, *, scaled: bool) -> tuple
         return loss + 2 * numbers * np.log(scale), np.maximum(np.sqrt(expected), LEAST_SCALE)
 
     best, at = np.full(len(d), np.inf), np.full(len(d), LEAST_SCALE)
-    next_scale = at
-    for number in range(len(SCALES_TRIED) + SCALE_STEPS if scaled else 1):
-        step = number >= len(SCALES_TRIED)
-        scale = next_scale if step else np.full(len(d), LEAST_SCALE * SCALES_TRIED[number])
+    next_scale, powers = at, options.largest_power + 1
+    for number in range(powers + options.scale_steps if scaled else 1):
+        step = number >= powers
+        scale = next_scale if step else np.full(len(d), LEAST_SCALE * 2.0**number)
         value, expected = cost_at(scale)
         better = value < best
         best, at = np.where(better, value, best), np.where(better, scale, at)
@@ -191,7 +205,9 @@ def _kind_cost(d: Array, count: Integers, unit: Array, *, scaled: bool) -> tuple
     return best, at
 
 
-def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) -> RobustStart:
+def robust_start(
+    problem: Problem, start: BatchState, *, scaled: bool = True, options: RobustOptions = ROBUST
+) -> RobustStart:
     """Start near the solution even where measurements are wrong, or parameters far from nominal.
 
     The end of the annealing; or, where that rejects measurements and least squares of all of them
@@ -199,7 +215,7 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
 
     scaled : whether noise may be larger than stated.
     """
-    annealed = anneal(problem, start)
+    annealed = anneal(problem, start, options)
     rejects = [
         np.any(kind.present & (weight < 0.5), axis=(1, 2))
         for kind, weight in zip(problem.kinds, annealed.weight, strict=True)
@@ -208,27 +224,27 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
     if not runs.size:
         return annealed  # both starts lead to the same solution
     part, state = problem.select(runs), take(annealed.state, runs)
-    usual, _, _ = robust_cost(part, state, scaled=scaled)
+    usual, _, _ = robust_cost(part, state, scaled=scaled, options=options)
     # second start: all measurements at full weight
     every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.kinds)
     one = np.ones(len(runs))
     every = Kinds(*(p.astype(float) for p in every))
     other = RobustStart(state, every, Kinds(one, one, one), 0)
     poses, before = bool(problem.kinds.poses.present.any()), np.full(len(runs), np.inf)
-    for _ in range(MOST_REWEIGHTINGS):
+    for _ in range(options.most_reweightings):
         parts = zip(other.weight, other.scale, strict=True)
         weight = Kinds(*(own / each[:, None, None] ** 2 for own, each in parts))
         searched = part.weighted(weight).as_noisy_as_at(other.state)
-        solution = minimise(searched, other.state, tolerance=ROUGHLY_SOLVED_DISTANCE)
-        cost, weight, scale = robust_cost(part, solution.state, scaled=scaled)
+        solution = minimise(searched, other.state, tolerance=options.roughly_solved)
+        cost, weight, scale = robust_cost(part, solution.state, scaled=scaled, options=options)
         other = RobustStart(solution.state, weight, scale, other.steps + int(solution.steps.max()))
         # a few wrong edges among thousands always draw least squares away: these iterations go on
         # only where they cost less at once
-        if np.all(cost > before - LOSS_CHANGE) or not (poses or np.any(cost < usual)):
+        if np.all(cost > before - options.loss_change) or not (poses or np.any(cost < usual)):
             break
         before = cost
     # the cheaper solution of each run
-    better = np.flatnonzero(cost < usual - LOSS_CHANGE)
+    better = np.flatnonzero(cost < usual - options.loss_change)
     runs = runs[better]
     return RobustStart(
         put(annealed.state, runs, take(other.state, better)),
@@ -238,14 +254,18 @@ def robust_start(problem: Problem, start: BatchState, *, scaled: bool = True) ->
     )
 
 
-def anneal(problem: Problem, start: BatchState) -> RobustStart:
+def anneal(problem: Problem, start: BatchState, options: RobustOptions = ROBUST) -> RobustStart:
     """Graduated non-convexity from a start: weights at a scale that shrinks from stage to stage."""
     state, steps = start, 0
-    most = POSE_STEPS if problem.kinds.poses.present.size else 1
+    most = options.pose_steps if problem.kinds.poses.present.size else 1
     d = norms(problem, problem.unweighted(state))
-    cut = [4 * GEMAN_MCCLURE_SCALE * scale for scale in noise_scales(problem, d, LEAST_SCALE)]
-    for _ in range(MOST_ANNEALING_STAGES):
-        aim = [GEMAN_MCCLURE_SCALE * scale for scale in noise_scales(problem, d, LEAST_SCALE)]
+    cut = [
+        4 * options.geman_mcclure_scale * scale for scale in noise_scales(problem, d, LEAST_SCALE)
+    ]
+    for _ in range(options.most_stages):
+        aim = [
+            options.geman_mcclure_scale * scale for scale in noise_scales(problem, d, LEAST_SCALE)
+        ]
         new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new

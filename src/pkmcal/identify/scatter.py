@@ -46,6 +46,10 @@ class EdgeScatter:
         """One run's alone."""
         return EdgeScatter(self.scale[run], self.shading[run], self.dof[run])
 
+    def batch(self) -> EdgeScatter:
+        """The noise of one run as a batch; the inverse of :meth:`of_run`."""
+        return EdgeScatter(self.scale[None], self.shading[None], self.dof[None])
+
     def irls_weight(self, blocks: EdgeBlocks, square: Array) -> Array:
         """By how much more or less each edge counts than on average, (B, K, G), where the squares
         of its whitened residuals are (B, K, G).

@@ -46,6 +46,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Column
 from pkmcal.solver.elimination import Linear, divisions, eliminate
@@ -66,7 +67,8 @@ MOST_VIOLATIONS_SOUGHT = 4
 @dataclass(frozen=True)
 class Score:
     """Result of a score test: decrease of chi2 by dof numbers; chance : p-value of this test;
-    adjusted : that among all tests, with equal shares for the families, NaN for a test alone.
+    adjusted : that among all tests of a session (:mod:`pkmcal.identify.false_alarm`), with equal
+    shares for the families, NaN for a test alone.
     """
 
     chi2: float
@@ -86,11 +88,6 @@ class OneStepUpdate:
     by_data: Array
 
 
-FALSE_ALARM = 0.005
-"""The false-alarm level of a session: the chance at which a session that agrees with its model
-shows any named violation, any discrepancy, or any measured pose that disagrees with all others."""
-
-
 class ScoreTests:
     """Score tests at the minimum of an estimate; the first run of the problem of ``info``.
 
@@ -108,14 +105,17 @@ class ScoreTests:
         singles: bool = False,
         beside: Sequence[Column] = (),
         variance: float = 1.0,
+        false_alarm: FalseAlarm = SESSION_FALSE_ALARM,
     ) -> None:
         """Evaluate the products of all columns.
 
-        families : number of each listed violation's family. The level is shared equally among the
-        families, and within a family among its tests. One family if absent; single readings are a
-        family of their own. beside : columns with a prior, which count as further unknowns.
-        variance : factor on the variance of all residuals, for further errors.
+        families : number of each listed violation's family. The level of the search is shared
+        equally among the families, and within a family among its tests. One family if absent;
+        single readings are a family of their own. beside : columns with a prior, which count as
+        further unknowns. variance : factor on the variance of all residuals, for further errors.
+        false_alarm : level of the session.
         """
+        self._false_alarm = false_alarm
         self._variance, self._scatter = variance, dict[int, float]()
         basis = _basis_beside(assembled, info, beside)
         self._problem = assembled, info, listed, basis, beside
@@ -150,20 +150,20 @@ class ScoreTests:
         tests = np.bincount(self._family, weights=dof > 0)
         times = np.count_nonzero(tests) * tests[self._family]
         chance = np.where(dof > 0, chdtrc(np.maximum(dof, 1), chi2), 1.0)
-        adjusted = np.where(dof > 0, np.minimum(times * chance, 1.0), 1.0)
+        adjusted = np.where(dof > 0, self._false_alarm.adjusted(chance, times), 1.0)
         every = zip(*(x.tolist() for x in (chi2, dof.astype(int), chance, adjusted)), strict=True)
         return [Score(*one) for one in every]
 
-    def tests_beyond(self, alpha: float, freed: Sequence[int] = ()) -> list[tuple[int, Score]]:
-        """Violations, by number, beyond a level ``alpha`` of all tests together (Bonferroni), the
-        smallest p-value first; each is tested beside those before it and beside the ``freed``.
+    def significant(self, freed: Sequence[int] = ()) -> list[tuple[int, Score]]:
+        """Violations, by number, that are significant at the level of the session, the smallest
+        p-value first; each is tested beside those before it and beside the ``freed``.
         """
         out: list[tuple[int, Score]] = []
         while len(out) < min(MOST_VIOLATIONS_SOUGHT, len(self._family)):
             scores = self.scores([*freed, *(k for k, _ in out)])
             # chances below the smallest number are all zero
             best = min(range(len(scores)), key=lambda k: (scores[k].adjusted, -scores[k].chi2))
-            if scores[best].adjusted > alpha:
+            if scores[best].adjusted > self._false_alarm.level:
                 break
             if best < len(self._made.listed) and best not in self._scatter:
                 self._scatter[best] = self._scattered(best, [*freed, *(k for k, _ in out)])

@@ -7,24 +7,31 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.robust import norms
+from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import ForwardResult
 
 MEDIAN_TURN_STEPS = 15
 EQUAL_TURNS_ANGLE = 1e-4
 """rad, about; rotations that differ by less are equal."""
 
 
-def start_state(machine: Machine, measurements: Measurements, T_camera_base_guess: Array) -> State:
+def start_state(
+    machine: Machine,
+    measurements: Measurements,
+    T_camera_base_guess: Array,
+    forward: ForwardResult | None = None,
+) -> State:
     """Initial state: the machine's present values, and poses by forward kinematics of the readings.
 
     Readings, not seen directions: the latter lead into local minima (errata, B).
-    T_camera_base_guess : (S, 4, 4).
+    T_camera_base_guess : (S, 4, 4). forward : forward kinematics of the machine at these readings,
+    if solved already.
     """
-    fk = machine.forward_result(measurements.joints)
+    fk = forward or machine.forward_result(measurements.joints)
     poses = fk.T_base_platform
     stations = np.asarray(T_camera_base_guess)
     return State(

@@ -28,36 +28,55 @@ from pkmcal.solver.search import Stop
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
 
-TOO_NOISY = 4.0
-"""Noise scale beyond which the model does not explain the images, or the poses."""
-TOO_MANY_LOST = 0.4
-"""Share of rejected edges beyond which the remaining ones may be the outliers."""
-UNIDENTIFIABLE = 0.05
-"""Share of the platform's error by the nominal model that may remain undetermined. A calibration
-reduces that error by a factor of twenty to fifty; a twentieth of it would be the result's largest
-error, and more of the same images do not reduce it. A result whose standard deviation is larger
-anyway is no worse for it."""
-MOSTLY_SINGULAR_SHARE = 0.5
-"""Share of configurations near a singular pose from which on the estimate is not reliable."""
-LARGE_CAUSE_SHARE = 0.3
-"""Share of what is undetermined from which on a single cause becomes a reason of its own."""
-WORTH_REPORTING = 0.5
-"""Displacement relative to the platform's standard deviation from which on a cause is worth a
-warning; one half makes the total larger by an eighth."""
-NOMINAL_ERROR_SHARE = 0.5
-"""Error relative to that expected by the prior sigmas that a result may leave: below a half the
-result is almost surely better than the nominal model; above, new values are not worth their risk.
-"""
-ENOUGH_TOUCHES = 15
-"""Heights of a bed, where a wrong one moves the tool by little more than its standard deviation
-before it is detected (benchmarks/heights.py)."""
-EXACT_SHARE = 1e-9
-"""Share of a variance below which it is rounding."""
 POLISHED_SHADING = 4 * OWN_SHADING
 """Shading of each edge beside its line, px, from which on tubes are like polished metal or in hard
 light: 0.07 to 0.26 on path-traced machines of metal, 0.005 to 0.05 on painted ones."""
 POOR_MODEL_POSE_SCALE = 1.3
 """Noise scale of poses beyond which the model is insufficient for them, unless by chance."""
+
+
+@dataclass(frozen=True)
+class VerdictOptions:
+    """Limits of a result that may be used."""
+
+    # noise scale beyond which the model does not explain the images, or the poses
+    too_noisy: float = 4.0
+    # share of rejected edges beyond which the remaining ones may be the outliers
+    too_many_rejected: float = 0.4
+    # share of the platform's error by the nominal model that may remain undetermined. A calibration
+    # reduces that error by a factor of twenty to fifty; a twentieth of it would be the result's
+    # largest error, and more of the same images do not reduce it. A result whose standard deviation
+    # is larger anyway is no worse for it
+    undetermined_share: float = 0.05
+    # share of configurations near a singular pose from which on the estimate is not reliable
+    singular_share: float = 0.5
+    # share of what is undetermined from which on a single cause becomes a reason of its own
+    large_cause_share: float = 0.3
+    # displacement relative to the platform's standard deviation from which on a cause is worth a
+    # warning; one half makes the total larger by an eighth
+    worth_reporting: float = 0.5
+    # error relative to that expected by the prior sigmas that a result may leave: below a half the
+    # result is almost surely better than the nominal model; above, new values are not worth their
+    # risk
+    nominal_error_share: float = 0.5
+    # residual of a reading, in standard deviations, beyond which it contradicts the images, and the
+    # share of such readings that is a reason: two in a billion normal errors are so large
+    reading_residual: float = 6.0
+    contradicted_share: float = 0.02
+    # edges of a leg, relative to the median of all legs, below which the leg is seldom in view
+    few_edges_share: float = 0.3
+    # factor on the edges' stated noise that is worth a warning: the standard deviations contain it
+    edge_scatter: float = 1.5
+    # configurations below which a note says that they are few
+    few_configurations: int = 10
+    # heights of a bed, where a wrong one moves the tool by little more than its standard deviation
+    # before it is detected (benchmarks/heights.py)
+    enough_touches: int = 15
+    # share of a variance below which it is rounding
+    rounding: float = 1e-9
+
+
+VERDICT = VerdictOptions()
 
 
 @dataclass(frozen=True)
@@ -82,6 +101,7 @@ def judge(
     richer: tuple[RicherModel, ...] = (),
     explained: bool = False,
     others: Sequence[Finding] = (),
+    options: VerdictOptions = VERDICT,
 ) -> Verdict:
     """Verdict on an estimate of a session.
 
@@ -92,28 +112,28 @@ def judge(
     others : findings of any level about the session.
     """
     bed = findings.bed
-    large, small = ((), ()) if bed else _unidentifiable_text(estimate, findings)
+    large, small = ((), ()) if bed else _unidentifiable_text(estimate, findings, options)
     # small parts of the standard deviation are in it already, and in the report
     matter = [s for s in small if s.matters]
     if matter:
-        least = WORTH_REPORTING * platform_sigma(estimate)
+        least = options.worth_reporting * platform_sigma(estimate)
         matter = [s for s in matter if s.moves_platform > least]
     # reasons against the result by what is undetermined
     undetermined = [_undetermined(s, Level.WRONG) for s in large]
     if bed:
-        undetermined = list(_bed_unknown(bed))
+        undetermined = list(_bed_unknown(bed, options))
     elif not large:
-        undetermined = list(_platform_unknown(estimate, findings.by_nominal))
+        undetermined = list(_platform_unknown(estimate, findings.by_nominal, options))
     # all findings, in the order of the report
     every = (
-        *_estimate_misfit(estimate, method),
+        *_estimate_misfit(estimate, method, options),
         *undetermined,
-        *_singular(estimate),
-        *_readings_misfit(estimate),
-        *(() if explained else _poses_misfit(estimate, richer)),
-        *_warnings(observation, estimate),
-        *(_touch_unnoticed(bed) if bed else ()),
-        *_few_configurations(estimate),
+        *_singular(estimate, options),
+        *_readings_misfit(estimate, options),
+        *(() if explained else _poses_misfit(estimate, richer, options)),
+        *_warnings(observation, estimate, options),
+        *(_touch_unnoticed(bed, options) if bed else ()),
+        *_few_configurations(estimate, options),
         *(_not_by_heights(bed, findings) if bed else ()),
         *others,
         *(_undetermined(s, Level.DOUBTFUL) for s in matter),
@@ -171,40 +191,42 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     )
 
 
-def no_gain(sigma: float, by_drawing: float) -> bool:
+def no_gain(sigma: float, by_drawing: float, options: VerdictOptions = VERDICT) -> bool:
     """Whether a result is no better than the nominal model, for data of any kind.
 
     sigma : standard deviation of the purpose of the result (the platform at given readings, or the
     tool's height above the bed).
     by_drawing : the same by the prior sigmas alone, in the same unit.
     """
-    return not sigma <= NOMINAL_ERROR_SHARE * by_drawing
+    return not sigma <= options.nominal_error_share * by_drawing
 
 
-def _platform_unknown(estimate: Estimate, by_drawing: float) -> Iterator[Finding]:
+def _platform_unknown(
+    estimate: Estimate, by_drawing: float, options: VerdictOptions
+) -> Iterator[Finding]:
     """Wrong if measurements of the platform do not improve on the nominal model."""
     sigma = platform_sigma(estimate)
-    if no_gain(sigma, by_drawing):
+    if no_gain(sigma, by_drawing, options):
         yield wrong("platform.no_gain", sigma=sigma, nominal_sigma=by_drawing)
 
 
-def _bed_unknown(bed: Bed) -> Iterator[Finding]:
+def _bed_unknown(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
     """Wrong if heights do not improve on the nominal model."""
-    if no_gain(bed.sigma, bed.by_drawing):
+    if no_gain(bed.sigma, bed.by_drawing, options):
         yield wrong("bed.no_gain", sigma=bed.sigma, nominal_sigma=bed.by_drawing)
 
 
-def _touch_unnoticed(bed: Bed) -> Iterator[Finding]:
+def _touch_unnoticed(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
     """Doubtful if one undetected wrong height has a large effect: no standard deviation contains
     it, since the size of such an error, of a crumb for example, is unknown.
     """
-    if bed.unnoticed is None or no_gain(bed.unnoticed, bed.by_drawing):
+    if bed.unnoticed is None or no_gain(bed.unnoticed, bed.by_drawing, options):
         yield doubtful(
             "bed.height_unnoticed",
             touches=bed.touches,
             shift=bed.unnoticed,
             nominal_sigma=bed.by_drawing,
-            more=max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2),
+            more=max(options.enough_touches - bed.touches, options.enough_touches // 2),
         )
 
 
@@ -224,37 +246,37 @@ def _not_by_heights(bed: Bed, findings: Findings) -> Iterator[Finding]:
         )
 
 
-def _estimate_misfit(estimate: Estimate, method: str) -> Iterator[Finding]:
+def _estimate_misfit(estimate: Estimate, method: str, options: VerdictOptions) -> Iterator[Finding]:
     """Findings on edges that the model does not explain, and on an estimate without convergence or
     redundancy.
     """
     s = estimate.statistics
     rejected = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
-    if s.noise_scale > TOO_NOISY and method != "bundle":
+    if s.noise_scale > options.too_noisy and method != "bundle":
         yield wrong("estimate.method_misfit", method=method, scale=s.noise_scale)
-    elif s.noise_scale > TOO_NOISY:
+    elif s.noise_scale > options.too_noisy:
         yield wrong("edges.misfit", scale=s.noise_scale)
-    if rejected > TOO_MANY_LOST:
-        yield wrong("edges.rejected_share", share=rejected, limit=TOO_MANY_LOST)
+    if rejected > options.too_many_rejected:
+        yield wrong("edges.rejected_share", share=rejected, limit=options.too_many_rejected)
     if s.dof <= 0:
         yield wrong("estimate.no_redundancy", dof=s.dof)
     if s.stopped == Stop.STEPS.value:
         yield wrong("estimate.not_converged", steps=s.steps)
     if method == "linear":
-        yield _base_alone(estimate)
+        yield _base_alone(estimate, options)
 
 
-def _readings_misfit(estimate: Estimate) -> Iterator[Finding]:
+def _readings_misfit(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
     """Readings that the images contradict."""
-    bad = np.abs(estimate.joint_residuals) > 6.0
-    if np.mean(bad) > 0.02:
+    bad = np.abs(estimate.joint_residuals) > options.reading_residual
+    if np.mean(bad) > options.contradicted_share:
         joint = int(np.argmax(bad.sum(axis=0))) + 1
         yield wrong(
             "readings.misfit", f"joint {joint}", joint=joint, number=int(bad.sum()), of=bad.size
         )
 
 
-def _base_alone(estimate: Estimate) -> Finding:
+def _base_alone(estimate: Estimate, options: VerdictOptions) -> Finding:
     """Finding on [B]'s linear method, which determines the base only, and on its accuracy.
 
     The variance by the edges alone is found by removing the prior: in units of the prior's
@@ -270,12 +292,12 @@ def _base_alone(estimate: Estimate) -> Finding:
     )
     # principal axes of the prior
     values, vectors = np.linalg.eigh(before)
-    above_limit = values > EXACT_SHARE * values[-1]
+    above_limit = values > options.rounding * values[-1]
     unit = vectors[:, above_limit] * np.sqrt(values[above_limit])
     inverse = vectors[:, above_limit] / np.sqrt(values[above_limit])
     v, axes = np.linalg.eigh(inverse.T @ together @ inverse)
     # e, and back to metres
-    by_edges = v / np.maximum(1 - v, EXACT_SHARE)
+    by_edges = v / np.maximum(1 - v, options.rounding)
     alone = np.sum((unit @ axes) ** 2 * by_edges)
     edges, prior, both = (
         float(np.sqrt(x / len(before))) for x in (alone, np.trace(before), np.trace(together))
@@ -283,7 +305,9 @@ def _base_alone(estimate: Estimate) -> Finding:
     return wrong("estimate.base_only", sigma=both, edges_sigma=edges, nominal_sigma=prior)
 
 
-def _poses_misfit(estimate: Estimate, richer: tuple[RicherModel, ...]) -> Iterator[Finding]:
+def _poses_misfit(
+    estimate: Estimate, richer: tuple[RicherModel, ...], options: VerdictOptions
+) -> Iterator[Finding]:
     """Findings on poses that the model does not explain, of which many are rejected, or that
     scatter more than stated; with the simplest of the richer models that fit equally well.
     """
@@ -291,30 +315,32 @@ def _poses_misfit(estimate: Estimate, richer: tuple[RicherModel, ...]) -> Iterat
     best = min((model.scale for model in richer), default=np.inf)
     fits = next((model for model in richer if model.scale < 1.1 * best), None)
     better = {"model": fits and fits.name, "model_scale": fits and fits.scale}
-    if s.pose_scale > TOO_NOISY:
+    if s.pose_scale > options.too_noisy:
         yield wrong("poses.misfit", scale=s.pose_scale, **better)
     share = float(np.mean(estimate.pose_weights < 0.5)) if estimate.pose_weights.size else 0.0
-    if share > TOO_MANY_LOST:
-        yield wrong("poses.rejected_share", share=share, limit=TOO_MANY_LOST)
+    if share > options.too_many_rejected:
+        yield wrong("poses.rejected_share", share=share, limit=options.too_many_rejected)
     # the scale of n numbers that are noise has the standard deviation 1 / sqrt(2 n)
     chance = 1 + 4 / np.sqrt(2 * max(s.dof_poses, 1.0))
-    if max(POOR_MODEL_POSE_SCALE, chance) < s.pose_scale <= TOO_NOISY:
+    if max(POOR_MODEL_POSE_SCALE, chance) < s.pose_scale <= options.too_noisy:
         yield doubtful("poses.scatter", scale=s.pose_scale, **better)
 
 
-def _singular(estimate: Estimate) -> Iterator[Finding]:
+def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
     """Wrong if most poses are singular: small errors then move the platform far, and no
     linearization holds.
     """
     machine = estimate.machine
     poses = estimate.state.T_base_platform[estimate.configurations]
     weak = on_manifold(machine.layout, machine.values, poses).singularity < NEAR_SINGULAR
-    if weak.mean() >= MOSTLY_SINGULAR_SHARE:
+    if weak.mean() >= options.singular_share:
         yield wrong("configurations.singular", number=int(weak.sum()), of=weak.size)
 
 
 def _unidentifiable_text(
-    estimate: Estimate, findings: Findings
+    estimate: Estimate,
+    findings: Findings,
+    options: VerdictOptions,
 ) -> tuple[tuple[Sentence, ...], tuple[Sentence, ...]]:
     """Sentences on what is undetermined: reasons against the result, and those to know of.
 
@@ -325,12 +351,12 @@ def _unidentifiable_text(
     weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
     open_ = findings.unidentified + weak
     total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
-    if total <= UNIDENTIFIABLE * findings.by_nominal:
+    if total <= options.undetermined_share * findings.by_nominal:
         return (), open_
     # where other causes make more of the standard deviation, that deviation suffices
     if total <= np.sqrt(max(platform_sigma(estimate) ** 2 - total**2, 0.0)):
         return (), open_
-    least = min(LARGE_CAUSE_SHARE * total, max(s.moves_platform for s in open_))
+    least = min(options.large_cause_share * total, max(s.moves_platform for s in open_))
     large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)
     return large, tuple(s for s in open_ if s not in large)
 
@@ -358,7 +384,9 @@ def _undecided(estimate: Estimate) -> list[str]:
     return [name for name, kind, by in named if by == "drawing" and kind != "radius"]
 
 
-def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]:
+def _warnings(
+    observation: Observation, estimate: Estimate, options: VerdictOptions
+) -> Iterator[Finding]:
     """Findings on values far from the nominal model, and on what increases standard deviations."""
     table = estimate.machine.parameters
     change = np.abs(_from_nominal(estimate.machine))
@@ -372,9 +400,9 @@ def _warnings(observation: Observation, estimate: Estimate) -> Iterator[Finding]
             most=float(change.max()),
         )
     in_view = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
-    for leg in np.flatnonzero(in_view < 0.3 * np.median(in_view)).tolist():
+    for leg in np.flatnonzero(in_view < options.few_edges_share * np.median(in_view)).tolist():
         yield doubtful("edges.leg_seldom_seen", f"leg {leg + 1}", leg=leg + 1)
-    if estimate.statistics.noise_scale > 1.5:
+    if estimate.statistics.noise_scale > options.edge_scatter:
         yield doubtful("edges.scatter", scale=estimate.statistics.noise_scale)
     shading = estimate.edge_noise.shading if observation.edges.leg.size else np.zeros(1)
     if shading.min() > POLISHED_SHADING:
@@ -393,8 +421,8 @@ def _from_nominal(machine: Machine) -> Array:
     return change - frames @ np.linalg.lstsq(frames, change, rcond=None)[0]
 
 
-def _few_configurations(estimate: Estimate) -> Iterator[Finding]:
-    """Note if fewer than ten configurations are in use."""
+def _few_configurations(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
+    """Note if few configurations are in use."""
     used = int(np.sum(estimate.configurations))
-    if used < 10 and not only_heights(estimate):
+    if used < options.few_configurations and not only_heights(estimate):
         yield note("configurations.few", number=used)

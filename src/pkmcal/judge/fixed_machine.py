@@ -25,9 +25,10 @@ from pkmcal.geometry.rigid import pose_difference, skew
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information, reduced_rows
-from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.effects import INTRINSICS

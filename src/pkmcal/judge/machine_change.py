@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, short_repr
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
     BestFit,
     alignment,
@@ -31,6 +30,7 @@ from pkmcal.identify.gauge import (
     generators,
     moved_centres,
 )
+from pkmcal.identify.state import State
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import numerical_rank
 

@@ -23,8 +23,8 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import pose_generators
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.judge.fixed_machine import Held, hold, too_little
 from pkmcal.measurements import Measurements

@@ -37,10 +37,12 @@ class Column:
 
     edges : (n, 2, k) turn of the normals of the edges ``edge_rows`` (n,), in their bases. poses :
     (n, 6, k) left perturbation of T_station_target of the poses ``pose_rows`` (n,). Without rows,
-    all of them in their order. readings : (K, m, k). motion : (S, K, 6, k) left perturbation
-    (omega, tau) of the stations' poses, by configuration. station, since : the camera or tracker of
-    that number stands elsewhere from that configuration on, by (omega, tau), k = 6. Absent: no
-    effect on these.
+    all of them in their order. edge_numbers : (n, w) the numbers of the column on which each edge
+    depends, where these are few; edges is then (n, 2, w). The problem's structure is that of the
+    rows and numbers, whatever the values of the derivatives. readings : (K, m, k). motion : (S, K,
+    6, k) left perturbation (omega, tau) of the stations' poses, by configuration. station, since :
+    the camera or tracker of that number stands elsewhere from that configuration on, by (omega,
+    tau), k = 6. Absent: no effect on these.
 
     prior : (k, l) root L of the numbers' covariance L L^T; None where nothing is known of them.
     at : (k,) numbers at which the measurements were made, zero if absent: an estimate finds their
@@ -53,6 +55,7 @@ class Column:
     kind: str = ""
     edges: Array | None = None
     edge_rows: Integers | None = None
+    edge_numbers: Integers | None = None
     poses: Array | None = None
     pose_rows: Integers | None = None
     readings: Array | None = None
@@ -70,12 +73,18 @@ class Column:
         """Number of its numbers, k."""
         if self.station is not None:
             return 6
+        if self.prior is not None:
+            return len(self.prior)
         parts = (self.edges, self.poses, self.readings, self.motion)
         return max((part.shape[-1] for part in parts if part is not None), default=0)
 
     def edges_of(self, number: int) -> Array | None:
         """Derivatives (N, 2, k) of all N edges; None where it acts on none."""
-        return _everywhere(self.edges, self.edge_rows, number)
+        edges = self.edges
+        if edges is not None and self.edge_numbers is not None:
+            few, edges = edges, np.zeros((len(edges), 2, self.count))
+            np.put_along_axis(edges, self.edge_numbers[:, None], few, axis=2)
+        return _everywhere(edges, self.edge_rows, number)
 
     def poses_of(self, number: int) -> Array | None:
         """Derivatives (N, 6, k) of all N poses; None where it acts on none."""

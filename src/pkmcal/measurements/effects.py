@@ -55,7 +55,7 @@ def intrinsics(measurements: Measurements) -> Iterator[Column]:
             str(c),
             edges=edges.by_intrinsics[of_edges] @ root if len(of_edges) else None,
             edge_rows=of_edges,
-            poses=poses.by_intrinsics[of_poses] @ root[:n],
+            poses=poses.by_intrinsics[of_poses] @ root[:n] if n else None,
             pose_rows=of_poses,
             prior=np.eye(root.shape[1]),
             at=measurements.intrinsics_at[c],
@@ -76,8 +76,6 @@ def shading(measurements: Measurements) -> Iterator[Column]:
     ends = np.searchsorted(number[order], cuts).tolist()
     for k, (start, stop) in enumerate(pairwise(cuts.tolist())):
         own = order[ends[k] : ends[k + 1]]
-        by = np.zeros((len(own), 2, stop - start))
-        by[np.arange(len(own)), :, number[own] - start] = -measurements.edges.shift[own]
         side = keys[start:stop, 3]
         correlation = np.where(side[:, None] == side, TUBE_CORRELATION, 0.0)
         np.fill_diagonal(correlation, 1.0)
@@ -85,8 +83,9 @@ def shading(measurements: Measurements) -> Iterator[Column]:
         yield Column(
             SHADING,
             f"station {station}, leg {leg}",
-            edges=by,
+            edges=-measurements.edges.shift[own][..., None],
             edge_rows=own,
+            edge_numbers=(number[own] - start)[:, None],
             prior=np.linalg.cholesky(correlation),
         )
 

@@ -24,8 +24,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot, nearest_rotation
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import BestFit, centre_index, default_gauge, in_gauge
+from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import four_step_checks as checks

@@ -24,7 +24,7 @@ from pkmcal.geometry.rigid import (
     perturb,
     pose_difference,
 )
-from pkmcal.identify.estimate import State
+from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.leg_axes import Axes

@@ -31,8 +31,8 @@ from pkmcal.geometry.rigid import (
     register,
     skew,
 )
-from pkmcal.identify.estimate import State
 from pkmcal.identify.start import middle_pose
+from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.poses import PoseBlocks, PoseData, pose_rows
 from pkmcal.mechanisms import Machine

@@ -25,8 +25,8 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge, in_gauge
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA

@@ -31,7 +31,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import cross, dot, perturb, register
-from pkmcal.identify.bundle import SHADING_CHANGE
+from pkmcal.identify.bundle import BATCH
 from pkmcal.identify.gauge import centre_index
 from pkmcal.identify.line_shading import common_shading
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE, LEAST_SCALE, clean_norm
@@ -109,7 +109,7 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
             shading = common_shading(*given, SHADING_SIGMA)[0]
         # weights at the new scale, and convergence of scale, shading and weights
         weight = final_weights(np.abs(residual) / scale * ONE_RESIDUAL_FACTOR) * system.used
-        change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
+        change = np.abs(shading / before[2] - 1).max(initial=0.0) / BATCH.shading_change
         change = max(change, np.abs(weight - before[0]).max() / 1e-2)
         if max(change, abs(scale / before[1] - 1) / 1e-3) < 1:
             break

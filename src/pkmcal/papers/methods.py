@@ -17,9 +17,10 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share, prior_in_gauge
-from pkmcal.identify.estimate import Estimate, State, Statistics, estimated_unknowns
+from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.scatter import EdgeScatter
+from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
@@ -150,7 +151,7 @@ def _estimate(
     """
     gauge = default_gauge(machine)
     # whitened residuals of the state
-    assembled = assemble(machine, measurements, gauge, use_prior=False)
+    assembled = assemble(machine, measurements, gauge)
     batch = batch_of(machine, assembled, state)
     unweighted = assembled.problem.unweighted(batch)
     edges = np.nan_to_num(assembled.places.edges.taken(unweighted.edges[0]))
@@ -207,4 +208,5 @@ def _estimate(
             pose_scale=pose_scale,
         ),
         gauge=gauge.name,
+        problem=assembled,
     )

@@ -25,7 +25,6 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import InputError
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
     BestFit,
     conventions,
@@ -34,6 +33,7 @@ from pkmcal.identify.gauge import (
     transformation,
 )
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.state import State
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine

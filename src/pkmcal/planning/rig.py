@@ -18,8 +18,8 @@ from pkmcal.boards.poses import LEAST_CORNERS_WEIGHED, pose_set
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, skew
 from pkmcal.identify.assembly import Assembled, assemble, batch_of
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import (
     SHADING_SIGMA,

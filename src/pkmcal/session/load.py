@@ -10,6 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanism
+from pkmcal.mechanisms.kinematics import ForwardResult
 from pkmcal.mechanisms.region import Region
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
@@ -160,6 +162,18 @@ class Session:
             count(self.images_taken, "image"),
         )
         return f"<Session {resolved(self.folder).name}: {self.machine.name}, {', '.join(parts)}>"
+
+    @cached_property
+    def forward(self) -> ForwardResult:
+        """Forward kinematics of the nominal model at the readings, solved once.
+
+        The nearest pose where its loops do not close. Raises GeometryError if the nominal model
+        has no home pose.
+        """
+        result = self.machine.forward_result(self.joints)
+        for shared in (result.T_base_platform, result.internal):
+            shared.setflags(write=False)
+        return result
 
     @property
     def called(self) -> str:

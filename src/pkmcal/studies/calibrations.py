@@ -30,7 +30,6 @@ from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference,
 from pkmcal.identify.assembly import Assembled, assemble, state_of
 from pkmcal.identify.bundle import BatchResult, counts, solve_batch
 from pkmcal.identify.covariance import machine_covariance
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
     BestFit,
     Gauge,
@@ -42,9 +41,10 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.identify.parameter_estimates import ROUNDING_SIGMA
 from pkmcal.identify.start import middle_pose
+from pkmcal.identify.state import State
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.identify.verdict import TOO_NOISY
+from pkmcal.identify.verdict import VERDICT
 from pkmcal.measurements import OWN_SHADING, SHADING_CORRELATION_ANGLE, SHADING_SIGMA
 from pkmcal.measurements.edges import EdgeData
 from pkmcal.measurements.effects import SHIFT_SIGMA, lines
@@ -182,7 +182,7 @@ class SimulatedCalibrations:
                     "chi2": fit.solution.cost / dof,
                     "scale": scale,
                     "steps": fit.solution.steps.astype(float),
-                    "failed": 1.0 - (good & (scale <= TOO_NOISY)),
+                    "failed": 1.0 - (good & (scale <= VERDICT.too_noisy)),
                 },
                 covariance=np.array([covariance for _, covariance in parameters]),
             )

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, on_manifold, readings_at_poses

@@ -128,7 +128,7 @@ class Viewed:
         The nearest pose where its loops do not close.
         """
         try:
-            return self.session.machine.forward_result(self.session.joints).T_base_platform
+            return self.session.forward.T_base_platform
         except GeometryError as error:  # the nominal model is the user's file
             raise error.as_input(self.session.document["mechanism"]) from None
 

@@ -1,0 +1,78 @@
+"""All searches of a session together give a false alarm at most at the level of the session."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.calibration.discrepancy_basis import discrepancy_components
+from pkmcal.identify.covariance import Information
+from pkmcal.identify.discrepancy import DiscrepancyOptions, discrepancy_of
+from pkmcal.identify.false_alarm import FalseAlarm
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.score import ScoreTests
+from pkmcal.measurements import Column
+from pkmcal.solver.elimination import Linear
+from test_discrepancy import right_session
+from test_model_violations import plays, scales
+
+LEVEL, SESSIONS = 0.2, 30
+
+
+@dataclass(frozen=True)
+class LinearProblem(Problem):
+    """A problem of which the residuals are drawn, by the rows at one state."""
+
+    drawn: Linear | None = None
+
+    def linearize(self, state):
+        return self.drawn
+
+    @classmethod
+    def of(cls, problem: Problem, rows: Linear, rng: np.random.Generator) -> LinearProblem:
+        """White residuals, priors included."""
+        value = np.where(rows.usable, rng.standard_normal(rows.value.shape), 0.0)
+        shared = rng.standard_normal(rows.shared_value.shape)
+        drawn = rows._replace(value=value, shared_value=shared)
+        parts = {name: getattr(problem, name) for name in Problem.__dataclass_fields__}
+        return cls(**parts, drawn=drawn)
+
+
+def test_a_session_gives_a_false_alarm_at_most_at_its_level():
+    """Linear sessions without any violation; the searches for violations, for a discrepancy, and,
+    with p-values drawn for them, for tubes and poses.
+    """
+    rng = np.random.default_rng(0)
+    _, data, estimate, _ = right_session(5, 10)
+    assembled, info = estimate.linearized
+    rows = info.linear
+    listed = [Column("test", readings=by) for by in scales(data) + plays(data)]
+    families = [0] * 6 + [1] * 6
+    components = discrepancy_components(data, estimate)
+    level = FalseAlarm(LEVEL)
+    alarms = np.zeros((SESSIONS, 4), dtype=bool)
+    for k in range(SESSIONS):
+        problem = LinearProblem.of(info.problem, rows, rng)
+        here = replace(assembled, problem=problem), Information(problem, info.state)
+        tests = ScoreTests(*here, listed, families, singles=True, false_alarm=level)
+        found = discrepancy_of(
+            *here, components, options=DiscrepancyOptions(false_alarm=level, scales=31)
+        )
+        tubes, poses = rng.uniform(size=(2, 15))
+        alarms[k] = (
+            bool(tests.significant()),
+            bool(found.scales),
+            tubes.min() < level.of_test(15),
+            level.adjusted(poses.min(), 15) < LEVEL,
+        )
+    most = LEVEL * SESSIONS
+    assert np.any(alarms, axis=1).sum() < most + 2 * np.sqrt(most * (1 - LEVEL))
+    assert np.any(alarms)
+
+
+def test_tests_of_one_search_share_its_level():
+    level = FalseAlarm(0.01, ("violations", "poses"))
+    assert level.of_test(5) == 0.001
+    assert level.of_test(0) == 0.005
+    np.testing.assert_allclose(level.adjusted(np.array([1e-3, 0.5]), np.array([5, 5])), [0.01, 1.0])
