@@ -44,7 +44,7 @@ from pkmcal.calibration.localization import (
 )
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
-from pkmcal.calibration.pose_hypotheses import check_frozen, check_poses
+from pkmcal.calibration.pose_hypotheses import check_closure, check_poses
 from pkmcal.calibration.refinement import (
     RefinementResult,
     identify_poses,
@@ -307,7 +307,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
     again, until none calls for another repair. Then mistakes that a user has to correct are
     compared. case : of the session. Raises `InputError` or `ResultError` where it cannot.
     """
-    check_frozen(session, case.boards)
+    check_closure(session, case.boards)
     repaired: dict[str, UpsideDown] = {}
     while True:
         turns = _identify(case, refine_camera, seed, clock)
