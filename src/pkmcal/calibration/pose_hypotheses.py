@@ -43,6 +43,7 @@ from pkmcal.outcome.finding import Finding, note
 from pkmcal.outcome.hypotheses import (
     OPTIONS,
     EvidenceLevel,
+    Explanation,
     Hypothesis,
     Ranked,
     decide,
@@ -55,8 +56,8 @@ from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
 from pkmcal.session.station_movement import how_far
 
-SUSPECT_POSE_SCALE = 2.0
-"""Factor on the poses' noise from which mistakes are looked for."""
+SUSPECT_SCALE = 2.0
+"""Factor on the noise of poses, or of edges, from which mistakes are looked for."""
 SUSPECT_REJECTED_SHARE = 0.1
 """Share of rejected poses from which they are."""
 FEWEST_POSES_A_SIDE = 3
@@ -544,7 +545,7 @@ def poses_disagree(estimate: Estimate) -> bool:
     """Whether the poses disagree with the machine so much that a mistake is likely."""
     rejected = estimate.pose_weights < 0.5
     return bool(rejected.size) and (
-        estimate.statistics.pose_scale > SUSPECT_POSE_SCALE
+        estimate.statistics.pose_scale > SUSPECT_SCALE
         or rejected.mean() > SUSPECT_REJECTED_SHARE
         or rejected.sum() >= 2 * FEWEST_POSES_A_SIDE
     )
@@ -572,29 +573,29 @@ def check_closure(session: Session, boards: Boards) -> None:
         raise error
 
 
-def check_poses(
+def explain_poses(
     session: Session,
     measurements: Measurements,
     estimate: Estimate,
     richer: tuple[RicherModel, ...] = (),
-) -> tuple[Finding, ...]:
-    """Raise `InputError` where a mistake explains why poses disagree with the machine, or where a
-    reading never changes; a note on hypotheses that have no estimate.
+) -> Explanation:
+    """The mistake that explains why poses disagree with the machine, if any.
 
     richer : other models of the mechanism file; where one of them fits, the model is at fault.
+    Raises InputError where poses disagree and a reading never changes.
     """
-    if not poses_disagree(estimate) or any(model.scale < SUSPECT_POSE_SCALE for model in richer):
-        return ()
+    if not poses_disagree(estimate) or any(model.scale < SUSPECT_SCALE for model in richer):
+        return Explanation()
     if error := frozen_in(session):
         raise error
     diagnosis = diagnose(session.machine, measurements, estimate)
-    if error := _error_of(session, diagnosis, pose_misfit(estimate)):
-        raise error
-    if not diagnosis.untested:
-        return ()
-    codes = [code for code, _ in diagnosis.untested]
-    why = diagnosis.untested[0][1].rstrip(".")
-    return (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
+    untested: tuple[Finding, ...] = ()
+    if diagnosis.untested:
+        codes = [code for code, _ in diagnosis.untested]
+        why = diagnosis.untested[0][1].rstrip(".")
+        untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
+    error = _error_of(session, diagnosis, pose_misfit(estimate))
+    return Explanation(error, diagnosis.log_odds, untested)
 
 
 def _error_of(session: Session, diagnosis: Diagnosis, misfit: float) -> InputError | None:

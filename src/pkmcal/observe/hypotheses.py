@@ -23,6 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
+from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_hypotheses
 from pkmcal.observe.pose_likelihood import (
     StationView,
@@ -298,9 +299,9 @@ def _likelier(
     )
 
 
-def _log_prior(view: StationView) -> float:
-    """Prior log-odds of each explanation of a station's images, all alike."""
-    readings = reading_hypotheses(view.all_joints, view.machine.joint_ranges)
+def log_prior_of_each(machine: Machine, joints: Array) -> float:
+    """Prior log-odds of each explanation of images, all alike. joints : readings (K, m)."""
+    readings = reading_hypotheses(joints, machine.joint_ranges)
     return -math.log(len({h.meaning for h in readings}) + OTHER_EXPLANATIONS)
 
 
@@ -308,7 +309,7 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
     """All mistakes in the readings, and images under their neighbours' names; of a station that was
     not localized, diameters taken for radii.
     """
-    view, prior = station.view, _log_prior(station.view)
+    view, prior = station.view, log_prior_of_each(station.view.machine, station.view.all_joints)
     # of a machine with equal thirds, any of its equal numberings would do
     any_numbering = station.localization.good and station.by_hand is None
     for h in reading_hypotheses(view.all_joints, view.machine.joint_ranges):
@@ -355,7 +356,7 @@ def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
     localized, or elsewhere than the user says, as its mirror image is.
     """
     view, T_camera_base = station.view, station.localization.T_camera_base
-    names, prior = view.configuration, _log_prior(view)
+    names, prior = view.configuration, log_prior_of_each(view.machine, view.all_joints)
     if station.elsewhere:
         yield ImageHypothesis(
             "image.mirrored",
