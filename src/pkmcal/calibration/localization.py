@@ -297,6 +297,8 @@ def mistake_in(
                 station.name,
                 [label_of(session.folder, station.photographs[k].path) for k in visible],
                 session.configurations,
+                session.document["joints"]["file"],
+                session.document["joints"]["columns"],
                 view,
                 station.T_camera_base,
                 item,

@@ -622,7 +622,8 @@ def _error(
 ) -> InputError:
     """The error that names the mistake. misfit_before : of the poses with it, in stated sigmas."""
     facts, joints = hypothesis.facts, session.document["joints"]
-    residual = f"with that, the poses fit {diagnosis.misfit:.1f} times their noise"
+    without = f"the poses fit {diagnosis.misfit:.1f} times their noise"
+    residual = f"with that, {without}"
     if hypothesis.code in ("board.moved", "station.moved"):
         what = (
             "the board was moved on the platform"
@@ -649,14 +650,14 @@ def _error(
         )
     times = f"{misfit_before:.{int(misfit_before < 10)}f}"
     parts = [
-        reading_error(one, joints["file"], joints["columns"], session.machine.joint_units)
+        reading_error(one, joints["file"], joints["columns"], session.machine.joint_units, without)
         for one in facts.get("parts", (hypothesis,))
     ]
     return InputError(
         ", and ".join(one.what for one in parts),
         where=parts[0].where,
         found=f"poses that the readings miss by {times} times their noise",
-        expected="; ".join([*(f"{one.expected}" for one in parts), residual]),
+        expected="; ".join(f"{one.expected}" for one in parts),
         next_step=". ".join(f"{one.next_step}" for one in parts),
         code=hypothesis.code,
     )

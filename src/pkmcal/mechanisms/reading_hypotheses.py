@@ -133,11 +133,16 @@ def shifted_rows(count: int) -> list[ReadingHypothesis]:
 
 
 def reading_error(
-    hypothesis: ReadingHypothesis, file: str, columns: Sequence[str], units: Sequence[str]
+    hypothesis: ReadingHypothesis,
+    file: str,
+    columns: Sequence[str],
+    units: Sequence[str],
+    without: str,
 ) -> InputError:
     """The error that names a mistake in the readings, without what shows it.
 
-    file : of the readings, with ``columns``. units : ``m`` or ``rad`` of each.
+    file : of the readings, with ``columns``. units : ``m`` or ``rad`` of each. without : what the
+    data do where the readings are right.
     """
     facts, where = hypothesis.facts, f"{file}, line 1"
     names = [columns[motor] for motor in facts.get("motors", ())]
@@ -173,5 +178,9 @@ def reading_error(
         expected = f"the columns in the order {listed(order, len(order))}"
         next_step = "Give the columns the order of the legs in the mechanism file"
     return InputError(
-        what, where=where, expected=expected, next_step=next_step, code=hypothesis.code
+        what,
+        where=where,
+        expected=f"{expected}; with that, {without}",
+        next_step=next_step,
+        code=hypothesis.code,
     )
