@@ -11,6 +11,7 @@ import pytest
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.calibration.localization import platform_poses
 from pkmcal.calibration.pose_hypotheses import (
     check_closure,
     closure_limit,
@@ -291,3 +292,31 @@ def test_what_no_mistake_explains_is_left_to_the_estimate(tmp_path):
     rng = np.random.default_rng(0)
     write_joints(made.folder, rng.permutation(made.joints))
     check_closure(load_session(made.folder), Boards())
+
+
+# legs that do not meet the platform
+
+
+@pytest.mark.parametrize(("motors", "code"), [([2], "readings.sign"), ([2, 3], "error.input")])
+def test_a_sign_is_named_where_the_legs_meet_with_the_other_one(tmp_path, motors, code):
+    """By the readings alone; with two wrong signs no single one explains it."""
+    make(tmp_path / "session", "h4", n=16)
+    session = load_session(tmp_path / "session")
+    joints = session.joints.copy()
+    joints[:, motors] *= -1
+    with pytest.raises(InputError) as caught:
+        platform_poses(replace(session, joints=joints))
+    assert caught.value.code == code
+    platform_poses(session)
+
+
+def test_signs_of_two_motors_are_not_taken_for_degrees(tmp_path):
+    """More than half of the readings are out of range, and in range divided by 57."""
+    made = make(tmp_path / "session", "h4", n=24)
+    joints = made.joints.copy()
+    joints[:, [0, 2]] *= -1
+    write_joints(made.folder, joints)
+    with pytest.raises(InputError) as caught:
+        load_session(made.folder)
+    assert caught.value.code == "readings.sign"
+    assert "motor1 and motor3" in caught.value.what

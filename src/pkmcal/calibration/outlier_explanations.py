@@ -102,12 +102,12 @@ def outlier_explanations(
     least = FALSE_ALARM / len(which)
     rejected = estimate.pose_weights[which] < 0.5
     odd = np.unique(measured.configuration[rejected & (_chance(m, squares / usual) < least)])
-    told: set[int] = set()
+    named: set[int] = set()
     for k in odd.tolist():
-        if k in told:
+        if k in named:
             continue
         finding, partner = _explained(session, measured, joints, odd, k, least)
-        told |= {partner}
+        named |= {partner}
         if finding is not None:
             yield finding
 

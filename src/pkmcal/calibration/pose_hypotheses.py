@@ -382,7 +382,7 @@ def _pairs(
     single: Sequence[PoseHypothesis], measurements: Measurements
 ) -> Iterator[PoseHypothesis]:
     """Two mistakes at once, each pair of readings once. Facts: ``parts``, the two."""
-    seen: set[bytes] = set()
+    compared: set[bytes] = set()
     for one, other in product(single, single):
 
         def apply(
@@ -391,9 +391,9 @@ def _pairs(
             return other.apply(one.apply(case))
 
         joints = np.round(apply(PoseCase(measurements)).measurements.joints, 12).tobytes()
-        if one.meaning == other.meaning or joints in seen:
+        if one.meaning == other.meaning or joints in compared:
             continue
-        seen.add(joints)
+        compared.add(joints)
         subject = " and ".join(sorted(f"{part.code} of {part.subject}" for part in (one, other)))
         prior = one.log_prior + other.log_prior
         yield PoseHypothesis(one.code, subject, apply, prior, facts={"parts": (one, other)})
