@@ -52,7 +52,7 @@ def explain_radii(
     cameras are estimated. seed : for the localization of the stations.
     """
     null = _edge_misfit(turns)
-    if not case.photographs or null <= SUSPECT_SCALE:
+    if not case.images or null <= SUSPECT_SCALE:
         return Explanation()
     inliers = 0.0 if turns is None else float(turns.estimate.edge_weights.sum())
     # errors of an imperfect model vary smoothly, so no more are independent than it has parameters
@@ -96,7 +96,7 @@ def _edge_misfit(turns: RefinementResult | None) -> float:
 def _refined(case: Case, session: Session, refine_camera: bool, seed: int) -> RefinementResult:
     """The refinement of another session with the images of a case."""
     rng = np.random.default_rng(seed)
-    again = localize_case(session, case.photographs, case.boards, rng)
+    again = localize_case(session, case.images, case.boards, rng)
     cameras = refinement_of(again.session, refine_camera)
     return refine_alternating(again, cameras, lambda _text, _share: None, lambda _step: None)
 
