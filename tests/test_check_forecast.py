@@ -220,7 +220,7 @@ def test_pictures_of_all_images(found, tmp_path):
     write_pictures(found.look, tmp_path / "pictures")
     names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
     assert names == sorted(picture_names(found.look).values())
-    assert len(names) == sum(station.images for station in found.stations)
+    assert len(names) == sum(station.photographs for station in found.stations)
     station = found.look.stations[0]
     width, height = station.images.camera.image_size
     drawn = cv2.imread(str(tmp_path / "pictures" / names[0]))

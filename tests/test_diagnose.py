@@ -16,17 +16,19 @@ from pkmcal.calibration.localization import boards_of, localize_stations, read_i
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import hypotheses
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.hypotheses import SuspectStation, _best_names, _numbering, mistake
+from pkmcal.observe.hypotheses import SuspectStation, _best_names, mistake
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LocalizedPose, find_station
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import camera_of_size
+from pkmcal.wording import listed
 from test_observe_drawing import camera_of, draw, images, machine, poses, redrawn, tubes_at
 from test_observe_search import clouds, rough_pose
 
 NAMES = tuple("abcdefghi")
+COLUMNS = [f"leg{k + 1}" for k in range(6)]
 
 
 def pictures(count=6):
@@ -63,7 +65,7 @@ def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None,
             key=lambda f: (f.good, f.log_likelihood_ratio),
         )
     files = [f"images/front/{name}.png" for name in NAMES]
-    return SuspectStation("front", files, NAMES, view, by_hand, localization)
+    return SuspectStation("front", files, NAMES, "joints.csv", COLUMNS, view, by_hand, localization)
 
 
 def b_again():
@@ -111,12 +113,9 @@ def test_two_columns_exchanged(pair, by_hand, seed):
     order, count = np.arange(6), 6 if by_hand else 9
     order[list(pair)] = order[list(pair)[::-1]]
     error = said(pictures(count), readings_with(order, count), by_hand=given(by_hand), seed=seed)
-    a, b = pair
-    assert str(error) == (
-        f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the images"
-        f" fit with these two columns exchanged. Exchange the columns of legs {a + 1} and {b + 1}"
-        " in joints.csv, or the two legs in the nominal model."
-    )
+    assert error.code == "readings.exchanged"
+    a, b = (COLUMNS[k] for k in pair)
+    assert error.what == f"the readings of {a} and {b} are exchanged"
 
 
 @pytest.mark.parametrize("motor", [2, also(5)])
@@ -126,42 +125,29 @@ def test_a_motor_that_counts_the_other_way(motor):
     constant = readings[:, motor].min() + readings[:, motor].max() + 0.004
     readings[:, motor] = constant - readings[:, motor]
     error = said(pictures(), readings, by_hand=given(True))
-    assert error.what == f"the readings of motor {motor + 1} count the other way"
-    named = float(re.search(r"some (\d+) mm less the reading", error.found)[1])
+    assert error.code == "readings.reversed"
+    assert error.what == f"the readings of {COLUMNS[motor]} count the other way"
+    named = float(re.match(r"(\d+) mm, or nearly so", error.expected)[1])
     assert abs(named - 1e3 * constant) < 10
 
 
-@pytest.mark.parametrize(
-    ("turn", "or_else"),
-    [
-        also(1, ""),
-        also(2, "; they fit as well if the pose by hand is of another side of the machine"),
-    ],
-)
-def test_columns_turned_round(turn, or_else):
+@pytest.mark.parametrize(("turn", "another_side"), [also(1, False), also(2, True)])
+def test_columns_turned_round(turn, another_side):
     """A hexapod turned by a third looks the same, and only the rough pose decides."""
-    error = said(pictures(), readings_with(np.roll(np.arange(6), turn)), by_hand=given(True))
-    assert str(error) == (
-        "joints.csv: the legs are numbered differently in the readings and in the nominal"
-        " model; found"
-        f" the images fit when leg 1 takes the readings of column {turn + 1}, leg 2 those of"
-        f" column {turn + 2}, and so on round{or_else}. Give the columns of joints.csv the order of"
-        " the legs in the nominal model."
-    )
-
-
-def test_which_way_round_legs_are_numbered_is_told():
-    text = str(_numbering(np.array([5, 4, 3, 2, 1, 0])))
-    assert "leg 1 takes the readings of column 6, leg 2 those of column 5" in text
-    assert "and so on backwards" in text
-    assert "and so on round" in str(_numbering(np.array([5, 0, 1, 2, 3, 4])))
+    order = np.roll(np.arange(6), turn)
+    error = said(pictures(), readings_with(order), by_hand=given(True))
+    assert error.code == "readings.numbering_turned"
+    right = listed([COLUMNS[k] for k in np.argsort(order)], 6)
+    assert error.expected.startswith(f"the columns in the order {right}")
+    rival = "the pose by hand is of another side of the machine"
+    assert (rival in (error.found or "")) == another_side
 
 
 @pytest.mark.slow
 def test_columns_in_reverse():
     error = said(pictures(), readings_with(np.arange(6)[::-1]), by_hand=given(True))
-    assert "leg 1 takes the readings of column 6, leg 2 those of column 5" in str(error)
-    assert "backwards" in str(error)
+    assert error.code == "readings.numbering_reversed"
+    assert error.expected.startswith(f"the columns in the order {listed(COLUMNS[::-1], 6)}")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from math import exp, log
 
@@ -10,7 +11,13 @@ import pytest
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
-from pkmcal.calibration.pose_hypotheses import closure_misfits, contradicted_by_closure
+from pkmcal.calibration.localization import platform_poses
+from pkmcal.calibration.pose_hypotheses import (
+    check_closure,
+    closure_limit,
+    closure_misfits,
+)
+from pkmcal.errors import InputError
 from pkmcal.mechanisms.reading_hypotheses import reading_hypotheses
 from pkmcal.outcome.hypotheses import (
     OPTIONS,
@@ -23,7 +30,7 @@ from pkmcal.outcome.hypotheses import (
     rivals_of,
 )
 from pkmcal.session.load import load_session
-from test_pose_sessions import make
+from test_pose_sessions import make, write_joints
 
 
 def named(code, subject="", log_prior=0.0, action="refuse"):
@@ -217,6 +224,12 @@ def test_closure_finds_the_mistake(tmp_path, name, kind, code):
             assert np.median(np.abs(restored - right.joints)) < 0.02
 
 
+def contradicted(machine, measurements, rng):
+    """Whether poses and readings contradict each other."""
+    (misfit,) = closure_misfits(machine, [measurements])
+    return misfit > closure_limit(machine, measurements, rng)
+
+
 @pytest.mark.parametrize("name", ["gough-stewart", "delta"])
 def test_a_reading_that_stands_still_contradicts_the_poses(tmp_path, name):
     """But not where the machine stood so in truth."""
@@ -226,7 +239,7 @@ def test_a_reading_that_stands_still_contradicts_the_poses(tmp_path, name):
     joints = right.joints.copy()
     joints[:, 1] = joints[0, 1]
     frozen, rng = replace(right, joints=joints), np.random.default_rng(0)
-    assert contradicted_by_closure(session.machine, frozen, rng)
+    assert contradicted(session.machine, frozen, rng)
     held = made.machine.forward_result(joints)
     body = held.T_base_platform[held.converged]
     rows = np.flatnonzero(held.converged)
@@ -234,4 +247,76 @@ def test_a_reading_that_stands_still_contradicts_the_poses(tmp_path, name):
     there = right.poses.T_station_target[0] @ np.linalg.inv(body[0]) @ body
     still = replace(right, joints=joints[rows], poses=replace(
         poses, T_station_target=there, configuration=np.arange(len(rows))))  # fmt: skip
-    assert not contradicted_by_closure(session.machine, still, rng)
+    assert not contradicted(session.machine, still, rng)
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "h4", "delta"])
+@pytest.mark.parametrize("kind", ["poses", "points"])
+def test_right_readings_contradict_no_poses(tmp_path, name, kind):
+    make(tmp_path / "session", name, kind, n=24)
+    session = load_session(tmp_path / "session")
+    right = measurements_of(session, Boards())
+    assert not contradicted(session.machine, right, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", ["delta", "gough-stewart"])
+def test_exchanged_columns_are_refused_before_any_estimate_of_them(tmp_path, name):
+    """An estimate from them takes a thousand steps; one from the right order is made."""
+    made = make(tmp_path / "session", name, n=24)
+    write_joints(made.folder, made.joints[:, [1, 0, *range(2, made.joints.shape[1])]])
+    with pytest.raises(InputError) as caught:
+        check_closure(load_session(made.folder), Boards())
+    assert caught.value.code == "readings.exchanged"
+
+
+def test_two_mistakes_are_named_together(tmp_path):
+    """Two motors that count the other way, and two rows exchanged, which hide neither."""
+    made = make(tmp_path / "session", "gough-stewart", n=24)
+    joints, constants = made.joints.copy(), []
+    for motor in (0, 3):
+        constants.append(joints[:, motor].min() + joints[:, motor].max() + 0.003)
+        joints[:, motor] = constants[-1] - joints[:, motor]
+    joints[[5, 9]] = joints[[9, 5]]
+    write_joints(made.folder, joints)
+    with pytest.raises(InputError) as caught:
+        check_closure(load_session(made.folder), Boards())
+    assert caught.value.code == "readings.reversed"
+    assert re.findall(r"motor\d", caught.value.what) == ["motor1", "motor4"]
+    named = [1e-3 * int(value) for value in re.findall(r"(\d+) mm, or", caught.value.expected)]
+    np.testing.assert_allclose(named, constants, atol=6e-3)
+
+
+def test_what_no_mistake_explains_is_left_to_the_estimate(tmp_path):
+    """Readings of another movement of the machine."""
+    made = make(tmp_path / "session", "gough-stewart", n=24)
+    rng = np.random.default_rng(0)
+    write_joints(made.folder, rng.permutation(made.joints))
+    check_closure(load_session(made.folder), Boards())
+
+
+# legs that do not meet the platform
+
+
+@pytest.mark.parametrize(("motors", "code"), [([2], "readings.sign"), ([2, 3], "error.input")])
+def test_a_sign_is_named_where_the_legs_meet_with_the_other_one(tmp_path, motors, code):
+    """By the readings alone; with two wrong signs no single one explains it."""
+    make(tmp_path / "session", "h4", n=16)
+    session = load_session(tmp_path / "session")
+    joints = session.joints.copy()
+    joints[:, motors] *= -1
+    with pytest.raises(InputError) as caught:
+        platform_poses(replace(session, joints=joints))
+    assert caught.value.code == code
+    platform_poses(session)
+
+
+def test_signs_of_two_motors_are_not_taken_for_degrees(tmp_path):
+    """More than half of the readings are out of range, and in range divided by 57."""
+    made = make(tmp_path / "session", "h4", n=24)
+    joints = made.joints.copy()
+    joints[:, [0, 2]] *= -1
+    write_joints(made.folder, joints)
+    with pytest.raises(InputError) as caught:
+        load_session(made.folder)
+    assert caught.value.code == "readings.sign"
+    assert "motor1 and motor3" in caught.value.what

@@ -13,12 +13,21 @@ import yaml
 import pkmcal
 from pkmcal.calibration import calibrate
 from pkmcal.calibration.camera_refinement import refinement_of
-from pkmcal.calibration.image_rotation import UpsideDown, turned_round, upside_down
+from pkmcal.calibration.image_rotation import (
+    rotation_finding,
+    turned_round,
+    upside_down,
+    upside_down_images,
+)
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras import load_camera
+from pkmcal.errors import InputError
+from pkmcal.files import csv_text
+from pkmcal.files.tables import read_csv
 from pkmcal.identify.score import OneStepUpdate, ScoreTests
 from pkmcal.judge.new_data import _as_calibrated
+from pkmcal.outcome.hypotheses import Ranked, decide
 from pkmcal.report.calibration import save
 from test_calibration import check_found
 
@@ -50,8 +59,8 @@ def turned_calibration(calibrated):
     """The demonstration's calibration as if its images had been upside down."""
     session, file = calibrated.session, "cameras/camera.yaml"
     camera = session.stations[0].camera.turned_by_half()
-    one = UpsideDown(file, tuple(station.entry for station in session.stations), camera, 20.0)
-    return replace(calibrated, session=turned_round(session, {file: camera}), upside_down=(one,))
+    one = upside_down_images(file, [station.entry for station in session.stations], camera)
+    return replace(calibrated, session=one.apply(session), upside_down=(one,))
 
 
 @pytest.mark.slow
@@ -75,6 +84,19 @@ def test_upside_down_images_are_known_by_their_cameras_centre(turned):
         np.testing.assert_array_equal(station.camera.parameters, own.parameters)
 
 
+@pytest.mark.slow
+def test_a_motor_that_counts_the_other_way_beside_upside_down_images(turned, tmp_path):
+    """The readings are refused before any repair; right ones lead to the repair, as above."""
+    folder = shutil.copytree(turned, tmp_path / "session")
+    table = read_csv(folder / "joints.csv")
+    joints = table.values.copy()
+    joints[:, 2] = joints[:, 2].min() + joints[:, 2].max() + 0.004 - joints[:, 2]
+    (folder / "joints.csv").write_text(csv_text(table.columns, table.names, joints))
+    with pytest.raises(InputError) as caught:
+        pkmcal.calibrate(folder)
+    assert caught.value.code == "readings.reversed"
+
+
 def test_upright_images_are_left_as_they_are(calibrated):
     assert not calibrated.verdict.of("image")
     for station in calibrated.session.stations:
@@ -89,7 +111,7 @@ def test_where_it_is_likely_it_is_said(demo, monkeypatch):
     def likely(session, turns):
         station = session.stations[0]
         file, camera = station.camera_file, station.camera.turned_by_half()
-        return (UpsideDown(file, ("station1",), camera, np.log(376.0)),)
+        return (Ranked(upside_down_images(file, ["station1"], camera), np.log(376.0)),)
 
     monkeypatch.setattr(calibrate, "upside_down", likely)
     results = pkmcal.calibrate(demo.session)
@@ -104,13 +126,10 @@ def test_where_it_is_likely_it_is_said(demo, monkeypatch):
 
 def test_odds_that_are_too_few_are_said_with_what_to_do(calibrated):
     camera = calibrated.session.stations[0].camera.turned_by_half()
-    one = UpsideDown("cameras/camera.yaml", ("station1",), camera, np.log(376.0))
-    assert not one.sure
-    assert (one.finding.code, one.finding.subject) == (
-        "image.perhaps_upside_down",
-        "cameras/camera.yaml",
-    )
-    assert "odds of 376 to 1" in one.finding.text
+    one = Ranked(upside_down_images("cameras/camera.yaml", ["station1"], camera), np.log(376.0))
+    finding = rotation_finding(one)
+    assert (finding.code, finding.subject) == ("image.perhaps_upside_down", "cameras/camera.yaml")
+    assert finding.facts["odds"] == pytest.approx(376.0)
 
 
 def lens(session, centre, covariance=None):
@@ -139,11 +158,13 @@ def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigm
     session = lens(calibrated.session, (8.0, -5.0))
     (camera,) = {id(station.camera): station.camera for station in session.stations}.values()
     results = upside_down(session, calibrated)
-    assert [(one.file, one.entries, one.sure) for one in results] == [
-        ("cameras/camera.yaml", ("station1", "station2", "station3"), known)
-    ] * (known is not None)
+    subjects = [(one.hypothesis.subject, one.hypothesis.facts["stations"]) for one in results]
+    expected = ("cameras/camera.yaml", ("station1", "station2", "station3"))
+    assert subjects == [expected] * (known is not None)
     for one in results:
-        np.testing.assert_array_equal(one.camera.parameters, camera.turned_by_half().parameters)
+        assert (decide([one]) is not None) == known
+        turned = one.hypothesis.camera.parameters
+        np.testing.assert_array_equal(turned, camera.turned_by_half().parameters)
 
 
 @pytest.mark.parametrize(

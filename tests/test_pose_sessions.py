@@ -268,24 +268,28 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
 
 def test_no_configuration_is_exchanged_with_itself(folder):
     """A pose that lost its weight, its reading off by as much as makes it just disagree."""
-    made = make(folder, "h4", n=30)
+    make(folder, "h4", n=30)
     right = calibrate_session(folder)
     estimate, measurements = right.estimate, right.measurements
     weights = estimate.pose_weights.copy()
     weights[measurements.poses.configuration == 7] = 0.0
     text = []
-    for off in np.linspace(0, 2e-3, 401):
+    for off in np.linspace(0, 4e-3, 81):
         joints = measurements.joints.copy()
-        joints[7] += off
+        joints[7, 2] += off
         text += outlier_explanations(
             replace(right.session, joints=joints),
             replace(measurements, joints=joints),
             replace(estimate, pose_weights=weights),
         )
-    assert text  # far off enough it is named
-    assert "007" not in {one.facts.get("other") for one in text}
+    # far off enough it is named, and nothing else
+    assert {(one.code, one.subject) for one in text} == {("readings.outvoted", "motor3, 007")}
     assert "007" not in {one.facts.get("like") for one in text}
-    assert len(made.joints) == 30
+    joints = measurements.joints.copy()
+    joints[7] += [2e-3, -2e-3, 3e-3, 1e-3]  # no single reading, and no other configuration's
+    spoilt = replace(measurements, joints=joints)
+    estimate = replace(estimate, pose_weights=weights)
+    assert not [*outlier_explanations(right.session, spoilt, estimate)]
 
 
 def test_poses_that_coarse_readings_explain_are_not_rejected(folder):

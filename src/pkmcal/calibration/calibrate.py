@@ -32,7 +32,7 @@ from pkmcal.calibration.faults import (
     size_notes,
 )
 from pkmcal.calibration.handheld import inconsistent_poses, localize_case, without_misplaced
-from pkmcal.calibration.image_rotation import UpsideDown, turned_round, upside_down
+from pkmcal.calibration.image_rotation import UpsideDown, rotation_finding, upside_down
 from pkmcal.calibration.leg_numbering import numbering_note
 from pkmcal.calibration.localization import (
     CalibrationProgress,
@@ -44,7 +44,7 @@ from pkmcal.calibration.localization import (
 )
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
-from pkmcal.calibration.pose_hypotheses import check_frozen, check_poses
+from pkmcal.calibration.pose_hypotheses import check_closure, explain_poses
 from pkmcal.calibration.refinement import (
     RefinementResult,
     identify_poses,
@@ -53,7 +53,7 @@ from pkmcal.calibration.refinement import (
 )
 from pkmcal.calibration.rejections import rejection_findings, unused_configurations
 from pkmcal.calibration.summary import CalibrationSummary, Overview
-from pkmcal.calibration.tube_radii import check_radii
+from pkmcal.calibration.tube_radii import explain_radii
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, quoted, resolved
 from pkmcal.identify.bundle import bundle
@@ -72,6 +72,7 @@ from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, doubtful, note
+from pkmcal.outcome.hypotheses import Ranked, decide, refuse
 from pkmcal.papers import PaperMethod
 from pkmcal.papers.conditions import conditions
 from pkmcal.ranges import check_number
@@ -94,9 +95,9 @@ class Calibration(CalibrationSummary):
     machine's parameters. timings : seconds by step. holdout : configurations that the estimate does
     not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them. violations :
     detected model violations. model_errors : smooth model errors without a name, which the
-    covariance contains. upside_down : cameras, turned by half, by which upside-down images were
-    measured. images : images of stations whose legs were observed, by the station's number;
-    those that fitted into memory are decoded.
+    covariance contains. upside_down : images that were measured by their camera turned by half.
+    images : images of stations whose legs were observed, by the station's number; those that
+    fitted into memory are decoded.
     """
 
     session: Session
@@ -285,15 +286,16 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
 class Settled(NamedTuple):
     """A repaired session and its estimate, which no hypothesis explains better.
 
-    stated : the estimate with the readings' noise as stated. turned : cameras whose images are
-    upside down, or may be. findings : notes on hypotheses that could not be tested.
+    stated : the estimate with the readings' noise as stated. repairs : that were made, the data
+    otherwise than stated. findings : on repairs, on hypotheses that are likely but not decided for,
+    and on those that could not be tested.
     """
 
     case: Case
     turns: RefinementResult
     stated: Estimate
     richer: tuple[RicherModel, ...]
-    turned: tuple[UpsideDown, ...]
+    repairs: tuple[UpsideDown, ...] = ()
     findings: tuple[Finding, ...] = ()
 
 
@@ -301,49 +303,66 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
     """All that decides whether a session can be calibrated: `calibrate` goes on from it, and
     `check` ends with it.
 
-    Repairs change the case, so after each one the machine is estimated and every hypothesis weighed
-    again, until none calls for another repair. Then mistakes that a user has to correct are
-    compared. case : of the session. Raises `InputError` or `ResultError` where it cannot.
+    All hypotheses are compared with the data as stated. A repair changes the data, so after each
+    one the machine is localized and estimated, and all hypotheses are compared, again; each repair
+    concerns a camera's file or a station that no later one concerns, which bounds their number.
+    Raises `InputError`, the likeliest mistake, or `ResultError` where there is no estimate.
+
+    case : of the session.
     """
-    check_frozen(session, case.boards)
-    repaired: dict[str, UpsideDown] = {}
+    repairs: list[Ranked[UpsideDown]] = []
     while True:
-        turns = _identify(case, refine_camera, seed, clock)
-        turned = [one for one in upside_down(case.session, turns) if one.file not in repaired]
-        if sure := [one for one in turned if one.sure]:
-            repaired |= {one.file: one for one in sure}
-            # of the whole session: a station that was left out before may have been upside down
-            cameras = {file: one.camera for file, one in repaired.items()}
-            case = _observe(turned_round(session, cameras), seed, clock)
+        # mistakes in the readings, without which no estimate means anything
+        check_closure(case.session, case.boards)
+        try:
+            turns = _identify(case, refine_camera, clock)
+        except ResultError:
+            refuse(explain_radii(case, None, refine_camera, seed))
+            raise
+        # images that are upside down; all stations begin anew, for one that was rejected before
+        # may have been upside down, too
+        files = {one.hypothesis.subject for one in repairs}
+        rotations = [
+            one for one in upside_down(case.session, turns) if one.hypothesis.subject not in files
+        ]
+        if sure := [one for one in rotations if decide([one])]:
+            repairs += sure
+            repaired = session
+            for one in repairs:
+                repaired = one.hypothesis.apply(repaired)
+            case = _observe(repaired, seed, clock)
             continue
+        # stations that are not where they were localized
         wrong = by_chance(case.session, turns) or inconsistent_poses(
             case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
         )
         if not wrong:
             break
         case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
+    # mistakes that a user has to correct
     clock.progress("Looking for mistakes that explain the data", 0.86)
-    machine = case.session.machine
-    stated = refit_fixed_noise(machine, turns.measurements, turns.estimate)
+    stated = refit_fixed_noise(case.session.machine, turns.measurements, turns.estimate)
     richer = richer_models(case.session, turns.measurements, stated)
-    untested = (
-        *case.scene.findings,
-        *(
-            note("poses.model_failed", model.name, why=model.failure.rstrip("."))
-            for model in richer
-            if model.failure
-        ),
-        *check_poses(case.session, turns.measurements, stated, richer),
-        *check_radii(case, turns.estimate, bool(chance_match_reason(turns)), refine_camera, seed),
+    untested = refuse(
+        explain_poses(case.session, turns.measurements, stated, richer),
+        explain_radii(case, turns, refine_camera, seed),
     )
-    return Settled(case, turns, stated, richer, (*repaired.values(), *turned), untested)
+    failed = (
+        note("poses.model_failed", model.name, why=model.failure.rstrip("."))
+        for model in richer
+        if model.failure
+    )
+    found = (rotation_finding(one) for one in (*repairs, *rotations))
+    findings = (*found, *case.scene.findings, *failed, *untested)
+    made = tuple(one.hypothesis for one in repairs)
+    return Settled(case, turns, stated, richer, made, findings)
 
 
 def _finished(
     settled: Settled, method: CalibrationMethod, seed: int, holdout: int, clock: Clock
 ) -> Calibration:
     """The calibration of a session after all repairs."""
-    case, turns, stated, richer, turned, untested = settled
+    case, turns, stated, richer, repairs, found = settled
     machine = case.session.machine
     turns = imputation_variance(case, turns, np.random.default_rng(0), clock.progress)
     clock.lap("identify")
@@ -352,7 +371,7 @@ def _finished(
     if model_at_fault(richer, stated):
         turns = turns._replace(estimate=stated)
     value = _estimated(machine, turns, richer, method, seed, holdout, clock)
-    return _judge(case, value, turned, untested, method, seed, clock)
+    return _judge(case, value, repairs, found, method, seed, clock)
 
 
 class _Identified(NamedTuple):
@@ -391,21 +410,15 @@ def _observe(session: Session, seed: int, clock: Clock) -> Case:
     return case
 
 
-def _identify(case: Case, refine_camera: bool, seed: int, clock: Clock) -> RefinementResult:
-    """Refine the machine in turns with measurement passes. Where there is no estimate, diameters
-    may have been written for radii.
-    """
+def _identify(case: Case, refine_camera: bool, clock: Clock) -> RefinementResult:
+    """Refine the machine in turns with measurement passes."""
     session, cameras = case.session, refinement_of(case.session, refine_camera)
-    try:
-        if case.images:
-            turns = refine_alternating(case, cameras, clock.progress, clock.lap)
-        else:
-            turns = identify_poses(
-                session, case.boards, case.scene.T_camera_base, cameras, clock.progress
-            )
-    except ResultError:
-        check_radii(case, None, False, refine_camera, seed)
-        raise
+    if case.images:
+        turns = refine_alternating(case, cameras, clock.progress, clock.lap)
+    else:
+        turns = identify_poses(
+            session, case.boards, case.scene.T_camera_base, cameras, clock.progress
+        )
     clock.lap("identify")
     return turns
 
@@ -442,16 +455,15 @@ def _estimated(
 def _judge(
     case: Case,
     value: _Identified,
-    turned: tuple[UpsideDown, ...],
-    untested: tuple[Finding, ...],
+    repairs: tuple[UpsideDown, ...],
+    found: tuple[Finding, ...],
     method: CalibrationMethod,
     seed: int,
     clock: Clock,
 ) -> Calibration:
     """Verdict on an estimate: model violations, identifiability and all findings.
 
-    turned : cameras whose images are upside down, or may be. untested : notes on hypotheses that
-    could not be tested.
+    repairs : that were made. found : on hypotheses, see :class:`Settled`.
     """
     clock.progress("Judging", 0.95)
     session, turns = _as_measured(case.session, value.turns), value.turns
@@ -468,8 +480,8 @@ def _judge(
     others = (
         *_findings_of_estimate(session, value, findings, detections, errors, method == "bundle"),
         *numbering_note(session),
-        *(one.finding for one in (*turned, *turns.responses)),
-        *untested,
+        *(one.finding for one in turns.responses),
+        *found,
     )
     verdict = judge(
         turns.observation,
@@ -496,7 +508,7 @@ def _judge(
         holdout=value.out,
         violations=detections,
         model_errors=errors,
-        upside_down=tuple(one for one in turned if one.sure),
+        upside_down=repairs,
         images={one.station: one.images for one in case.images},
     )
 

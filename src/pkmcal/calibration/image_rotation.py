@@ -10,8 +10,10 @@ are upside down. At log-odds of ``act`` the images are measured by the turned ca
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from math import exp
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from pkmcal.cameras.files import written_camera
 from pkmcal.identify.score import ScoreTests
 from pkmcal.measurements import Column
 from pkmcal.outcome.finding import Finding, doubtful, note
-from pkmcal.outcome.hypotheses import OPTIONS
+from pkmcal.outcome.hypotheses import OPTIONS, Hypothesis, Ranked, decide
 from pkmcal.session.load import Session
 
 FURTHER_THAN_TURNED = 1.5
@@ -37,44 +39,46 @@ LEAST_CENTRE_ERROR = 1e-6
 
 
 @dataclass(frozen=True)
-class UpsideDown:
-    """A camera's file against which images are upside down.
+class UpsideDown(Hypothesis[Session]):
+    """Images that are upside down against their camera's file, the subject.
 
-    entries : names of the stations in session.yaml. camera : turned by half, as the images are.
-    log_odds : for the turned camera, nats.
+    camera : turned by half, as the images are. Facts: ``stations``, names in session.yaml.
     """
 
-    file: str
-    entries: tuple[str, ...]
-    camera: Camera
-    log_odds: float
-
-    @property
-    def sure(self) -> bool:
-        """Whether the images are measured by the camera turned by half."""
-        return self.log_odds > OPTIONS.act
-
-    @property
-    def finding(self) -> Finding:
-        """A note where the images are measured by the turned camera, else a warning."""
-        facts = {"file": self.file, "stations": self.entries, "log_odds": self.log_odds}
-        if not self.sure:
-            return doubtful(
-                "image.perhaps_upside_down", self.file, **facts, odds=float(np.exp(self.log_odds))
-            )
-        x, y = self.camera.document()["center"]
-        return note(
-            "image.upside_down",
-            self.file,
-            **facts,
-            odds=round(np.exp(OPTIONS.act)),
-            centre_x=x,
-            centre_y=y,
-            written=written_camera(self.file),
-        )
+    camera: Camera = field(kw_only=True)
 
 
-def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, ...]:
+def upside_down_images(file: str, entries: Sequence[str], camera: Camera) -> UpsideDown:
+    """Images of some stations that are upside down. camera : of the file, turned by half."""
+    return UpsideDown(
+        "image.upside_down",
+        file,
+        partial(turned_round, cameras={file: camera}),
+        action="repair",
+        facts={"stations": tuple(entries)},
+        camera=camera,
+    )
+
+
+def rotation_finding(one: Ranked[UpsideDown]) -> Finding:
+    """A note where the images are measured by the turned camera, else a warning."""
+    file, camera = one.hypothesis.subject, one.hypothesis.camera
+    facts = {"file": file, **one.hypothesis.facts, "log_odds": one.log_odds}
+    if decide([one]) is None:
+        return doubtful("image.perhaps_upside_down", file, **facts, odds=exp(one.log_odds))
+    x, y = camera.document()["center"]
+    return note(
+        "image.upside_down",
+        file,
+        **facts,
+        odds=round(exp(OPTIONS.act)),
+        centre_x=x,
+        centre_y=y,
+        written=written_camera(file),
+    )
+
+
+def upside_down(session: Session, turns: RefinementResult) -> tuple[Ranked[UpsideDown], ...]:
     """Cameras whose images are upside down against their files with log-odds of ``report`` or more,
     and of no station upright with as much.
     """
@@ -90,7 +94,7 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, 
         for entry, attempt in ways.items()
     ]
     fits = ScoreTests(*turns.estimate.linearized, effects).fitted(range(len(effects)))
-    out = list[UpsideDown]()
+    out = list[Ranked[UpsideDown]]()
     for file, camera in dict(cameras.values()).items():
         own = [k for k, (mine, _) in enumerate(cameras.values()) if mine == file]
         value = np.concatenate([fits[k].value for k in own])
@@ -99,8 +103,9 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[UpsideDown, 
         alone = [_log_odds(value[[k]], sigma[[k]], reference_values) for k in range(len(own))]
         odds = _log_odds(value, sigma, reference_values)
         if odds > OPTIONS.report and min(alone) > -OPTIONS.report:
-            names = tuple(list(cameras)[k] for k in own)
-            out.append(UpsideDown(file, names, camera.turned_by_half(), odds))
+            names = [list(cameras)[k] for k in own]
+            hypothesis = upside_down_images(file, names, camera.turned_by_half())
+            out.append(Ranked(hypothesis, odds, "score"))
     return tuple(out)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import log
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +15,9 @@ from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
+from pkmcal.identify.verdict import VERDICT
 from pkmcal.measurements.contract import LinkKind, kinds_of
-from pkmcal.mechanisms.kinematics import ForwardResult
+from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_error, reversed_motor
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.hypotheses import SuspectStation, mistake
@@ -23,6 +25,7 @@ from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, fitting
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.station_localization import LocalizedPose, find_station
+from pkmcal.outcome.hypotheses import EvidenceLevel, decide, log_likelihood, posterior
 from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, Station
 from pkmcal.session.poses import check_lengths
@@ -41,7 +44,6 @@ ALLOWED_LEG_MISS = 2.0
 """Prior sigmas of a centre by which legs may miss the platform at the nearest nominal pose."""
 LEAST_REACHED_SHARE = 0.5
 """Share of the configurations that the nominal model has to reach for the others to be accepted."""
-ALMOST_ALL = 0.9
 
 
 def check_observable(session: Session) -> None:
@@ -123,30 +125,49 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
 
 
 def _check_columns(session: Session, bad: list[str]) -> None:
-    """Raise `InputError` where loops do not close because a reading never changes, or close in
-    nearly all configurations with the other sign of one motor.
+    """Raise `InputError` where loops do not close because a reading never changes, or because the
+    readings of one motor have the wrong sign.
     """
     if error := frozen_in(session):
         raise error
+    document, machine = session.document["joints"], session.machine
+    count = machine.n_joints
+    null = _closing_misfit(session, session.joints)
+
+    def by_legs(hypotheses: Sequence[ReadingHypothesis]) -> Array:
+        misfits = [_closing_misfit(session, one.apply(session.joints)) for one in hypotheses]
+        values = log_likelihood(np.array([null, *misfits]), len(session.joints))
+        return np.where(np.array(misfits) < 1, values[1:] - values[0], -np.inf)
+
+    signs = [replace(reversed_motor(k, 0.0), log_prior=-log(count)) for k in range(count)]
+    best = decide(posterior(signs, [EvidenceLevel("legs", by_legs)]))
+    if best is None:
+        return
+    without = "the legs meet the platform"
+    error = reading_error(
+        best.hypothesis, document["file"], document["columns"], machine.joint_units, without
+    )
+    raise InputError(
+        error.what,
+        where=error.where,
+        found=f"readings that the machine cannot take in configuration {listed(bad)}",
+        expected=error.expected,
+        next_step=error.next_step,
+        code=error.code,
+    )
+
+
+def _closing_misfit(session: Session, joints: Array) -> float:
+    """Root mean square by which legs miss the platform at readings (K, m), in ALLOWED_LEG_MISS
+    prior sigmas, no configuration by more than ``VerdictOptions.too_noisy``; where the platform
+    turns further than its parts allow, by that.
+    """
     machine = session.machine
-    now = _taken(session, session.forward)
-    for column, name in enumerate(session.document["joints"]["columns"]):
-        turned = session.joints * np.where(np.arange(machine.n_joints) == column, -1.0, 1.0)
-        if _taken(session, machine.forward_result(turned)) > max(ALMOST_ALL, now):
-            raise InputError(
-                f"the readings of {name} have the wrong sign",
-                where=f"{session.document['joints']['file']}, column {name}",
-                found=f"readings that the machine cannot take in configuration {listed(bad)}",
-                expected="the other sign of this column, with which its legs meet the platform",
-                next_step="Turn the sign of this column round, or the axis in the mechanism file",
-                code="readings.sign",
-            )
-
-
-def _taken(session: Session, fk: ForwardResult) -> float:
-    """Share of readings that the nominal machine can take, by its forward kinematics there."""
-    turn = _turn(fk.T_base_platform)
-    return float(np.mean(fk.converged & ~(np.abs(turn) > session.machine.most_turn[0])))
+    fk = machine.forward_result(joints)
+    miss = fk.error / (ALLOWED_LEG_MISS * machine.document.tolerance.center)
+    blocked = np.abs(_turn(fk.T_base_platform)) > machine.most_turn[0]
+    miss = np.where(blocked | ~(miss < VERDICT.too_noisy), VERDICT.too_noisy, miss)
+    return float(np.sqrt(np.mean(miss**2)))
 
 
 def _turn(poses: Array) -> Array:
@@ -297,6 +318,8 @@ def mistake_in(
                 station.name,
                 [label_of(session.folder, station.images[k].path) for k in visible],
                 session.configurations,
+                session.document["joints"]["file"],
+                session.document["joints"]["columns"],
                 view,
                 station.T_camera_base,
                 item,

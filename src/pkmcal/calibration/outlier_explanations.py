@@ -1,34 +1,79 @@
-"""Measured poses that the estimate let go, and what explains them: a reading, or a wrong name.
+"""Measured poses that the estimate rejects, and what explains them: a reading, or a wrong name.
 
-A pose that was measured tells what all motors should have read, whatever they did read. Where a
-configuration disagrees and all of its readings but one agree, that reading is wrong; where its pose
-agrees with the readings of another configuration, names were mixed up. Either is outvoted by the
-other configurations, so the result is right; but whoever took the images wants to know.
+A measured pose determines what all motors should have read. Where a configuration disagrees and all
+of its readings but one agree, that reading is wrong; where its pose agrees with the readings of
+another configuration, names were mixed up. Either is rejected because of the other configurations,
+so the result is right; but whoever took the images wants to know. Hypotheses are transformations of
+the readings (:mod:`pkmcal.outcome.hypotheses`), each with the absolute test that the configuration
+then disagrees no more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from math import log
+from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.effects import BOARD_SIZE
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis
 from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.outcome.hypotheses import (
+    EvidenceLevel,
+    decide,
+    log_likelihood,
+    parameter_cost,
+    posterior,
+    rivals_of,
+)
 from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
 from pkmcal.wording import listed
 
-UNLIKELY_EXPLANATION_CHANCE = 1e-4
-"""Chance below which one reading, or another configuration's, is no explanation; so small because
-the machine's own uncertainty, about as large as that of a pose, is not counted."""
-MOST_USUAL_MISFIT = 100.0
-"""Times its noise that the better half of a session may be off: with more, nothing fits, and no
-configuration stands out."""
+
+class MeasuredPlatforms(NamedTuple):
+    """Where n measured poses have the platform, T_base_platform (n, 4, 4), the configuration of
+    each, and the covariance (n, m, m) of the readings that follow from each.
+    """
+
+    machine: Machine
+    configuration: Integers
+    T_base_platform: Array
+    noise: Array
+
+    def select(self, rows: Array) -> MeasuredPlatforms:
+        """Some poses: indices, or a mask."""
+        return MeasuredPlatforms(self.machine, *(part[rows] for part in self[1:]))
+
+    def differences(self, joints: Array) -> Array:
+        """Differences (n, m) of the readings that follow from those that were read, (K, m)."""
+        return self.differences_of(joints[self.configuration])
+
+    def differences_of(self, readings: Array) -> Array:
+        """Differences (..., n, m) from readings (..., n, m)."""
+        shape = readings.shape
+        poses = np.broadcast_to(self.T_base_platform, (*shape[:-1], 4, 4)).reshape(-1, 4, 4)
+        flat = readings.reshape(-1, shape[-1])
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            return (self.machine.inverse(poses, flat) - flat).reshape(shape)
+
+    def squares(self, differences: Array) -> Array:
+        """Squares (..., n) of differences in units of their covariance, infinite where the machine
+        cannot take a pose.
+        """
+        value = np.sum(
+            differences * np.linalg.solve(self.noise, differences[..., None])[..., 0], axis=-1
+        )
+        return np.where(np.isfinite(value), value, np.inf)
 
 
 def outlier_explanations(
@@ -39,60 +84,142 @@ def outlier_explanations(
     which = np.flatnonzero(whole)
     if not which.size:
         return
+    joints, m = measurements.joints, measurements.joints.shape[1]
     poses, noise = _platforms(measurements, estimate, which)
-    machine, joints, own = estimate.machine, measurements.joints, measurements.poses.configuration
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        off = machine.inverse(poses, joints[own[which]]) - joints[own[which]]
-    finite = np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))
-    which, poses, off, noise = which[finite], poses[finite], off[finite], noise[finite]
-    own, m = own[which], off.shape[1]
+    measured = MeasuredPlatforms(
+        estimate.machine, measurements.poses.configuration[which], poses, noise
+    )
+    off = measured.differences(joints)
+    finite = np.asarray(np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2)))
+    measured, off, which = measured.select(finite), off[finite], which[finite]
     if len(which) < 2 * m:
         return
-    chi2 = _chi2(off, noise)
-    usual = max(float(np.median(chi2)) / m, 1.0)  # what the model leaves out, all poses have
-    if usual > MOST_USUAL_MISFIT**2:
-        return
-    noise = usual * noise
-    odd = _chance(m, chi2 / usual) < SESSION_FALSE_ALARM.of_test(len(which))
-    odd = np.flatnonzero(odd & (estimate.pose_weights[which] < 0.5))
-    # rows of the table that say what the machine did in each odd one, (n, K)
-    every = np.broadcast_to(poses[odd, None], (len(odd), len(joints), 4, 4)).reshape(-1, 4, 4)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        rows = machine.inverse(every, np.tile(joints, (len(odd), 1))).reshape(-1, *joints.shape)
-    same_station = (
-        _chance(m, np.nan_to_num(_chi2(rows - joints, noise[odd, None]), nan=np.inf))
-        > UNLIKELY_EXPLANATION_CHANCE
-    )
-    # its own readings are those that it stands against, however narrowly
-    same_station[np.arange(len(odd)), own[odd]] = False
-    exchanged = same_station[:, own[odd]] & same_station[:, own[odd]].T
-    columns, units = session.document["joints"]["columns"], session.machine.joint_units
-    for n, k in enumerate(odd.tolist()):
-        name = session.configurations[own[k]]
-        if exchanged[n].any():
-            if exchanged[n, n:].any():  # told once, at the first of the two
-                other = session.configurations[own[odd[n + int(np.argmax(exchanged[n, n:]))]]]
-                yield _misnamed(session, name, other, True)
+    squares = measured.squares(off)
+    usual = max(float(np.median(squares)) / m, 1.0)  # what the model leaves out, all poses have
+    if usual > HOPELESS_POSE_SCALE**2:
+        return  # nothing fits, and no configuration stands out
+    measured = measured._replace(noise=usual * measured.noise)
+    least = SESSION_FALSE_ALARM.of_test(len(which))
+    rejected = estimate.pose_weights[which] < 0.5
+    odd = np.unique(measured.configuration[rejected & (_chance(m, squares / usual) < least)])
+    named: set[int] = set()
+    for k in odd.tolist():
+        if k in named:
             continue
-        sharp = np.linalg.inv(noise[k])
-        value, sigma = (sharp @ off[k]) / np.diag(sharp), 1 / np.sqrt(np.diag(sharp))
-        explains = (
-            _chance(m - 1, chi2[k] / usual - (value / sigma) ** 2) > UNLIKELY_EXPLANATION_CHANCE
+        finding, partner = _explained(session, measured, joints, odd, k, least)
+        named |= {partner}
+        if finding is not None:
+            yield finding
+
+
+def _explained(
+    session: Session,
+    measured: MeasuredPlatforms,
+    joints: Array,
+    odd: Integers,
+    k: int,
+    least: float,
+) -> tuple[Finding | None, int]:
+    """The finding that explains configuration k, None where nothing does, and the configuration
+    with which it is exchanged, or else k. odd : configurations that disagree. least : chance below
+    which a configuration disagrees.
+    """
+    name, names = session.configurations[k], session.configurations
+    columns, units = session.document["joints"]["columns"], session.machine.joint_units
+
+    def ratios(hypotheses: Sequence[ReadingHypothesis]) -> Array:
+        tables = np.stack([joints, *(one.apply(joints) for one in hypotheses)])
+        out = np.zeros(len(tables))
+        concerned = [{k}, *({k, one.facts.get("partner", k)} for one in hypotheses)]
+        for c in set().union(*concerned):
+            poses = measured.select(measured.configuration == c)
+            rows = [n for n, some in enumerate(concerned) if c in some]
+            readings = np.repeat(tables[rows, c][:, None], len(poses.configuration), axis=1)
+            squares = poses.squares(poses.differences_of(readings)).sum(axis=-1)
+            n_values = readings.shape[1] * readings.shape[2]
+            own = poses.squares(poses.differences(joints)).sum()
+            gain = log_likelihood(np.sqrt(np.append(squares, own) / n_values), n_values)
+            out[rows] += gain[:-1] - gain[-1]
+            freed = np.array([n > 0 and "motor" in hypotheses[n - 1].facts for n in rows])
+            out[rows] = np.where(_chance(n_values - freed, squares) < least, -np.inf, out[rows])
+        return out[1:]
+
+    hypotheses = [
+        *_wrong_readings(measured, joints, k),
+        *(_other_row(k, int(c)) for c in range(len(joints)) if c != k),
+        *(_exchanged(k, int(c)) for c in odd if c != k),
+    ]
+    prior = -log(len(hypotheses))
+    ranked = posterior(
+        [replace(one, log_prior=one.log_prior + prior) for one in hypotheses],
+        [EvidenceLevel("readings", ratios)],
+    )
+    best = decide(ranked)
+    if best is None:
+        return None, k
+    likely = [one.hypothesis for one in (best, *rivals_of(ranked))]
+    exchanged = [one for one in likely if "partner" in one.facts]
+    if exchanged:
+        partner = exchanged[0].facts["partner"]
+        return _misnamed(session, name, names[partner], True), partner
+    motors = [one for one in likely if "motor" in one.facts]
+    like = [names[one.facts["like"]] for one in likely if "like" in one.facts]
+    if len(motors) == 1:
+        facts = motors[0].facts
+        column = wrong_reading(columns[facts["motor"]], units[facts["motor"]], name)
+        value = column.facts(facts["value"], facts["sigma"])
+        found = doubtful(
+            "readings.outvoted", column.subject, **value, like=like[0] if like else None
         )
-        if np.count_nonzero(explains) == 1:
-            motor = int(np.argmax(explains))
-            one = wrong_reading(columns[motor], units[motor], name)
-            row = (
-                session.configurations[int(np.argmax(same_station[n]))]
-                if same_station[n].any()
-                else None
-            )
-            facts = one.facts(value[[motor]], sigma[[motor]])
-            yield doubtful("readings.outvoted", one.subject, **facts, like=row)
-        elif same_station[n].any():
-            yield _misnamed(
-                session, name, session.configurations[int(np.argmax(same_station[n]))], False
-            )
+        return found, k
+    return (_misnamed(session, name, like[0], False) if like else None), k
+
+
+def _wrong_readings(
+    measured: MeasuredPlatforms, joints: Array, k: int
+) -> Iterator[ReadingHypothesis]:
+    """Each reading of configuration k wrong, by what all of its poses make the likeliest.
+
+    Facts: ``motor``, and ``value`` and ``sigma`` (1,), m or rad.
+    """
+    poses = measured.select(measured.configuration == k)
+    sharp = np.linalg.inv(poses.noise)
+    information = sharp.sum(axis=0).diagonal()
+    value = (sharp @ poses.differences(joints)[..., None]).sum(axis=0)[:, 0] / information
+    for motor in range(joints.shape[1]):
+
+        def apply(joints: Array, motor: int = motor) -> Array:
+            out = joints.copy()
+            out[k, motor] += value[motor]
+            return out
+
+        facts = {"motor": motor, "value": value[[motor]], "sigma": information[[motor]] ** -0.5}
+        cost = parameter_cost(1, len(measured.configuration))
+        yield ReadingHypothesis("readings.outvoted", f"motor {motor}", apply, cost, facts=facts)
+
+
+def _other_row(k: int, other: int) -> ReadingHypothesis:
+    """The readings of another configuration stand for those of k. Facts: ``like``, the other."""
+
+    def apply(joints: Array) -> Array:
+        out = joints.copy()
+        out[k] = joints[other]
+        return out
+
+    return ReadingHypothesis("configurations.misnamed", f"as {other}", apply, facts={"like": other})
+
+
+def _exchanged(k: int, other: int) -> ReadingHypothesis:
+    """The readings of two configurations exchanged. Facts: ``partner``, the other."""
+
+    def apply(joints: Array) -> Array:
+        out = joints.copy()
+        out[[k, other]] = joints[[other, k]]
+        return out
+
+    return ReadingHypothesis(
+        "configurations.misnamed", f"for {other}", apply, facts={"partner": other}
+    )
 
 
 def _misnamed(session: Session, name: str, other: str, both: bool) -> Finding:
@@ -136,12 +263,8 @@ def _platforms(
     return T_base_platform, statistics.pose_scale**2 * root @ root.mT + own * np.eye(root.shape[1])
 
 
-def _chi2(off: Array, noise: Array) -> Array:
-    """Squares (...) of deviations (..., m) in units of their covariance (..., m, m)."""
-    return np.sum(off * np.linalg.solve(noise, off[..., None])[..., 0], axis=-1)
-
-
-def _chance(dof: int, chi2: Array) -> Array:
+def _chance(dof: Integers | int, squares: Array) -> Array:
+    """Probability of larger squares by normal errors."""
     from scipy.special import chdtrc
 
-    return chdtrc(dof, chi2)
+    return chdtrc(dof, squares)

@@ -8,6 +8,10 @@ evidence compare them:
   robot-world/hand-eye in closed form. Milliseconds for each; nominal errors are in the residuals.
 - estimate: the joint estimate from the data as they would be without the mistake. Seconds for each,
   so only hypotheses that closure leaves in the running are estimated.
+
+Where poses and readings contradict each other by far more than nominal errors do, an estimate from
+the data as stated would take minutes and mean nothing: closure is asked first, for several mistakes
+in the readings at once.
 """
 
 from __future__ import annotations
@@ -15,12 +19,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from math import log
 from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.localization import frozen_in
@@ -31,15 +36,17 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import identified, only_heights
-from pkmcal.identify.verdict import RicherModel
+from pkmcal.identify.verdict import VERDICT, RicherModel
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.reading_hypotheses import reading_hypotheses
+from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.outcome.hypotheses import (
     OPTIONS,
     EvidenceLevel,
+    Explanation,
     Hypothesis,
+    Ranked,
     decide,
     log_likelihood,
     parameter_cost,
@@ -49,10 +56,9 @@ from pkmcal.outcome.hypotheses import (
 from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
 from pkmcal.session.station_movement import how_far
-from pkmcal.wording import DISPLAY_UNITS, listed, number
 
-SUSPECT_POSE_SCALE = 2.0
-"""Factor on the poses' noise from which mistakes are looked for."""
+SUSPECT_SCALE = 2.0
+"""Factor on the noise of poses, or of edges, from which mistakes are looked for."""
 SUSPECT_REJECTED_SHARE = 0.1
 """Share of rejected poses from which they are."""
 FEWEST_POSES_A_SIDE = 3
@@ -61,18 +67,18 @@ OTHER_SIZE = 2e-3
 """Relative difference of a board's size below which the print is as good as printers are."""
 EXPLAINED_POSES_SHARE = 0.85
 """Share of the poses that a mistake put right has to explain; the rest may be outliers."""
-TENABLE_MISFIT = 4.0
-"""Root mean square of the poses' residuals, in stated standard deviations, beyond which a
-hypothesis explains nothing: errors of the nominal model that no parameter takes up are below."""
 HOPELESS_POSE_SCALE = 50.0
 """Factor on the poses' noise at which an estimate under a hypothesis is given up after a first
-search: far beyond TENABLE_MISFIT."""
+search: far beyond ``VerdictOptions.too_noisy``."""
 NOMINAL_ERROR_FACTOR = 10.0
 """Factor by which the errors of a nominal model may exceed its prior sigmas. A motor that stands
 still while its readings move, or the reverse, is off by 20 to 50 times as much."""
 NOMINAL_DRAWS = 4
 """Machines drawn from the prior sigmas to know how large closure residuals are by nominal errors:
 four draws of some thirty parameters each tell it to a tenth."""
+PAIR_CONFIGURATIONS = 48
+"""Configurations, spread over all, in which pairs of mistakes are compared: a thousand pairs in
+seconds."""
 NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
 """Errors by which an estimate under a hypothesis fails."""
 
@@ -90,38 +96,57 @@ PoseHypothesis = Hypothesis[PoseCase]
 class Diagnosis(NamedTuple):
     """The mistake that explains measured poses.
 
-    hypothesis : None where none does. misfit : rms residual of the poses without the mistake, in
-    stated standard deviations. movement : (6,) left perturbation (omega, tau) of a board, or a
-    station, that moved; NaN where the data do not determine it. untested : codes and errors of
-    hypotheses without an estimate. rivals : other mistakes that are not excluded.
+    hypothesis : None where none does. log_odds : of it, nats. misfit : rms residual of the poses
+    without the mistake, in stated standard deviations. movement : (6,) left perturbation (omega,
+    tau) of a board, or a station, that moved; NaN where the data do not determine it. untested :
+    codes and errors of hypotheses without an estimate. rivals : other mistakes that are not
+    excluded.
     """
 
-    hypothesis: PoseHypothesis | None
-    misfit: float
-    movement: Array
-    untested: tuple[tuple[str, str], ...]
+    hypothesis: PoseHypothesis | None = None
+    log_odds: float = -np.inf
+    misfit: float = np.inf
+    movement: Array = np.zeros(6)
+    untested: tuple[tuple[str, str], ...] = ()
     rivals: tuple[PoseHypothesis, ...] = ()
 
 
-def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -> Diagnosis:
-    """The mistake that explains why poses disagree with the machine.
+class PoseEvidence:
+    """Levels of evidence for the mistakes of one machine's measured poses.
 
-    machine : nominal. estimate : of these measurements.
+    machine : nominal. null_misfit : of the poses as stated, by an estimate. closure_unit : misfit
+    by closure below which differences are nominal errors, in stated standard deviations. rows :
+    configurations (n,) that closure compares; all, if None. estimates, misfits : by an estimate and
+    by closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
     """
-    if not np.any(measurements.on_platform[measurements.poses.mount]):
-        return Diagnosis(None, np.inf, np.zeros(6), ())  # poses of boards on the base alone
-    n_effective = effective_sample_size(machine, measurements)
-    estimates: dict[int, Estimate] = {}
-    untested: list[tuple[str, str]] = []
 
-    def by_closure(hypotheses: Sequence[PoseHypothesis]) -> Array:
-        cases = [one.apply(PoseCase(measurements)).measurements for one in hypotheses]
-        null, *values = log_likelihood(
-            closure_misfits(machine, [measurements, *cases]), n_effective
-        ).tolist()
+    def __init__(
+        self,
+        machine: Machine,
+        measurements: Measurements,
+        null_misfit: float,
+        closure_unit: float = 1.0,
+    ) -> None:
+        self.machine, self.measurements = machine, measurements
+        self.null_misfit, self.closure_unit = null_misfit, closure_unit
+        self.n_effective = effective_sample_size(machine, measurements)
+        self.rows: Integers | None = None
+        self.estimates: dict[int, Estimate] = {}
+        self.misfits: dict[int, float] = {}
+        self.untested: list[tuple[str, str]] = []
+
+    def by_closure(self, hypotheses: Sequence[PoseHypothesis]) -> Array:
+        """Log-likelihood ratios by closure, minus infinity for mistakes in the readings that are
+        less likely than none, and for all but the best variant of an explanation.
+        """
+        cases = [one.apply(PoseCase(self.measurements)).measurements for one in hypotheses]
+        misfits = closure_misfits(self.machine, [self.measurements, *cases], self.rows)
+        misfits = misfits / self.closure_unit
+        self.misfits = {id(one): m for one, m in zip(hypotheses, misfits[1:].tolist(), strict=True)}
+        null, *values = log_likelihood(misfits, self.n_effective).tolist()
         best: dict[tuple[str, str], int] = {}
-        for k, (one, value) in enumerate(zip(hypotheses, values, strict=True)):
-            if value > values[best.setdefault(one.meaning, k)]:
+        for k, (one, misfit) in enumerate(zip(hypotheses, misfits[1:], strict=True)):
+            if misfit < misfits[1 + best.setdefault(one.meaning, k)]:
                 best[one.meaning] = k
         # of a motor's constants the best is enough: its offset, estimated, takes up the rest
         retained = np.isin(np.arange(len(values)), list(best.values()))
@@ -132,44 +157,100 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
         readings = np.array([one.code.startswith("readings.") for one in hypotheses])
         return np.where(retained & (~readings | (ratios + prior > 0)), ratios, -np.inf)
 
-    def by_estimate(hypotheses: Sequence[PoseHypothesis]) -> Array:
-        null = log_likelihood(np.array(pose_misfit(estimate)), n_effective)
+    def by_estimate(self, hypotheses: Sequence[PoseHypothesis]) -> Array:
+        """Log-likelihood ratios by joint estimates, minus infinity where none is tenable."""
+        null = log_likelihood(np.array(self.null_misfit), self.n_effective)
         out = np.full(len(hypotheses), -np.inf)
         for k, one in enumerate(hypotheses):
-            case = one.apply(PoseCase(measurements))
+            case = one.apply(PoseCase(self.measurements))
             try:
-                start = case.start or start_from_poses(machine, case.measurements)
+                start = case.start or start_from_poses(self.machine, case.measurements)
                 value = bundle(
-                    machine, case.measurements, start, hopeless=HOPELESS_POSE_SCALE,
+                    self.machine, case.measurements, start, hopeless=HOPELESS_POSE_SCALE,
                     scale_readings=False,
                 )  # fmt: skip
             except NO_ESTIMATE as error:
-                untested.append((one.code, str(error)))
+                self.untested.append((one.code, str(error)))
                 continue
-            estimates[id(one)] = value
+            self.estimates[id(one)] = value
             misfit = pose_misfit(value)
-            if misfit < TENABLE_MISFIT:
-                out[k] = log_likelihood(np.array(misfit), n_effective) - null
+            if misfit < VERDICT.too_noisy:
+                out[k] = log_likelihood(np.array(misfit), self.n_effective) - null
         return out
 
+    def diagnosis(self, ranked: Sequence[Ranked[PoseHypothesis]]) -> Diagnosis:
+        """What to decide by hypotheses that were estimated."""
+        best, untested = decide(ranked), tuple(self.untested)
+        if best is None:
+            return Diagnosis(untested=untested)
+        value = self.estimates[id(best.hypothesis)]
+        movement = _movement(self.machine, best.hypothesis, value)
+        hypothesis = self._with_constants(best.hypothesis, value)
+        # such as a camera that moved beside a board that did
+        rivals = [one.hypothesis for one in rivals_of(ranked) if one.log_odds > OPTIONS.report]
+        misfit = pose_misfit(value)
+        return Diagnosis(hypothesis, best.log_odds, misfit, movement, untested, tuple(rivals))
+
+    def _with_constants(self, hypothesis: PoseHypothesis, estimate: Estimate) -> PoseHypothesis:
+        """The hypothesis with the constants (m or rad) of its reversed motors as estimated.
+
+        The values follow from the estimated platform poses by the nominal machine, whose offset the
+        corrected readings are read with.
+        """
+        if parts := hypothesis.facts.get("parts"):
+            if any("order" in one.facts or "step" in one.facts for one in parts):
+                return hypothesis  # a motor's readings are then in another column or row
+            parts = tuple(self._with_constants(one, estimate) for one in parts)
+            return replace(hypothesis, facts={"parts": parts})
+        if hypothesis.code != "readings.reversed":
+            return hypothesis
+        (motor,) = hypothesis.facts["motors"]
+        joints = self.measurements.joints
+        near = hypothesis.apply(PoseCase(self.measurements)).measurements.joints
+        values = self.machine.inverse(estimate.state.T_base_platform, near)[:, motor]
+        constant = values + joints[:, motor]
+        if not np.isfinite(constant).any():
+            return hypothesis
+        return replace(
+            hypothesis, facts={**hypothesis.facts, "constant": float(np.nanmedian(constant))}
+        )
+
+
+def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -> Diagnosis:
+    """The mistake that explains why poses disagree with the machine.
+
+    machine : nominal. estimate : of these measurements.
+    """
+    if not np.any(measurements.on_platform[measurements.poses.mount]):
+        return Diagnosis()  # poses of boards on the base alone
+    evidence = PoseEvidence(machine, measurements, pose_misfit(estimate))
     levels = (
         # nominal errors are in these residuals, so closure drops hypotheses and confirms none
-        EvidenceLevel("closure", by_closure, decides=False, most=OPTIONS.most),
-        EvidenceLevel("estimate", by_estimate),
+        EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most),
+        EvidenceLevel("estimate", evidence.by_estimate),
     )
-    ranked = posterior(pose_hypotheses(machine, measurements, estimate), levels)
-    best = decide(ranked)
-    if best is None:
-        return Diagnosis(None, np.inf, np.zeros(6), tuple(untested))
-    hypothesis = best.hypothesis
-    value = estimates[id(hypothesis)]
-    movement = _movement(machine, hypothesis, value)
-    if hypothesis.code == "readings.reversed":
-        constant = _constant_by_estimate(machine, hypothesis, measurements.joints, value)
-        hypothesis = replace(hypothesis, facts={**hypothesis.facts, "constant": constant})
-    # such as a camera that moved beside a board that did
-    rivals = [one.hypothesis for one in rivals_of(ranked) if one.log_odds > OPTIONS.report]
-    return Diagnosis(hypothesis, pose_misfit(value), movement, tuple(untested), tuple(rivals))
+    return evidence.diagnosis(posterior(pose_hypotheses(machine, measurements, estimate), levels))
+
+
+def diagnose_by_closure(machine: Machine, measurements: Measurements, limit: float) -> Diagnosis:
+    """The mistake in the readings, or the two, that explain why poses contradict them.
+
+    By closure they have to leave nominal errors alone; those that do are estimated. limit : of
+    :func:`closure_limit`.
+    """
+    (misfit,) = (closure_misfits(machine, [measurements]) / limit).tolist()
+    evidence = PoseEvidence(machine, measurements, misfit, limit)
+    closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
+    estimate = EvidenceLevel("estimate", evidence.by_estimate)
+    single = reading_mistakes(machine, measurements)
+    for hypotheses in (single, _pairs(single, measurements)):
+        likely = [one.hypothesis for one in posterior([*hypotheses], [closure])]
+        tenable = [one for one in likely if evidence.misfits[id(one)] < 1]
+        diagnosis = evidence.diagnosis(posterior(tenable, [estimate]))
+        if diagnosis.hypothesis is not None:
+            return diagnosis
+        evidence.rows = evenly(len(measurements.joints), PAIR_CONFIGURATIONS)
+    return Diagnosis()
 
 
 def effective_sample_size(machine: Machine, measurements: Measurements) -> float:
@@ -200,14 +281,18 @@ def _usual(squares: Array) -> Array:
 # ------------------------------------------------------------------ evidence: closure
 
 
-def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
+def closure_misfits(
+    machine: Machine, cases: Sequence[Measurements], rows: Integers | None = None
+) -> Array:
     """Misfits (N,) of N cases of measurements where platform poses follow from the nominal machine
     and the readings: as :func:`pose_misfit`.
 
     Each pair of a station and a mount on the platform is laid by itself, by the best of the closed
     forms. Cases may differ in their readings and in their poses' stations, mounts and values.
+    rows : configurations (n,) that are compared; all, if None.
     """
-    joints = np.stack([case.joints for case in cases])
+    rows = np.arange(len(cases[0].joints)) if rows is None else rows
+    joints = np.stack([case.joints[rows] for case in cases])
     fk = machine.forward_result(joints.reshape(-1, joints.shape[-1])).T_base_platform
     body = fk.reshape(*joints.shape[:2], 4, 4)
     # where legs do not meet, the nearest pose is off by as much as the readings are wrong
@@ -221,11 +306,12 @@ def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
         poses, on_platform = cases[group[0]].poses, cases[group[0]].on_platform
         observed = np.stack([cases[k].poses.T_station_target for k in group])
         squares: list[Array] = []
-        pairs = np.unique(np.stack([poses.station, poses.mount], axis=1), axis=0)
+        compared = np.isin(poses.configuration, rows)
+        pairs = np.unique(np.stack([poses.station, poses.mount], axis=1)[compared], axis=0)
         for s, m in pairs[on_platform[pairs[:, 1]]]:
-            rows = np.flatnonzero((poses.station == s) & (poses.mount == m))
-            here, there = body[group][:, poses.configuration[rows]], observed[:, rows]
-            squares.append(_laid(here, there, poses.whiten[rows]))
+            own = np.flatnonzero((poses.station == s) & (poses.mount == m) & compared)
+            at = np.searchsorted(rows, poses.configuration[own])
+            squares.append(_laid(body[group][:, at], observed[:, own], poses.whiten[own]))
         if squares:
             out[group] = _usual(np.concatenate(squares, axis=1))
     return out
@@ -247,20 +333,17 @@ def _laid(body: Array, observed: Array, whiten: Array) -> Array:
     return each[best, np.arange(each.shape[1])]
 
 
-def contradicted_by_closure(
-    machine: Machine, measurements: Measurements, rng: np.random.Generator
-) -> bool:
-    """Whether poses and readings contradict each other by far more than nominal errors explain.
-
-    These are known by closure of machines that are drawn from the prior sigmas.
+def closure_limit(machine: Machine, measurements: Measurements, rng: np.random.Generator) -> float:
+    """Misfit by closure, as of :func:`closure_misfits`, beyond which poses and readings contradict
+    each other: NOMINAL_ERROR_FACTOR times that of machines drawn from the prior sigmas.
     """
-    poses = measurements.poses
-    if not np.any(measurements.on_platform[poses.mount]):
-        return False
-    fk = machine.forward_result(measurements.joints).T_base_platform
-    exact = np.where(
-        measurements.on_platform[poses.mount][:, None, None], fk[poses.configuration], np.eye(4)
-    )
+    poses, exact = measurements.poses, measurements.poses.T_station_target.copy()
+    fk = machine.forward_result(measurements.joints).T_base_platform[poses.configuration]
+    moving = measurements.on_platform[poses.mount]
+    whole = moving & (poses.rows == 6)
+    exact[~moving] = np.eye(4)
+    exact[moving, :3, 3] = fk[moving, :3, 3]
+    exact[whole, :3, :3] = fk[whole, :3, :3]
     nominal = replace(measurements, poses=replace(poses, T_station_target=exact))
     spread = machine.parameters.tolerance
     expected = [
@@ -272,24 +355,21 @@ def contradicted_by_closure(
         )[0]
         for _ in range(NOMINAL_DRAWS)
     ]
-    limit = NOMINAL_ERROR_FACTOR * max(float(np.sqrt(np.mean(np.square(expected)))), 1.0)
-    return bool(closure_misfits(machine, [measurements])[0] > limit)
+    return NOMINAL_ERROR_FACTOR * max(float(np.sqrt(np.mean(np.square(expected)))), 1.0)
 
 
 # ------------------------------------------------------------------ hypotheses
 
 
-def pose_hypotheses(
-    machine: Machine, measurements: Measurements, estimate: Estimate
-) -> list[PoseHypothesis]:
-    """All mistakes that measured poses can show."""
+def reading_mistakes(machine: Machine, measurements: Measurements) -> list[PoseHypothesis]:
+    """All mistakes in the readings."""
     n_effective = effective_sample_size(machine, measurements)
-    out = [
+    return [
         PoseHypothesis(
             one.code,
             one.subject,
-            lambda case, one=one: PoseCase(
-                replace(case.measurements, joints=one.apply(case.measurements.joints))
+            lambda case, one=one: case._replace(
+                measurements=replace(case.measurements, joints=one.apply(case.measurements.joints))
             ),
             # a reversed motor's constant is a free parameter
             one.log_prior + parameter_cost(int(one.code == "readings.reversed"), n_effective),
@@ -297,15 +377,42 @@ def pose_hypotheses(
         )
         for one in reading_hypotheses(measurements.joints, machine.joint_ranges)
     ]
+
+
+def _pairs(
+    single: Sequence[PoseHypothesis], measurements: Measurements
+) -> Iterator[PoseHypothesis]:
+    """Two mistakes at once, each pair of readings once. Facts: ``parts``, the two."""
+    compared: set[bytes] = set()
+    for one, other in product(single, single):
+
+        def apply(
+            case: PoseCase, one: PoseHypothesis = one, other: PoseHypothesis = other
+        ) -> PoseCase:
+            return other.apply(one.apply(case))
+
+        joints = np.round(apply(PoseCase(measurements)).measurements.joints, 12).tobytes()
+        if one.meaning == other.meaning or joints in compared:
+            continue
+        compared.add(joints)
+        subject = " and ".join(sorted(f"{part.code} of {part.subject}" for part in (one, other)))
+        prior = one.log_prior + other.log_prior
+        yield PoseHypothesis(one.code, subject, apply, prior, facts={"parts": (one, other)})
+
+
+def pose_hypotheses(
+    machine: Machine, measurements: Measurements, estimate: Estimate
+) -> list[PoseHypothesis]:
+    """All mistakes that measured poses can show."""
+    n_effective = effective_sample_size(machine, measurements)
     # heights do not determine where a tracker stands: score tests tell whether it moved
     whole = () if only_heights(estimate) else _movements(measurements, estimate)
     rest = [*whole, *_sizes(machine, measurements, estimate)]
     prior = -log(max(len({one.meaning for one in rest}), 1))
-    out += [
+    return reading_mistakes(machine, measurements) + [
         replace(one, log_prior=prior + parameter_cost(one.facts["parameters"], n_effective))
         for one in rest
     ]
-    return out
 
 
 def _movements(measurements: Measurements, estimate: Estimate) -> Iterator[PoseHypothesis]:
@@ -407,24 +514,6 @@ def _movement(machine: Machine, hypothesis: PoseHypothesis, estimate: Estimate) 
     return np.where(determined, pose_difference(T[1], T[0]), np.nan)
 
 
-def _constant_by_estimate(
-    machine: Machine, hypothesis: PoseHypothesis, joints: Array, estimate: Estimate
-) -> float:
-    """Sum of a reversed motor's readings and the values that they stand for, m or rad.
-
-    The values follow from the estimated platform poses by the nominal machine, whose offset the
-    corrected readings are read with.
-    """
-    (motor,) = hypothesis.facts["motors"]
-    near = joints.copy()
-    near[:, motor] = hypothesis.facts["constant"] - joints[:, motor]
-    values = machine.inverse(estimate.state.T_base_platform, near)[:, motor]
-    reached = np.isfinite(values)
-    if not reached.any():
-        return hypothesis.facts["constant"]
-    return float(np.median((values + joints[:, motor])[reached]))
-
-
 def _sizes(
     machine: Machine, measurements: Measurements, estimate: Estimate
 ) -> Iterator[PoseHypothesis]:
@@ -457,60 +546,76 @@ def poses_disagree(estimate: Estimate) -> bool:
     """Whether the poses disagree with the machine so much that a mistake is likely."""
     rejected = estimate.pose_weights < 0.5
     return bool(rejected.size) and (
-        estimate.statistics.pose_scale > SUSPECT_POSE_SCALE
+        estimate.statistics.pose_scale > SUSPECT_SCALE
         or rejected.mean() > SUSPECT_REJECTED_SHARE
         or rejected.sum() >= 2 * FEWEST_POSES_A_SIDE
     )
 
 
-def check_frozen(session: Session, boards: Boards) -> None:
-    """Raise `InputError` where a reading never changes and measured poses contradict the readings.
+def check_closure(session: Session, boards: Boards) -> None:
+    """Raise `InputError` where readings and measured poses contradict each other, and a reading
+    never changes or mistakes in the readings explain it.
 
-    Asked before any estimate: one from frozen readings takes a thousand steps and ends nowhere.
+    Asked before any estimate: one from such readings takes a thousand steps and ends nowhere.
     """
-    error = frozen_in(session)
-    if error is None:
-        return
     measurements = measurements_of(session, boards)
-    if contradicted_by_closure(session.machine, measurements, np.random.default_rng(0)):
+    poses = measurements.poses
+    positions = (poses.rows >= 3) & measurements.on_platform[poses.mount]
+    if np.count_nonzero(positions) < 2 * FEWEST_POSES_A_SIDE:
+        return  # a frame and mount of their own explain few
+    machine = session.machine
+    limit = closure_limit(machine, measurements, np.random.default_rng(0))
+    (misfit,) = closure_misfits(machine, [measurements]).tolist()
+    if misfit <= limit:
+        return
+    if error := frozen_in(session):
+        raise error
+    if error := _error_of(session, diagnose_by_closure(machine, measurements, limit), misfit):
         raise error
 
 
-def check_poses(
+def explain_poses(
     session: Session,
     measurements: Measurements,
     estimate: Estimate,
     richer: tuple[RicherModel, ...] = (),
-) -> tuple[Finding, ...]:
-    """Raise `InputError` where a mistake explains why poses disagree with the machine, or where a
-    reading never changes; a note on hypotheses that have no estimate.
+) -> Explanation:
+    """The mistake that explains why poses disagree with the machine, if any.
 
     richer : other models of the mechanism file; where one of them fits, the model is at fault.
+    Raises InputError where poses disagree and a reading never changes.
     """
-    if not poses_disagree(estimate) or any(model.scale < SUSPECT_POSE_SCALE for model in richer):
-        return ()
+    if not poses_disagree(estimate) or any(model.scale < SUSPECT_SCALE for model in richer):
+        return Explanation()
     if error := frozen_in(session):
         raise error
     diagnosis = diagnose(session.machine, measurements, estimate)
-    if diagnosis.hypothesis is not None:
-        misfit = pose_misfit(estimate)
-        error = _error(session, diagnosis.hypothesis, diagnosis, misfit)
-        others = [_error(session, one, diagnosis, misfit).what for one in diagnosis.rivals]
-        if not others:
-            raise error
-        raise InputError(
-            error.what,
-            where=error.where,
-            found=f"{error.found}; the poses fit as well if {' or '.join(others)}",
-            expected=error.expected,
-            next_step=error.next_step,
-            code=error.code,
-        )
-    if not diagnosis.untested:
-        return ()
-    codes = [code for code, _ in diagnosis.untested]
-    why = diagnosis.untested[0][1].rstrip(".")
-    return (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
+    untested: tuple[Finding, ...] = ()
+    if diagnosis.untested:
+        codes = [code for code, _ in diagnosis.untested]
+        why = diagnosis.untested[0][1].rstrip(".")
+        untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
+    error = _error_of(session, diagnosis, pose_misfit(estimate))
+    return Explanation(error, diagnosis.log_odds, untested)
+
+
+def _error_of(session: Session, diagnosis: Diagnosis, misfit: float) -> InputError | None:
+    """The error that names a diagnosis's mistakes, and those that it does not exclude; None where
+    it has none. misfit : of the poses as stated, in stated sigmas.
+    """
+    if diagnosis.hypothesis is None:
+        return None
+    error = _error(session, diagnosis.hypothesis, diagnosis, misfit)
+    others = [_error(session, one, diagnosis, misfit).what for one in diagnosis.rivals]
+    also = f"; the poses fit as well if {' or '.join(others)}" if others else ""
+    return InputError(
+        error.what,
+        where=error.where,
+        found=f"{error.found}{also}",
+        expected=error.expected,
+        next_step=error.next_step,
+        code=error.code,
+    )
 
 
 def _error(
@@ -518,10 +623,8 @@ def _error(
 ) -> InputError:
     """The error that names the mistake. misfit_before : of the poses with it, in stated sigmas."""
     facts, joints = hypothesis.facts, session.document["joints"]
-    residual = f"with that, the poses fit {diagnosis.misfit:.1f} times their noise"
-    times = f"{misfit_before:.{int(misfit_before < 10)}f}"
-    found = f"poses that the readings miss by {times} times their noise"
-    columns = joints["columns"]
+    without = f"the poses fit {diagnosis.misfit:.1f} times their noise"
+    residual = f"with that, {without}"
     if hypothesis.code in ("board.moved", "station.moved"):
         what = (
             "the board was moved on the platform"
@@ -546,42 +649,16 @@ def _error(
             next_step=f"Multiply square and marker by {facts['size']:.4f}, if a ruler agrees",
             code=hypothesis.code,
         )
-    where = f"{joints['file']}, line 1"
-    if hypothesis.code == "readings.sign":
-        (name,) = (columns[k] for k in facts["motors"])
-        what = f"the readings of {name} have the wrong sign"
-        where = f"{joints['file']}, column {name}"
-        expected = "the readings with the other sign"
-        next_step = "Turn the sign of this column round, or the axis in the mechanism file"
-    elif hypothesis.code == "readings.reversed":
-        ((motor, name),) = ((k, columns[k]) for k in facts["motors"])
-        unit = session.machine.joint_units[motor]
-        scale, display = DISPLAY_UNITS[unit]
-        constant = f"{number(scale * facts['constant'], 0 if unit == 'm' else 1)} {display}"
-        what = f"the readings of {name} count the other way"
-        where = f"{joints['file']}, column {name}"
-        expected = f"{constant}, or nearly so, less the reading"
-        next_step = (
-            f"Turn the motor's direction round where it is set, or write {constant} less"
-            " the reading into this column; what is left of the constant is calibrated"
-        )
-    elif hypothesis.code == "readings.exchanged":
-        one, other = (columns[k] for k in facts["motors"])
-        what = f"the readings of {one} and {other} are exchanged"
-        expected = "the two columns in the other order"
-        next_step = "Exchange the two columns, or the motors in the mechanism file"
-    elif hypothesis.code == "readings.shifted":
-        what = "the readings are shifted against the poses by one configuration"
-        where = joints["file"]
-        near = "before" if facts["step"] > 0 else "after"
-        expected = f"at each pose the readings of the configuration {near} it"
-        next_step = "Look for a row that is missing or was written twice"
-    else:
-        order = [columns[k] for k in facts["order"]]
-        what = "the legs are numbered differently in the readings and in the mechanism file"
-        expected = f"the columns in the order {listed(order, len(order))}"
-        next_step = "Give the columns the order of the legs in the mechanism file"
+    times = f"{misfit_before:.{int(misfit_before < 10)}f}"
+    parts = [
+        reading_error(one, joints["file"], joints["columns"], session.machine.joint_units, without)
+        for one in facts.get("parts", (hypothesis,))
+    ]
     return InputError(
-        what, where=where, found=found, expected=f"{expected}; {residual}", next_step=next_step,
+        ", and ".join(one.what for one in parts),
+        where=parts[0].where,
+        found=f"poses that the readings miss by {times} times their noise",
+        expected="; ".join(f"{one.expected}" for one in parts),
+        next_step=". ".join(f"{one.next_step}" for one in parts),
         code=hypothesis.code,
-    )  # fmt: skip
+    )

@@ -127,7 +127,7 @@ def texts_of(calibration: Calibration, document: dict[str, Any]) -> dict[str, st
         camera = cameras.result(calibration.estimate, file)
         texts[written_camera(file)] = camera_text(camera)
     for turned in calibration.upside_down:
-        texts[written_camera(turned.file)] = camera_text(turned.camera)
+        texts[written_camera(turned.subject)] = camera_text(turned.camera)
     return texts
 
 
@@ -382,7 +382,7 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
     # trackers, whose number means nothing, come last
     files = {c: station.camera_file for c, station in zip(numbers, stations, strict=False)}
     pixels = dict(zip(numbers, calibration.observation.binning.tolist(), strict=False))
-    turned = {one.file for one in calibration.upside_down}
+    turned = {one.subject for one in calibration.upside_down}
     return [
         {
             "file": files[c],

@@ -10,60 +10,102 @@ and they agree.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.calibration.camera_refinement import refinement_of
 from pkmcal.calibration.case import Case
+from pkmcal.calibration.chance_matches import chance_match_reason
 from pkmcal.calibration.handheld import localize_case
-from pkmcal.calibration.refinement import refine_alternating
+from pkmcal.calibration.pose_hypotheses import SUSPECT_SCALE
+from pkmcal.calibration.refinement import RefinementResult, refine_alternating
 from pkmcal.errors import PkmcalError
-from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.document import Leg
 from pkmcal.mechanisms.machine import machine_from_document
-from pkmcal.observe.hypotheses import diameters
+from pkmcal.observe.hypotheses import diameters, log_prior_of_each
 from pkmcal.outcome.finding import Finding, note
+from pkmcal.outcome.hypotheses import (
+    EvidenceLevel,
+    Explanation,
+    Hypothesis,
+    decide,
+    log_likelihood,
+    posterior,
+)
+from pkmcal.session.load import Session
 
-SUSPECT_NOISE_SHARE = 0.5
-"""Part of ``VerdictOptions.too_noisy`` by which edges have to scatter for other radii to be tried,
-and below which these explain the edges."""
+RadiiHypothesis = Hypothesis[Session]
 
 
-def check_radii(
-    case: Case, estimate: Estimate | None, by_chance: bool, refine_camera: bool, seed: int
-) -> tuple[Finding, ...]:
-    """Raise `InputError` where edges disagree with the machine and more of them agree with one of
-    half the radii; a note where the machine of half the radii has no estimate.
+def explain_radii(
+    case: Case, turns: RefinementResult | None, refine_camera: bool, seed: int
+) -> Explanation:
+    """Diameters for radii, where edges disagree with the machine and more of them agree with one of
+    half the radii.
 
-    estimate : with the stated radii, None where there is none. by_chance : whether its edges may be
-    chance matches, which agree with anything. refine_camera : whether the cameras were estimated.
-    seed : for the localization of the stations.
+    turns : with the stated radii, None where they give no estimate. refine_camera : whether the
+    cameras are estimated. seed : for the localization of the stations.
     """
-    agree = SUSPECT_NOISE_SHARE * VERDICT.too_noisy
-    bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
-    if not bad or not case.images:
-        return ()
-    thinner = replace(case.session, machine=_of_half_the_radii(case.session.machine))
-    try:
-        rng = np.random.default_rng(seed)
-        again = localize_case(thinner, case.images, case.boards, rng)
-        cameras = refinement_of(again.session, refine_camera)
-        turns = refine_alternating(again, cameras, lambda _text, _share: None, lambda _step: None)
-    except PkmcalError as error:  # it is not found in these images, or they do not determine it
-        mechanism = case.session.document["mechanism"]
-        return (note("tube.diameter_untested", mechanism, why=str(error).rstrip(".")),)
-    value = turns.estimate
-    cured = value.statistics.noise_scale <= agree
-    inliers = 0.0 if estimate is None else estimate.edge_weights.sum()
-    if cured and value.edge_weights.sum() > inliers:
-        raise diameters(case.session.document["mechanism"])
-    return ()
+    null = _edge_misfit(turns)
+    if not case.images or null <= SUSPECT_SCALE:
+        return Explanation()
+    inliers = 0.0 if turns is None else float(turns.estimate.edge_weights.sum())
+    # errors of an imperfect model vary smoothly, so no more are independent than it has parameters
+    n_effective = float(case.session.machine.parameters.free_matrix().shape[1])
+    untested: list[Finding] = []
+
+    def by_estimate(hypotheses: Sequence[RadiiHypothesis]) -> Array:
+        out = np.full(len(hypotheses), -np.inf)
+        for k, one in enumerate(hypotheses):
+            try:
+                other = _refined(case, one.apply(case.session), refine_camera, seed)
+            except PkmcalError as error:  # not localized in these images, or undetermined by them
+                why = str(error).rstrip(".")
+                untested.append(note(f"{one.code}_untested", one.subject, why=why))
+                continue
+            misfit = _edge_misfit(other)
+            if misfit <= SUSPECT_SCALE and other.estimate.edge_weights.sum() > inliers:
+                misfits = log_likelihood(np.array([null, misfit]), n_effective)
+                out[k] = misfits[1] - misfits[0]
+        return out
+
+    mechanism = case.session.document["mechanism"]
+    prior = log_prior_of_each(case.session.machine, case.session.joints)
+    half = RadiiHypothesis("tube.diameter", mechanism, _of_half_the_radii, prior)
+    best = decide(posterior([half], [EvidenceLevel("estimate", by_estimate)]))
+    if best is None:
+        return Explanation(untested=tuple(untested))
+    return Explanation(diameters(mechanism), best.log_odds)
 
 
-def _of_half_the_radii(machine: Machine) -> Machine:
+def _edge_misfit(turns: RefinementResult | None) -> float:
+    """Scatter of the edges, in what they state; no less than is untenable where there is no
+    estimate or its edges may be chance matches, which agree with anything.
+    """
+    if turns is None:
+        return VERDICT.too_noisy
+    scale = turns.estimate.statistics.noise_scale
+    return max(scale, VERDICT.too_noisy) if chance_match_reason(turns) else scale
+
+
+def _refined(case: Case, session: Session, refine_camera: bool, seed: int) -> RefinementResult:
+    """The refinement of another session with the images of a case."""
+    rng = np.random.default_rng(seed)
+    again = localize_case(session, case.images, case.boards, rng)
+    cameras = refinement_of(again.session, refine_camera)
+    return refine_alternating(again, cameras, lambda _text, _share: None, lambda _step: None)
+
+
+def _of_half_the_radii(session: Session) -> Session:
+    return replace(session, machine=_thinner(session.machine))
+
+
+def _thinner(machine: Machine) -> Machine:
     legs: list[Leg] = []
     for leg in machine.document.legs:
         tubes = [tube.model_copy(update={"radius": tube.radius / 2}) for tube in leg.tubes]

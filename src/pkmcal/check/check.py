@@ -295,7 +295,7 @@ def _check_images(
         *(one.finding for one in rejected),
     ]
     if isinstance(settled, Settled):
-        findings += [*(one.finding for one in settled.turned), *settled.findings]
+        findings += settled.findings
         heights = settled.case.session.heights_alone
         findings += _height_findings(settled) if heights else _pose_scale_findings(settled)
     stations = [  # default for stations that observe no legs

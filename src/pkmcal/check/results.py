@@ -58,7 +58,7 @@ class StationCheck:
     """
 
     name: str
-    images: int
+    photographs: int
     recognised: bool
     mismatch: float = math.nan
     moved: float = math.nan

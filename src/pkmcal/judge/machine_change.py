@@ -78,8 +78,8 @@ def machine_change(
     """What differs between two machines of the same parameters.
 
     covariances : (P, P) of either's parameters in any frames; None for a nominal model, which is
-    taken at its word. same_nominal : whether both calibrations lean on the same one. shared : of the
-    data of the one that has less, the share that the other saw as well.
+    taken at its word. same_nominal : whether both calibrations have the same nominal model.
+    shared : share of the smaller data set that the other calibration has as well.
     """
     held = replace(a, parameters=replace(a.parameters, nominal=a.values))
     table, layout = held.parameters, held.layout

@@ -7,6 +7,7 @@ trackers weigh these hypotheses by how platform poses close, images by the likel
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from math import log
@@ -15,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError
 from pkmcal.outcome.hypotheses import Hypothesis
+from pkmcal.wording import DISPLAY_UNITS, listed, number
 
 RANGE_MARGIN = 0.05
 """Part of a stroke by which a reading may leave its range: homing shifts a range by the offset's
@@ -127,3 +130,57 @@ def shifted_rows(count: int) -> list[ReadingHypothesis]:
         )
         for step in (1, -1)
     ]
+
+
+def reading_error(
+    hypothesis: ReadingHypothesis,
+    file: str,
+    columns: Sequence[str],
+    units: Sequence[str],
+    without: str,
+) -> InputError:
+    """The error that names a mistake in the readings, without what shows it.
+
+    file : of the readings, with ``columns``. units : ``m`` or ``rad`` of each. without : what the
+    data do where the readings are right.
+    """
+    facts, where = hypothesis.facts, f"{file}, line 1"
+    names = [columns[motor] for motor in facts.get("motors", ())]
+    if hypothesis.code == "readings.sign":
+        what = f"the readings of {names[0]} have the wrong sign"
+        where = f"{file}, column {names[0]}"
+        expected = "the readings with the other sign"
+        next_step = "Turn the sign of this column round, or the axis in the mechanism file"
+    elif hypothesis.code == "readings.reversed":
+        unit = units[facts["motors"][0]]
+        scale, display = DISPLAY_UNITS[unit]
+        constant = f"{number(scale * facts['constant'], 0 if unit == 'm' else 1)} {display}"
+        what = f"the readings of {names[0]} count the other way"
+        where = f"{file}, column {names[0]}"
+        expected = f"{constant}, or nearly so, less the reading"
+        next_step = (
+            f"Turn the motor's direction round where it is set, or write {constant} less"
+            " the reading into this column; what is left of the constant is calibrated"
+        )
+    elif hypothesis.code == "readings.exchanged":
+        what = f"the readings of {listed(names)} are exchanged"
+        expected = "the two columns in the other order"
+        next_step = "Exchange the two columns, or the motors in the mechanism file"
+    elif hypothesis.code == "readings.shifted":
+        what = "the readings are shifted by one configuration"
+        where = file
+        near = "before" if facts["step"] > 0 else "after"
+        expected = f"at each configuration the readings of the one {near} it"
+        next_step = "Look for a row that is missing or was written twice"
+    else:
+        order = [columns[k] for k in facts["order"]]
+        what = "the legs are numbered differently in the readings and in the mechanism file"
+        expected = f"the columns in the order {listed(order, len(order))}"
+        next_step = "Give the columns the order of the legs in the mechanism file"
+    return InputError(
+        what,
+        where=where,
+        expected=f"{expected}; with that, {without}",
+        next_step=next_step,
+        code=hypothesis.code,
+    )

@@ -23,7 +23,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
-from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_hypotheses
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
 from pkmcal.observe.pose_likelihood import (
     StationView,
     likelihood_from,
@@ -39,7 +40,7 @@ from pkmcal.outcome.hypotheses import (
     posterior,
     rivals_of,
 )
-from pkmcal.wording import DISPLAY_UNITS, how_often, listed, number
+from pkmcal.wording import how_often, listed
 
 SEARCH_OPTIONS = HypothesisOptions(beam=math.inf, most=3)
 """Of hypotheses whose likelihood a search bounds from below: the likeliest three go on."""
@@ -72,13 +73,16 @@ STATION_PAIRS_SEARCHED = 15
 
 
 class SuspectStation(NamedTuple):
-    """A station: its name, the files of its images and the names of the session's configurations,
-    its view, its pose by hand (4, 4) if there is one, and its localization.
+    """A station: its name, the files of its images, the names of the session's configurations, the
+    file of the readings and its columns, its view, its pose by hand (4, 4) if there is one, and its
+    localization.
     """
 
     name: str
     files: list[str]
     configurations: tuple[str, ...]
+    table: str
+    columns: Sequence[str]
     view: StationView
     by_hand: Array | None
     localization: LocalizedPose
@@ -292,15 +296,20 @@ def _likelier(
     distinct = [what for what in dict.fromkeys(also) if what != error.what]  # several numberings
     if not distinct:
         return error
-    message = f"{error.found}; they fit as well if {' or '.join(distinct)}"
+    rivals = f"fit as well if {' or '.join(distinct)}"
     return InputError(
-        error.what, where=error.where, found=message, next_step=error.next_step, code=error.code
+        error.what,
+        where=error.where,
+        found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}",
+        expected=error.expected,
+        next_step=error.next_step,
+        code=error.code,
     )
 
 
-def _log_prior(view: StationView) -> float:
-    """Prior log-odds of each explanation of a station's images, all alike."""
-    readings = reading_hypotheses(view.all_joints, view.machine.joint_ranges)
+def log_prior_of_each(machine: Machine, joints: Array) -> float:
+    """Prior log-odds of each explanation of images, all alike. joints : readings (K, m)."""
+    readings = reading_hypotheses(joints, machine.joint_ranges)
     return -math.log(len({h.meaning for h in readings}) + OTHER_EXPLANATIONS)
 
 
@@ -308,7 +317,7 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
     """All mistakes in the readings, and images under their neighbours' names; of a station that was
     not localized, diameters taken for radii.
     """
-    view, prior = station.view, _log_prior(station.view)
+    view, prior = station.view, log_prior_of_each(station.view.machine, station.view.all_joints)
     # of a machine with equal thirds, any of its equal numberings would do
     any_numbering = station.localization.good and station.by_hand is None
     for h in reading_hypotheses(view.all_joints, view.machine.joint_ranges):
@@ -321,7 +330,9 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
             lambda view, joints=joints: view.with_joints(joints),
             prior,
             facts=h.facts,
-            error=_reading_error(h, view.machine.joint_units),
+            error=reading_error(
+                h, station.table, station.columns, view.machine.joint_units, "the images fit"
+            ),
             readings=joints[view.configuration],
         )
     names = view.configuration
@@ -355,7 +366,7 @@ def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
     localized, or elsewhere than the user says, as its mirror image is.
     """
     view, T_camera_base = station.view, station.localization.T_camera_base
-    names, prior = view.configuration, _log_prior(view)
+    names, prior = view.configuration, log_prior_of_each(view.machine, view.all_joints)
     if station.elsewhere:
         yield ImageHypothesis(
             "image.mirrored",
@@ -405,52 +416,6 @@ def _best_names(score: Array) -> Integers:
     from scipy.optimize import linear_sum_assignment
 
     return linear_sum_assignment(-score)[1]
-
-
-def _reading_error(hypothesis: ReadingHypothesis, units: Sequence[str]) -> InputError:
-    """The error that names a mistake in the readings. units : ``m`` or ``rad`` of each."""
-    facts = hypothesis.facts
-    if hypothesis.code == "readings.exchanged":
-        return _two_legs(*(k + 1 for k in facts["motors"]))
-    if hypothesis.code.startswith(NUMBERING):
-        return _numbering(facts["order"])
-    (motor,) = facts["motors"]
-    scale, display = DISPLAY_UNITS[units[motor]]
-    constant = f"{number(scale * facts['constant'], 0 if units[motor] == 'm' else 1)} {display}"
-    less = f"some {constant} less the reading" if facts["constant"] else (
-        "the reading with the other sign")  # fmt: skip
-    return InputError(
-        f"the readings of motor {motor + 1} count the other way",
-        where="joints.csv",
-        found=f"the images fit with {less}",
-        next_step=f"Turn the motor's direction round where it is set, or write {less} into this"
-        " column; what is left of a constant is calibrated",
-        code=hypothesis.code,
-    )
-
-
-def _two_legs(a: int, b: int) -> InputError:
-    return InputError(
-        f"the readings of legs {a} and {b} are mixed up",
-        where="joints.csv",
-        found="the images fit with these two columns exchanged",
-        next_step=f"Exchange the columns of legs {a} and {b} in joints.csv, or the two legs in"
-        " the nominal model",
-        code="readings.exchanged",
-    )
-
-
-def _numbering(order: Integers) -> InputError:
-    """The error about legs that are numbered differently; order : column of each leg, from 0."""
-    rising = bool((order[1] - order[0]) % len(order) == 1)
-    return InputError(
-        "the legs are numbered differently in the readings and in the nominal model",
-        where="joints.csv",
-        found=f"the images fit when leg 1 takes the readings of column {order[0] + 1},"
-        f" leg 2 those of column {order[1] + 1}, and so on {'round' if rising else 'backwards'}",
-        next_step="Give the columns of joints.csv the order of the legs in the nominal model",
-        code="readings.numbering_turned" if rising else "readings.numbering_reversed",
-    )
 
 
 def _shifted(step: int) -> InputError:

@@ -16,6 +16,7 @@ noise, are absolute tests, which a level makes by returning minus infinity.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import log
@@ -24,6 +25,8 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.outcome.finding import Finding
 
 Data = TypeVar("Data")
 Subject = TypeVar("Subject", bound="Hypothesis[Any]")
@@ -98,6 +101,18 @@ class Ranked(NamedTuple, Generic[Subject]):
     level: str = "prior"
 
 
+class Explanation(NamedTuple):
+    """What hypotheses about one kind of data explain.
+
+    error : that names the mistake, None where none is decided for. log_odds : of it, nats.
+    untested : notes on hypotheses that could not be tested.
+    """
+
+    error: InputError | None = None
+    log_odds: float = -math.inf
+    untested: tuple[Finding, ...] = ()
+
+
 def posterior(
     hypotheses: Sequence[Subject],
     levels: Sequence[EvidenceLevel[Subject]],
@@ -148,6 +163,16 @@ def rivals_of(
             out.setdefault(one.hypothesis.meaning, one)
     out.pop(first.hypothesis.meaning, None)
     return list(out.values())
+
+
+def refuse(*explanations: Explanation) -> tuple[Finding, ...]:
+    """Raise the error of the likeliest explanation; notes on what could not be tested where none
+    has an error.
+    """
+    likeliest = max(explanations, key=lambda one: one.log_odds)
+    if likeliest.error is not None:
+        raise likeliest.error
+    return tuple(found for one in explanations for found in one.untested)
 
 
 def parameter_cost(count: int, n_effective: float) -> float:

@@ -14,13 +14,10 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.measurements import Column
+from pkmcal.mechanisms.reading_hypotheses import RANGE_MARGIN
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
-# Margin beyond a joint's nominal range, as a share of its stroke. The range is no hard stop: homing
-# shifts it by the prior sigma of the offset. Readings within the margin give a warning, readings
-# beyond it are refused.
-_MARGIN = 0.05
 # Largest range of K repeated readings, in standard deviations: below 6 for any K under a million,
 # so a larger range is movement.
 _SAME_SIGMAS = 6.0
@@ -90,7 +87,14 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
 
 
 def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Refuse readings in mm or degrees: most are out of range, and in range after conversion."""
+    """Refuse readings in mm or degrees: most are out of range, and in range after conversion.
+
+    Readings that signs alone bring back have the right unit: divided by a thousand, or 57, nearly
+    all are near zero, which most ranges contain.
+    """
+    signs = np.where(_reversed(table, ranges), -1.0, 1.0)
+    if _inside(signs * table.values, ranges).all():
+        return
     for kind, (factor, unit, expected, next_step) in _UNITS.items():
         finite = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
         if not finite.any() or _inside(table.values, ranges)[:, finite].mean() > 0.5:
@@ -108,16 +112,21 @@ def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
             )
 
 
+def _reversed(table: CsvTable, ranges: Array) -> Booleans:
+    """Whether each column (m,) is mostly out of range and all in range with the other sign."""
+    here, there = _inside(table.values, ranges), _inside(-table.values, ranges)
+    return (here.mean(axis=0) < 0.5) & there.all(axis=0)
+
+
 def _check_signs(table: CsvTable, ranges: Array) -> None:
     """Refuse a joint whose readings are mostly out of range and all in range with the opposite
     sign.
     """
-    here, there = _inside(table.values, ranges), _inside(-table.values, ranges)
-    wrong = np.flatnonzero((here.mean(axis=0) < 0.5) & there.all(axis=0))
+    wrong = np.flatnonzero(_reversed(table, ranges))
     if not wrong.size:
         return
     column = int(wrong[0])
-    row = int(np.argmin(here[:, column]))
+    row = int(np.argmin(_inside(table.values, ranges)[:, column]))
     low, high = ranges[column]
     names = listed([table.columns[k] for k in wrong])
     raise InputError(
@@ -144,7 +153,7 @@ def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
             if not which.any() or inside[:, which].mean() > 0.5 or not near[:, ~which].all():
                 continue
             low, high = ranges[which].T
-            readings, slack = table.values[:, which], _MARGIN * (high - low)
+            readings, slack = table.values[:, which], RANGE_MARGIN * (high - low)
             # fmax and fmin ignore NaN: an unknown range allows any shift
             least = float(np.fmax.reduce(low - slack - readings.min(axis=0)))
             most = float(np.fmin.reduce(high + slack - readings.max(axis=0)))
@@ -346,7 +355,7 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Findi
     return merged, [doubtful("readings.repeated_poses", table.label, **rows)]
 
 
-def _inside(values: Array, ranges: Array, margin: float = _MARGIN) -> np.ndarray:
+def _inside(values: Array, ranges: Array, margin: float = RANGE_MARGIN) -> np.ndarray:
     """Whether each reading (K, m) is inside its range, widened by `margin` of the stroke; True for
     unknown ranges.
     """
