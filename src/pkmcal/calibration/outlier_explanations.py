@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
@@ -50,7 +50,7 @@ class MeasuredPlatforms(NamedTuple):
     T_base_platform: Array
     noise: Array
 
-    def select(self, rows: Array) -> MeasuredPlatforms:
+    def select(self, rows: Integers | Booleans) -> MeasuredPlatforms:
         """Some poses: indices, or a mask."""
         return MeasuredPlatforms(self.machine, *(part[rows] for part in self[1:]))
 
@@ -90,7 +90,7 @@ def outlier_explanations(
         estimate.machine, measurements.poses.configuration[which], poses, noise
     )
     off = measured.differences(joints)
-    finite = np.asarray(np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2)))
+    finite = np.flatnonzero(np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2)))
     measured, off, which = measured.select(finite), off[finite], which[finite]
     if len(which) < 2 * m:
         return
