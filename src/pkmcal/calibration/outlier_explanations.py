@@ -52,7 +52,9 @@ class MeasuredPlatforms(NamedTuple):
 
     def select(self, rows: Integers | Booleans) -> MeasuredPlatforms:
         """Some poses: indices, or a mask."""
-        return MeasuredPlatforms(self.machine, *(part[rows] for part in self[1:]))
+        return MeasuredPlatforms(
+            self.machine, self.configuration[rows], self.T_base_platform[rows], self.noise[rows]
+        )
 
     def differences(self, joints: Array) -> Array:
         """Differences (n, m) of the readings that follow from those that were read, (K, m)."""
