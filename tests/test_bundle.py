@@ -153,7 +153,7 @@ def shaded(scene, sigma, rng):
     return replace(scene, shading=shift[:, lines])
 
 
-@pytest.mark.parametrize("sigma", [0.03, 0.3])
+@pytest.mark.parametrize("sigma", [pytest.param(0.03, marks=pytest.mark.slow), 0.3])
 def test_shading_is_as_large_as_the_edges_say(sigma):
     """Shading as small as its prior, or ten times that, as in hard light on polished metal: it is
     estimated, and the standard deviations are right with either.

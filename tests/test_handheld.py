@@ -531,6 +531,7 @@ def placed(remeasured, monkeypatch, faults, textured=False):
     return handheld.localize_case(session, photographs, Boards(), np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
     """All images show some of the same points about the machine."""
     _, photographs, _, truth = looked
@@ -586,6 +587,7 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
     assert handheld._sure({}, 5) == []
 
 
+@pytest.mark.slow
 def test_a_photograph_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
     """However well its silhouettes match something: it determines no machine."""
     rows = []
@@ -690,6 +692,7 @@ def test_tubes_stand_out_of_a_chart():
     assert clear[wide, (normal + PAIR_DIRECTIONS // 2) % PAIR_DIRECTIONS] == 0
 
 
+@pytest.mark.slow
 def test_one_photograph_is_found_from_nothing(looked):
     """Ten seconds: all poses about the machine, for the easiest of the three images."""
     session, photographs, poses, truth = looked
@@ -782,6 +785,7 @@ def test_photographs_join_what_is_known(looked):
         evaluate_pose(session, names, 2, nowhere, view)
 
 
+@pytest.mark.slow
 def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
     """Scoring is an estimate of one image, and no pose is scored twice."""
     session, photographs, poses, truth = looked

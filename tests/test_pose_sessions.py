@@ -266,6 +266,7 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
     assert values.facts["value"] == pytest.approx(-0.02, rel=0.06)
 
 
+@pytest.mark.slow
 def test_no_configuration_is_exchanged_with_itself(folder):
     """A pose that lost its weight, its reading off by as much as makes it just disagree."""
     made = make(folder, "h4", n=30)
@@ -288,6 +289,7 @@ def test_no_configuration_is_exchanged_with_itself(folder):
     assert len(made.joints) == 30
 
 
+@pytest.mark.slow
 def test_poses_that_coarse_readings_explain_are_not_rejected(folder):
     """Hobby servos, half a degree, stated as a thousandth of that: some poses look wrong until the
     readings' noise is estimated, and are right then.
