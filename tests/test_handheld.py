@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from conftest import two_looks
 from faults import fault, replaced
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import handheld, pose_scoring
@@ -324,7 +325,7 @@ def breathed(simulated, tmp_path_factory):
     (folder / "mechanism.yaml").write_text(
         re.sub(r"(?m)^tolerance:.*$", "tolerance: {center: 1e-5, offset: 1e-5, radius: 1e-5}", text)
     )
-    with pytest.MonkeyPatch.context() as patch:
+    with two_looks() as patch:
         at_truth(patch, folder)
         return calibrate_session(folder), load_truth(folder, load_mechanism("gough-stewart"))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from conftest import run
+from conftest import run, two_looks
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
@@ -417,7 +417,7 @@ def looked(repeats):
         made.append(calibrate_session(*words, **more))
         return made[0]
 
-    with pytest.MonkeyPatch.context() as patch:
+    with two_looks() as patch:
         patch.setattr("pkmcal.judge.repeatability.calibrate_session", once)
         study = study_repeats(repeats)
     (calibration,) = made
