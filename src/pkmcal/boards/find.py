@@ -1,4 +1,4 @@
-"""A board's corners in one photograph: found by OpenCV's detectors, then fitted to sub-pixel.
+"""A board's corners in one image: found by OpenCV's detectors, then fitted to sub-pixel.
 
 A detector says which corners there are and where they lie to a pixel; of boards with markers also
 whether the picture is a mirror image. Each corner is then fitted to the grey levels around it.
@@ -9,7 +9,7 @@ the blur, the picture of a chessboard's corner is ``c + a g(e1 / s) g(e2 / s)`` 
 directions, blur and grey levels are fitted to all pixels of a window that follows the board's
 local scale, so that it stays short where a lens or mirror makes the board small and bends its
 lines. This is the maximum-likelihood place of the corner, and measures the same on a slanted
-board as on a straight one. All corners of a photograph are fitted at once.
+board as on a straight one. All corners of an image are fitted at once.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pkmcal.solver.marquardt import Damping
 
 CORNER_FIT_STEPS = 12
 CORNER_FIT_SETTLED = 1e-3
-"""px; a thirtieth of what the noise of a good photograph does."""
+"""px; a thirtieth of what the noise of a good image does."""
 FARTHEST_CORNER_MOVE = 0.25
 """Squares by which the fit may move a corner that a detector has found."""
 LEAST_RADIUS, MOST_RADIUS = 2.5, 14
@@ -43,7 +43,7 @@ UNMODELLED_EDGE_BEND = 0.02
 BLANK_BORDER_SHARE = 0.9
 """Share of the blank border between edge and marker that the window may fill."""
 LEAST_DETECTED_CORNERS = 6
-"""Corners below which a photograph says nothing: four fix a board's pose, two more test it."""
+"""Corners below which an image says nothing: four fix a board's pose, two more test it."""
 WHOLE_CHESSBOARD_SHARE = 0.75
 """Share of a chessboard's corners that must look like corners: what is found there is the whole
 board, or something else."""
@@ -56,7 +56,7 @@ Raw = tuple[Integers, Array]
 
 
 def detect_board(image: Integers, board: Board, name: str = "", quick: bool = False) -> Detection:
-    """Find the board's corners in one photograph, grey levels (height, width) uint8.
+    """Find the board's corners in one image, grey levels (height, width) uint8.
 
     quick : only the first way of finding a chessboard.
     """
@@ -165,7 +165,7 @@ def marker_bits(name: str) -> int:
 
 
 class Markers(NamedTuple):
-    """Markers in a photograph: ids (k,) and corners (k, 4, 2) px."""
+    """Markers in an image: ids (k,) and corners (k, 4, 2) px."""
 
     ids: Integers
     corners: Array
@@ -237,7 +237,7 @@ def _attempts(image: Integers, counts: tuple[int, int], quick: bool) -> Iterator
 
 
 def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Any, float]]:
-    """The photograph; with its contrast evened out; smaller; larger; each with its scale."""
+    """The image; with its contrast evened out; smaller; larger; each with its scale."""
     import cv2
 
     yield image, 1.0

@@ -61,7 +61,7 @@ MOVED_BOARD_DEVIATIONS = 4.0
 """Standard deviations of the images' own noise allowed in addition."""
 MOST_ODD = 1 / 3
 """Largest share of single images that disagree; with more, the board never stood still."""
-_EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
+_EXPECTED = "a board fixed to the base, and a camera that stands still: all images of a " \
     "station show the board in one place"  # fmt: skip
 MOST_COMMON = 0.99
 """Largest share of a pose's covariance that repeats have in common."""
@@ -106,9 +106,9 @@ class BoardViews:
         unsure = [(int(k), UNSURE_BOARD_REASON) for k in self.numbers[~self.usable]]
         return tuple(self.rejection(k, why) for k, why in sorted(missed + unsure))
 
-    def rejection(self, photograph: int, reason: str) -> Rejection:
-        """Rejection of the board in one image; photograph : index among the K images."""
-        return Rejection(self.station, int(self.configuration[photograph]), -1, -1, -1, reason)
+    def rejection(self, image: int, reason: str) -> Rejection:
+        """Rejection of the board in one image; image : index among the K images."""
+        return Rejection(self.station, int(self.configuration[image]), -1, -1, -1, reason)
 
 
 def detect_in(
@@ -221,19 +221,18 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
     if mirrored and others:
         one = len(mirrored) == 1
         raise InputError(
-            "this photograph is a mirror image" if one else "these photographs are mirror images",
+            "this image is a mirror image" if one else "these images are mirror images",
             where=listed(mirrored, 3),
-            found=f"the board's markers reversed, and not in {count(others, 'other photograph')}",
-            next_step=f"Flip {'this photograph' if one else 'these photographs'} alone, or take"
+            found=f"the board's markers reversed, and not in {count(others, 'other image')}",
+            next_step=f"Flip {'this image' if one else 'these images'} alone, or take"
             f" {'it' if one else 'them'} again",
         )
     if mirrored:
         raise InputError(
-            "the photographs are mirror images",
+            "the images are mirror images",
             where=listed(mirrored, 3),
-            expected="photographs in which the board's markers are not reversed",
-            next_step="Flip all photographs of this camera, and calibrate the camera from flipped"
-            " ones",
+            expected="images in which the board's markers are not reversed",
+            next_step="Flip all images of this camera, and calibrate the camera from flipped ones",
         )
 
 
@@ -309,7 +308,7 @@ def standing_board(views: BoardViews) -> Standing | None:
         tuple(
             views.rejection(
                 int(views.numbers[k]),
-                f"the board stands {distance[k]:.1f} px from where the other photographs show it",
+                f"the board stands {distance[k]:.1f} px from where the other images show it",
             )
             for k in np.flatnonzero(odd)
         ),
@@ -360,7 +359,7 @@ def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
         raise InputError(
             "the board, or the camera, did not stand still",
             where=views.names[0].rpartition("/")[0] or views.names[0],
-            found=f"{odd} of {len(used)} photographs show it in other places than the rest",
+            found=f"{odd} of {len(used)} images show it in other places than the rest",
             expected=_EXPECTED,
         )
 
@@ -382,7 +381,7 @@ def _movement_error(
         found=f"the board {pixels:.1f} px away ({metres * 1e3:.1f} mm, {np.rad2deg(turn):.2f}"
         " degrees)",
         expected=_EXPECTED,
-        next_step=f"Make the photographs from {names[after[0]]} on a station of their own, if only"
+        next_step=f"Make the images from {names[after[0]]} on a station of their own, if only"
         " the camera was moved; take them again, if the board was",
     )
 

@@ -170,7 +170,7 @@ class CameraCalibration:
         }
 
 
-def calibrate_photographs(
+def calibrate_images(
     paths: Sequence[Path | str], board: Board, model: str = "auto"
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
@@ -248,7 +248,7 @@ def check_enough(used: Sequence[Any], taken: int) -> None:
     """Raise `InputError` if fewer than LEAST_VIEWS images show the board."""
     if len(used) < LEAST_VIEWS:
         raise InputError(
-            "too few photographs show the board",
+            "too few images show the board",
             found=f"{len(used)} of {taken}",
             expected=f"{LEAST_VIEWS} at least, better ten, with the board tilted differently",
         )
@@ -258,10 +258,10 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
     """Error about a model for which no starting value gives finite pixels."""
     other = min(pool, key=lambda c: c.left_out) if pool else None
     return InputError(
-        f"the model {model} does not fit the photographs",
+        f"the model {model} does not fit the images",
         expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
         if other
-        else "photographs of one flat board by one camera",
+        else "images of one flat board by one camera",
     )
 
 
@@ -274,7 +274,7 @@ def check_model(model: str, chosen: Candidate, best: Candidate) -> list[Finding]
     ratio = chosen.left_out / best.left_out
     if ratio > UNFIT_MODEL_RATIO:
         raise InputError(
-            f"the model {model} does not fit the photographs",
+            f"the model {model} does not fit the images",
             found=f"an error of {chosen.left_out:.2g} px on views left out",
             expected=f"{best.model}, with {best.left_out:.2g} px",
         )
@@ -307,11 +307,11 @@ def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
         return
     tilt = tilts(fit.T_camera_board, views.points)
     raise ResultError(
-        "the photographs do not tell the focal length, because the board looks much the same in"
+        "the images do not tell the focal length, because the board looks much the same in"
         " all of them",
         found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
-        next_step="Take photographs with the board tilted by 20 to 45 degrees, each to another"
+        next_step="Take images with the board tilted by 20 to 45 degrees, each to another"
         " side, and near the picture's corners",
     )
 
@@ -340,11 +340,11 @@ def check_explained(rms: float, camera: Camera) -> None:
     if rms <= limit:
         return
     raise ResultError(
-        "no camera model explains these photographs",
+        "no camera model explains these images",
         found=f"an error of {rms:.2g} px on views left out ({camera.model} fits best)",
         expected=f"{limit:.2g} px at most, usually a tenth of that",
         next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
-        " photographs of two cameras",
+        " images of two cameras",
     )
 
 

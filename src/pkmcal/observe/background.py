@@ -210,8 +210,8 @@ class Surroundings:
     returns the grey levels and the camera of the image with a given number.
     """
 
-    def __init__(self, photograph: Callable[[int], tuple[Integers, Camera]]) -> None:
-        self.texture: Callable[[int], Texture] = cache(lambda k: texture_of(*photograph(k)))
+    def __init__(self, image: Callable[[int], tuple[Integers, Camera]]) -> None:
+        self.texture: Callable[[int], Texture] = cache(lambda k: texture_of(*image(k)))
         self._pairs: Callable[[int, int], Integers] = cache(
             lambda j, k: partners(self.texture(j), self.texture(k))
         )

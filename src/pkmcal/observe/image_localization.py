@@ -25,7 +25,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.distance_tables import WORKING_WIDTH, distance_tables
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.pose_candidates import (
     CAMERA_DIRECTIONS,
     SIGHT_LINE_TURNS,
@@ -160,15 +160,13 @@ def distinct(view: StationView, values: Array) -> Integers:
     return retained_rows[~same_pose(values[retained_rows], values[0]) | (retained_rows == 0)]
 
 
-def finest_view(
-    machine: Machine, photograph: Photographs, joints: Array, poses: Array
-) -> StationView:
+def finest_view(machine: Machine, image: StationImages, joints: Array, poses: Array) -> StationView:
     """View of one image with the finest tables.
 
     joints, poses : of all configurations of the session; the latter are T_base_platform.
     """
-    tables = distance_tables([photograph.images[0]], *FINEST_TABLES)
-    return StationView(machine, photograph.camera, photograph.configuration, joints, poses, tables)
+    tables = distance_tables([image.images[0]], *FINEST_TABLES)
+    return StationView(machine, image.camera, image.configuration, joints, poses, tables)
 
 
 def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tuple[Array, float]:

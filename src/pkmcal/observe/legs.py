@@ -31,7 +31,7 @@ from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
 from pkmcal.observe.grey_levels import levels_at
-from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed, windows
+from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages, windows
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -101,7 +101,7 @@ OTHER_OUTLINE_CLEARANCE = 5.0
 """Distance in pixels from the outlines of other legs: the outer reach of a profile and of the
 search around it."""
 
-OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the photograph"
+OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the image"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
 _LAMP = "a highlight lies along it, and hides where the leg ends"
 _TOO_LITTLE = "too little of it is seen as a clear edge"
@@ -316,14 +316,14 @@ class StationEdges:
 
 
 def search(
-    photographs: Photographs,
+    images: StationImages,
     machine: Machine,
     T_camera_base: Array,
     poses: Array,
     reach: float = LEG_SEARCH_REACH,
 ) -> StationEdges:
     """:func:`search_stations` for one station's images; poses : T_base_platform (K, 4, 4)."""
-    return search_stations([Placed(photographs, T_camera_base, poses)], machine, reach)[0]
+    return search_stations([Placed(images, T_camera_base, poses)], machine, reach)[0]
 
 
 def search_stations(
@@ -340,10 +340,10 @@ def search_stations(
             done(len(window.images))
         del window  # free before the next one is decoded
     every = joined_passes(passes, float("nan"), reach)
-    return [every.of_station(one.photographs.station) for one in placed]
+    return [every.of_station(one.images.station) for one in placed]
 
 
-def _searched(window: PhotographWindow, machine: Machine, reach: float) -> StationEdges:
+def _searched(window: ImageWindow, machine: Machine, reach: float) -> StationEdges:
     """Edges of one window of images by :func:`search_stations`."""
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
     places = search_legs(window.images, tubes, points, clear, reach)
@@ -363,7 +363,7 @@ def _searched(window: PhotographWindow, machine: Machine, reach: float) -> Stati
 
 
 def measure(
-    photographs: Photographs,
+    images: StationImages,
     machine: Machine,
     T_camera_base: Array,
     poses: Array,
@@ -371,8 +371,8 @@ def measure(
     refine_camera: bool = False,
 ) -> StationEdges:
     """:func:`measure_stations` for one station's images; poses : T_base_platform (K, 4, 4)."""
-    blur_by_station = {} if blur is None else {photographs.station: blur}
-    placed = Placed(photographs, T_camera_base, poses)
+    blur_by_station = {} if blur is None else {images.station: blur}
+    placed = Placed(images, T_camera_base, poses)
     return measure_stations([placed], machine, blur_by_station, refine_camera)[0]
 
 
@@ -392,7 +392,7 @@ def measure_stations(
     # blur of stations with several windows, from images spread over all of them
     numbers = dict(blur)
     for one in placed:
-        p = one.photographs
+        p = one.images
         if p.station not in numbers and len(p.images) > p.window:
             few = next(windows([one.select(p.spread(p.window))]))
             numbers |= _blur_in(_predicted_edges(few, machine).across, [p.station])
@@ -413,7 +413,7 @@ def measure_stations(
     away, at = np.concatenate(shifted), every.edges.station[every.point_edge]
     out: list[StationEdges] = []
     for one in placed:
-        station = one.photographs.station
+        station = one.images.station
         own, station_blur = away[at == station], numbers.get(station, profiles.USUAL_BLUR)
         middle = float(np.median(own)) if own.size else 0.0
         out.append(replace(every.of_station(station), blur=station_blur, shift=middle))
@@ -461,7 +461,7 @@ class _PredictedEdges:
     across: Profiles
 
 
-def _predicted_edges(window: PhotographWindow, machine: Machine) -> _PredictedEdges:
+def _predicted_edges(window: ImageWindow, machine: Machine) -> _PredictedEdges:
     """Middles of all segments, and the mean profiles of those with enough clear points."""
     tubes, points, clear = predicted(window, machine, EDGE_SEGMENTS * POINTS_A_SEGMENT)
     middles = np.arange(EDGE_SEGMENTS) * POINTS_A_SEGMENT + POINTS_A_SEGMENT // 2
@@ -472,7 +472,7 @@ def _predicted_edges(window: PhotographWindow, machine: Machine) -> _PredictedEd
 
 
 def _measured(
-    window: PhotographWindow, prediction: _PredictedEdges, blur: BlurByStation, refine_camera: bool
+    window: ImageWindow, prediction: _PredictedEdges, blur: BlurByStation, refine_camera: bool
 ) -> tuple[StationEdges, Array]:
     """Edges of one window by :func:`measure_stations`, and the distance (px) of each inlier from
     its prediction.
@@ -502,7 +502,7 @@ def _measured(
 
 
 def predicted(
-    window: PhotographWindow, machine: Machine, samples: int
+    window: ImageWindow, machine: Machine, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
     """Edges of all tubes, with ``samples`` points on each, and the mask (K, E, n) of unobstructed
     ones.
@@ -515,7 +515,7 @@ def predicted(
 
 
 def _segment_profiles(
-    window: PhotographWindow, points: EdgePoints, clear: Booleans, half_width: Array
+    window: ImageWindow, points: EdgePoints, clear: Booleans, half_width: Array
 ) -> tuple[Booleans, Profiles]:
     """Mean profiles over the clear points of each segment.
 

@@ -84,7 +84,7 @@ def global_candidates(
     radius: Array,
     legs: LegsInCamera,
     tables: DistanceTables,
-    photographs: Integers,
+    images: Integers,
     keep: int,
 ) -> Array:
     """Likeliest poses T_camera_base (keep, 4, 4) without a prior, best first.
@@ -92,13 +92,13 @@ def global_candidates(
     radius : (E,) m of the tubes of each edge.
     legs : (K, L) in the base frame, of all configurations.
     tables : of the same K images.
-    photographs : numbers of the images that are scored.
+    images : numbers of the images that are scored.
     """
     in_view = _direction_spread(camera, tables)
     frame = frame_of(in_view.middle)
     places, spread = _places(tubes, radius, legs, float(in_view.width))
-    chart = _chart_tables(camera, tables, photographs, frame, float(in_view.width))
-    scores = _scores(chart, places, spread, tubes, legs, photographs, float(in_view.width))
+    chart = _chart_tables(camera, tables, images, frame, float(in_view.width))
+    scores = _scores(chart, places, spread, tubes, legs, images, float(in_view.width))
     best = np.argpartition(scores.ravel(), keep)[:keep]
     best = best[np.argsort(scores.ravel()[best])]
     place, turn, shift = np.unravel_index(best, scores.shape)
@@ -217,12 +217,12 @@ def _on_chart(rays: Array, width: float) -> Array:
 
 
 def _chart_tables(
-    camera: Camera, tables: DistanceTables, photographs: Integers, frame: Array, width: float
+    camera: Camera, tables: DistanceTables, images: Integers, frame: Array, width: float
 ) -> Integers:
     """Distance tables (K, EDGE_DIRECTIONS, n, n) uint8 on the chart, in cells, of some images."""
     n = 2 * CHART_HALF_CELLS + 1
-    out = np.empty((len(photographs), EDGE_DIRECTIONS, n, n), dtype=np.float32)
-    for row, k in enumerate(photographs):
+    out = np.empty((len(images), EDGE_DIRECTIONS, n, n), dtype=np.float32)
+    for row, k in enumerate(images):
         edges = tables.edges[k]
         # each edge point as a chord of one reduced pixel, which gives its direction on the chart
         along = np.stack([-edges.normal[:, 1], edges.normal[:, 0]], axis=-1) / 2
@@ -245,14 +245,14 @@ def _scores(
     spread: AngularExtent,
     tubes: TubeList,
     legs: LegsInCamera,
-    photographs: Integers,
+    images: Integers,
     width: float,
 ) -> Array:
     """Mean distance (P, SIGHT_LINE_TURNS, SIGHT_LINE_SHIFTS), in cells, of the legs' chords to
     edges of the same direction, weighted by the chords' lengths.
     """
     leg = np.unique(tubes.leg)
-    a, b, u = (v[photographs][:, leg] for v in (legs.a, legs.b, legs.u))
+    a, b, u = (v[images][:, leg] for v in (legs.a, legs.b, legs.u))
     # chords along the visible part of each leg, on the chart
     low = np.array([tubes.start[tubes.leg == j].min() for j in leg])
     high = np.array([tubes.stop[tubes.leg == j].max() for j in leg])

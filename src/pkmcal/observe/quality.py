@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.grey_levels import levels_at
-from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed, windows
+from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages, windows
 from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
 from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
 
@@ -63,15 +63,13 @@ class Quality:
         return np.abs(self.level - self.behind)
 
 
-def quality(
-    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
-) -> Quality:
+def quality(images: StationImages, machine: Machine, T_camera_base: Array, poses: Array) -> Quality:
     """Quality on the legs of one station's images.
 
     T_camera_base : (4, 4).
     poses : T_base_platform (K, 4, 4), one for each image.
     """
-    placed = Placed(photographs, T_camera_base, poses)
+    placed = Placed(images, T_camera_base, poses)
     parts = [_quality(window, machine) for window in windows([placed])]
     each = (f.name for f in fields(Quality))
     return Quality(
@@ -82,7 +80,7 @@ def quality(
     )
 
 
-def _quality(window: PhotographWindow, machine: Machine) -> Quality:
+def _quality(window: ImageWindow, machine: Machine) -> Quality:
     """Quality on the legs in one window of images."""
     # edges found by the search, and the widths of their legs
     tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)

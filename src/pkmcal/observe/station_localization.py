@@ -26,7 +26,7 @@ from pkmcal.observe.pose_candidates import global_candidates
 from pkmcal.observe.pose_likelihood import (
     LAST_REACH,
     StationView,
-    by_photograph,
+    by_image,
     correlation_length,
     distances_under,
     distinct_silhouettes,
@@ -264,20 +264,20 @@ def _search(
 
 
 def _best_about(
-    view: StationView, candidates: Array, photographs: Integers, rng: np.random.Generator
+    view: StationView, candidates: Array, images: Integers, rng: np.random.Generator
 ) -> Array:
     """Likeliest poses (PERTURBED_POSES_RETAINED, 4, 4) among refined candidates and perturbations
     of them.
     """
-    candidates = refine_lm(view, candidates, photographs, 5, (5, 4, 4, 3))
-    candidates = _best(view, candidates, photographs, reach=3, keep=24)
-    candidates = candidates[distinct_silhouettes(view, candidates, photographs)[:4]]
+    candidates = refine_lm(view, candidates, images, 5, (5, 4, 4, 3))
+    candidates = _best(view, candidates, images, reach=3, keep=24)
+    candidates = candidates[distinct_silhouettes(view, candidates, images)[:4]]
     # the likelihood has many local maxima: a pose beside a good one may be better
     beside = candidates[rng.integers(0, len(candidates), PERTURBED_POSES_TRIED)]
     steps = rng.normal(size=(PERTURBED_POSES_TRIED, 6)) * SHAKEN_SPREAD
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
     candidates, log_likelihood_ratio = refine_ml(
-        view, np.concatenate([candidates, turned]), photographs, 3, 2
+        view, np.concatenate([candidates, turned]), images, 3, 2
     )
     return candidates[np.argsort(-log_likelihood_ratio)[:PERTURBED_POSES_RETAINED]]
 
@@ -315,11 +315,9 @@ def _random_search(view: StationView, prior: _PosePrior, rng: np.random.Generato
     return shifted(likely(np.concatenate([best, again]), 10, descending))
 
 
-def _best(
-    view: StationView, candidates: Array, photographs: Integers, reach: float, keep: int
-) -> Array:
+def _best(view: StationView, candidates: Array, images: Integers, reach: float, keep: int) -> Array:
     """The ``keep`` candidates with the smallest mean distance."""
-    order = np.argsort(score(view, candidates, photographs, reach))
+    order = np.argsort(score(view, candidates, images, reach))
     return candidates[order[:keep]]
 
 
@@ -401,7 +399,7 @@ def _z_scores(
     places = np.broadcast_to(T_camera_base, (len(guessed), 4, 4))
     distances = distances_under(replace(view, guessed=guessed), places, other, 8)
     # own readings against the others
-    own, *rivals = by_photograph(distances.log_likelihood(mixture), len(other))
+    own, *rivals = by_image(distances.log_likelihood(mixture), len(other))
     count, fits = len(rivals), np.stack(rivals)
     scatter = np.maximum(fits.std(axis=0, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
     away = (own - fits.mean(axis=0)) / scatter
