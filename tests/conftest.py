@@ -8,8 +8,8 @@ import json
 import os
 import pickle
 import shutil
-from collections.abc import Callable
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Collection, Iterable
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -52,14 +52,14 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_diagnose",
-    "test_study_workers", "test_calibration", "test_repeats", "test_camera_calibration",
-    "test_calibrate_board", "test_pose_sessions", "test_boards", "test_report_page",
-    "test_departures", "test_watch_command", "test_paper_b", "test_paper_c", "test_check",
-    "test_validate", "test_examples", "test_observe_search", "test_handheld", "test_plan",
-    "test_paper_a", "test_servo", "test_bad_input", "test_bundle", "test_view",
-    "test_export_trees", "test_cli_camera", "test_servo_command", "test_reproduce_b",
-    "test_edge_noise", "test_reproduce",
+    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_pose_sessions",
+    "test_calibrate_board", "test_study_workers", "test_boards", "test_camera_calibration",
+    "test_validate", "test_repeats", "test_silhouettes", "test_watch_command", "test_handheld",
+    "test_bundle", "test_heights", "test_servo", "test_observe_search", "test_model_violations",
+    "test_export_c", "test_plan", "test_simulate", "test_hostile", "test_view", "test_diagnose",
+    "test_docs", "test_python", "test_export_mujoco", "test_export_trees", "test_examples",
+    "test_reproduce_b", "test_paper_a", "test_calibration", "test_h4", "test_catalogue",
+    "test_response", "test_accepted_inputs", "test_legible", "test_paper_c", "test_writing",
 )  # fmt: skip
 
 
@@ -98,6 +98,21 @@ def few_looks(request, monkeypatch):
 def all_looks(few_looks, monkeypatch):
     """As many further measurement passes as by default."""
     monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", ALL_LOOKS)
+
+
+@contextmanager
+def two_looks():
+    """Two further measurement passes for a shared fixture whose calibration's variance between
+    passes is not tested.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
+        yield patch
+
+
+def slow_but(few: Collection[str], names: Iterable[str]) -> list:
+    """Names as parameters of a test: a few that differ in kind, the others as slow tests."""
+    return [name if name in few else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
 @dataclass(frozen=True)

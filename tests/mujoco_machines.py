@@ -112,8 +112,11 @@ TURNED = {
 BUILT_WRONG = ("3-rps", "delta", "gough-stewart", "h4-rods")
 """Machines of either motion and every kind of closure; the other machines, with errors, are slow
 tests."""
+AS_DRAWN = ("3-rpr", "3-upu", "6-rus", "6-spu-passive", "four-belt", "hexaglide")
+"""Machines whose kind of joints none of the above and of the turned ones has; the others are slow
+tests."""
 ALL = [
-    *CATALOGUE,
+    *(pytest.param(n, marks=() if n in AS_DRAWN else pytest.mark.slow) for n in CATALOGUE),
     *(pytest.param(f"wrong {n}", marks=() if n in BUILT_WRONG else pytest.mark.slow)
       for n in CATALOGUE),
     *MADE,

@@ -214,6 +214,7 @@ def test_images_of_something_else(session):
     )
 
 
+@pytest.mark.slow
 def test_two_stations_swapped(session):
     def swap(value):
         first, second = value["station1"], value["station2"]

@@ -268,6 +268,7 @@ def test_another_board_than_described(folder):
     assert "markers of DICT_4X4_50" in caught.value.found
 
 
+@pytest.mark.slow
 def test_a_board_that_is_nowhere(found):
     session, station_images, _ = found
     # one of it: if no board is found, one of every other kind is searched as well

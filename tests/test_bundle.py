@@ -152,7 +152,7 @@ def shaded(scene, sigma, rng):
     return replace(scene, shading=shift[:, lines])
 
 
-@pytest.mark.parametrize("sigma", [0.03, 0.3])
+@pytest.mark.parametrize("sigma", [pytest.param(0.03, marks=pytest.mark.slow), 0.3])
 def test_shading_is_as_large_as_the_edges_say(sigma):
     """Shading as small as its prior, or ten times that, as in hard light on polished metal: it is
     estimated, and the standard deviations are right with either.
@@ -196,7 +196,7 @@ def test_stated_noise_is_kept_when_asked():
 @pytest.mark.parametrize("share", [pytest.param(0.05, marks=pytest.mark.slow), 0.2])
 def test_wrong_edges_change_nothing_that_matters(share):
     """Edges replaced by another leg's: the same answer within 1.5 of its standard deviations."""
-    for seed in range(4):
+    for seed in range(2):
         scene = make_scene(np.random.default_rng(10 + seed), configurations=20)
         rng = np.random.default_rng(seed)
         clean = estimate(scene, scene.measurements(np.random.default_rng(100 + seed)), rng)

@@ -103,6 +103,7 @@ def test_start_ten_centimetres_and_ten_degrees_off(demo, calibrated, seed):
     assert np.max(np.abs(change) / np.maximum(sigma, 1e-6)) < 1.0
 
 
+@pytest.mark.slow
 def test_start_from_a_bad_drawing(demo, calibrated):
     """A nominal model with errors of 5 mm on every coordinate, and a tolerance to match: the same
     machine.

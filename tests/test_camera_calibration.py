@@ -228,6 +228,7 @@ def misnumbered(value, columns=8):
     return out
 
 
+@pytest.mark.slow
 def test_corners_with_wrong_numbers_are_no_lens(monkeypatch):
     """All fit but those of one column: the board is another, however well the rest fits."""
     alone(monkeypatch, "pinhole")
@@ -238,6 +239,7 @@ def test_corners_with_wrong_numbers_are_no_lens(monkeypatch):
     assert caught.value.found.startswith(f"{BOARD.counts[1] - 1} of {len(BOARD.points)} corners")
 
 
+@pytest.mark.slow
 def test_corners_at_others_places_in_one_view_are_outliers(monkeypatch):
     """A detection that failed once does not reject the board."""
     alone(monkeypatch, "pinhole")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pkmcal
+from conftest import slow_but
 from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.files import parse_yaml, validated_document
@@ -256,6 +257,9 @@ def in_sigmas(nominal, estimate, truth):
     return error[above_limit] / scale[above_limit]
 
 
+@pytest.mark.parametrize(
+    "machine", slow_but(("gough-stewart", "3-rps", "6-spu-passive"), NAMES), indirect=True
+)
 def test_a_simulated_session_calibrates(machine):
     """Errors match the covariance, over five machines with errors as large as the tolerances."""
     z = []

@@ -86,6 +86,7 @@ def test_a_workspace_blurred_and_overexposed_images(session):
     assert not [text for text in faults if text.startswith("station3")]
 
 
+@pytest.mark.slow
 def test_black_images_of_nothing(session):
     only(session, "station1", "station3")
     changed(session, lambda picture: picture * 0, "station3")
@@ -124,6 +125,7 @@ def test_of_many_broken_images_some_are_named(session, monkeypatch):
     assert "stations.station1: images cannot be decoded; found 3 more of this" in others
 
 
+@pytest.mark.slow
 def test_a_station_without_a_pose_is_found_anywhere(session):
     text = (session / "session.yaml").read_text()
     start, end = text.index("    pose:"), text.index("  station2:")

@@ -121,7 +121,7 @@ sys.exit(cli.main(["tell"]))
 """A command with more output than a pipe holds, for a result that should not be used."""
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("unbuffered", ["", pytest.param("1", marks=pytest.mark.slow)])
 def test_a_reader_that_leaves_changes_nothing(unbuffered, monkeypatch):
     monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
     for merged in (subprocess.PIPE, subprocess.STDOUT):
@@ -447,6 +447,7 @@ def test_calibrate_as_json_in_a_process_of_its_own(tmp_path):
     assert 0 < result["figures"]["joint_centre_sigma"] < 1e-3
 
 
+@pytest.mark.slow
 def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
     """Barely enough for the methods: marked as comparison, or refused with [A]'s own condition."""
     monkeypatch.setattr(

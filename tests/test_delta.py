@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from conftest import slow_but
 from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.gauge import alignment, changed_frames, default_gauge, freedoms
 from pkmcal.identify.state import State
@@ -114,7 +115,7 @@ def test_frames_change_no_reading(name):
     np.testing.assert_allclose(again, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", DRIVEN)
+@pytest.mark.parametrize("name", slow_but(("delta", "hexaglide"), DRIVEN))
 def test_errors_are_as_large_as_they_say(name):
     """Board poses of 0.2 mm and 0.03 degrees: the predicted board has the expected error."""
     machine = load_mechanism(name)

@@ -115,7 +115,7 @@ def test_c_is_our_own_kinematics(name, library):
             library(name)
         return
     c = library(name)
-    poses, joints = samples(c.machine, 40, seed=5)
+    poses, joints = samples(c.machine, 15, seed=5)
     home = c.machine.home()
     rng = np.random.default_rng(6)
     motion = c.machine.layout.motion

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from conftest import slow_but
 from pkmcal.calibration.refinement import initial_guess
 from pkmcal.errors import ResultError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
@@ -382,7 +383,7 @@ def test_given_poses_join_stations_that_share_no_legs():
     assert_same(value, scene.truth)
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", slow_but(("gough-stewart", "3-rps", "6-spu-passive"), MACHINES))
 def test_the_bundle_starts_from_the_steps(name):
     """With noise the steps are a start: better than a nominal model with large errors,
     and not NaN.
@@ -404,9 +405,7 @@ def test_the_bundle_starts_from_the_steps(name):
     np.testing.assert_allclose(again.state.theta, best.state.theta, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "name", ["3-rpr", "3-rps", pytest.param("6-spu-passive", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", slow_but(("3-rps",), ["3-rpr", "3-rps", "6-spu-passive"]))
 def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     """``--method four-step``: deviations by repetition, residuals, a mechanism that can be read."""
     monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 20)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from conftest import two_looks
 from faults import fault, replaced
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import handheld, pose_scoring
@@ -324,7 +325,7 @@ def breathed(simulated, tmp_path_factory):
     (folder / "mechanism.yaml").write_text(
         re.sub(r"(?m)^tolerance:.*$", "tolerance: {center: 1e-5, offset: 1e-5, radius: 1e-5}", text)
     )
-    with pytest.MonkeyPatch.context() as patch:
+    with two_looks() as patch:
         at_truth(patch, folder)
         return calibrate_session(folder), load_truth(folder, load_mechanism("gough-stewart"))
 
@@ -531,6 +532,7 @@ def placed(remeasured, monkeypatch, faults, textured=False):
     return handheld.localize_case(session, images, Boards(), np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
     """All images show some of the same points about the machine."""
     _, images, _, truth = looked
@@ -586,6 +588,7 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
     assert handheld._sure({}, 5) == []
 
 
+@pytest.mark.slow
 def test_a_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
     """However well its silhouettes match something: it determines no machine."""
     rows = []
@@ -690,6 +693,7 @@ def test_tubes_stand_out_of_a_chart():
     assert clear[wide, (normal + PAIR_DIRECTIONS // 2) % PAIR_DIRECTIONS] == 0
 
 
+@pytest.mark.slow
 def test_one_image_is_found_from_nothing(looked):
     """Ten seconds: all poses about the machine, for the easiest of the three images."""
     session, images, poses, truth = looked
@@ -782,6 +786,7 @@ def test_images_join_what_is_known(looked):
         evaluate_pose(session, names, 2, nowhere, view)
 
 
+@pytest.mark.slow
 def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
     """Scoring is an estimate of one image, and no pose is scored twice."""
     session, images, poses, truth = looked

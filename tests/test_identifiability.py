@@ -233,7 +233,7 @@ def upright(document):
     return document
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 @pytest.mark.parametrize(
     ("poses", "places"),
     [(heave, around), (one_leg_moving, around), (one_configuration, around), (wide, along_a_leg)],

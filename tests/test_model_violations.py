@@ -400,6 +400,7 @@ def scaled_readings(folder, column, factor):
     path.write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
 
 
+@pytest.mark.slow
 def test_an_encoder_of_another_scale_is_named_and_the_result_refused(session, tmp_path):
     scaled_readings(session, 4, 1 / 1.02)
     out = tmp_path / "out"

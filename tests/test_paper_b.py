@@ -111,6 +111,7 @@ def test_plain_and_m_regressions_collapse(method):
     assert errors(method, 0.05, 2) > 50e-3
 
 
+@pytest.mark.slow
 def test_a_hexapod_seen_through_a_mirror(tmp_path):
     """Rendered images from between the legs, one place, to a fifth of the nominal error."""
     folder = Path(tmp_path) / "session"

@@ -266,6 +266,7 @@ def test_one_wrong_reading_is_outvoted_and_told(folder):
     assert values.facts["value"] == pytest.approx(-0.02, rel=0.06)
 
 
+@pytest.mark.slow
 def test_no_configuration_is_exchanged_with_itself(folder):
     """A pose that lost its weight, its reading off by as much as makes it just disagree."""
     make(folder, "h4", n=30)
@@ -292,6 +293,7 @@ def test_no_configuration_is_exchanged_with_itself(folder):
     assert not [*outlier_explanations(right.session, spoilt, estimate)]
 
 
+@pytest.mark.slow
 def test_poses_that_coarse_readings_explain_are_not_rejected(folder):
     """Hobby servos, half a degree, stated as a thousandth of that: some poses look wrong until the
     readings' noise is estimated, and are right then.

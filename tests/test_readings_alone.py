@@ -93,7 +93,7 @@ def whitened(value, truth):
     ("make", "noise", "n"),
     [
         (lambda: load_mechanism("four-belt"), NOISE, 25),
-        (four_rpr, 1e-4, 40),
+        pytest.param(four_rpr, 1e-4, 40, marks=pytest.mark.slow),
         pytest.param(seven_legs, 1e-4, 40, marks=pytest.mark.slow),
     ],
     ids=["four-belt", "4-rpr", "7 legs"],

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from fuzz import bases
 from pkmcal.errors import InputError
 from pkmcal.files import staged_file
 from pkmcal.geometry.rigid import apply, inverse
@@ -184,8 +185,9 @@ def test_without_rerun_it_is_said_before_the_work(session, tmp_path, monkeypatch
     assert not (tmp_path / "out").exists()
 
 
-def test_the_recording_is_told_with_the_other_files(session, tmp_path, monkeypatch):
-    made = []
+def test_the_recording_is_told_with_the_other_files(tmp_path, monkeypatch):
+    made, session = [], tmp_path / "session"
+    bases.measured(session, seed=1, count=14)
     monkeypatch.setattr(rrd, "find_spec", lambda name: object())
     monkeypatch.setattr(rrd, "write_rrd", lambda found, path: made.append((found, path)))
     path = tmp_path / "a.rrd"

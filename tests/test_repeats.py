@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from conftest import run
+from conftest import run, two_looks
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
@@ -414,7 +414,7 @@ def looked(repeats):
         made.append(calibrate_session(*words, **more))
         return made[0]
 
-    with pytest.MonkeyPatch.context() as patch:
+    with two_looks() as patch:
         patch.setattr("pkmcal.judge.repeatability.calibrate_session", once)
         study = study_repeats(repeats)
     (calibration,) = made
@@ -466,6 +466,7 @@ def test_check_repeat_as_json(repeats):
     assert [s["cause"] for s in value["stations"]] == ["noise", "noise"]
 
 
+@pytest.mark.slow
 def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3, "size": (360, 270)}

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pkmcal
+from conftest import two_looks
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_responses import (
     LEAST_RESPONSE_GAIN,
@@ -162,7 +163,8 @@ def coded(demo, tmp_path_factory):
     """The demonstration's images with a response unusual for PNG files, and its detection."""
     folder = shutil.copytree(demo.session, tmp_path_factory.mktemp("coded") / "session")
     recode(folder, ".png", SRGB)
-    return SimpleNamespace(folder=folder, calibration=pkmcal.calibrate(folder))
+    with two_looks():
+        return SimpleNamespace(folder=folder, calibration=pkmcal.calibrate(folder))
 
 
 def check_overruled(calibration, value, usual, demo, worse=1.0):

@@ -181,6 +181,7 @@ def tripod_calibration(beside):
         return calibrate_session(beside[0].parent / "tripod")
 
 
+@pytest.mark.slow
 def test_looks_scatter_by_their_variance_in_that_of_noise(tripod_calibration):
     """Machines that scatter as noise lets them have one, twice as far apart they have four."""
     calibration = tripod_calibration

@@ -271,6 +271,7 @@ def mixed(tmp_path_factory):
     return imaged(folder, "h4", camera, 8, board_from_fields(fields), 1)
 
 
+@pytest.mark.slow
 def test_forearms_and_board_in_images(mixed):
     value = pkmcal.calibrate(observing(mixed, ["legs", "board"]))
     errors = compare_with_truth(value, mixed)

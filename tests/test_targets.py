@@ -227,6 +227,7 @@ def still(board, n=8, moves=(), seed=0):
 AWAY = (0.0, 0.0, 0.0, 2e-3, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_a_still_board_is_one_measurement(board):
     """Its covariance is that of the mean, and matches its error, over many sessions."""
     values, sigmas = [], []

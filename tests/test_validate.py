@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from conftest import run
+from conftest import run, two_looks
 from document_keys import assert_keys
 from faults import replaced
 from pkmcal.calibration.holdout import (
@@ -450,8 +450,7 @@ def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
 def kept(demo, tmp_path_factory):
     """The demonstration's session calibrated without three configurations, and validated."""
     folder = tmp_path_factory.mktemp("validate")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
+    with two_looks():
         made = run("calibrate", demo.session, "--holdout", 3, "-o", folder / "c", "--json")
     value = run("validate", folder / "c", demo.session, "-o", folder / "v", "--json")
     return SimpleNamespace(folder=folder, made=made, found=value)

@@ -242,6 +242,7 @@ def test_stations_are_numbered_without_images_that_were_not_placed(demo, stayed,
     assert [one.station.name for one in value.session.rejected] == ["by hand/1"]
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
     """A camera decimetres away, far beyond the linear range: localized again, and no leg is
     reported.
