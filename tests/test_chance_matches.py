@@ -14,7 +14,7 @@ from pkmcal.calibration.refinement import RefinementResult
 from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
 from pkmcal.observe.legs import OUT_OF_SIGHT_REASON, measure
-from pkmcal.observe.profiles import USUAL_BLUR
+from pkmcal.observe.profiles import PROFILE_OPTIONS
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
 
@@ -75,7 +75,7 @@ def test_repeats_count_once():
     """
     once = aside(taken(), 2.5 * IMAGE_OFFSET)
     twice = once.select(np.repeat(np.arange(len(once.images)), 2))
-    turns = turns_of(once)._replace(blur={0: USUAL_BLUR})
+    turns = turns_of(once)._replace(blur={0: PROFILE_OPTIONS.usual_blur})
     assert (
         chance_match_reason(turns._replace(photographs=[twice])) == chance_match_reason(turns) != ()
     )

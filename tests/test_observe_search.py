@@ -19,7 +19,7 @@ from pkmcal.observe.distance_tables import (
     distance_tables,
 )
 from pkmcal.observe.image_batches import Photographs
-from pkmcal.observe.legs import LEG_SEARCH_REACH, search, search_legs
+from pkmcal.observe.legs import LEG_SEARCH_OPTIONS, search, search_legs
 from pkmcal.observe.pose_likelihood import StationView, score
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
@@ -99,7 +99,7 @@ def test_a_leg_that_is_not_there_is_not_found():
 def test_a_leg_beyond_the_search_is_not_found():
     """All edges moved sideways by more than the reach: the place at its end is no place. A few
     legs meet their neighbours' edges instead."""
-    far = int(LEG_SEARCH_REACH) + 6
+    far = int(LEG_SEARCH_OPTIONS.reach) + 6
     shifted = [np.roll(image, far, axis=1) for image in images()]
     assert looked_for(machine(), shifted)[0].clear.mean() < 0.35
 

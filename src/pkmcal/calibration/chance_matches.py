@@ -26,7 +26,7 @@ from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.session.load import Session
 from pkmcal.wording import how_often
 
-IMAGE_OFFSET = 2 * legs.LEG_SEARCH_REACH
+IMAGE_OFFSET = 2 * legs.LEG_SEARCH_OPTIONS.reach
 """Shift of the images, px: further than legs are searched."""
 OFFSET_DIRECTIONS = 8
 """Number of directions of the shift, evenly spaced; the p-value is that of one more draw."""

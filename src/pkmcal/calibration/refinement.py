@@ -47,7 +47,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.image_batches import Photographs, placed_at
 from pkmcal.observe.image_localization import finest_view
 from pkmcal.observe.images import CACHED_IMAGE_BYTES
-from pkmcal.observe.profiles import EDGE_SHIFTS, BlurByStation
+from pkmcal.observe.profiles import PROFILE_OPTIONS, BlurByStation
 from pkmcal.observe.quality import quality
 from pkmcal.observe.repeats import combined
 from pkmcal.observe.silhouettes import silhouette_edges
@@ -74,7 +74,7 @@ SETTLED_EDGE_DISTANCE = 0.15
 """Median distance (px) of edges from their prediction below which another look changes nothing:
 the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
 far."""
-ASTRAY_EDGE_DISTANCE = float(EDGE_SHIFTS[-1]) / 3
+ASTRAY_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 3
 """The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
 over the profiles' reach, so that the median of hundreds of places is half of it."""
 IMPUTATION_PASSES = 6
@@ -509,8 +509,8 @@ def _first_estimate(
         return bundle(session.machine, measurements, start)
     start: State | None = None
     for text, reach, share in (
-        ("Finding the legs", legs.LEG_SEARCH_REACH, 0.35),
-        ("Finding the legs again", legs.REPEATED_SEARCH_REACH, 0.4),
+        ("Finding the legs", legs.LEG_SEARCH_OPTIONS.reach, 0.35),
+        ("Finding the legs again", legs.LEG_SEARCH_OPTIONS.repeated_reach, 0.4),
     ):
         done = _counted(progress, text, total, share)
         search = partial(_whole_legs, scene=reference_values, reach=reach, done=done)

@@ -328,9 +328,9 @@ def first_track_state(view: MachineView, start: Array | None = None) -> TrackSta
 
 def warm_up(blur: float) -> None:
     """Fill the tables of edge profiles for a blur (px), so that no image waits for them."""
-    samples = len(profiles.profile_offsets())
-    width = np.repeat(profiles.HALF_WIDTHS, samples)
-    cut = np.tile(np.arange(samples), len(profiles.HALF_WIDTHS))
+    samples = len(profiles.PROFILE_OPTIONS.profile_offsets)
+    width = np.repeat(profiles.PROFILE_OPTIONS.half_widths, samples)
+    cut = np.tile(np.arange(samples), len(profiles.PROFILE_OPTIONS.half_widths))
     grey = np.zeros((len(width), samples))
     none = np.zeros(len(width), dtype=int)
     some = profiles.Profiles(grey, np.ones(len(width)), width, cut, none, none, none > 0)

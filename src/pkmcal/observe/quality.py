@@ -11,8 +11,8 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.grey_levels import levels_at
 from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed, windows
-from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
-from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
+from pkmcal.observe.legs import LEG_SEARCH_OPTIONS, predicted, search_legs
+from pkmcal.observe.profiles import PROFILE_OPTIONS
 
 BLACK_GREY_LEVEL = 8
 """Largest grey level of a black sample: shading and edges are lost in noise."""
@@ -85,7 +85,7 @@ def quality(
 def _quality(window: PhotographWindow, machine: Machine) -> Quality:
     """Quality on the legs in one window of images."""
     # edges found by the search, and the widths of their legs
-    tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
+    tubes, points, clear = predicted(window, machine, LEG_SEARCH_OPTIONS.samples)
     places = search_legs(window.images, tubes, points, clear)
     edge = places.outward(points, clear, tubes)[..., None]
     half_width = (points.gain * machine.values[tubes.radius][:, None])[..., None]
@@ -108,7 +108,7 @@ def _quality(window: PhotographWindow, machine: Machine) -> Quality:
         hidden[:, leg] = 1 - clear[:, tubes.leg == leg].mean(axis=(1, 2))
     return Quality(
         legs=places.clear,
-        saturated=_share(inside >= SATURATED_GREY_LEVEL, clear),
+        saturated=_share(inside >= PROFILE_OPTIONS.saturated, clear),
         black=_share(inside <= BLACK_GREY_LEVEL, clear),
         blur=np.array([_blur(a[f]) for a, f in zip(across, valid, strict=True)]),
         hidden=hidden,
@@ -123,7 +123,7 @@ def unrecognised_quality(images: Sequence[Integers], n_legs: int) -> Quality:
     count = len(images)
     shares = np.array(
         [
-            (np.mean(image >= SATURATED_GREY_LEVEL), np.mean(image <= BLACK_GREY_LEVEL))
+            (np.mean(image >= PROFILE_OPTIONS.saturated), np.mean(image <= BLACK_GREY_LEVEL))
             for image in images
         ],
         dtype=float,

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.observe.legs import OTHER_OUTLINE_CLEARANCE, StationEdges
+from pkmcal.observe.legs import EDGE_OPTIONS, StationEdges
 from pkmcal.observe.pose_likelihood import StationView, first_mixture, linearize_distances
 from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed
 from pkmcal.observe.profiles import edge_set, fit_edges
@@ -48,7 +48,7 @@ def silhouette_edges(
     mixture = distances.mixture(first_mixture(1), 10, WIDEST_SCATTER)
     legs = legs_in_camera(view.machine, T_camera_base, view.poses, view.joints)
     points = edge_points(view.machine, view.camera, legs, tubes, SILHOUETTE_SAMPLES)
-    clear = unobstructed(view.machine, view.camera, legs, tubes, points, OTHER_OUTLINE_CLEARANCE)
+    clear = unobstructed(view.machine, view.camera, legs, tubes, points, EDGE_OPTIONS.clearance)
     scale = view.tables.scale
     # derivative of a distance by an outward motion of the edge, in pixels of the tables
     with np.errstate(divide="ignore", invalid="ignore"):
