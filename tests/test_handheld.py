@@ -51,8 +51,8 @@ from pkmcal.observe.image_localization import (
 )
 from pkmcal.observe.images import decode
 from pkmcal.observe.pose_likelihood import StationView, log_likelihood_of
-from pkmcal.observe.station_localization import RIVAL_POSE_PROBABILITY
-from pkmcal.observe.tubes import PAIR_DIRECTIONS, SURPRISAL_STEPS, tube_chart
+from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
+from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, tube_chart
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Level
 from pkmcal.report.calibration import outcome_of
@@ -685,9 +685,12 @@ def test_tubes_stand_out_of_a_chart():
     chart = tube_chart(image, camera_of_size((400, 300)))
     clear = chart.surprisal.max(axis=(2, 3))
     wide = int(chart.width_number(np.array(10.0)))
-    normal = round(np.arctan2(200, 140) % np.pi * PAIR_DIRECTIONS / np.pi)
-    assert clear[wide, normal] > SURPRISAL_STEPS * np.log(20)
-    assert clear[wide, (normal + PAIR_DIRECTIONS // 2) % PAIR_DIRECTIONS] == 0
+    normal = round(np.arctan2(200, 140) % np.pi * TUBE_CHART_OPTIONS.directions / np.pi)
+    assert clear[wide, normal] > TUBE_CHART_OPTIONS.steps * np.log(20)
+    assert (
+        clear[wide, (normal + TUBE_CHART_OPTIONS.directions // 2) % TUBE_CHART_OPTIONS.directions]
+        == 0
+    )
 
 
 def test_one_photograph_is_found_from_nothing(looked):
@@ -698,7 +701,7 @@ def test_one_photograph_is_found_from_nothing(looked):
     view = view_of(session, p, poses)
     value = localize_image(view, p.images[0])
     off = pose_difference(value.T_camera_base[0], truth.T_camera_base[k])
-    assert value.rival_probability < RIVAL_POSE_PROBABILITY
+    assert value.rival_probability < LOCALIZATION_OPTIONS.rival
     assert np.degrees(np.linalg.norm(off[:3])) < 4
     assert np.linalg.norm(off[3:]) < 0.1
 

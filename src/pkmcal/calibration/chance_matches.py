@@ -21,7 +21,7 @@ from pkmcal.calibration.refinement import FEW_MEASURED, RefinementResult
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import placed_at
 from pkmcal.observe.repeats import combined
-from pkmcal.observe.station_localization import BY_CHANCE
+from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.session.load import Session
 from pkmcal.wording import how_often
@@ -110,7 +110,8 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     own = _count(turns, stations, np.zeros(2))
     apart = (own - mean) / (spread * np.sqrt(1 + 1 / len(counts)))
     chance = float(stdtr(len(counts) - 1, -apart))
-    return _Offered(in_sight, measured, mean, chance) if chance >= BY_CHANCE else None
+    surely = chance < LOCALIZATION_OPTIONS.by_chance
+    return None if surely else _Offered(in_sight, measured, mean, chance)
 
 
 def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> int:

@@ -16,7 +16,7 @@ from pkmcal.check.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_OPTIONS
-from pkmcal.observe.quality import BLACK_GREY_LEVEL
+from pkmcal.observe.quality import QUALITY_OPTIONS
 from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.planning.first import EdgesOf
@@ -157,7 +157,10 @@ def _lost_edges(
     usual = float(np.median(usual)) if usual.size else math.nan
     finite = lost & np.isfinite(contrast)
     brighter = np.fmax(level, behind)
-    kinds = {"white": brighter >= PROFILE_OPTIONS.saturated, "black": brighter <= BLACK_GREY_LEVEL}
+    kinds = {
+        "white": brighter >= QUALITY_OPTIONS.saturated,
+        "black": brighter <= QUALITY_OPTIONS.black,
+    }
     kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < usual / 2)
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
     number = {name: int(np.sum(finite & of)) for name, of in kinds.items()}
