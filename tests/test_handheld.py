@@ -521,7 +521,7 @@ def found_with(monkeypatch, truth, faults, textured=False):
     monkeypatch.setattr(handheld, "THREADS", 1)
     if not textured:
         empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
-        monkeypatch.setattr(background, "texture_of", lambda _image, _camera: empty)
+        monkeypatch.setattr(background, "texture_of", lambda *_: empty)
 
 
 def placed(remeasured, monkeypatch, faults, textured=False):
@@ -538,7 +538,7 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
     world = rng.uniform(-1.2, 1.2, (6000, 3))
     names = rng.standard_normal((len(world), 128)).astype(np.float32)
 
-    def texture(image, camera):
+    def texture(image, camera, _options):
         k = next(k for k, p in enumerate(photographs) if p.images[0] is image)
         visible = apply(truth.T_camera_base[k], world)
         pixel = camera.project(np.where(visible[:, 2:] > 0.1, visible, np.nan))

@@ -20,7 +20,7 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.refinement import FEW_MEASURED, RefinementResult
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import placed_at
-from pkmcal.observe.repeats import combined
+from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.session.load import Session
@@ -94,7 +94,7 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     mine = np.isin(in_view.edges.station, stations)
     measured = int(np.sum(mine & ~in_view.edges.coarse))
     missed = sum(
-        r.side >= 0 and r.reason != legs.OUT_OF_SIGHT_REASON and r.station in stations
+        r.side >= 0 and r.code != "edges.out_of_sight" and r.station in stations
         for r in in_view.rejected
     )
     given_up = int(np.sum(mine & (turns.estimate.edge_weights < 0.5)))  # which are among both
@@ -127,5 +127,5 @@ def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> i
     placed = placed_at(shifted, state.T_camera_base, state.T_base_platform)
     passes = legs.measure_stations(placed, turns.estimate.machine, turns.blur)
     return sum(
-        len(combined(station_edges).edges) for station_edges in passes
+        len(combine_repeats(station_edges).edges) for station_edges in passes
     )  # as those that were measured

@@ -49,7 +49,7 @@ from pkmcal.observe.image_localization import finest_view
 from pkmcal.observe.images import CACHED_IMAGE_BYTES
 from pkmcal.observe.profiles import PROFILE_OPTIONS, BlurByStation
 from pkmcal.observe.quality import quality
-from pkmcal.observe.repeats import combined
+from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.outcome.finding import Finding, note, wrong
 from pkmcal.session.load import Session
@@ -615,9 +615,9 @@ def _search_pass(
     """
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in photographs)
     if pixels <= CACHED_IMAGE_BYTES:
-        return [combined(one) for one in measure(photographs)]
+        return [combine_repeats(one) for one in measure(photographs)]
     with ThreadPoolExecutor(THREADS) as pool:
-        return [combined(one) for (one,) in pool.map(measure, ([p] for p in photographs))]
+        return [combine_repeats(one) for (one,) in pool.map(measure, ([p] for p in photographs))]
 
 
 def _edges(passes: list[legs.StationEdges]) -> EdgeSet:

@@ -24,7 +24,6 @@ from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
 from pkmcal.observe.image_batches import Photographs
 from pkmcal.observe.legs import (
-    OUT_OF_SIGHT_REASON,
     StationEdges,
     measure,
     search,
@@ -429,9 +428,9 @@ def _reasons(sight: Sight, at: _EdgePass) -> tuple[str, ...]:
         return ("its edges are not where they were predicted",) * len(sight.view.legs)
     out: list[str] = []
     for leg, results, agrees in zip(sight.view.legs, at.lines.valid, at.lines.agrees, strict=True):
-        mine = [r.reason for r in at.station_edges.rejected if r.leg == leg]
-        display = [reason for reason in mine if reason != OUT_OF_SIGHT_REASON]
-        why = (display or mine or ["only one of its sides is seen"])[0]
+        mine = [r for r in at.station_edges.rejected if r.leg == leg]
+        in_sight = [r for r in mine if r.code != "edges.out_of_sight"]
+        why = ([r.reason for r in in_sight or mine] or ["only one of its sides is seen"])[0]
         out.append("" if results else why if agrees else "its edges do not belong to one leg")
     return tuple(out)
 

@@ -53,18 +53,12 @@ from pkmcal.observe.profiles import (
     estimate_blur,
     fit_edges,
 )
+from pkmcal.outcome.finding import note
 
 USUAL_PICTURE_LENGTH = 1024
 """Longer side, in pixels, of images in which errors of the nominal model are pixels and tubes
 are tens of pixels wide; the lengths below refer to it. Larger images are binned to about this
 size."""
-
-OUT_OF_SIGHT_REASON = "hidden behind another leg or outside the photograph"
-_NO_PLACE = "not found: no place, or two places, where all its edges fit"
-_LAMP = "a highlight lies along it, and hides where the leg ends"
-_TOO_LITTLE = "too little of it is seen as a clear edge"
-_NOT_ONE_EDGE = "its places do not lie on one edge"
-
 
 ImageBatchesInUse = Callable[[int], None]
 """Progress callback, called with the number of images processed since the last call."""
@@ -410,10 +404,19 @@ def _searched(
     fits = fit_edges(points, position, np.full(position.shape, options.sigma), valid)
     keep = fits.good & places.clear[:, tubes.leg]
     edges = edge_set(points, fits, tubes, window.station, window.configuration, keep)
+    hidden, no_place = note("edges.out_of_sight"), note("edges.no_place")
     rejected = [
-        Rejection(int(window.station[k]), int(window.configuration[k]), int(leg), -1, -1, why)
+        Rejection(
+            int(window.station[k]),
+            int(window.configuration[k]),
+            int(leg),
+            -1,
+            -1,
+            why.text,
+            why.code,
+        )
         for k, leg in zip(*np.nonzero(~places.clear), strict=True)
-        for why in [OUT_OF_SIGHT_REASON if places.share[k, leg] < options.in_sight else _NO_PLACE]
+        for why in [hidden if places.share[k, leg] < options.in_sight else no_place]
         if leg in tubes.leg
     ]
     nowhere = np.zeros((0, 2)), np.zeros(0, dtype=int)
@@ -720,8 +723,15 @@ def _rejections(
     visible, in_view, mirrored = (where[k, e].sum(axis=-1) for where in (full, valid, lamps))
     few = in_view < fewest
     lamp = few & (in_view + mirrored >= fewest)
-    why = np.select(
-        [visible == 0, lamp, few], [OUT_OF_SIGHT_REASON, _LAMP, _TOO_LITTLE], _NOT_ONE_EDGE
+    reasons = (
+        note("edges.out_of_sight"),
+        note("edges.highlight"),
+        note("edges.too_little"),
+        note("edges.not_one_edge"),
     )
-    names = station[k], configuration[k], tubes.leg[e], tubes.tube[e], tubes.side[e], why
+    why = np.select([visible == 0, lamp, few], [0, 1, 2], 3)
+    text, code = (
+        np.array(part)[why] for part in zip(*((r.text, r.code) for r in reasons), strict=True)
+    )
+    names = station[k], configuration[k], tubes.leg[e], tubes.tube[e], tubes.side[e], text, code
     return tuple(Rejection(*name) for name in zip(*(v.tolist() for v in names), strict=True))
