@@ -85,9 +85,9 @@ def allowed(folder: Path, draws: int, seed: int) -> tuple[float, ...]:
         raise SystemExit(f"{folder.name}: {truth}")
     edges = measurements.edges
     # the truth lists images station by station, as the session does
-    photographs = [(k, p.configuration) for k, s in enumerate(session.stations)
-                   for p in s.photographs]  # fmt: skip
-    number = {key: row for row, key in enumerate(photographs)}
+    images = [(k, p.configuration) for k, s in enumerate(session.stations)
+                   for p in s.images]  # fmt: skip
+    number = {key: row for row, key in enumerate(images)}
     row = np.array([number[key] for key in zip(edges.station, edges.configuration, strict=True)])
     normal = true_normals(edges, truth, true_radii(folder, session.machine, edges), row)
     turn = (edges.basis.mT @ (edges.normal - normal)[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Photographs of a board a second, from their files to fitted corners, and the processor's time.
+"""Images of a board a second, from their files to fitted corners, and the processor's time.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/boards.py BOARD.yaml PHOTOGRAPH…
 

@@ -4,7 +4,7 @@
 
 One core. Times are of the process, so that other programs on the machine count less; the wall
 clock is printed beside them. The machine is the Gough-Stewart platform, all six legs seen, the
-photograph 640x480 and rendered.
+image 640x480 and rendered.
 """
 
 from __future__ import annotations
@@ -68,19 +68,19 @@ def shown(name: str, call: Callable[[], object], calls: int) -> None:
     print(f"{name:34}" + "".join(f"{value:9.2f}" for value in columns))
 
 
-def photographed() -> tuple[Truth, Camera, Integers]:
+def imaged() -> tuple[Truth, Camera, Integers]:
     """The truth of a session with one image, its camera, and the image."""
     camera = camera_of_size((640, 480))
     settings = Settings(stations=1, configurations=1, tolerance=0.0, extreme=0.0)
     truth = draw_truth(load_mechanism("gough-stewart"), (camera,), settings, 5)
-    return truth, camera, Studio.of(truth, (camera,), settings).photographs(0)[0]
+    return truth, camera, Studio.of(truth, (camera,), settings).images(0)[0]
 
 
 def main() -> None:
     """Print a table of the kinds of samples."""
     cv2.setNumThreads(1)
     calls = int(sys.argv[1]) if len(sys.argv) > 1 else CALLS
-    truth, camera, image = photographed()
+    truth, camera, image = imaged()
     machine, T = truth.machine, truth.T_camera_base[0]
     pose, readings = truth.T_base_platform[0], truth.readings[0]
     goal = perturb(machine.home(), np.array([0.02, -0.03, 0.05, 0.01, 0.005, 0.0]))
@@ -94,13 +94,11 @@ def main() -> None:
         less[1] = np.nan
         shown(f"{law}: from edges, a leg lost", partial(servo.step_edges, less, readings), calls)
         servo.reset(pose)
-        shown(f"{law}: from a photograph", partial(servo.step_image, image, readings), calls)
+        shown(f"{law}: from an image", partial(servo.step_image, image, readings), calls)
     covered = np.full_like(image, 90)
     servo.reset(pose)
     pictures = cycle([image, covered])
-    shown(
-        "every other photograph covered", lambda: servo.step_image(next(pictures), readings), calls
-    )
+    shown("every other image covered", lambda: servo.step_image(next(pictures), readings), calls)
 
 
 if __name__ == "__main__":

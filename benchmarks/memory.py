@@ -1,10 +1,10 @@
-"""Memory and time of a whole calibration by the number of photographs.
+"""Memory and time of a whole calibration by the number of images.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/memory.py [--photographs 500 2000 6000] [--parts]
         [--size 480x360] [--stations 3] [--keep FOLDER]
 
 Thirty configurations of a hexapod are simulated, seen from each of a few places, and repeated as
-many configurations with other names: hard links to the photographs, and readings that scatter
+many configurations with other names: hard links to the images, and readings that scatter
 about the true ones as the session states, so the session stays right. (What the renderer's shading
 does to thirty configurations' edges is the same in every repeat; of hundreds it may be told as a
 lens that is another, and the result refused; costs are the same.) ``pkmcal calibrate``, with
@@ -90,7 +90,7 @@ def main() -> None:
         if not base.exists():
             simulated(base, args.stations, args.size)
         sessions = []
-        for count in args.photographs:
+        for count in args.images:
             configurations = max(count // args.stations, 2)
             session = folder / f"{base.name}-{configurations}"
             if not session.exists():
@@ -98,22 +98,22 @@ def main() -> None:
             sessions.append((configurations * args.stations, session))
         if args.parts:
             print(f"  {'step':44} {'cpu (s)':>8} {'clock':>8} {'MB then':>8} {'MB most':>8}")
-            for photographs, session in sessions:
-                print(f"{photographs} photographs", flush=True)
+            for images, session in sessions:
+                print(f"{images} images", flush=True)
                 subprocess.run([sys.executable, "-c", PARTS, str(session)], check=False)
             return
         alone = cost([sys.executable, "-c", IMPORTS])
         print("photographs  processor (s)  clock (s)  largest memory (MB)")
         print(f"{'imports':>11}  {alone.processor:13.1f}  {alone.clock:9.1f}  {alone.memory:19.0f}")
         costs: list[Cost] = []
-        for photographs, session in sessions:
+        for images, session in sessions:
             command = [sys.executable, "-m", "pkmcal", "calibrate", str(session), "--quiet"]
             costs.append(cost([*command, "-o", str(folder / "calibration")]))
             shutil.rmtree(folder / "calibration", ignore_errors=True)
-            print(f"{photographs:11}  {costs[-1].processor:13.1f}  {costs[-1].clock:9.1f}"
+            print(f"{images:11}  {costs[-1].processor:13.1f}  {costs[-1].clock:9.1f}"
                   f"  {costs[-1].memory:19.0f}", flush=True)  # fmt: skip
         if len(costs) > 1:
-            size = np.log([photographs for photographs, _ in sessions])
+            size = np.log([images for images, _ in sessions])
             for name in ("processor", "memory"):
                 value = np.log([getattr(one, name) for one in costs])
                 print(f"{name} grows like the {np.polyfit(size, value, 1)[0]:.2f}th power")

@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, nargs="*", default=list(range(len(CASES))))
     args = parser.parse_args()
     nominal, camera = load_mechanism("gough-stewart"), demo_camera()
-    print(f"{args.runs} sessions, {args.stations} x {args.configurations} photographs")
+    print(f"{args.runs} sessions, {args.stations} x {args.configurations} images")
     print("true, stated (um)   told  factor   tool (mm)  stated    z")
     for true_noise, stated in (CASES[k] for k in args.cases):
         rows, factors, off, sigma, z = [], [], [], [], []
@@ -46,7 +46,7 @@ def main() -> None:
             rng = np.random.default_rng(1000 + seed)
             edges, joints = simulate_edges(
                 truth.machine, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(),
-                rng, photographs=truth.photographs, joint_noise=true_noise,
+                rng, images=truth.images, joint_noise=true_noise,
             )  # fmt: skip
             given = Measurements(
                 edges, joints, stated, args.stations, np.zeros(args.stations, dtype=int)

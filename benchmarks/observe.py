@@ -1,4 +1,4 @@
-"""Observation against what anybody would run first: decoding the photographs and cv2.Canny.
+"""Observation against what anybody would run first: decoding the images and cv2.Canny.
 
     python benchmarks/observe.py [SESSION]
 
@@ -49,10 +49,10 @@ def main() -> None:
         begin = time.perf_counter()
         page_html(outcome_of(first))
         parts["report"] = time.perf_counter() - begin
-        paths = [p.path for s in session.stations for p in s.photographs]
+        paths = [p.path for s in session.stations for p in s.images]
         plain = best_of(lambda: decode_and_canny(paths))
     observation = parts["decode"] + parts["observe"]
-    print(f"{len(paths)} photographs")
+    print(f"{len(paths)} images")
     print(f"start-up (imports)          {start_up:6.2f} s")
     for name, seconds in parts.items():
         print(f"{name:27} {seconds:6.2f} s")

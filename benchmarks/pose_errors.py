@@ -327,7 +327,7 @@ def made(error: str, observer: str, seed: int, folder: Path) -> Made:
     session = load_session(folder)
     sets, points = [], []
     for s in range(len(truth.T_camera_base)):
-        rows = truth.photographs[truth.photographs[:, 0] == s, 1]
+        rows = truth.images[truth.images[:, 0] == s, 1]
         T = truth.T_camera_base[s] @ d.base[rows]
         if s == 0:
             T = perturb(T, d.camera[rows])
@@ -430,7 +430,7 @@ def write_texts(
                 },
             }  # fmt: skip
             (folder / "images" / name).mkdir(parents=True)
-            for k in truth.photographs[truth.photographs[:, 0] == s, 1].tolist():
+            for k in truth.images[truth.images[:, 0] == s, 1].tolist():
                 (folder / "images" / name / f"{truth.configurations[k]}.png").write_bytes(blank)
     document = {"pkmcal": 1, "mechanism": "mechanism.yaml",
                 "joints": {"file": "joints.csv", "noise": 3e-6}, "stations": stations}  # fmt: skip

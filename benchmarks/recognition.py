@@ -3,7 +3,7 @@
     python benchmarks/recognition.py [--stations 100]         right, refused, wrong; seconds
     python benchmarks/recognition.py --machines 3-rps ...     of some machines alone
     python benchmarks/recognition.py --mistakes [--no-pose]   named, refused otherwise, not noticed
-    python benchmarks/recognition.py --keep FOLDER ...        draws photographs once and keeps them
+    python benchmarks/recognition.py --keep FOLDER ...        draws images once and keeps them
 
 Each session is simulated with a machine of its own, and what calibration begins with is asked where
 the cameras stand. Right is a place within a tenth of its distance and six degrees of the true one:
@@ -30,7 +30,7 @@ import yaml
 NEAR, TURNED = 0.1, np.radians(6.0)
 """Share of the camera's distance, and rad, within which a place is right."""
 SIZE = (640, 480)
-PHOTOGRAPHS = 10
+IMAGES = 10
 """Images of each station of the catalogue's machines."""
 MISTAKEN = (2, 8)
 """Stations, and images of each, of a session with a mistake."""
@@ -81,7 +81,7 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
         boards_of,
         check_observable,
         localize_stations,
-        read_photographs,
+        read_images,
     )
     from pkmcal.errors import PkmcalError
     from pkmcal.session.load import load_session
@@ -91,10 +91,10 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
     try:
         session = load_session(folder)
         check_observable(session)
-        photographs = read_photographs(session)
-        boards = boards_of(session, photographs)
+        images = read_images(session)
+        boards = boards_of(session, images)
         begin = time.process_time()  # of the search alone, where it comes to that
-        values = localize_stations(session, photographs, boards, np.random.default_rng(seed))
+        values = localize_stations(session, images, boards, np.random.default_rng(seed))
     except PkmcalError as error:
         return Outcome("refused", str(error), time.process_time() - begin, error.code)
     seconds = time.process_time() - begin
@@ -253,10 +253,10 @@ MISTAKES: dict[str, Mistake] = {
     "numbering backwards": Mistake(
         lambda f, _: readings(f, lambda row: row[::-1]), "readings.numbering_reversed"
     ),
-    "photographs exchanged": Mistake(
+    "images exchanged": Mistake(
         lambda f, rng: renamed(f, lambda paths: _exchanged(paths, rng)), "image.exchanged"
     ),
-    "photographs shifted": Mistake(
+    "images shifted": Mistake(
         lambda f, _: renamed(f, lambda paths: paths[1:] + paths[:1]), "image.shifted"
     ),
     "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), "image.mirrored"),
@@ -299,7 +299,7 @@ def of_catalogue(
     names = machines or sorted(set(catalogue()) - set(HINGED))
     for k in range(count):
         name, seed = names[k % len(names)], k // len(names)
-        folder = simulated(name, seed, 1, PHOTOGRAPHS, keep)
+        folder = simulated(name, seed, 1, IMAGES, keep)
         with tempfile.TemporaryDirectory() as temporary:
             copy = Path(temporary) / folder.name
             shutil.copytree(folder, copy)
@@ -325,7 +325,7 @@ def main() -> None:
     parser.add_argument("--mistakes", action="store_true")
     parser.add_argument("--sessions", type=int, default=5, help="of each mistake")
     parser.add_argument("--no-pose", action="store_true", help="mistakes: drop the rough poses")
-    parser.add_argument("--keep", type=Path, help="folder for the photographs")
+    parser.add_argument("--keep", type=Path, help="folder for the images")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         keep = options.keep or Path(temporary)

@@ -10,7 +10,7 @@ intervals of the readings' noise at 95 % that hold the truth, of those that have
 all; the tool's error over the session's poses in stated standard deviations (root mean square over
 the sessions, and the largest); seconds. Then each of these findings, in its own words.
 
-Legs and photographs by hand are rendered; boards are corners with noise, trackers tables, and
+Legs and images by hand are rendered; boards are corners with noise, trackers tables, and
 printers the heights that their firmware keeps.
 """
 
@@ -87,7 +87,7 @@ def written(folder: Path, nominal: Any, readings: Any, noise: float, **more: Any
     (folder / "session.yaml").write_text(yaml_text(document))
 
 
-def photographed(
+def imaged(
     machine: str, stations: int, count: int, size: tuple[int, int], *, handheld: bool = False
 ) -> Callable[[Path, int], Session]:
     """A session of legs in rendered images."""
@@ -255,9 +255,9 @@ def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
 
 
 KINDS: dict[str, Callable[[Path, int], Session]] = {
-    "legs, hexapod": photographed("gough-stewart", 2, 8, (640, 480)),
-    "legs, three-legged": photographed("3-rps", 2, 8, (640, 480)),
-    "by hand, hexapod": photographed("gough-stewart", 1, 8, (640, 480), handheld=True),
+    "legs, hexapod": imaged("gough-stewart", 2, 8, (640, 480)),
+    "legs, three-legged": imaged("3-rps", 2, 8, (640, 480)),
+    "by hand, hexapod": imaged("gough-stewart", 1, 8, (640, 480), handheld=True),
     "board, hexapod": board("gough-stewart", 20, 3e-6),
     "board, H4": board("h4", 24, 3e-6),
     "board, delta": board("delta", 24, 1e-5),

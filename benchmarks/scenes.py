@@ -1,4 +1,4 @@
-"""Calibrations of photographed scenes whose truth is known: how wrong, and how wrong they say.
+"""Calibrations of imaged scenes whose truth is known: how wrong, and how wrong they say.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/scenes.py FOLDER [FOLDER ...] [--json]
         [--no-pose | --pose-error M DEG] [--seed N]
@@ -12,11 +12,11 @@ rigid motions of both bodies change is projected out of the error e and of its c
 
 - whitened: sqrt(e' C^+ e / dof), 1 where the standard deviations are honest, with the range in
   which 95 of 100 honest ones lie, and the direction that is furthest off (in sigmas);
-- tool: the platform's origin at the same readings, over 200 poses between those photographed; true
+- tool: the platform's origin at the same readings, over 200 poses between those imaged; true
   and stated root mean squares, and z, the true error in units of the stated covariance.
 
 Times are of the processor, so that other programs on the machine count less. "observe" is decoding,
-recognising and measuring, in times of decoding the photographs and cv2.Canny.
+recognising and measuring, in times of decoding the images and cv2.Canny.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Row:
     """
 
     name: str
-    photographs: int = 0
+    images: int = 0
     refusal: str = ""
     usable: bool = False
     headline: str = ""
@@ -261,7 +261,7 @@ def read_truth(folder: Path, nominal: Any) -> TrueMachine | str:
         numbers = numbers_of(items.machine)
         if isinstance(numbers, str):
             return numbers
-        in_view = items.T_base_platform[items.photographs[:, 1]]
+        in_view = items.T_base_platform[items.images[:, 1]]
         values = items.machine.values[numbers]
         return TrueMachine(*parts_of(values), items.T_camera_base, in_view)
     missing = [key for key in ("A_base", "B_platform", "joint_offsets") if key not in data]
@@ -348,8 +348,8 @@ def run(folder: Path, options: argparse.Namespace) -> Row:
         clock = SimpleNamespace(perf_counter=time.process_time)
         try:
             session = load_session(copy)
-            paths = [p.path for s in session.stations for p in s.photographs]
-            row = replace(row, photographs=len(paths))
+            paths = [p.path for s in session.stations for p in s.images]
+            row = replace(row, images=len(paths))
             with patch.object(calibrate, "time", clock):
                 calibration = calibrate.calibrate_session(session, seed=options.seed)
         except PkmcalError as error:
@@ -405,7 +405,7 @@ COLUMNS = (
 
 def cells(row: Row) -> list[str]:
     """One line of the table."""
-    e, start = row.errors, [row.name, str(row.photographs)]
+    e, start = row.errors, [row.name, str(row.images)]
     times = [f"{row.observe:.1f}" if np.isfinite(row.observe) else "–", f"{row.seconds:.1f}"]
     if e is None:
         return [*start, "refused" if row.refusal and not row.headline else "–"] + ["–"] * 11 + times

@@ -3,7 +3,7 @@
     python benchmarks/wrong_sessions.py [--sessions 10] [--only WORDS] [--keep FOLDER]
 
 Each fact of the table is made wrong in simulated sessions, each of a machine and room of its own:
-hexapods by their legs (three places, twelve photographs from each), H4s by a board (one place,
+hexapods by their legs (three places, twelve images from each), H4s by a board (one place,
 twenty-four). Told for each fact: in how many sessions the wrong fact was named in the result, or as
 the reason of a refusal; how many were refused otherwise, how many warned of something else, and how
 many were accepted without a word; how many of these two are off by more than three stated standard
@@ -216,11 +216,11 @@ def moved(metres: float, radians: float) -> Any:
         T = truth.T_camera_base.copy()
         T[0] = perturb(T[0], step)
         studio = Studio.of(replace(truth, T_camera_base=T), cameras, settings)
-        mine = np.flatnonzero(truth.photographs[:, 0] == 0)
+        mine = np.flatnonzero(truth.images[:, 0] == 0)
         for index in mine[len(mine) // 2 :].tolist():
-            name = truth.configurations[truth.photographs[index, 1]]
+            name = truth.configurations[truth.images[index, 1]]
             (path,) = folder.glob(f"images/*/{name}.png")
-            cv2.imwrite(str(path), studio.photographs(index)[0])
+            cv2.imwrite(str(path), studio.images(index)[0])
 
     return make
 
@@ -279,7 +279,7 @@ FACTS: dict[str, Fact] = {
     "a sleeve of .3 mm": Fact(sleeve(3e-4), ("tube.radius",), ("legs",)),
     "a sleeve of 1.5 mm": Fact(sleeve(1.5e-3), ("tube.radius",), ("legs",)),
     "a frozen reading": Fact(frozen, ("readings.frozen", "readings.unmoved")),
-    "two photographs exchanged": Fact(exchanged, ("configurations.misnamed", "image.exchanged")),
+    "two images exchanged": Fact(exchanged, ("configurations.misnamed", "image.exchanged")),
 }
 
 

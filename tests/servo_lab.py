@@ -9,7 +9,7 @@ from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, photograph, render_light
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, render_light, sensor_image
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Wall
 from pkmcal.simulation.surfaces import Clouds, Lamp, Lighting, Material, SmoothNoise
@@ -39,10 +39,10 @@ class Lab:
         )
         self.view = PixelRays.of(camera)
 
-    def photograph(self, T_base_platform, readings):
+    def image(self, T_base_platform, readings):
         parts = machine_parts(self.machine, self.discs, self.finish, T_base_platform, readings)
         light = render_light(self.room.having(parts), self.view, self.T_camera_base, self.rng)
-        return photograph(light, Sensor(), self.rng)
+        return sensor_image(light, Sensor(), self.rng)
 
     def painted(self, image, T_base_platform, readings, legs):
         """An image with some legs painted over."""

@@ -41,7 +41,7 @@ def only(session, *names):
     stations(session, lambda item: [item.pop(name) for name in [*item] if name not in names])
 
 
-def photographs(session, station):
+def images(session, station):
     return sorted((session / "images" / station).iterdir())
 
 
@@ -113,24 +113,24 @@ def test_wrong_columns(session):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
-def test_a_pipe_with_the_name_of_a_photograph(session):
-    path = photographs(session, "station2")[1]
+def test_a_pipe_with_the_name_of_a_image(session):
+    path = images(session, "station2")[1]
     path.unlink()
     os.mkfifo(path)
     refused(session, f"images/station2/{path.name}: this is a pipe, not a file")
 
 
-def test_a_folder_with_the_name_of_a_photograph(session):
-    path = photographs(session, "station2")[1]
+def test_a_folder_with_the_name_of_a_image(session):
+    path = images(session, "station2")[1]
     path.unlink()
     path.mkdir()
     refused(session, f"images/station2/{path.name}: this is a folder, not a file")
 
 
-def test_a_folder_beside_the_photographs_is_nobodys_business(session):
-    files = photographs(session, "station2")
+def test_a_folder_beside_the_images_is_nobodys_business(session):
+    files = images(session, "station2")
     files[1].with_name("thumbnails.png").mkdir()
-    assert [p.path for p in load_session(session).stations[1].photographs] == files
+    assert [p.path for p in load_session(session).stations[1].images] == files
 
 
 LONG = "n" * 5000
@@ -141,7 +141,7 @@ LONG = "n" * 5000
     [
         ("session.yaml", "mechanism: ", f"mechanism: {LONG} # ", "mechanism: the file"),
         ("session.yaml", "mechanism: ", f"mechanism: {LONG}.yaml # ", "mechanism: the file"),
-        ("session.yaml", "images/station1", f"images/{LONG}", "images: there is no photograph"),
+        ("session.yaml", "images/station1", f"images/{LONG}", "images: there is no image"),
         ("session.yaml", "{configuration}", f"{{{LONG}}}", "this placeholder is not known"),
         ("session.yaml", "joints:", f"a: !{LONG} 3\njoints:", "is not allowed"),
         ("joints.csv", "0003", LONG, "joints.csv, line 5: this name is too long"),
@@ -177,39 +177,39 @@ def test_a_zero_in_a_pattern(session):
     refused(session, "session.yaml, line ", "images: this text holds a character")
 
 
-def test_a_damaged_photograph_is_told_by_pkmcal_alone(session, capfd):
-    path = photographs(session, "station2")[1]
+def test_a_damaged_image_is_told_by_pkmcal_alone(session, capfd):
+    path = images(session, "station2")[1]
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
-    refused(session, f"images/station2/{path.name}: the photograph cannot be decoded; found a PNG")
+    refused(session, f"images/station2/{path.name}: the image cannot be decoded; found a PNG")
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_photograph_cut_short(session):
-    path = photographs(session, "station2")[1]
+def test_a_image_cut_short(session):
+    path = images(session, "station2")[1]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     text = refused(session)
     assert text == (
-        f"images/station2/{path.name}: the photograph cannot be decoded; found a PNG file that"
+        f"images/station2/{path.name}: the image cannot be decoded; found a PNG file that"
         " ends early, expected a whole PNG or JPEG file. Copy it again from the camera, or remove"
-        " it: an absent photograph is allowed."
+        " it: an absent image is allowed."
     )
 
 
 @pytest.mark.slow
-def test_photographs_of_something_else(session):
+def test_images_of_something_else(session):
     rng = np.random.default_rng(1)
-    for path in photographs(session, "station2"):
+    for path in images(session, "station2"):
         cloud = cv2.GaussianBlur(rng.normal(size=(360, 480)), (0, 0), 9)
         picture = 255 * (cloud - cloud.min()) / np.ptp(cloud)
         assert cv2.imwrite(str(path), picture.astype(np.uint8))
     only(session, "station1", "station2")
     refused_by_calibrate(
         session,
-        "session.yaml, stations.station2: the machine is not recognised in the photographs of"
+        "session.yaml, stations.station2: the machine is not recognised in the images of"
         " station2; found legs that readings of other configurations fit as well",
-        "Check that these photographs show this machine's legs, that each bears the name of its"
+        "Check that these images show this machine's legs, that each bears the name of its"
         " configuration, and that the nominal model is this machine's.",
     )
 
@@ -224,7 +224,7 @@ def test_two_stations_swapped(session):
     text = refused_by_calibrate(session)
     assert text == (
         "session.yaml, stations: stations station1 and station2 are mixed up; found the"
-        " photographs of each fit the pose of the other. Exchange the poses of station1 and"
+        " images of each fit the pose of the other. Exchange the poses of station1 and"
         " station2 in session.yaml, or their image folders."
     )
 

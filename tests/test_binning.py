@@ -16,7 +16,7 @@ from pkmcal.calibration.refinement import observation_of
 from pkmcal.calibration.results import calibration_document
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import binned
 from pkmcal.observe.legs import first_binning, measure, sharp_binning
 from pkmcal.observe.profiles import PROFILE_OPTIONS
@@ -69,7 +69,7 @@ def test_what_is_sharper_is_binned_less():
     assert [sharp_binning(k, PROFILE_OPTIONS.blurs[-1]) for k in (1, 2)] == [2, 4]
 
 
-def test_binned_photographs_give_the_edges_of_small_ones():
+def test_binned_images_give_the_edges_of_small_ones():
     small, large = (measure(p, machine(), FRONT, poses()) for p in (taken(), larger()))
     assert len(small.edges) > 50
     np.testing.assert_array_equal(large.edges.leg, small.edges.leg)
@@ -138,7 +138,7 @@ def away(value, other):
     return np.abs(value.machine.values - other.machine.values)[sigma > 0] / sigma[sigma > 0]
 
 
-def test_photographs_larger_than_sharp(blurred, calibrated):
+def test_images_larger_than_sharp(blurred, calibrated):
     """Binned images give the machine of the sharp small images, to the scatter of other images.
 
     Without binning their edges are blurred over three pixels, and hardly one is found.
@@ -157,14 +157,14 @@ def test_photographs_larger_than_sharp(blurred, calibrated):
 def test_stations_of_one_camera_are_binned_alike(calibrated):
     """A leg without images, too: the camera's edge shift is in binned pixels."""
     c = calibrated
-    taken = [Photographs(0, c.session.stations[0].camera, *[np.zeros(0, int)] * 2, [], binning=2)]
+    taken = [StationImages(0, c.session.stations[0].camera, *[np.zeros(0, int)] * 2, [], binning=2)]
     count = observation_of(c.session, [], Boards(), c.measurements, c.estimate, taken)
     assert len({station.camera_file for station in c.session.stations}) == 1
     np.testing.assert_array_equal(count.binning, 2)
 
 
 @pytest.mark.parametrize("spread", [1.6, pytest.param(2.4, marks=pytest.mark.slow)])
-def test_photographs_out_of_focus(session, calibrated, spread):
+def test_images_out_of_focus(session, calibrated, spread):
     """Profiles do not explain edges blurred over so much; of half the pixels they do. What is lost
     is stated.
     """
@@ -180,7 +180,7 @@ def test_photographs_out_of_focus(session, calibrated, spread):
 
 
 @pytest.mark.slow
-def test_sharp_photographs_end_unbinned(session, calibrated, monkeypatch):
+def test_sharp_images_end_unbinned(session, calibrated, monkeypatch):
     """Measured at first with half the resolution; the last measurement passes use all pixels."""
     width = calibrated.session.stations[0].camera.image_size[0]
     monkeypatch.setattr(legs, "USUAL_PICTURE_LENGTH", width // 2)

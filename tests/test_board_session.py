@@ -20,7 +20,7 @@ from pkmcal.calibration.localization import (
     check_observable,
     localize_stations,
     platform_poses,
-    read_photographs,
+    read_images,
     recognise,
 )
 from pkmcal.check.check import check_session
@@ -56,8 +56,8 @@ def folder(rendered, tmp_path):
 def found(rendered):
     """A session, its images and the boards in them."""
     session = load_session(rendered)
-    photographs = read_photographs(session)
-    return session, photographs, boards_of(session, photographs)
+    images = read_images(session)
+    return session, images, boards_of(session, images)
 
 
 def without_pose(folder, station):
@@ -86,7 +86,7 @@ def test_rendered_corners_are_true_to_two_hundredths_of_a_pixel(rendered, found)
         assert np.all(np.abs(off.mean(axis=0)) < 0.005)
 
 
-def test_poses_from_rendered_photographs(rendered, found):
+def test_poses_from_rendered_images(rendered, found):
     session, _, boards = found
     truth = load_truth(rendered, session.machine)
     poses = boards.poses
@@ -153,9 +153,9 @@ def test_stations_without_a_pose_are_found_through_the_board(rendered, folder, w
         name in without for name in ("station1", "station2")
     ]
     check_observable(session)
-    photographs = read_photographs(session)
-    boards = boards_of(session, photographs)
-    T = localize_stations(session, photographs, boards, np.random.default_rng(0))
+    images = read_images(session)
+    boards = boards_of(session, images)
+    T = localize_stations(session, images, boards, np.random.default_rng(0))
     truth = load_truth(rendered, session.machine)
     error = pose_difference(inverse(T), inverse(truth.T_camera_base))
     # as near as the search comes from a pose by hand; the estimate's start need not be nearer
@@ -186,13 +186,13 @@ def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
         text[:start] + "      position: [0.9, 0.9, 1.1]" + text[text.index("\n", start) :]
     )
     session = load_session(folder)
-    photographs = read_photographs(session)
-    boards = boards_of(session, photographs)
-    T = localize_stations(session, photographs, boards, np.random.default_rng(1))
+    images = read_images(session)
+    boards = boards_of(session, images)
+    T = localize_stations(session, images, boards, np.random.default_rng(1))
     assert np.linalg.norm(inverse(T[1])[:3, 3] - [0.9, 0.9, 1.1]) > 0.3
     # without the board too: a pose by hand that shows nothing is only where the search begins
     rng = np.random.default_rng(1)
-    alone = recognise(session, photographs[1:], platform_poses(session), [rng])
+    alone = recognise(session, images[1:], platform_poses(session), [rng])
     assert alone.complete
     off = pose_difference(alone.localizations[0].T_camera_base, T[1])
     assert np.rad2deg(np.linalg.norm(off[:3])) < 3
@@ -249,12 +249,12 @@ def test_a_camera_that_moved(folder):
     assert run("calibrate", folder).err == f"Error: {text}\n"
 
 
-def test_a_photograph_that_disagrees_is_told(folder):
+def test_a_image_that_disagrees_is_told(folder):
     shifted(folder, "station1", 3)
     session = load_session(folder)
-    boards = boards_of(session, read_photographs(session))
+    boards = boards_of(session, read_images(session))
     assert [r.reason for r in boards.rejected] == [
-        "the board stands 2.0 px from where the other photographs show it"
+        "the board stands 2.0 px from where the other images show it"
     ]
 
 
@@ -263,25 +263,23 @@ def test_another_board_than_described(folder):
     path.write_text(path.read_text().replace("DICT_4X4_50", "DICT_5X5_50"))
     session = load_session(folder)
     with pytest.raises(InputError, match="another board than the one described") as caught:
-        boards_of(session, read_photographs(session))
+        boards_of(session, read_images(session))
     assert caught.value.where == "session.yaml, stations.station1: 0000.png"
     assert "markers of DICT_4X4_50" in caught.value.found
 
 
 def test_a_board_that_is_nowhere(found):
-    session, photographs, _ = found
+    session, images, _ = found
     # one of it: if no board is found, one of every other kind is searched as well
-    one = replace(session.stations[0], photographs=session.stations[0].photographs[:1])
+    one = replace(session.stations[0], images=session.stations[0].images[:1])
     session = replace(session, stations=(one, *session.stations[1:]))
-    images = {0: [np.full_like(photographs[0].images[0], 90)]}
-    with pytest.raises(
-        InputError, match="in none of the photographs of station station1"
-    ) as caught:
+    images = {0: [np.full_like(images[0].images[0], 90)]}
+    with pytest.raises(InputError, match="in none of the images of station station1") as caught:
         find_boards(session, images)
     assert caught.value.where == "images/station1/0000.png"
 
 
-def test_one_photograph_of_a_board_is_noted(folder, found):
+def test_one_image_of_a_board_is_noted(folder, found):
     """Three of four images are grey at the board's place; one station is enough to detect it."""
     only(folder, "station1")
     board = found[2].stations[0]
@@ -292,7 +290,7 @@ def test_one_photograph_of_a_board_is_noted(folder, found):
         picture[max(y - 75, 0) : y + 75, max(x - 75, 0) : x + 75] = 60
         assert cv2.imwrite(str(path), picture)
     checked = check_session(folder)
-    assert any("Only one photograph shows the board" in f.text for f in checked.findings)
+    assert any("Only one image shows the board" in f.text for f in checked.findings)
 
 
 def test_a_board_on_the_platform_needs_no_rough_pose(folder):
@@ -302,11 +300,11 @@ def test_a_board_on_the_platform_needs_no_rough_pose(folder):
     check_observable(load_session(folder))
 
 
-def test_a_board_on_the_platform_gives_a_measurement_a_photograph(found):
+def test_a_board_on_the_platform_gives_a_measurement_a_image(found):
     """Quantities that a session with such a board uses; here it is at rest, which is not tested."""
-    session, photographs, _ = found
+    session, images, _ = found
     moving = replace(session, board_body="platform")
-    boards = find_boards(moving, {p.station: p.images for p in photographs})
+    boards = find_boards(moving, {p.station: p.images for p in images})
     assert len(boards.poses) == 8
     assert boards.poses.configuration.tolist() == [0, 1, 2, 3, 4, 5, 6, 7]
     assert all(isinstance(s, StationBoard) and s.stood is None for s in boards.stations.values())

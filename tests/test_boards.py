@@ -213,7 +213,7 @@ def test_mirror_images_are_told(tmp_path):
     np.testing.assert_allclose(value.pixels, [SIZE[0] - 1, 0] + [-1, 1] * truth, atol=0.2)
 
 
-def photographs(folder, board, count=3, size=None, start=0):
+def images(folder, board, count=3, size=None, start=0):
     paths = []
     for k in range(start, start + count):
         T_camera_board = view(board, (0.2 * k - 0.2, 0.25, 0.1), (0.0, 0.0), 0.42)
@@ -231,7 +231,7 @@ def pictures(tmp_path_factory):
     for kind in FILES:
         (folder / kind).mkdir()
         board = board_of(folder / kind, FILES[kind])
-        boards[kind] = board, photographs(folder / kind, board)
+        boards[kind] = board, images(folder / kind, board)
     return boards
 
 
@@ -243,7 +243,7 @@ def described(tmp_path, kind, *pairs):
     return board_of(tmp_path, text)
 
 
-def test_every_photograph_has_a_result(pictures):
+def test_every_image_has_a_result(pictures):
     board, paths = pictures["charuco"]
     results = detect_boards(paths, board)
     assert [d.name for d in results] == ["p0.png", "p1.png", "p2.png"]
@@ -319,20 +319,20 @@ def test_no_board_anywhere(tmp_path, pictures):
     for k, path in enumerate(paths):
         noise = np.random.default_rng(k).normal(90, 5, (180, 240))
         cv2.imwrite(str(path), noise.astype(np.uint8))
-    with pytest.raises(InputError, match="in none of the photographs") as caught:
+    with pytest.raises(InputError, match="in none of the images") as caught:
         detect_boards(paths, pictures["charuco"][0])
     assert caught.value.found == "none of the board's markers is recognised"
 
 
-def test_photographs_of_two_sizes(tmp_path, pictures):
+def test_images_of_two_sizes(tmp_path, pictures):
     board, paths = pictures["charuco"]
-    odd = photographs(tmp_path, board, 1, (640, 480), start=7)
+    odd = images(tmp_path, board, 1, (640, 480), start=7)
     with pytest.raises(InputError) as caught:
         detect_boards([*paths, *odd], board)
     assert str(caught.value) == (
-        "p7.png: the photographs differ in size, so one camera as it was calibrated did not take"
+        "p7.png: the images differ in size, so one camera as it was calibrated did not take"
         " them; found 640x480 pixels, expected 480x360, as the other 3. Calibrate each resolution"
-        " on its own, from unscaled, uncropped photographs."
+        " on its own, from unscaled, uncropped images."
     )
 
 

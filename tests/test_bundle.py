@@ -248,7 +248,7 @@ def test_starts_far_away_find_the_same_answer():
         np.testing.assert_allclose(far.solution.state.z, near.solution.state.z, atol=3e-6)
 
 
-def test_configurations_that_nobody_photographed():
+def test_configurations_that_nobody_imaged():
     """Configurations without inliers do not enter the estimate; their poses follow from the
     readings.
     """
@@ -478,7 +478,7 @@ def test_results_do_not_depend_on_the_gauge(gauge):
     scene = make_scene(rng)
     m = scene.measurements(rng)
     start = start_state(scene.machine, m, scene.T_camera_base)
-    options = {"use_drawing": False, "robust": False, "scale_noise": False}
+    options = {"use_prior": False, "robust": False, "scale_noise": False}
     reference = bundle(scene.machine, m, start, **options)
     other = bundle(scene.machine, m, start, gauge=gauge, **options)
     assert registered_error(scene.machine, other.state.theta, reference.state.theta) < 1e-11

@@ -12,14 +12,14 @@ import yaml
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.calibration.localization import boards_of, read_photographs
+from pkmcal.calibration.localization import boards_of, read_images
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.papers import methods
 from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.calibration import save
 from pkmcal.report.corners import board_corners
-from pkmcal.report.provenance import used_photographs
+from pkmcal.report.provenance import used_images
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 from rendered import by_command
@@ -67,7 +67,7 @@ def test_boards_are_where_they_are(rendered):
     session = load_session(rendered)
     assert session.without({0: "no place"}).images_taken == 12  # those left out are counted
     truth = load_truth(rendered, session.machine)
-    poses = boards_of(session, read_photographs(session)).poses
+    poses = boards_of(session, read_images(session)).poses
     there = truth.T_camera_base[0] @ truth.T_base_platform @ truth.T_platform_board
     error = pose_difference(poses.T_station_target, there[poses.configuration])
     z2 = np.sum(np.einsum("nij,nj->ni", poses.whiten, error) ** 2, axis=1)
@@ -142,7 +142,7 @@ def test_cameras_are_refined_with_the_board(rendered, folder):
 
 
 @pytest.mark.slow
-def test_a_photograph_of_another_configuration_is_let_go(folder):
+def test_a_image_of_another_configuration_is_let_go(folder):
     images = folder / "images" / "station1"
     names = sorted(path.name for path in images.iterdir())
     shutil.copy(images / names[3], images / names[5])
@@ -155,7 +155,7 @@ def test_a_photograph_of_another_configuration_is_let_go(folder):
     (warned,) = result.verdict.of("rejected.units")
     assert warned.facts["of"] == f"{len(lost)} boards"
     assert f"images/station1/{names[5]}" in warned.subject
-    assert used_photographs(result.session, result.observation, result.estimate) == (11,)
+    assert used_images(result.session, result.observation, result.estimate) == (11,)
 
 
 def test_a_missing_board_file_and_another_camera(folder):

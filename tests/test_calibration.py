@@ -21,7 +21,7 @@ from pkmcal.simulation.demo import camera_of_size
 from rendered import rendered
 
 
-def photographed(folder, seed):
+def imaged(folder, seed):
     """Three stations, six configurations each, 640x480: half as many images again as the
     demonstration's, and larger ones.
     """
@@ -64,9 +64,9 @@ def test_the_machine_is_found(demo, calibrated):
 
 
 @pytest.mark.slow
-def test_the_machine_is_found_in_more_and_larger_photographs(tmp_path):
+def test_the_machine_is_found_in_more_and_larger_images(tmp_path):
     """Eighteen, 640x480: deviations of 0.1 mm, so errors of 0.2 mm would be wrong."""
-    folder = photographed(tmp_path / "session", seed=11)
+    folder = imaged(tmp_path / "session", seed=11)
     check_found(pkmcal.calibrate(folder), folder, 0.2e-3)
 
 
@@ -76,7 +76,7 @@ def test_slim_bare_rods_are_told_honestly(tmp_path):
     neither the profiles' sigmas nor one edge shift for a camera model; each line's own shading
     does. Without it errors are 1.25 standard deviations here, with it 0.87.
     """
-    folder = photographed(tmp_path / "session", seed=5)
+    folder = imaged(tmp_path / "session", seed=5)
     value = pkmcal.calibrate(folder)
     result = compare_with_truth(value, folder)
     assert result.calibrated.centre < result.nominal.centre / 5

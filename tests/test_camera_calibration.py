@@ -21,7 +21,7 @@ from pkmcal.boards.fit import (
     settled_poses,
     views_of,
 )
-from pkmcal.camera_calibration.calibrate import calibrate_camera, calibrate_photographs
+from pkmcal.camera_calibration.calibrate import calibrate_camera, calibrate_images
 from pkmcal.camera_calibration.model_selection import (
     best_of,
     camera_candidates,
@@ -161,7 +161,7 @@ def test_the_truth_of_other_models_comes_back(name):
     check_truth(calibration_of(name), TRUE[name])
 
 
-def test_photographs_give_the_camera(tmp_path, monkeypatch):
+def test_images_give_the_camera(tmp_path, monkeypatch):
     """From rendered images, including the corners."""
     alone(monkeypatch, "pinhole")
     camera, board = CAMERAS["pinhole"], chessboard((8, 5), 0.03)
@@ -172,7 +172,7 @@ def test_photographs_give_the_camera(tmp_path, monkeypatch):
         image = render(camera, view(board, turn, where, 0.38), board, seed=k)
         paths.append(tmp_path / f"p{k}.png")
         cv2.imwrite(str(paths[-1]), image)
-    calibration = calibrate_photographs(paths, board, "pinhole")
+    calibration = calibrate_images(paths, board, "pinhole")
     focal, sigma = calibration.camera.parameters[:2], calibration.sigma[:2]
     np.testing.assert_allclose(focal, camera.parameters[:2], rtol=2e-3)
     assert np.all(np.abs(focal - camera.parameters[:2]) < 4 * sigma)
@@ -354,7 +354,7 @@ def fitted_once(wide_pool, monkeypatch):
 def test_a_model_that_does_not_fit(wide_views):
     with pytest.raises(InputError) as caught:
         calibrate_camera(wide_views, BOARD, "pinhole")
-    assert caught.value.what == "the model pinhole does not fit the photographs"
+    assert caught.value.what == "the model pinhole does not fit the images"
     assert caught.value.expected.split(",")[0] in ("unified", "fisheye")
 
 
@@ -365,7 +365,7 @@ def test_no_such_model(wide_views):
 
 def test_too_few_views(wide_views):
     nothing = replace(wide_views[2], ids=np.zeros(0, dtype=int), reason="dark")
-    with pytest.raises(InputError, match="too few photographs show the board; found 2 of 3"):
+    with pytest.raises(InputError, match="too few images show the board; found 2 of 3"):
         calibrate_camera([*wide_views[:2], nothing], BOARD)
 
 
@@ -394,11 +394,11 @@ def test_corners_of_no_board(wide_views, monkeypatch):
 
 
 @pytest.mark.usefixtures("fitted_once")
-def test_a_photograph_without_a_board_is_not_dropped_silently(wide_views):
+def test_a_image_without_a_board_is_not_dropped_silently(wide_views):
     nothing = replace(wide_views[0], name="dark.png", ids=np.zeros(0, dtype=int), reason="too dark")
     calibration = calibrate_camera([*wide_views, nothing], BOARD, "unified")
     assert calibration.views == tuple(d.name for d in wide_views)
-    assert "1 of 11 photographs are not used: dark.png (too dark)." in calibration.warnings
+    assert "1 of 11 images are not used: dark.png (too dark)." in calibration.warnings
     assert calibration.document()["not_used"] == {"dark.png": "too dark"}
 
 

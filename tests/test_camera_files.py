@@ -134,7 +134,7 @@ def test_files_as_others_write_them(tmp_path):
          "no model here has; found 2."),
         (ROS, "plumb_bob", "rational_polynomial", "c.yaml, line 5, distortion_model: this model of "
          "camera or lens is not known here; found rational_polynomial, expected plumb_bob, "
-         "equidistant and fisheye. Calibrate again from photographs of a board: pkmcal camera."),
+         "equidistant and fisheye. Calibrate again from images of a board: pkmcal camera."),
         (ROS, "0.3]", "0.3, 0.1]", "c.yaml, line 4, camera_matrix: the camera has distortion "
          "beyond the model's 5 terms; found 6 terms."),
         (ROS, "[500, 0, 320, 0, 501,", "[5, 0, 320, 0, 5,", "c.yaml, line 4, camera_matrix: the "

@@ -216,7 +216,7 @@ def simulated(machine, seed, stations=1):
     truth = draw_truth(machine, (CAMERA,) * stations, Settings(stations=stations), seed)
     edges, readings = simulate_edges(
         truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
-        np.random.default_rng(seed), photographs=truth.photographs,
+        np.random.default_rng(seed), images=truth.images,
     )  # fmt: skip
     zeros = np.zeros(stations, dtype=int)
     return truth, Measurements(edges, readings, 3e-6, stations, zeros)
@@ -275,7 +275,7 @@ RENDERED = {name: 1 if name == "3-rpr" else 3 for name in NAMES}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_photographs_calibrate(name, tmp_path):
+def test_images_calibrate(name, tmp_path):
     """Fifteen images from each place, 1024x768: localized, usable, and errors as stated.
 
     Bare rods' edges are shifted by some hundredths of a pixel, equally in all images from a place,

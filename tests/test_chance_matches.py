@@ -19,10 +19,10 @@ from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
 
 
-def turns_of(photographs, keep=1.0):
+def turns_of(images, keep=1.0):
     """Result of a measurement pass with a share of its edges; the others count as not found."""
     state = SimpleNamespace(T_camera_base=FRONT[None], T_base_platform=poses())
-    station_edges = measure(photographs, machine(), FRONT, poses())
+    station_edges = measure(images, machine(), FRONT, poses())
     count = round(keep * len(station_edges.edges))
     lost = tuple(
         station_edges.edges.rejection(k, "faint") for k in range(count, len(station_edges.edges))
@@ -38,14 +38,14 @@ def turns_of(photographs, keep=1.0):
         np.ones(1),
     )
     estimate = SimpleNamespace(machine=machine(), state=state, edge_weights=np.ones(count))
-    return RefinementResult(visible, None, estimate, None, photographs=[photographs], blur={})
+    return RefinementResult(visible, None, estimate, None, images=[images], blur={})
 
 
-def aside(photographs, px):
+def aside(images, px):
     """Edges as if the machine were elsewhere in the image."""
-    parameters = photographs.camera.parameters.copy()
+    parameters = images.camera.parameters.copy()
     parameters[2] += px
-    return replace(photographs, camera=replace(photographs.camera, parameters=parameters))
+    return replace(images, camera=replace(images.camera, parameters=parameters))
 
 
 def test_few_edges_of_the_right_machine_are_no_chance():
@@ -54,7 +54,7 @@ def test_few_edges_of_the_right_machine_are_no_chance():
 
 def test_edges_of_a_machine_that_is_elsewhere_are():
     (why,) = chance_match_reason(turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)))
-    assert "may not be the machine in the photographs" in why.text
+    assert "may not be the machine in the images" in why.text
     in_view = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)).observation
     hidden = sum(r.code == "edges.out_of_sight" for r in in_view.rejected)
     in_sight = len(in_view.edges) + len(in_view.rejected) - hidden
@@ -76,9 +76,7 @@ def test_repeats_count_once():
     once = aside(taken(), 2.5 * IMAGE_OFFSET)
     twice = once.select(np.repeat(np.arange(len(once.images)), 2))
     turns = turns_of(once)._replace(blur={0: PROFILE_OPTIONS.usual_blur})
-    assert (
-        chance_match_reason(turns._replace(photographs=[twice])) == chance_match_reason(turns) != ()
-    )
+    assert chance_match_reason(turns._replace(images=[twice])) == chance_match_reason(turns) != ()
 
 
 def test_chance_that_offers_more_is_told_in_words(monkeypatch):
@@ -104,9 +102,9 @@ def two_stations(second, **values):
     estimate = SimpleNamespace(
         machine=machine(), state=state, edge_weights=np.ones(len(in_view.edges))
     )
-    both = [*one.photographs, replace(second, station=1)]
+    both = [*one.images, replace(second, station=1)]
     measured = SimpleNamespace(poses=SimpleNamespace(station=np.array(values.pop("boards", []))))
-    turns = RefinementResult(in_view, measured, estimate, None, photographs=both, blur={})
+    turns = RefinementResult(in_view, measured, estimate, None, images=both, blur={})
     station = SimpleNamespace(**{"handheld": False, "T_camera_base": None, **values})
     return SimpleNamespace(stations=(station, station)), turns
 

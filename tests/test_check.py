@@ -60,10 +60,10 @@ def test_a_good_session(checked):
 def test_progress_is_told_in_order(checked):
     text, shares = zip(*checked.told, strict=True)
     assert list(shares) == sorted(shares)
-    assert text[-1] == "What such photographs will give"
+    assert text[-1] == "What such images will give"
 
 
-def test_a_workspace_blurred_and_overexposed_photographs(session):
+def test_a_workspace_blurred_and_overexposed_images(session):
     """Three cases that are no mistakes, and do not stop the check."""
     with (session / "session.yaml").open("a") as file:
         file.write("workspace: {z: [1.0, 2.0]}\n")
@@ -86,19 +86,19 @@ def test_a_workspace_blurred_and_overexposed_photographs(session):
     assert not [text for text in faults if text.startswith("station3")]
 
 
-def test_black_photographs_of_nothing(session):
+def test_black_images_of_nothing(session):
     only(session, "station1", "station3")
     changed(session, lambda picture: picture * 0, "station3")
     check = check_session(session)
     assert check.exit_code == 2
     assert "station3: 100% of the pictures are black" in texts(check, Level.DOUBTFUL)[0]
-    assert "not recognised in the photographs of station3" in texts(check, Level.WRONG)[0]
+    assert "not recognised in the images of station3" in texts(check, Level.WRONG)[0]
     assert [station.recognised for station in check.stations] == [True, False]
 
 
-def test_all_broken_photographs_are_named(session):
+def test_all_broken_images_are_named(session):
     broken = sorted((session / "images" / "station1").iterdir())[:2]
-    names = [f"images/station1/{path.name}: the photograph cannot be decoded" for path in broken]
+    names = [f"images/station1/{path.name}: the image cannot be decoded" for path in broken]
     for path in broken:
         path.write_bytes(path.read_bytes()[:-300])
     check = check_session(session)
@@ -107,7 +107,7 @@ def test_all_broken_photographs_are_named(session):
     assert check.stations[0].recognised  # by its other images
 
 
-def test_a_station_whose_photographs_are_all_broken(session):
+def test_a_station_whose_images_are_all_broken(session):
     for path in (session / "images" / "station1").iterdir():
         path.write_bytes(path.read_bytes()[:-300])
     check = check_session(session)
@@ -115,13 +115,13 @@ def test_a_station_whose_photographs_are_all_broken(session):
     assert not any(station.recognised for station in check.stations)
 
 
-def test_of_many_broken_photographs_some_are_named(session, monkeypatch):
-    monkeypatch.setattr(check, "BROKEN_PHOTOGRAPHS_NAMED", 1)
+def test_of_many_broken_images_some_are_named(session, monkeypatch):
+    monkeypatch.setattr(check, "BROKEN_IMAGES_NAMED", 1)
     for path in (session / "images" / "station1").iterdir():
         path.write_bytes(path.read_bytes()[:-300])
     first, others = texts(check_session(session), Level.WRONG)
     assert "cannot be decoded" in first
-    assert "stations.station1: photographs cannot be decoded; found 3 more of this" in others
+    assert "stations.station1: images cannot be decoded; found 3 more of this" in others
 
 
 def test_a_station_without_a_pose_is_found_anywhere(session):
@@ -201,12 +201,12 @@ def test_a_pose_under_several_names_is_told(demo):
     assert joint_findings(session, ()) == []
     noise = session.joint_noise * np.random.default_rng(0).normal(size=(2, joints.shape[1]))
     joints[1:3] = joints[0] + noise
-    photos = [p for p in session.stations[0].photographs if p.configuration > 2]
+    photos = [p for p in session.stations[0].images if p.configuration > 2]
 
     def report(*in_view):
         """Findings if stations see these of the first three configurations."""
         stations = tuple(
-            replace(s, photographs=(*(replace(photos[0], configuration=k) for k in rows), *photos))
+            replace(s, images=(*(replace(photos[0], configuration=k) for k in rows), *photos))
             for s, rows in zip(session.stations, in_view, strict=True)
         )
         (finding,) = joint_findings(replace(session, joints=joints, stations=stations), ())
@@ -218,13 +218,12 @@ def test_a_pose_under_several_names_is_told(demo):
         return finding.text.partition("one pose: ")[2]
 
     assert report((0, 1, 2), (), ()) == (
-        "at station1 name its photographs images/station1/0000_1.png and"
+        "at station1 name its images images/station1/0000_1.png and"
         " images/station1/0000_2.png, with images: images/station1/{configuration}_{repeat}.png,"
         " and keep one of its rows in joints.csv."
     )
     assert report((0,), (1,), (2,)) == (
-        "its photographs bear one name at all stations, such as 0000, and it has one row in"
-        " joints.csv."
+        "its images bear one name at all stations, such as 0000, and it has one row in joints.csv."
     )
 
 

@@ -63,7 +63,7 @@ def alone(demo, tmp_path_factory):
 
 def test_the_forecast_is_what_calibrate_then_states(found, calibrated):
     """From two images of each of three stations, for the four of each that exist."""
-    each = len(calibrated.session.stations[0].photographs)
+    each = len(calibrated.session.stations[0].images)
     values = forecast(found.look, each)
     _, tool = centres_and_tool(
         calibrated.session.machine, calibrated.estimate, calibrated.session.joints
@@ -73,7 +73,7 @@ def test_the_forecast_is_what_calibrate_then_states(found, calibrated):
     assert values.orientation == pytest.approx(tool.orientation.mean(), rel=0.5)
 
 
-def test_more_photographs_tell_more(found):
+def test_more_images_tell_more(found):
     few, many = forecast(found.look, 8), forecast(found.look, 32)
     # independent errors would halve; what shading does to a side stays
     assert 0.4 < many.position / few.position < 0.85
@@ -95,7 +95,7 @@ def test_shares_are_parts_of_a_whole(found):
     assert "look" not in found.as_dict()
 
 
-def test_three_photographs_of_one_station(alone):
+def test_three_images_of_one_station(alone):
     check = check_session(alone)
     assert not [f for f in check.findings if f.level is Level.WRONG]
     rows = check.forecast
@@ -103,7 +103,7 @@ def test_three_photographs_of_one_station(alone):
     # from one place the line of sight is determined badly
     assert rows.second < rows.position
     text = outcome_of(check).parts[-1].terminal_text
-    assert "by the edges of 3 photographs" in text[0]
+    assert "by the edges of 3 images" in text[0]
 
 
 def test_no_forecast_where_a_station_is_not_recognised(found):
@@ -112,11 +112,11 @@ def test_no_forecast_where_a_station_is_not_recognised(found):
     assert forecast(lost) is None
 
 
-def test_no_forecast_of_photographs_without_edges(found):
+def test_no_forecast_of_images_without_edges(found):
     edges = found.look
-    grey = [replace(s.photographs, images=[np.full_like(i, 90) for i in s.photographs.images])
+    grey = [replace(s.images, images=[np.full_like(i, 90) for i in s.images.images])
             for s in edges.stations]  # fmt: skip
-    stations = [replace(s, photographs=p) for s, p in zip(edges.stations, grey, strict=True)]
+    stations = [replace(s, images=p) for s, p in zip(edges.stations, grey, strict=True)]
     with pytest.raises(ResultError):
         forecast(replace(edges, stations=tuple(stations)))
 
@@ -216,31 +216,31 @@ def test_why_edges_are_lost(found, level, behind, code):
 # ------------------------------------------------------------------ pictures
 
 
-def test_pictures_of_all_photographs(found, tmp_path):
+def test_pictures_of_all_images(found, tmp_path):
     write_pictures(found.look, tmp_path / "pictures")
     names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
     assert names == sorted(picture_names(found.look).values())
-    assert len(names) == sum(station.photographs for station in found.stations)
+    assert len(names) == sum(station.images for station in found.stations)
     station = found.look.stations[0]
-    width, height = station.photographs.camera.image_size
+    width, height = station.images.camera.image_size
     drawn = cv2.imread(str(tmp_path / "pictures" / names[0]))
     assert drawn.shape == (height + CAPTION_BAR_HEIGHT, 2 * width + PANE_GAP, 3)
     # beside the lines the image is unchanged, and all legs' colours are in it
     after = drawn[CAPTION_BAR_HEIGHT:, width + PANE_GAP :]
-    plain = cv2.cvtColor(station.photographs.images[0], cv2.COLOR_GRAY2BGR)
+    plain = cv2.cvtColor(station.images.images[0], cv2.COLOR_GRAY2BGR)
     assert np.mean(np.any(after != plain, axis=-1)) < 0.2
     for colour in leg_colours()[:6]:  # thin lines are blended with what they cross
         assert np.abs(after.astype(int) - colour).max(axis=-1).min() < 60
 
 
-def test_pictures_of_large_photographs_are_binned(found):
+def test_pictures_of_large_images_are_binned(found):
     station = found.look.stations[0]
-    large = replace(station, photographs=replace(station.photographs, binning=2))
-    width, height = station.photographs.camera.image_size
+    large = replace(station, images=replace(station.images, binning=2))
+    width, height = station.images.camera.image_size
     size = width // 2, height // 2
     drawn = []
     for edges, grey in (
-        (station, photo := station.photographs.images[0]),
+        (station, photo := station.images.images[0]),
         (large, binned(photo, 2)),
     ):
         pane = picture(found.look, edges, 0)[CAPTION_BAR_HEIGHT:, : grey.shape[1]]
@@ -253,15 +253,15 @@ def test_pictures_of_large_photographs_are_binned(found):
 
 def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
     """Under its lines the image changes; under those at the rough pose, which are off, less."""
-    from pkmcal.check.pictures import drawing_over_photograph
+    from pkmcal.check.pictures import nominal_over_image
 
     def strength(T_camera_base, k):
-        image = station.photographs.images[k].astype(np.float32)
+        image = station.images.images[k].astype(np.float32)
         slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))
         slope = cv2.dilate(slope, np.ones((5, 5)))
         mask = np.zeros(image.shape, np.uint8)
-        for edge in drawing_over_photograph(
-            found.look, station, station.photographs.camera, T_camera_base, k
+        for edge in nominal_over_image(
+            found.look, station, station.images.camera, T_camera_base, k
         )[0]:
             cv2.polylines(mask, [np.rint(edge.points).astype(np.int32)], False, 255)
         return float(np.median(slope[mask > 0]))
@@ -271,11 +271,11 @@ def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
 
 
 def test_each_number_stands_once_and_apart(found):
-    from pkmcal.check.pictures import drawing_over_photograph
+    from pkmcal.check.pictures import nominal_over_image
 
     station = found.look.stations[0]
-    eye = station.photographs.camera
-    _, spots = drawing_over_photograph(found.look, station, eye, station.T_camera_base, 0)
+    eye = station.images.camera
+    _, spots = nominal_over_image(found.look, station, eye, station.T_camera_base, 0)
     numbered = [spot for spot in spots if spot.labelled]
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 
@@ -316,7 +316,7 @@ def test_the_command_writes_page_and_pictures(alone, tmp_path, monkeypatch):
     assert len(list((tmp_path / "drawn").iterdir())) == 3
     assert all(Path(path).exists() for path in done.json["files"].values())
     page = (tmp_path / "out" / "check.html").read_text()
-    assert "The nominal model over the photographs" in page
+    assert "The nominal model over the images" in page
     assert "What a full capture would give" in page
     # again, over the same; but not beside what is somebody's
     assert run("check", alone, "--pictures", tmp_path / "drawn").code == done.code
@@ -330,7 +330,7 @@ def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr("pkmcal.check.pictures.drawing_over_photograph", never)
+    monkeypatch.setattr("pkmcal.check.pictures.nominal_over_image", never)
     before = sorted(alone.rglob("*"))
     assert run("check", alone).code < 2
     assert sorted(alone.rglob("*")) == before

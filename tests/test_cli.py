@@ -249,7 +249,7 @@ def test_new_then_check_says_what_is_missing(tmp_path):
     value = run("check", tmp_path / "mine")
     text = " ".join(value.out.split())
     assert value.code == 2
-    assert "there is no photograph under this pattern; found only README.txt in" in text
+    assert "there is no image under this pattern; found only README.txt in" in text
     for name, what in ((n, w) for n, w in TO_FILL.items() if n in session_texts()):
         assert f"{name} is still the example of pkmcal new: {what}" in text
 
@@ -282,7 +282,7 @@ def test_a_new_session_says_nothing_of_where_its_camera_stands(tmp_path, options
 
 
 @pytest.mark.parametrize("name", sorted(catalogue()))
-def test_a_new_session_of_any_machine_lacks_its_photographs_alone(name, tmp_path):
+def test_a_new_session_of_any_machine_lacks_its_images_alone(name, tmp_path):
     done = run("new", tmp_path / "mine", "--machine", name, "--json")
     assert done.code == 0
     drawn, folder = load_mechanism(name), tmp_path / "mine"
@@ -297,7 +297,7 @@ def test_a_new_session_of_any_machine_lacks_its_photographs_alone(name, tmp_path
     else:
         in_view = "legs" if drawn.document.legs[0].tubes else "board"
         assert f"observe: {in_view}\n" in text
-        with pytest.raises(InputError, match="there is no photograph under this pattern"):
+        with pytest.raises(InputError, match="there is no image under this pattern"):
             load_session(folder)
         session = load_session(folder, measured=False)
         assert (session.board is None) == (in_view == "legs")
@@ -378,12 +378,12 @@ def test_check_tells_errors_as_every_command_does(session, tmp_path):
     shape = {"error", "exit_code", "message", "what", "where", "found", "expected", "next_step"}
     nowhere = run("check", tmp_path / "none", "--json").json
     assert run("calibrate", tmp_path / "none", "--json").json.items() <= nowhere.items()
-    photograph = min((session / "images" / "station1").iterdir())
-    photograph.write_bytes(photograph.read_bytes()[:1000])
+    image = min((session / "images" / "station1").iterdir())
+    image.write_bytes(image.read_bytes()[:1000])
     actual_names = run("check", session, "--json").json
     assert shape <= set(actual_names)
     assert actual_names["exit_code"] == 2
-    assert actual_names["what"] == "the photograph cannot be decoded"
+    assert actual_names["what"] == "the image cannot be decoded"
     broken, *others = actual_names["findings"]
     assert broken.items() >= {key: actual_names[key] for key in shape - {"exit_code"}}.items()
     assert broken["station"] == "station1"
@@ -517,7 +517,7 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
 @pytest.mark.parametrize(
     ("option", "value", "said"),
     [
-        ("--size", "3x4", "no size of a photograph; found 3x4, expected width x height"),
+        ("--size", "3x4", "no size of an image; found 3x4, expected width x height"),
         ("--size", "large", "found large, expected width x height"),
         (
             "--joint-noise",

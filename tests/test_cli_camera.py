@@ -43,7 +43,7 @@ def test_a_camera_is_calibrated(boards, tmp_path):
     }
 
 
-def test_a_sessions_board_photographs(boards, tmp_path):
+def test_a_sessions_board_images(boards, tmp_path):
     """A session that observes a board is enough: it has the images and the board."""
     folder = tmp_path / "session"
     (folder / "images").mkdir(parents=True)
@@ -81,8 +81,8 @@ def test_a_sessions_board_photographs(boards, tmp_path):
 
 def test_faults_are_sentences(boards, tmp_path):
     cases = {
-        ("camera", tmp_path / "nowhere"): "there is no such photograph or folder",
-        ("camera", tmp_path): "the folder holds no photographs",
+        ("camera", tmp_path / "nowhere"): "there is no such image or folder",
+        ("camera", tmp_path): "the folder holds no images",
         ("camera", boards, "--board", tmp_path / "b.yaml"): "the file does not exist",
     }
     for words, sentence in cases.items():

@@ -33,9 +33,9 @@ class Heard:
 def test_a_long_step_is_told_in_plain_lines(monkeypatch, capsys):
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     with redirect_stderr(Heard()) as heard, console.progress() as progress:
-        progress("Finding the legs: 3 of 9 photographs", 0.35)
+        progress("Finding the legs: 3 of 9 images", 0.35)
         assert heard.written.wait(60)
-    line = r"Finding the legs: 3 of 9 photographs \(35%, \d+ s\)"
+    line = r"Finding the legs: 3 of 9 images \(35%, \d+ s\)"
     assert all(re.fullmatch(line, x) for x in heard.text.splitlines())
     assert capsys.readouterr().out == ""
 

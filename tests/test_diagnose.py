@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pkmcal.calibration.localization import boards_of, localize_stations, read_photographs
+from pkmcal.calibration.localization import boards_of, localize_stations, read_images
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import hypotheses
 from pkmcal.observe.distance_tables import distance_tables
@@ -23,7 +23,7 @@ from pkmcal.observe.station_localization import LocalizedPose, find_station
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import camera_of_size
-from test_observe_drawing import camera_of, draw, machine, photographs, poses, redrawn, tubes_at
+from test_observe_drawing import camera_of, draw, images, machine, poses, redrawn, tubes_at
 from test_observe_search import clouds, rough_pose
 
 NAMES = tuple("abcdefghi")
@@ -32,7 +32,7 @@ NAMES = tuple("abcdefghi")
 def pictures(count=6):
     more = range(6, count)
     return [
-        *photographs()[0],
+        *images()[0],
         *(draw(tubes_at(machine(), poses(count)[k]), seed=k)[0] for k in more),
     ]
 
@@ -113,7 +113,7 @@ def test_two_columns_exchanged(pair, by_hand, seed):
     error = said(pictures(count), readings_with(order, count), by_hand=given(by_hand), seed=seed)
     a, b = pair
     assert str(error) == (
-        f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the photographs"
+        f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the images"
         f" fit with these two columns exchanged. Exchange the columns of legs {a + 1} and {b + 1}"
         " in joints.csv, or the two legs in the nominal model."
     )
@@ -144,7 +144,7 @@ def test_columns_turned_round(turn, or_else):
     assert str(error) == (
         "joints.csv: the legs are numbered differently in the readings and in the nominal"
         " model; found"
-        f" the photographs fit when leg 1 takes the readings of column {turn + 1}, leg 2 those of"
+        f" the images fit when leg 1 takes the readings of column {turn + 1}, leg 2 those of"
         f" column {turn + 2}, and so on round{or_else}. Give the columns of joints.csv the order of"
         " the legs in the nominal model."
     )
@@ -167,21 +167,21 @@ def test_columns_in_reverse():
 @pytest.mark.parametrize(
     ("step", "words", "by_hand"), [also(-1, "before", True), also(1, "after", False)]
 )
-def test_photographs_shifted_by_one(step, words, by_hand):
+def test_images_shifted_by_one(step, words, by_hand):
     error = said(pictures(), configuration=np.roll(np.arange(6), step), by_hand=given(by_hand))
-    assert "the photographs are shifted against the readings" in str(error)
+    assert "the images are shifted against the readings" in str(error)
     assert f"the configuration {words} its own" in str(error)
 
 
 @pytest.mark.parametrize("by_hand", [True, also(False)])
-def test_two_photographs_exchanged(by_hand):
+def test_two_images_exchanged(by_hand):
     error = said(pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(by_hand))
-    assert "photographs of front bear each other's names" in str(error)
+    assert "images of front bear each other's names" in str(error)
     assert "images/front/b.png fits configuration b" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
 
 
-def test_photographs_of_one_configuration_are_not_taken_for_exchanged():
+def test_images_of_one_configuration_are_not_taken_for_exchanged():
     """Another search may end where images fit better: as here, under any names."""
     rng = np.random.default_rng(1)
     images, readings = b_again()
@@ -193,7 +193,7 @@ def test_photographs_of_one_configuration_are_not_taken_for_exchanged():
     assert mistake([station], rng) is None
 
 
-def test_two_photographs_exchanged_beside_two_of_one_configuration():
+def test_two_images_exchanged_beside_two_of_one_configuration():
     images, readings = b_again()
     order = [0, 1, 3, 2, 4, 5, 6]
     error = said(images, readings, configuration=order, by_hand=given(True))
@@ -204,7 +204,7 @@ def test_two_photographs_exchanged_beside_two_of_one_configuration():
 
 
 @pytest.mark.slow
-def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely():
+def test_two_images_exchanged_at_the_station_that_is_recognised_most_surely():
     """The right name has a slightly lower likelihood, as may happen with many images."""
     rng = np.random.default_rng(0)
     wrong = looked_for(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
@@ -214,7 +214,7 @@ def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely
         for station, name, by_chance in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
     ]
     error = mistake(stations, rng)
-    assert "photographs of front bear each other's names" in str(error)
+    assert "images of front bear each other's names" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
 
 
@@ -226,15 +226,15 @@ def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely
                           " so that they alone are said"),
     ])],
 )  # fmt: skip
-def test_mirrored_photographs(by_hand):
+def test_mirrored_images(by_hand):
     """A hexapod with its legs numbered backwards is its own mirror image: both should be
     reported.
     """
     mirrored = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures()]
-    assert "the photographs of front are mirrored" in str(said(mirrored, by_hand=given(by_hand)))
+    assert "the images of front are mirrored" in str(said(mirrored, by_hand=given(by_hand)))
 
 
-def test_tables_of_mirrored_photographs_are_mirrored_tables():
+def test_tables_of_mirrored_images_are_mirrored_tables():
     mirrored = distance_tables([np.ascontiguousarray(p[:, ::-1]) for p in pictures()])
     tables = distance_tables(pictures()).mirrored()
     np.testing.assert_allclose(tables.moving, mirrored.moving)
@@ -274,11 +274,11 @@ def test_diameters_for_radii():
 
 
 @pytest.mark.slow
-def test_photographs_of_nothing_are_refused():
+def test_images_of_nothing_are_refused():
     """From Python; by both commands in test_bad_input.py and test_check.py."""
     rng = np.random.default_rng(0)
     error = said([clouds(rng) for _ in range(6)], by_hand=given(True))
-    assert "not recognised in the photographs of front" in str(error)
+    assert "not recognised in the images of front" in str(error)
 
 
 @pytest.mark.slow
@@ -317,7 +317,7 @@ def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
     assert error is not None
     assert ("not recognised" in error.what) != named
     if not named:
-        assert "2 photographs alone" in error.found
+        assert "2 images alone" in error.found
         assert "of so few it cannot be said whether anything is mixed up" in error.next_step
 
 
@@ -333,6 +333,6 @@ def test_configurations_that_are_alike_do_not_change_names(tmp_path):
     del document["stations"]["station1"]["pose"]
     path.write_text(yaml.safe_dump(document))
     session = load_session(tmp_path / "s")
-    photographs = read_photographs(session)
-    boards = boards_of(session, photographs)
-    assert len(localize_stations(session, photographs, boards, np.random.default_rng(7))) == 1
+    images = read_images(session)
+    boards = boards_of(session, images)
+    assert len(localize_stations(session, images, boards, np.random.default_rng(7))) == 1

@@ -176,7 +176,7 @@ def test_after_a_crash(saved):
     assert 0.2 < ratio < 1.2  # less, for frames take a part of it
 
 
-def test_shared_photographs_are_counted(saved):
+def test_shared_images_are_counted(saved):
     value = difference(saved, saved)
     assert not value.changed
     assert value.shared == int(saved.used.sum())
@@ -186,7 +186,7 @@ def test_shared_photographs_are_counted(saved):
     assert any("100% of what" in text for text in value.assumed)
 
 
-def test_photographs_are_counted_however_they_are_grouped(saved):
+def test_images_are_counted_however_they_are_grouped(saved):
     """Three images under one name or under three have as much in common."""
     each = [{"photographs": {f"{k}.png"}} for k in range(6)]
     grouped = [{"photographs": {f"{k}.png" for k in row}} for row in ((0, 1, 2), (6, 7, 8))]

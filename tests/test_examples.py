@@ -26,14 +26,14 @@ def run_example(name: str, *words) -> subprocess.CompletedProcess:
     )
 
 
-def test_a_folder_of_photographs_becomes_a_table(demo):
+def test_a_folder_of_images_becomes_a_table(demo):
     done = run_example("servo_from_folder.py", demo.session, demo.calibration)
     assert done.returncode == 0, done.stderr
     title, *lines = done.stdout.splitlines()
     assert "station1" in title
-    photographs = sorted(p.stem for p in (demo.session / "images" / "station1").iterdir())
+    images = sorted(p.stem for p in (demo.session / "images" / "station1").iterdir())
     rows = [line.split() for line in lines if not line.startswith(" " * 8)]
-    assert [row[0] for row in rows] == photographs
+    assert [row[0] for row in rows] == images
     speeds = [[float(v) for v in row[1:7]] for row in rows]
     assert any(any(speed) for speed in speeds)
     # at the goal itself, hardly anything is left: of what is seen, not of what legs that are hidden

@@ -345,7 +345,7 @@ def test_what_is_not_known_is_said(to):
     assert "NOT KNOWN: masses and inertias" in flat
     assert "<inertial" not in text
     values = " ".join(note.text for note in exporters()[to].notes(source))
-    assert "photographs weigh nothing" in values
+    assert "images weigh nothing" in values
     assert {"urdf": "A URDF is a tree", "sdf": "may leave them open"}[to] in values
 
 

@@ -18,9 +18,9 @@ from test_edge_noise import shaded
 from test_identify_scene import make_scene
 
 
-def by_hand(rng, wrong, photographs=8, in_view=0.6, runs=1):
+def by_hand(rng, wrong, images=8, in_view=0.6, runs=1):
     """Scene of two images of each configuration, each from its own place."""
-    scene = shaded(rng, 0.1, runs, photographs // 2, photographs)
+    scene = shaded(rng, 0.1, runs, images // 2, images)
     station, configuration = scene.index[:2]
     keep = (configuration == station // 2) & (rng.random(len(station)) < in_view)
     normal, middle, shading = (v[:, keep] for v in (scene.normal, scene.middle, scene.shading))
@@ -110,7 +110,7 @@ def test_it_is_what_each_edge_could_do(make):
         np.testing.assert_allclose(value[run], expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_where_photographs_share_a_station_it_is_little():
+def test_where_images_share_a_station_it_is_little():
     """There all other edges contradict a wrong one, polished as they are; by hand, few."""
     added = []
     for make in (on_tripods, by_hand):

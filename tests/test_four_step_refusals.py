@@ -125,7 +125,7 @@ def test_legs_that_are_never_seen_together(hexapod):
     four_step(hexapod.nominal, with_bridge)
 
 
-def test_photographs_of_one_configuration_by_several_stations_are_at_once(hexapod):
+def test_images_of_one_configuration_by_several_stations_are_at_once(hexapod):
     """The printed form, which uses each image alone, refuses what the corrected form accepts."""
     rng = np.random.default_rng(3)
     scene = make_scene("gough-stewart", rng, 24)

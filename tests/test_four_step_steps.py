@@ -513,7 +513,7 @@ def test_noise_leaves_weak_directions_to_the_drawing():
         assert np.sqrt(np.mean(np.sum((got - v) ** 2, axis=-1))) < 0.005
 
 
-def test_several_photographs_of_one_configuration_count_as_one():
+def test_several_images_of_one_configuration_count_as_one():
     """Weighted mean direction: each station determines it across its line of sight only."""
     rng = np.random.default_rng(23)
     T = random_poses(rng, 1, 2, turn=1.0)

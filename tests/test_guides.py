@@ -60,7 +60,7 @@ def test_a_delta_printer_with_its_probe(workplace):
     assert form(blocks(text, "ini")[0]) == form(re.sub(r"^#.*\n", "", values, flags=re.MULTILINE))
 
 
-def photograph(board, camera, T_camera_board, rng):
+def image(board, camera, T_camera_board, rng):
     """The board's print before a pinhole camera (h, w), grey: nine rays a pixel, blur and noise."""
     printed, fine, rays = Print.of(board), board.document["square"] / 96, 3
     margin = 0.5 * board.document["square"]
@@ -81,7 +81,7 @@ def photograph(board, camera, T_camera_board, rng):
     return np.clip(in_view.round(), 0, 255).astype(np.uint8)
 
 
-def photographed(kit):
+def imaged(kit):
     """A user's part of the recipe: the camera's file, 25 images, and readings as Klipper prints
     them.
     """
@@ -103,7 +103,7 @@ def photographed(kit):
     heads = [f"leg{k} [mm]" for k in (1, 2, 3)]
     (kit / "joints.csv").write_text(csv_text(heads, names, readings))
     for name, T_camera in zip(names, T_camera_board, strict=True):
-        picture = photograph(board, camera, T_camera, rng)
+        picture = image(board, camera, T_camera, rng)
         assert cv2.imwrite(str(kit / "images" / "front" / f"{name}.png"), picture)
 
 
@@ -115,7 +115,7 @@ def test_a_delta_kit_with_a_board(workplace):
         assert form(done.out, workplace) == form(display), command
     kit = workplace / "kit"
     assert (kit / "board.pdf").read_bytes().startswith(b"%PDF")
-    photographed(kit)
+    imaged(kit)
     for command, display in (calibrate, export):
         done = typed(command)
         assert done.code == 0, done.out + done.err

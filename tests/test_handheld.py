@@ -22,7 +22,7 @@ from pkmcal.calibration.handheld import (
     inconsistent_poses,
     without_misplaced,
 )
-from pkmcal.calibration.localization import platform_poses, read_photographs
+from pkmcal.calibration.localization import platform_poses, read_images
 from pkmcal.calibration.pose_scoring import (
     ScoredPoses,
     evaluate_pose,
@@ -149,14 +149,14 @@ def test_broken_exif_counts_as_absent(tmp_path, cut):
 # the format
 
 
-def test_each_photograph_by_hand_is_a_station(folder):
+def test_each_image_by_hand_is_a_station(folder):
     session = load_session(folder)
     names = ["phone-0000-1", "phone-0000-2", "phone-0001-1"]
     assert [station.name for station in session.stations] == names
     for station in session.stations:
         assert station.entry == "phone"
         assert station.handheld
-        assert len(station.photographs) == 1
+        assert len(station.images) == 1
         assert station.T_camera_base is None
         assert station.camera_file == "cameras/phone.yaml"
     written = session.document["stations"]["phone"]["photographs"]
@@ -173,7 +173,7 @@ def test_a_pose_of_a_camera_by_hand(folder):
 def test_a_board_alone_by_hand(folder):
     replaced(folder / "session.yaml", "observe: legs", "observe: board")
     replaced(folder / "session.yaml", "stations:", "board: cameras/phone.yaml\nstations:")
-    assert "photographs by hand of a board alone tell nothing of the machine" in fault(
+    assert "images by hand of a board alone tell nothing of the machine" in fault(
         load_session, folder
     )
 
@@ -187,7 +187,7 @@ def test_two_stations_of_one_name(folder):
         ' images: "other/{configuration}.jpg", observe: legs}',
     )
     message = fault(load_session, folder)
-    assert "two stations, or photographs by hand, have the same name; found phone-0001-1" in message
+    assert "two stations, or images by hand, have the same name; found phone-0001-1" in message
 
 
 # cameras by EXIF, and rotated images
@@ -205,14 +205,14 @@ def test_a_camera_by_exif(folder):
     assert 0.02 < sigma[0] / station.camera.parameters[0] < 0.05
 
 
-def test_a_photograph_without_a_focal_length(folder):
+def test_a_image_without_a_focal_length(folder):
     replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0000-2.jpg", Exif(6, None))
     message = fault(load_session, folder)
-    assert "0000-2.jpg: the photograph does not tell the focal length" in message
+    assert "0000-2.jpg: the image does not tell the focal length" in message
 
 
-def test_photographs_by_different_lenses(folder):
+def test_images_by_different_lenses(folder):
     replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0001-1.jpg", Exif(6, 52.0))
     message = fault(load_session, folder)
@@ -230,7 +230,7 @@ def test_the_sensors_picture_is_the_size_of_most(tmp_path):
 
 
 @pytest.mark.parametrize(("orientation", "quarters"), [(None, 1), (6, -1), (8, 1)])
-def test_a_turned_photograph_is_turned_back(tmp_path, orientation, quarters):
+def test_a_turned_image_is_turned_back(tmp_path, orientation, quarters):
     """Orientation by EXIF; by default a portrait image of a landscape sensor was turned
     clockwise.
     """
@@ -241,7 +241,7 @@ def test_a_turned_photograph_is_turned_back(tmp_path, orientation, quarters):
     np.testing.assert_array_equal(decode(path, (8, 6), "a.jpg"), np.rot90(stored, quarters))
 
 
-def test_a_turned_photograph_is_told(folder):
+def test_a_turned_image_is_told(folder):
     jpeg(folder / "images/phone/0000-2.jpg", Exif(1, 26.0), np.rot90(PICTURE))
     (warning,) = load_session(folder).warnings
     assert warning.startswith("images/phone/0000-2.jpg: turned by a quarter against its camera")
@@ -271,16 +271,16 @@ def test_a_simulated_session_by_hand_loads(simulated):
     assert [station.name for station in session.stations] == list(truth.stations) == names
     assert session.warnings == ()
     assert np.ptp(truth.focal_scale) > 1e-3
-    np.testing.assert_array_equal(truth.photographs, [[0, 0], [1, 1], [2, 2]])
+    np.testing.assert_array_equal(truth.images, [[0, 0], [1, 1], [2, 2]])
 
 
-def test_simulated_photographs_say_how_they_were_held(simulated):
+def test_simulated_images_say_how_they_were_held(simulated):
     """After the rotation that EXIF requests the platform is above the base."""
     session = load_session(simulated)
     truth = load_truth(simulated, session.machine)
     query = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}  # direction of up in the stored image
     for station, T in zip(session.stations, truth.T_camera_base, strict=True):
-        exif = exif_of(station.photographs[0].path.read_bytes())
+        exif = exif_of(station.images[0].path.read_bytes())
         assert T[:2, 2] @ query[exif.orientation] > np.cos(np.pi / 4) * np.linalg.norm(T[:2, 2])
         # of the lens, whatever it was focused at: 30.505, of which 0.02 % less would be 30
         assert exif.focal_35mm == round(705 / 1000 * np.hypot(36, 24))
@@ -304,11 +304,11 @@ def at_truth(monkeypatch, folder, off=2e-3):
     """Let hand-held images be localized nearly where they were taken."""
     rng = np.random.default_rng(1)
 
-    def place(session, photographs, boards, _rng, _told):
+    def place(session, images, boards, _rng, _told):
         truth = load_truth(folder, session.machine).T_camera_base
         near = perturb(truth, off * rng.normal(size=(len(truth), 6)))
         scene = PriorScene.as_drawn(session.machine, near, session.joints)
-        return Case(session, photographs, boards, scene)
+        return Case(session, images, boards, scene)
 
     monkeypatch.setattr("pkmcal.calibration.calibrate.localize_case", place)
 
@@ -329,7 +329,7 @@ def breathed(simulated, tmp_path_factory):
         return calibrate_session(folder), load_truth(folder, load_mechanism("gough-stewart"))
 
 
-def test_a_rejected_photograph_is_counted_named_and_shown(breathed):
+def test_a_rejected_image_is_counted_named_and_shown(breathed):
     """On the terminal, in the report and in the documents; it was dropped from the count."""
     calibration, _ = breathed
     session = calibration.session
@@ -393,7 +393,7 @@ def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):
 
 
 @pytest.mark.slow
-def test_photographs_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
+def test_images_that_are_held_out_are_not_misplaced(tmp_path, monkeypatch):
     """The estimate without silhouettes rejects all of their edges, and does not determine their
     poses.
     """
@@ -419,8 +419,8 @@ def test_focal_lengths_are_found_within_their_deviations(breathed):
 
 def test_normals_turn_with_the_focal_length_as_stated(looked):
     """The same image measured with a camera whose focal lengths are larger by a thousandth."""
-    session, photographs, _, truth = looked
-    p, excess = photographs[EASIEST], 1e-3
+    session, images, _, truth = looked
+    p, excess = images[EASIEST], 1e-3
     T, pose = truth.T_camera_base[EASIEST], truth.T_base_platform[[EASIEST]]
     wider = replace(p.camera, parameters=p.camera.parameters + excess * p.camera.focal_part)
     first, other = (
@@ -468,7 +468,7 @@ def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
         assert np.abs(here).max() > 0.1
 
 
-def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
+def test_a_images_edges_are_no_lines_of_their_own(breathed):
     """If each edge is its station's only one, its shading is no unknown: the common part of a
     line's edges is noise like the rest.
     """
@@ -495,7 +495,7 @@ def looked(simulated):
     """The session, its images, the platform's poses and the truth."""
     session = load_session(simulated)
     truth = load_truth(simulated, session.machine)
-    return session, read_photographs(session), platform_poses(session), truth
+    return session, read_images(session), platform_poses(session), truth
 
 
 def view_of(session, p, poses):
@@ -509,8 +509,8 @@ def found_with(monkeypatch, truth, faults, textured=False):
     background.
     """
 
-    def measure(_session, photograph, _before, _found, _others, _asked):
-        T, fault = truth.T_camera_base[photograph.station], faults[photograph.station]
+    def measure(_session, image, _before, _found, _others, _asked):
+        T, fault = truth.T_camera_base[image.station], faults[image.station]
         lead = np.log(1 / fault - 1)
         places = PoseHypotheses(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
         return places, ScoredPoses.nothing()
@@ -526,20 +526,20 @@ def found_with(monkeypatch, truth, faults, textured=False):
 
 def placed(remeasured, monkeypatch, faults, textured=False):
     """Poses of images that are localized right, with uncertainty; none : localized elsewhere."""
-    session, photographs, _, truth = remeasured
+    session, images, _, truth = remeasured
     found_with(monkeypatch, truth, faults, textured)
-    return handheld.localize_case(session, photographs, Boards(), np.random.default_rng(0))
+    return handheld.localize_case(session, images, Boards(), np.random.default_rng(0))
 
 
 def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
     """All images show some of the same points about the machine."""
-    _, photographs, _, truth = looked
+    _, images, _, truth = looked
     rng = np.random.default_rng(2)
     world = rng.uniform(-1.2, 1.2, (6000, 3))
     names = rng.standard_normal((len(world), 128)).astype(np.float32)
 
     def texture(image, camera, _options):
-        k = next(k for k, p in enumerate(photographs) if p.images[0] is image)
+        k = next(k for k, p in enumerate(images) if p.images[0] is image)
         visible = apply(truth.T_camera_base[k], world)
         pixel = camera.project(np.where(visible[:, 2:] > 0.1, visible, np.nan))
         with np.errstate(invalid="ignore"):
@@ -551,7 +551,7 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
     assert [s.name for s in results.session.stations] == [s.name for s in looked[0].stations]
 
 
-def test_a_board_on_the_base_serves_photographs_by_hand(folder):
+def test_a_board_on_the_base_serves_images_by_hand(folder):
     """Each image has a pose of its own, so one entry is many stations."""
     board = SESSION.replace("observe: legs", "observe: [legs, board]")
     text = board + "board: {file: board.yaml, fixed_to: base}\n"
@@ -560,10 +560,10 @@ def test_a_board_on_the_base_serves_photographs_by_hand(folder):
     assert not any("board" in values for values in load_session(folder).warnings)
 
 
-def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
+def test_unsure_images_are_left_out_and_told(looked, monkeypatch):
     results = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4])
     assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
-    assert [p.station for p in results.photographs] == [0, 1]
+    assert [p.station for p in results.images] == [0, 1]
     off = pose_difference(results.scene.T_camera_base, looked[3].T_camera_base[[0, 2]])
     # as in the joint estimate: two images hardly determine a machine
     assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
@@ -586,13 +586,13 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
     assert handheld._sure({}, 5) == []
 
 
-def test_a_photograph_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
+def test_a_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
     """However well its silhouettes match something: it determines no machine."""
     rows = []
 
-    def bare(scene, photograph):
+    def bare(scene, image):
         rows.append(sorted(scene.edges))
-        return photograph.station == 1
+        return image.station == 1
 
     monkeypatch.setattr(handheld, "_too_few_edges", bare)
     results = placed(looked, monkeypatch, [1e-4, 1e-4, 1e-4])
@@ -603,9 +603,9 @@ def test_a_photograph_in_which_no_leg_can_be_measured_is_left_out(looked, monkey
     assert len(rows) < 12  # the scoring ends
 
 
-def test_legs_are_measured_where_a_photograph_is_and_not_elsewhere(looked):
-    session, photographs, poses, truth = looked
-    p = photographs[EASIEST]
+def test_legs_are_measured_where_a_image_is_and_not_elsewhere(looked):
+    session, images, poses, truth = looked
+    p = images[EASIEST]
     there = PriorScene(session.machine, truth.T_camera_base, poses)
     assert not handheld._too_few_edges(there, p)
     turn = pose(rotation(np.array([0.0, 0.0, np.radians(40.0)])), np.zeros(3))
@@ -613,7 +613,7 @@ def test_legs_are_measured_where_a_photograph_is_and_not_elsewhere(looked):
     assert handheld._too_few_edges(elsewhere, p)
 
 
-def test_check_tells_which_photographs_are_sure(simulated, looked, monkeypatch):
+def test_check_tells_which_images_are_sure(simulated, looked, monkeypatch):
     found_with(monkeypatch, looked[3], [1e-4, 0.3, 1e-4])
     check = check_session(simulated)
     assert [station.recognised for station in check.stations] == [True, False, True]
@@ -626,17 +626,17 @@ def test_check_tells_which_photographs_are_sure(simulated, looked, monkeypatch):
     assert check.forecast is None
 
 
-def test_no_photograph_by_hand_is_recognised(looked, monkeypatch):
-    with pytest.raises(InputError, match="recognised in none of the photographs by hand"):
+def test_no_image_by_hand_is_recognised(looked, monkeypatch):
+    with pytest.raises(InputError, match="recognised in none of the images by hand"):
         placed(looked, monkeypatch, [0.3, 0.3, 0.3])
 
 
-def test_photographs_of_one_configuration_are_recognised(looked, monkeypatch):
+def test_images_of_one_configuration_are_recognised(looked, monkeypatch):
     with pytest.raises(InputError, match="are recognised show one configuration only"):
         placed(looked, monkeypatch, [0.3, 1e-4, 0.3])
 
 
-def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
+def test_a_image_in_a_wrong_place_is_found_out(breathed):
     """An image whose edges the estimate rejects, or whose camera it moves away, is rejected."""
     calibration, _ = breathed
     session, measurements = calibration.session, calibration.measurements
@@ -665,9 +665,9 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     assert inconsistent_poses(session, measurements, estimate, perturb(T, turn)) == {
         2: CAMERA_TURNED_REASON
     }
-    photographs = read_photographs(session)
+    images = read_images(session)
     scene = PriorScene.as_drawn(session.machine, T, session.joints)
-    case = Case(session, photographs, Boards(), scene)
+    case = Case(session, images, Boards(), scene)
     rest = without_misplaced(case, wrong, edges, estimate)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
     # the others are where the estimate has them, by the edges that it was made from
@@ -693,11 +693,11 @@ def test_tubes_stand_out_of_a_chart():
     )
 
 
-def test_one_photograph_is_found_from_nothing(looked):
+def test_one_image_is_found_from_nothing(looked):
     """Ten seconds: all poses about the machine, for the easiest of the three images."""
-    session, photographs, poses, truth = looked
+    session, images, poses, truth = looked
     k = EASIEST
-    p = photographs[k]
+    p = images[k]
     view = view_of(session, p, poses)
     value = localize_image(view, p.images[0])
     off = pose_difference(value.T_camera_base[0], truth.T_camera_base[k])
@@ -708,8 +708,8 @@ def test_one_photograph_is_found_from_nothing(looked):
 
 def test_turns_of_a_machine_onto_itself(looked):
     """A hexapod has equal thirds: two other poses with the same appearance."""
-    session, photographs, poses, truth = looked
-    p = photographs[0]
+    session, images, poses, truth = looked
+    p = images[0]
     view = view_of(session, p, poses)
     same = symmetric_poses(view, truth.T_camera_base[:1])
     assert len(same) == 2
@@ -724,8 +724,8 @@ def test_turns_of_a_machine_onto_itself(looked):
 
 def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     """A search holds the place and those from which the machine is turned onto itself for equal."""
-    session, photographs, poses, truth = looked
-    p = photographs[1]
+    session, images, poses, truth = looked
+    p = images[1]
     view = view_of(session, p, poses)
     true = truth.T_camera_base[1]
     places = np.concatenate([symmetric_poses(view, true[None]), true[None]])
@@ -760,12 +760,12 @@ def evidence_there(reference_values, view):
     ).sum()
 
 
-def test_photographs_join_what_is_known(looked):
+def test_images_join_what_is_known(looked):
     """A board of the same machine costs the other images little; with another's readings it does
     not fit.
     """
-    session, photographs, poses, truth = looked
-    at = {p.station: p for p in photographs}
+    session, images, poses, truth = looked
+    at = {p.station: p for p in images}
     places = dict(enumerate(truth.T_camera_base[:2]))
     drawn = PriorScene(session.machine, np.full((3, 4, 4), np.nan), poses)
     names = register_images(session, at, drawn, places, Boards())
@@ -787,8 +787,8 @@ def test_photographs_join_what_is_known(looked):
 
 def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
     """Scoring is an estimate of one image, and no pose is scored twice."""
-    session, photographs, poses, truth = looked
-    at = {p.station: p for p in photographs}
+    session, images, poses, truth = looked
+    at = {p.station: p for p in images}
     estimated = []
 
     def counted(machine, measurements, start, **options):

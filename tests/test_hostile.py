@@ -113,7 +113,7 @@ def with_unfinished_results(home):
 
 def with_links(home):
     """Links under the names of outputs, and fake work of another process."""
-    tracked, later, photographed = sessions(home)
+    tracked, later, imaged = sessions(home)
     empty = home / "empty"
     for name in RESULTS:
         if name != "calibration":
@@ -122,7 +122,7 @@ def with_links(home):
     (later / "calibration").symlink_to(empty)
     (tracked / "calibration" / "mechanism.yaml").unlink()
     (tracked / "calibration" / "mechanism.yaml").symlink_to(home / "x")
-    (photographed / "calibration").symlink_to(home / "earlier")
+    (imaged / "calibration").symlink_to(home / "earlier")
     # the folder in which the earlier result would be kept
     when = datetime.fromtimestamp((tracked / "calibration" / "calibration.json").stat().st_mtime)
     (tracked / f"calibration-{when:%Y-%m-%dT%H%M}").symlink_to(empty)
@@ -132,12 +132,12 @@ def with_links(home):
     (tracked / "named" / "batches" / "lock").symlink_to(home / "new")
     (tracked / "board.pdf").symlink_to(home / ".bashrc")
     # files that are read, and one that is written to
-    for folder, name in ((tracked, "joints.csv"), (photographed, "session.yaml")):
+    for folder, name in ((tracked, "joints.csv"), (imaged, "session.yaml")):
         shutil.move(folder / name, home / name)
         (folder / name).symlink_to(home / name)
     # a station's name, which is part of files' names
     replaced(home / "session.yaml", "station1:", "../../../home/station1:")
-    station = photographed / "images" / "station2"
+    station = imaged / "images" / "station2"
     shutil.move(station, home / "images")
     station.symlink_to(home / "images")
     for place in (*sessions(home), tracked / "calibration"):
@@ -152,9 +152,9 @@ def commands(out):
     """Every command that reads a session or a calibration: where results go unless named, and in a
     folder that is named.
     """
-    here, later, photographed = Path(), Path("../later"), Path("../photographed")
+    here, later, imaged = Path(), Path("../later"), Path("../photographed")
     yield "check", here
-    yield "check", photographed, "-o", out / "check", "--pictures", out / "pictures"
+    yield "check", imaged, "-o", out / "check", "--pictures", out / "pictures"
     yield "calibrate", here
     yield "calibrate", here, "-o", out / "calibration"
     yield "calibrate", later

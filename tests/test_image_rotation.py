@@ -55,7 +55,7 @@ def turned_calibration(calibrated):
 
 
 @pytest.mark.slow
-def test_upside_down_photographs_are_known_by_their_cameras_centre(turned):
+def test_upside_down_images_are_known_by_their_cameras_centre(turned):
     """As accurate as upright images, and the right camera file is reported.
 
     The required certainty is tested below.
@@ -75,7 +75,7 @@ def test_upside_down_photographs_are_known_by_their_cameras_centre(turned):
         np.testing.assert_array_equal(station.camera.parameters, own.parameters)
 
 
-def test_upright_photographs_are_left_as_they_are(calibrated):
+def test_upright_images_are_left_as_they_are(calibrated):
     assert not calibrated.verdict.of("image")
     for station in calibrated.session.stations:
         own = load_camera(calibrated.session.folder / station.camera_file)
@@ -181,7 +181,7 @@ def test_the_file_that_is_told_is_the_one_that_is_written(turned_calibration, tm
         np.testing.assert_allclose(in_view.parameters, own.parameters)
 
 
-def test_new_photographs_are_taken_to_be_as_those_of_the_calibration_were(
+def test_new_images_are_taken_to_be_as_those_of_the_calibration_were(
     turned_calibration, calibrated, tmp_path
 ):
     """As long as the file is the same; one that was set right is not turned again."""

@@ -52,7 +52,7 @@ class Session:
             self.truth.T_base_platform,
             EdgeNoise(shift=0.1 * noise, tilt=0.1 * noise),
             rng,
-            photographs=self.truth.photographs,
+            images=self.truth.images,
             joint_noise=JOINT_NOISE * noise,
         )
         self.mounts = tuple(Mount(f"board {k}", body) for k, body in enumerate(boards))
@@ -66,7 +66,7 @@ class Session:
 
     def _poses(self, on_platform, noise, rng):
         truth = self.truth
-        rows = [(s, k, m) for s, k in truth.photographs for m in range(len(on_platform))]
+        rows = [(s, k, m) for s, k in truth.images for m in range(len(on_platform))]
         s, k, m = np.array(rows, dtype=int).reshape(-1, 3).T
         body = np.where(on_platform[m][:, None, None], truth.T_base_platform[k], np.eye(4))
         in_view = truth.T_camera_base[s] @ body @ self.T_mount[m]

@@ -110,7 +110,7 @@ def test_rows_and_columns_of_a_table(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["MOST_IMAGES", "MOST_HANDHELD_IMAGES"])
-def test_photographs(demo, tmp_path, monkeypatch, name):
+def test_images(demo, tmp_path, monkeypatch, name):
     monkeypatch.setattr(f"pkmcal.session.{'image_files' if 'D_' not in name else 'load'}.{name}", 2)
     folder = tmp_path / "session"
     folder.mkdir()

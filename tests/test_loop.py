@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from pkmcal.control.loop import GoalPhotograph, Status, VisualServo
+from pkmcal.control.loop import GoalImage, Status, VisualServo
 from pkmcal.control.machine_view import machine_view, true_edges
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, look_at, perturb, pose_difference
@@ -218,7 +218,7 @@ def test_readings_of_no_pose_stop_it():
         (np.full((4, 4), np.nan), "not a finite number"),
         (perturb(HOME, np.array([0, 0, 0, 0, 0, 0.2])), "out of the machine's reach: leg 1"),
         (perturb(HOME, np.array([0, 0, np.pi / 2, 0, 0, -0.05])), "nearly singular"),
-        (GoalPhotograph(np.zeros((480, 640), np.uint8), READINGS), "needs the camera"),
+        (GoalImage(np.zeros((480, 640), np.uint8), READINGS), "needs the camera"),
     ],
 )
 def test_goals_that_cannot_be_are_refused(goal, words):
@@ -268,7 +268,7 @@ def test_samples_that_cannot_be_are_refused():
 
 
 @pytest.mark.parametrize("view", ["perspective", pytest.param("mirror", marks=pytest.mark.slow)])
-def test_photographs_lead_to_the_goal_and_past_a_painted_leg(view):
+def test_images_lead_to_the_goal_and_past_a_painted_leg(view):
     """Rendered images close the loop: in seven samples from 22 mm and 6 degrees to the accuracy of
     one image.
 
@@ -279,7 +279,7 @@ def test_photographs_lead_to_the_goal_and_past_a_painted_leg(view):
     loop = VisualServo(MACHINE, camera, T, GOAL, gain=0.8)
     pose, readings = HOME, READINGS.copy()
     for k in range(7):
-        image = lab.photograph(pose, readings)
+        image = lab.image(pose, readings)
         if k == 3:
             image = lab.painted(image, pose, readings, [0])
         step = loop.step_image(image, readings)
@@ -295,10 +295,10 @@ def test_photographs_lead_to_the_goal_and_past_a_painted_leg(view):
     assert np.nanmax(np.abs(step.remaining) / step.sigma) < 5
 
 
-def test_a_photograph_is_a_goal_and_a_wrong_start_is_said():
+def test_a_image_is_a_goal_and_a_wrong_start_is_said():
     lab = Lab(MACHINE, PERSPECTIVE, BESIDE)
-    image = lab.photograph(HOME, READINGS)
-    loop = VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalPhotograph(image, READINGS))
+    image = lab.image(HOME, READINGS)
+    loop = VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalImage(image, READINGS))
     step = loop.step_image(image, READINGS)
     assert np.abs(step.remaining).max() < 1e-9  # the same image
     assert step.converged
@@ -311,11 +311,9 @@ def test_a_photograph_is_a_goal_and_a_wrong_start_is_said():
     step = loop.step_image(image, READINGS * [2, 1, 1, 0.2, 1, 1])
     assert step.status is Status.UNREACHABLE
     with pytest.raises(GeometryError, match="no leg was found in the goal"):
-        VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalPhotograph(np.zeros_like(image), READINGS))
+        VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalImage(np.zeros_like(image), READINGS))
     with pytest.raises(GeometryError, match="no pose of the machine"):
-        VisualServo(
-            MACHINE, PERSPECTIVE, BESIDE, GoalPhotograph(image, READINGS * [2, 1, 1, 0.2, 1, 1])
-        )
+        VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalImage(image, READINGS * [2, 1, 1, 0.2, 1, 1]))
 
 
 # ------------------------------------------------------------------ a calibration on disk
@@ -342,9 +340,9 @@ def test_a_refused_calibration_does_not_control(demo, tmp_path):
     text = (demo.calibration / "calibration.json").read_text()
     document = json.loads(text)
     document["verdict"]["usable"] = False
-    document["verdict"]["reasons"] = ["Too few photographs."]
+    document["verdict"]["reasons"] = ["Too few images."]
     (tmp_path / "calibration.json").write_text(json.dumps(document))
-    with pytest.raises(PkmcalError, match="refused: Too few photographs"):
+    with pytest.raises(PkmcalError, match="refused: Too few images"):
         VisualServo.from_calibration(tmp_path, "station1", HOME)
     (tmp_path / "calibration.json").write_text(text)
     with pytest.raises(InputError, match="camera file was not found"):

@@ -33,7 +33,7 @@ def described(tmp_path, marker):
     return board_of(tmp_path, FILES["charuco"].replace("marker: 0.022", f"marker: {marker}"))
 
 
-def test_markers_are_measured_in_photographs(images, tmp_path):
+def test_markers_are_measured_in_images(images, tmp_path):
     board = board_of(tmp_path, FILES["charuco"])
     words = dictionary(board.document["dictionary"])
     shares = [

@@ -63,7 +63,7 @@ def measured(seed, *, scale=None, turned=None, play=None, machine=None, count=30
         T = where.copy()
         if turned is not None and part[-1]:
             T[0] = perturb(T[0], turned)
-        edges, joints = simulate_edges(true, T, camera, poses, NOISE, rng, photographs=pairs[part])
+        edges, joints = simulate_edges(true, T, camera, poses, NOISE, rng, images=pairs[part])
         sets.append(edges)
     if scale:
         joints[:, scale[0]] /= 1 + scale[1]
@@ -470,7 +470,7 @@ def test_readings_that_never_change_are_frozen(demo):
 
 def test_a_right_session_names_nothing(calibrated):
     assert calibrated.violations == ()
-    assert len(calibrated.session.stations[0].photographs) < 2 * FEWEST_BESIDE_MOVEMENT
+    assert len(calibrated.session.stations[0].images) < 2 * FEWEST_BESIDE_MOVEMENT
 
 
 def test_edges_answer_to_their_cameras_parameters(calibrated):

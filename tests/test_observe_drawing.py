@@ -152,7 +152,7 @@ def poses(count=6):
 
 
 @cache
-def photographs(distorted=True):
+def images(distorted=True):
     """Images of the machine with nominal geometry, from FRONT, and the legs at their pixels."""
     made = [
         draw(tubes_at(machine(), T), distorted=distorted, seed=k) for k, T in enumerate(poses())

@@ -84,7 +84,7 @@ def test_twelve_bits_of_each_colour_in_sixteen(tmp_path):
     assert "fill 12 bits" in fault(decode, tmp_path / "a.png", (8, 6), "a.png")
 
 
-def test_a_dark_photograph_of_eight_bits_is_no_fault_of_its_file(tmp_path):
+def test_a_dark_image_of_eight_bits_is_no_fault_of_its_file(tmp_path):
     path = tmp_path / "a.png"
     assert cv2.imwrite(str(path), np.full((6, 8), 3, np.uint8))
     assert decode(path, (8, 6), path.name).max() == 3
@@ -107,8 +107,8 @@ def test_what_phones_append_does_no_harm(tmp_path, kind):
 
 
 CUT = (
-    "images/front/a.png: the photograph cannot be decoded; found {found}, expected a whole PNG or "
-    "JPEG file. Copy it again from the camera, or remove it: an absent photograph is allowed."
+    "images/front/a.png: the image cannot be decoded; found {found}, expected a whole PNG or "
+    "JPEG file. Copy it again from the camera, or remove it: an absent image is allowed."
 )
 PNG, JPEG = encoded(".png"), encoded(".jpg")
 
@@ -185,7 +185,7 @@ def test_nobody_is_blamed_for_what_another_thread_decodes(tmp_path, capfd):
     paths = [tmp_path / f"{k}.jpg" for k in range(12)]
     for k, path in enumerate(paths):
         path.write_bytes(JPEG if k != 7 else JPEG[: len(JPEG) * 2 // 3] + b"\xff\xd9")
-    with pytest.raises(InputError, match=r"^7\.jpg: the photograph cannot be decoded"):
+    with pytest.raises(InputError, match=r"^7\.jpg: the image cannot be decoded"):
         Pictures.read(paths, SIZE, [path.name for path in paths], most=12)
     assert capfd.readouterr() == ("", "")
 
@@ -208,15 +208,15 @@ def test_a_whole_jpeg_with_a_preview_is_read(tmp_path):
     np.testing.assert_array_equal(decoded(tmp_path, with_preview(JPEG)), decoded(tmp_path, JPEG))
 
 
-def test_a_photograph_of_another_size(tmp_path):
+def test_a_image_of_another_size(tmp_path):
     assert sentence(tmp_path, PNG, (640, 480)) == (
-        "images/front/a.png: the photograph has another size than its camera; found 64x48 pixels, "
-        "expected 640x480, the camera file's image_size. Use the photograph as the camera gave "
+        "images/front/a.png: the image has another size than its camera; found 64x48 pixels, "
+        "expected 640x480, the camera file's image_size. Use the image as the camera gave "
         "it, neither scaled nor cropped."
     )
 
 
-def test_a_photograph_that_is_not_there(tmp_path):
+def test_a_image_that_is_not_there(tmp_path):
     with pytest.raises(InputError) as caught:
         decode(tmp_path / "b.png", SIZE, "images/front/b.png")
     assert str(caught.value) == "images/front/b.png: cannot be read (No such file or directory)."
@@ -245,7 +245,7 @@ def test_so_many_stay_decoded_and_the_others_are_decoded_again(tmp_path):
     assert [images[k] is images[k] for k in range(4)] == [True, True, False, False]
 
 
-def test_of_some_photographs_no_other_is_decoded(tmp_path):
+def test_of_some_images_no_other_is_decoded(tmp_path):
     paths, labels = several(tmp_path)
     images = Pictures(paths, SIZE, labels)
     for path in paths[:3]:

@@ -9,7 +9,7 @@ import pytest
 
 from pkmcal.observe import legs as looks
 from pkmcal.observe.grey_levels import levels_at
-from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed
+from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages
 from pkmcal.observe.legs import (
     EDGE_OPTIONS,
     _segment_profiles,
@@ -26,9 +26,9 @@ from test_observe_drawing import (
     FRONT,
     camera_of,
     draw,
+    images,
     machine,
     outward_to,
-    photographs,
     poses,
     redrawn,
     true_normals,
@@ -36,11 +36,11 @@ from test_observe_drawing import (
 )
 
 
-def taken(pictures=None) -> Photographs:
-    pictures = pictures or photographs()[0]
+def taken(pictures=None) -> StationImages:
+    pictures = pictures or images()[0]
     readings = machine().inverse(poses())
     rows = np.arange(len(pictures))
-    return Photographs(0, camera_of(), rows, readings[rows], pictures)
+    return StationImages(0, camera_of(), rows, readings[rows], pictures)
 
 
 def errors(edges):
@@ -87,7 +87,7 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     does not affect the rest.
     """
     mechanism, camera = redrawn(0, 0.0005), camera_of()
-    visible = PhotographWindow.of([Placed(taken(), FRONT, poses())])
+    visible = ImageWindow.of([Placed(taken(), FRONT, poses())])
     tubes, points, clear = looks.predicted(
         visible, mechanism, EDGE_OPTIONS.segments * EDGE_OPTIONS.segment_points
     )
@@ -157,7 +157,7 @@ def test_the_points_lie_on_the_true_edges():
     assert np.abs(off).max() < 3 * PROFILE_OPTIONS.faint_sigma
 
 
-def test_a_photograph_that_shows_no_leg_leaves_the_others_as_they_are():
+def test_a_image_that_shows_no_leg_leaves_the_others_as_they_are():
     beside = poses().copy()
     beside[2] = np.nan  # readings outside the nominal model's range have no pose
     usual = measure(taken(), machine(), FRONT, poses(), 0.7).edges
@@ -183,7 +183,7 @@ def test_a_known_blur_is_used_and_told():
     assert rms(errors(count.edges)[0]) < 0.05
 
 
-def test_overexposed_photographs_give_no_edges_rather_than_wrong_ones():
+def test_overexposed_images_give_no_edges_rather_than_wrong_ones():
     """The wall at 290 of 255 levels, the tubes before it at 190 and less: no edge is left."""
     bright = [draw(tubes_at(machine(), T), background=290.0)[0] for T in poses()[:2]]
     count = measure(taken(bright), machine(), FRONT, poses()[:2])
@@ -191,7 +191,7 @@ def test_overexposed_photographs_give_no_edges_rather_than_wrong_ones():
     assert len(count.rejected) == 2 * len(tubes_of(machine()))
 
 
-def test_photographs_of_nothing_give_no_edges():
+def test_images_of_nothing_give_no_edges():
     empty = [np.full((480, 640), 120, np.uint8)] * 2
     assert len(measure(taken(empty), machine(), FRONT, poses()[:2]).edges) == 0
 

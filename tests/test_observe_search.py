@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pkmcal.calibration.localization import platform_poses, read_photographs, recognise
+from pkmcal.calibration.localization import platform_poses, read_images, recognise
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import pose_likelihood, station_localization
@@ -17,7 +17,7 @@ from pkmcal.observe.distance_tables import (
     direction_of,
     distance_tables,
 )
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.legs import LEG_SEARCH_OPTIONS, search, search_legs
 from pkmcal.observe.pose_likelihood import StationView, score
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
@@ -30,9 +30,9 @@ from test_observe_drawing import (
     FRONT,
     camera_of,
     draw,
+    images,
     machine,
     outward_to,
-    photographs,
     poses,
     redrawn,
     true_normals,
@@ -43,7 +43,7 @@ CLEARANCE = 5.0
 
 
 def images():
-    return photographs()[0]
+    return images()[0]
 
 
 # Legs
@@ -106,7 +106,7 @@ def test_a_leg_beyond_the_search_is_not_found():
 def test_what_a_search_gives_and_why_it_leaves_legs_out():
     """Edges with sigmas of about a pixel; every leg that is left out has a reason."""
     pictures, readings = images(), machine().inverse(poses())
-    taken = Photographs(3, camera_of(), np.arange(6), readings, pictures)
+    taken = StationImages(3, camera_of(), np.arange(6), readings, pictures)
     wrong = redrawn(1, 0.001)
     value = search(taken, wrong, FRONT, poses())
     edges = value.edges
@@ -143,7 +143,7 @@ def view_of(pictures, mechanism=None, in_view=None):
     return StationView(mechanism, camera_of(), names, readings, in_view, tables)
 
 
-def test_photographs_are_asked_under_each_name_as_if_they_bore_it():
+def test_images_are_asked_under_each_name_as_if_they_bore_it():
     view, names = view_of(images()), np.array([4, 0, 3])
     fits = pose_likelihood.log_likelihood_by_name(view, FRONT, names)
     every = np.arange(len(images()))
@@ -154,9 +154,7 @@ def test_photographs_are_asked_under_each_name_as_if_they_bore_it():
         count = pose_likelihood.distances_under(named, FRONT[None], every, 8).log_likelihood(
             mixture
         )
-        np.testing.assert_allclose(
-            fit, pose_likelihood.by_photograph(count, len(every))[0], rtol=1e-5
-        )
+        np.testing.assert_allclose(fit, pose_likelihood.by_image(count, len(every))[0], rtol=1e-5)
         assert fit.argmax() == name
 
 
@@ -204,7 +202,7 @@ def test_the_station_is_found_from_ten_degrees_and_ten_centimetres_or_from_nothi
 
 
 @pytest.mark.parametrize("turn", [often(90), often(180), 270])
-def test_turned_photographs_are_found_from_nothing(turn):
+def test_turned_images_are_found_from_nothing(turn):
     """A camera rotated about its line of sight: the same pixels in another order."""
     turned = pose(rotation(np.array([0.0, 0.0, np.radians(turn)])), np.zeros(3))
     cosine, sine = np.round([np.cos(np.radians(turn)), np.sin(np.radians(turn))])
@@ -228,7 +226,7 @@ def test_turned_photographs_are_found_from_nothing(turn):
     assert inconsistent_poses(inverse(turned) @ localization.T_camera_base) < 5
 
 
-def test_one_photograph_says_where_but_not_that_it_is_the_machine():
+def test_one_image_says_where_but_not_that_it_is_the_machine():
     """From one image the pose is right; no other image confirms it."""
     for seed in range(2):
         localization = find_station(view_of(images()[:1]), None, np.random.default_rng(seed))
@@ -332,14 +330,14 @@ def sticks(rng):
      *(often(scene, 2) for scene in (blank, noisy, texture, clouds)),
      *(often(scene, 6) for scene in (blank, noisy, texture, clouds, sticks))],
 )  # fmt: skip
-def test_photographs_of_something_else_are_not_recognised(scene, count):
+def test_images_of_something_else_are_not_recognised(scene, count):
     rng = np.random.default_rng(1)
     view = view_of([scene(rng) for _ in range(count)])
     for start in (rough_pose(0), rough_pose(1), None):
         assert not find_station(view, start, np.random.default_rng(0)).good
 
 
-def test_photographs_of_other_configurations_are_not_recognised():
+def test_images_of_other_configurations_are_not_recognised():
     """Each image under its neighbour's name."""
     view = view_of([*images()[1:], images()[0]])
     for seed in range(2):
@@ -421,7 +419,7 @@ def test_outside_the_picture_and_without_an_image_nothing_is_inside():
     assert not tables.look_along(zero, pixel, np.zeros((4, 2)), zero)[-1].any()
 
 
-def test_edges_that_never_move_are_left_out_where_photographs_can_be_compared():
+def test_edges_that_never_move_are_left_out_where_images_can_be_compared():
     """A shelf in all of five images is background; in two images it cannot be separated."""
     shelf = np.full((480, 640), 180, np.uint8)
     shelf[100:140] = 60
@@ -462,7 +460,7 @@ def test_a_shadow_darkens_and_is_left_out_beside_what_casts_it():
 
 
 @pytest.mark.slow
-def test_a_place_that_half_of_the_photographs_miss_is_asked_about_again(tmp_path, monkeypatch):
+def test_a_place_that_half_of_the_images_miss_is_asked_about_again(tmp_path, monkeypatch):
     """Of three equal legs a search in five images ends beside the pose that all ten lead to: it is
     accepted once the other images are tested at that pose, and not before.
     """
@@ -470,7 +468,7 @@ def test_a_place_that_half_of_the_photographs_miss_is_asked_about_again(tmp_path
     folder = tmp_path / "session"
     simulate_session(folder, load_mechanism("3-rps"), camera_of_size((640, 480)), settings, seed=5)
     session = load_session(folder)
-    visible = read_photographs(session)
+    visible = read_images(session)
     (view,) = recognise(session, visible, platform_poses(session), [np.random.default_rng(0)]).views
     localization = find_station(view, None, np.random.default_rng(1))
     true = load_truth(folder, session.machine).T_camera_base[0]

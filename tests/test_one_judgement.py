@@ -115,20 +115,20 @@ def test_a_spoilt_session(session, spoil):
 
 
 @pytest.mark.slow
-def test_photographs_by_hand_without_a_machine(tmp_path):
+def test_images_by_hand_without_a_machine(tmp_path):
     """Both are refused, with one finding; `check` once accepted it."""
     folder = lines_alone(tmp_path / "session")
     done, other = run("check", folder, "--json"), run("calibrate", folder, "--json")
     assert done.code == other.code == 2
     assert done.json["message"] == other.json["message"]
-    assert done.json["what"] == "the machine is recognised in none of the photographs by hand"
+    assert done.json["what"] == "the machine is recognised in none of the images by hand"
     (wrong,) = [f for f in done.json["findings"] if f["level"] == Level.WRONG]
     assert wrong["text"] == other.json["message"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_photographs_by_hand(tmp_path, seed):
+def test_images_by_hand(tmp_path, seed):
     """Rejected images are the same in both, with the same reason."""
     folder = tmp_path / "session"
     settings = Settings(configurations=3, repeats=2, handheld=True)

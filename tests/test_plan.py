@@ -338,9 +338,9 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     assert len(table.names) == 12
     assert list(table.columns) == loaded.document["joints"]["columns"]
     assert not set(table.names) & set(loaded.configurations)
-    assert "How good edges are is told by 12 of the photographs" in (
-        result.out + result.err
-    ).replace("\n  ", " ")
+    assert "How good edges are is told by 12 of the images" in (result.out + result.err).replace(
+        "\n  ", " "
+    )
     np.testing.assert_allclose(
         table.values, [c["joints"] for c in values["configurations"]], atol=1e-6
     )
@@ -358,7 +358,7 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     assert retained["promised"]["position"] < later["promised"]["position"]
 
 
-def test_a_session_before_any_photograph(demo, quick_plans, tmp_path):
+def test_a_session_before_any_image(demo, quick_plans, tmp_path):
     session = tmp_path / "session"
     shutil.copytree(demo.session, session, ignore=shutil.ignore_patterns("images", "truth.json"))
     (session / "joints.csv").unlink()
@@ -366,7 +366,7 @@ def test_a_session_before_any_photograph(demo, quick_plans, tmp_path):
     assert result.code == 0, result.out + result.err
     values = result.json
     assert sum(place["chosen"] for place in values["places_tried"]) == 2
-    assert "no photograph tells it yet" in values["assumptions"][0]
+    assert "no image tells it yet" in values["assumptions"][0]
     assert (session / "plan" / "stations.yaml").is_file()
     # and calibrate still needs images
     assert run("calibrate", str(session)).code == 2
@@ -432,7 +432,7 @@ def test_a_hand_held_session_is_not_planned(demo):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_promise_is_kept_by_photographs(seed, tmp_path):
+def test_the_promise_is_kept_by_images(seed, tmp_path):
     """A few images, the plan made from them, its images, and the accuracy from calibrate."""
     few, whole = tmp_path / "few", tmp_path / "whole"
     size = ["--size", "640x480", "--seed", str(seed)]

@@ -103,7 +103,7 @@ def test_of_two_that_differ_both_stay():
 # boards in images
 
 
-def photographs(board, rows, noise, seed=0):  # noqa: F811
+def images(board, rows, noise, seed=0):  # noqa: F811
     """Detections of one board pose for each row, and the true poses of the rows in order."""
     rng = np.random.default_rng(seed)
     truth = poses_around(int(rows.max()) + 1)
@@ -117,9 +117,9 @@ def photographs(board, rows, noise, seed=0):  # noqa: F811
     return results, truth
 
 
-def test_photographs_of_one_configuration_become_one_measurement(board):  # noqa: F811
+def test_images_of_one_configuration_become_one_measurement(board):  # noqa: F811
     rows = np.repeat(np.arange(60), 4)
-    value, truth = photographs(board, rows, 0.1)
+    value, truth = images(board, rows, 0.1)
     poses, odd = one_a_configuration(seen(board, value, rows), mount=3)
     assert poses.configuration.tolist() == list(range(60))
     assert set(poses.mount.tolist()) == {3}
@@ -132,9 +132,9 @@ def test_photographs_of_one_configuration_become_one_measurement(board):  # noqa
     np.testing.assert_allclose(gain, 2.0, rtol=0.15)  # the root of four images
 
 
-def test_an_odd_photograph_is_named(board):  # noqa: F811
+def test_an_odd_image_is_named(board):  # noqa: F811
     rows = np.repeat(np.arange(6), 4)
-    values, truth = photographs(board, rows, 0.1)
+    values, truth = images(board, rows, 0.1)
     shifted = perturb(truth[2], np.array([0, 0, 0, 2e-3, 0, 0]))
     pixels = CAMERA.project(apply(shifted, board.points))
     values[9] = Detection(values[9].name, CAMERA.image_size, values[9].ids, pixels, values[9].sigma)

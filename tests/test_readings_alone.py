@@ -254,7 +254,7 @@ def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path
 
 def test_what_needs_a_camera_says_so(belts):
     folder, _ = belts
-    with pytest.raises(ResultError, match="four steps need photographs"):
+    with pytest.raises(ResultError, match="four steps need images"):
         calibrate_session(folder, method="four-step")
     with pytest.raises(InputError, match="no station has a camera"):
         calibrate_session(folder, refine_camera=True)

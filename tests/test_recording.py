@@ -42,12 +42,12 @@ def decoded(entry):
     return cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)
 
 
-def test_every_photograph_is_there_in_its_place(calibrated, entries):
+def test_every_image_is_there_in_its_place(calibrated, entries):
     session = calibrated.session
     for station in session.stations:
         display = {e.at: e for e in entries if e.path == image(station.name, "photograph")}
         assert sorted(display) == list(range(1, len(session.configurations) + 1))
-        taken = {p.configuration + 1: p for p in station.photographs}
+        taken = {p.configuration + 1: p for p in station.images}
         assert {e.kind for e in display.values()} == {"photograph"}
         assert {at for at, e in display.items() if decoded(e).any()} == set(taken)
         at, photo = next(iter(taken.items()))
@@ -56,13 +56,13 @@ def test_every_photograph_is_there_in_its_place(calibrated, entries):
         assert np.abs(grey.astype(float) - truth).mean() < 2  # grey levels, of JPEG
 
 
-def test_a_station_without_a_photograph_shows_nothing_of_the_last_one(calibrated, entries):
+def test_a_station_without_a_image_shows_nothing_of_the_last_one(calibrated, entries):
     session = calibrated.session
     absent = [
         (station.name, k + 1)
         for station in session.stations
         for k in range(len(session.configurations))
-        if k not in {p.configuration for p in station.photographs}
+        if k not in {p.configuration for p in station.images}
     ]
     assert absent
     for name, at in absent:
@@ -88,7 +88,7 @@ def apart(strip, line):
     return np.linalg.norm(points - nearest, axis=-1).min(axis=1).max()
 
 
-def test_tubes_in_space_lie_on_their_edges_in_the_photographs(calibrated, entries):
+def test_tubes_in_space_lie_on_their_edges_in_the_images(calibrated, entries):
     """From logged data only: the camera's pose and lens, the tubes, the edges."""
     off: list[float] = []
     for e in entries:

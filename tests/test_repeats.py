@@ -349,7 +349,7 @@ def test_two_edges_of_a_leg_say_nothing_of_its_motion(machine, poses):
 def test_repeats_without_an_edge_in_common_are_no_accuracy():
     (finding,) = _findings(())
     assert finding.level is Level.DOUBTFUL
-    assert finding.text.startswith("No edge shows in two photographs")
+    assert finding.text.startswith("No edge shows in two images")
 
 
 # whole sessions
@@ -366,7 +366,7 @@ def repeats(tmp_path_factory):
     return simulated(tmp_path_factory.mktemp("repeats") / "session", 4)
 
 
-def test_the_first_repeat_is_the_photograph_of_a_session_without(tmp_path):
+def test_the_first_repeat_is_the_image_of_a_session_without(tmp_path):
     single, repeats = (simulated(tmp_path / str(n), n, size=(120, 90)) for n in (1, 2))
     for path in sorted((single / "images" / "station1").iterdir()):
         first = repeats / "images" / "station1" / f"{path.stem}_1.png"
@@ -376,7 +376,7 @@ def test_the_first_repeat_is_the_photograph_of_a_session_without(tmp_path):
     assert "repeat" not in (single / "session.yaml").read_text()
     assert "repeats" not in (single / "truth.json").read_text()
     assert load_truth(repeats, load_session(repeats).machine).repeats == 2
-    assert len(load_session(repeats).stations[0].photographs) == 8
+    assert len(load_session(repeats).stations[0].images) == 8
 
 
 def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
@@ -484,7 +484,7 @@ def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypa
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     values = run("check", demo.session, "--repeat")
     assert values.code == 2
-    assert "the session has no repeated photographs" in values.err
+    assert "the session has no repeated images" in values.err
     assert "images/station1/{configuration}_{repeat}.png" in values.err
     assert "images/station1/0001_1.png" in values.err
 

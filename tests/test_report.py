@@ -299,7 +299,7 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
 def test_as_many_pictures_are_shown_as_there_is_room_for(case, monkeypatch):
     monkeypatch.setattr(pictures, "MOST_PAGE_IMAGES", 7)
     html = str(pictures.section(case.session, album_of(case)).html)
-    assert "Here are 7 of 15 photographs" in html
+    assert "Here are 7 of 15 images" in html
     assert html.count('<figure class="picture"') == html.count("data-large=") == 7
     whole = sum(len(shot.jpeg) + len(shot.large) for shot in album_of(case).pictures)
     small = sum(len(shot.jpeg) for shot in album_of(case).pictures)
@@ -318,7 +318,7 @@ def test_rejections_are_grouped_by_reason(case):
     first, second = provenance.reasons(case.session, case.observation.rejected)
     assert (first.count, first.text) == (2, "seen over … mm only")
     assert first.cases[0] == ("front0 / c0", "leg 3 tube 2 right: seen over 3.5 mm only")
-    assert second.cases == (("front1 / c3", "whole photograph"),)
+    assert second.cases == (("front1 / c3", "whole image"),)
 
 
 def test_a_group_that_stands_out_is_named(case):

@@ -20,7 +20,7 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
-from pkmcal.session.image_files import Photograph
+from pkmcal.session.image_files import Image
 from pkmcal.session.load import Session, Station
 
 OUTWARD = 0.25
@@ -125,16 +125,14 @@ def rejected() -> tuple[Rejection, ...]:
 def make_session(folder, nominal, joints, T, station, prefix) -> Session:
     stations = []
     for s, pose in enumerate(T):
-        photographs = []
+        images = []
         for k in range(len(joints)):
             path = folder / f"s{s}k{k}.png"
             cv2.imwrite(str(path), np.full((240, 320), 40 + 10 * k, np.uint8))
-            photographs.append(Photograph(k, None, path))
+            images.append(Image(k, None, path))
         rough = perturb(pose, np.array([0, 0, 0.01, 0.01, 0, 0]))
         name = f"{station}{s}"
-        stations.append(
-            Station(name, camera(), "cameras/a.yaml", rough, tuple(photographs), "legs")
-        )
+        stations.append(Station(name, camera(), "cameras/a.yaml", rough, tuple(images), "legs"))
     return Session(
         folder=folder,
         machine=nominal,

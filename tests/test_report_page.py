@@ -93,7 +93,7 @@ def test_page_tells_when_and_from_what_it_was_made(case):
     assert "<h3>Notes</h3>" not in report_html(case.session, case.observation, case.estimate, fine)
 
 
-def test_charts_lead_to_photographs_that_are_there(page, case):
+def test_charts_lead_to_images_that_are_there(page, case):
     results = Found(page)
     links = [str(a["href"]) for tag, a in results.tags if tag == "a" and "download" not in a]
     names = {f"#{a['id']}" for _, a in results.tags if "id" in a}
@@ -101,7 +101,7 @@ def test_charts_lead_to_photographs_that_are_there(page, case):
     # a bar a configuration, a box a leg, station, joint and kind of edge, and cells
     assert len(leading) > 5 + 6 + 3 + 6 + 20
     assert set(leading) <= names
-    bar = re.search(r'<a href="#photograph-\d-(\d)" aria-label="configuration c(\d):', page)
+    bar = re.search(r'<a href="#image-\d-(\d)" aria-label="configuration c(\d):', page)
     assert bar is not None
     assert int(bar[1]) == int(bar[2]) + 1
 
@@ -135,7 +135,7 @@ def test_hostile_names_stay_text(tmp_path):
 def test_a_scale_of_long_numbers_has_room():
     """Digits are less than 7 px wide; those of 0.005 px began outside."""
     bars = [UprightBar("one", "one", 0.0074)]
-    chart = bar_chart("Errors", "photographs; px", bars, (), "bars")
+    chart = bar_chart("Errors", "images; px", bars, (), "bars")
     assert chart is not None
     assert all(7 * len(text) <= chart.left for _, text in chart.ticks)
     assert chart.x(0) == chart.left
@@ -173,7 +173,7 @@ def test_a_page_without_a_single_edge(case):
     assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
 
 
-def test_a_photograph_that_is_gone_is_said(tmp_path):
+def test_a_image_that_is_gone_is_said(tmp_path):
     case = make_case(tmp_path, n_poses=4, n_stations=2)
     next(tmp_path.glob("*.png")).unlink()
     page = report_html(case.session, case.observation, case.estimate, Verdict(True, "Fine."))
@@ -224,7 +224,7 @@ LED = """
     clearInterval(wait);
     document.querySelector("#residuals a").dispatchEvent(new MouseEvent("click"));
     tell.bar = location.hash;
-    plot.emit("plotly_click", { points: [{ customdata: "#photograph-1-2" }] });
+    plot.emit("plotly_click", { points: [{ customdata: "#image-1-2" }] });
     tell.point = location.hash;
     tell.screen = width();
     dispatchEvent(new Event("beforeprint"));

@@ -92,7 +92,7 @@ def test_a_mirrors_field_has_no_plane():
     np.testing.assert_allclose(np.linalg.norm(border, axis=1), 0.5)
 
 
-def test_points_lead_to_photographs_that_are_on_the_page(case):
+def test_points_lead_to_images_that_are_on_the_page(case):
     album, plot = figure(case)
     poses = next(t for t in plot.figure["data"] if t["name"] == "measured poses")
     assert len(poses["customdata"]) == len(case.session.configurations)

@@ -290,9 +290,9 @@ def test_table_1_with_and_without_a_measurement():
 
 
 @pytest.mark.slow
-def test_table_1_on_photographs():
+def test_table_1_on_images():
     """Edges to a few hundredths of a pixel; depth from the width of a leg, so far worse."""
-    value = reproduce_paper("a", Options(runs=3, photographs=True)).document["table_1_measured"]
+    value = reproduce_paper("a", Options(runs=3, images=True)).document["table_1_measured"]
     assert 0.01 < value["edge_px"] < 0.08
     middle, worst = value["median"], value["worst"]
     assert all(middle[name] <= worst[name] for name in middle)

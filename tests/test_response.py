@@ -22,7 +22,7 @@ from pkmcal.calibration.camera_responses import (
     _scored,
     responses_by_edges,
 )
-from pkmcal.calibration.localization import read_photographs
+from pkmcal.calibration.localization import read_images
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras.response import levels_of_light, light_in, light_of_levels
 from pkmcal.errors import InputError, ResultError
@@ -32,7 +32,7 @@ from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.observe.legs import measure
 from pkmcal.session.load import load_session
 from test_calibration import check_found
-from test_observe_drawing import FRONT, photographs, poses, redrawn
+from test_observe_drawing import FRONT, images, poses, redrawn
 from test_observe_measure import errors, rms, taken
 
 SRGB = np.rint(levels_of_light(np.arange(256.0), "srgb")).astype(np.uint8)
@@ -86,7 +86,7 @@ def test_more_light_has_the_higher_level(pair):
     assert (light[0, 0] < light[0, 1]) == (low < high)
 
 
-def test_linear_photographs_are_their_own_light():
+def test_linear_images_are_their_own_light():
     image = np.arange(12, dtype=np.uint8).reshape(3, 4)
     assert light_in(image, "linear") is image
 
@@ -96,7 +96,7 @@ def test_linear_photographs_are_their_own_light():
 
 def test_a_blurred_edge_is_where_it_is_by_the_right_code_alone():
     """Painted legs before a darker room: by the wrong code they are wider by tenths of a pixel."""
-    pictures = [cv2.LUT(image, SRGB) for image in photographs()[0]]
+    pictures = [cv2.LUT(image, SRGB) for image in images()[0]]
     there = redrawn(0, 0.0005), FRONT, poses()
     shift = {}
     for response in ("srgb", "linear"):
@@ -112,7 +112,7 @@ def test_light_that_is_cut_off_is_so_by_any_code():
     represent.
     """
     table = np.minimum(1.6 * (255 - np.arange(256)), 255).astype(np.uint8)
-    clipped = [cv2.LUT(image, table) for image in photographs()[0]]
+    clipped = [cv2.LUT(image, table) for image in images()[0]]
     there = redrawn(0, 0.0005), FRONT, poses()
     usual = measure(taken(clipped), *there).edges
     coded = taken([cv2.LUT(image, SRGB) for image in clipped])
@@ -218,7 +218,7 @@ def asked_of(calibrated, measurements, estimate, other):
 
     responses_by_edges(
         calibrated.session,
-        read_photographs(calibrated.session),
+        read_images(calibrated.session),
         measurements,
         painted(estimate),
         roughly,
@@ -249,7 +249,7 @@ def test_edges_that_are_not_asked_do_not_hold_back_those_that_are(calibrated, se
     assert gain > 5 * held_back
 
 
-def test_right_photographs_are_seldom_all_asked(calibrated):
+def test_right_images_are_seldom_all_asked(calibrated):
     """Edges of some configurations show no gain: one session of ten has as much by chance, so of
     twenty no more than six.
     """
@@ -263,14 +263,14 @@ def test_right_photographs_are_seldom_all_asked(calibrated):
     assert times <= 6
 
 
-def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_photographs(calibrated):
+def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_images(calibrated):
     """In the dark the wrong response leaves three of a hundred, which do not decide, and the
     message says so.
     """
     few = calibrated.measurements.edges.select(np.arange(3))
     values = responses_by_edges(
         calibrated.session,
-        read_photographs(calibrated.session),
+        read_images(calibrated.session),
         calibrated.measurements,
         calibrated.estimate,
         lambda _: few,
@@ -285,10 +285,10 @@ def test_stations_whose_response_is_stated_are_not_asked_about(calibrated):
     stations = tuple(replace(station, response_given=True) for station in session.stations)
 
     def query(_):
-        pytest.fail("its photographs were measured otherwise")
+        pytest.fail("its images were measured otherwise")
 
     values = responses_by_edges(
-        replace(session, stations=stations), read_photographs(session), calibrated.measurements,
+        replace(session, stations=stations), read_images(session), calibrated.measurements,
         calibrated.estimate, query, query, query,
     )  # fmt: skip
     assert values == ()
@@ -315,7 +315,7 @@ def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
         )
     else:
         assert values.finding.code == "image.response_unknown"
-        assert "levels of the photographs of front and left are linear" in values.finding.text
+        assert "levels of the images of front and left are linear" in values.finding.text
         assert (
             "Write response: linear or response: srgb in session.yaml, under the"
             in values.finding.text
@@ -340,7 +340,7 @@ def test_each_camera_is_asked_by_itself(session):
     assert [one.facts["other"] for one in calibration.verdict.of("image.response")] == ["srgb"]
 
 
-def test_new_photographs_are_measured_as_the_calibration_found_them_to_be(coded, tmp_path):
+def test_new_images_are_measured_as_the_calibration_found_them_to_be(coded, tmp_path):
     coded.calibration.save(tmp_path / "calibration")
     saved = load(tmp_path / "calibration")
     assert {row["response"] for row in saved.document["stations"]} == {"srgb"}

@@ -119,8 +119,8 @@ def test_a_session(folder):
         "cameras/front.yaml",
     )
     assert front.camera.image_size == (8, 6)
-    assert [photo.configuration for photo in front.photographs] == [0, 1, 2]
-    assert front.photographs[2].path == folder / "images/front/0002.png"
+    assert [photo.configuration for photo in front.images] == [0, 1, 2]
+    assert front.images[2].path == folder / "images/front/0002.png"
     assert front.T_camera_base @ [0, 0, 0.2, 1] == pytest.approx([0, 0, 1, 1])
 
 
@@ -155,21 +155,21 @@ def test_the_resolved_document_is_plain_and_complete(folder):
     assert document["board"] is None
 
 
-def test_rows_and_photographs_pair_by_name(folder):
+def test_rows_and_images_pair_by_name(folder):
     header, *rows = JOINTS.splitlines(keepends=True)
     (folder / "joints.csv").write_text(header + "".join(reversed(rows)))
     session = load_session(folder)
-    for photo in session.stations[0].photographs:
+    for photo in session.stations[0].images:
         assert session.configurations[photo.configuration] == photo.path.stem
 
 
-def test_a_configuration_without_photograph_is_a_warning(folder):
+def test_a_configuration_without_image_is_a_warning(folder):
     (folder / "images/front/0001.png").unlink()
     (warning,) = load_session(folder).warnings
-    assert warning.startswith("joints.csv: no station has a photograph of configuration 0001 (1 of")
+    assert warning.startswith("joints.csv: no station has an image of configuration 0001 (1 of")
 
 
-def test_two_stations_need_not_photograph_the_same(folder):
+def test_two_stations_need_not_image_the_same(folder):
     image(folder / "images/left/0001.png")
     (folder / "images/front/0001.png").unlink()
     remainder = SESSION[SESSION.index("  front:") : SESSION.index("    pose:")]
@@ -179,7 +179,7 @@ def test_two_stations_need_not_photograph_the_same(folder):
         )
     session = load_session(folder)
     assert session.warnings == ()
-    assert [len(station.photographs) for station in session.stations] == [2, 1]
+    assert [len(station.images) for station in session.stations] == [2, 1]
     assert session.stations[1].T_camera_base is None
 
 
@@ -191,7 +191,7 @@ def test_repeats_and_absolute_patterns(folder):
     replaced(folder / "joints.csv", "0001,", "0001_x,")
     pattern = f"{folder}/elsewhere/{{configuration}}_{{repeat}}.png"
     replaced(folder / "session.yaml", "images/front/{configuration}.png", pattern)
-    photos = load_session(folder).stations[0].photographs
+    photos = load_session(folder).stations[0].images
     assert [(p.configuration, p.repeat) for p in photos] == [(0, "1"), (0, "2"), (1, "1")]
 
 
@@ -200,13 +200,13 @@ def test_a_folder_for_each_configuration(folder):
         image(folder / f"shots/{name}/front-{name}.png")
     new = "./shots/{configuration}/front-{configuration}.png"
     replaced(folder / "session.yaml", "images/front/{configuration}.png", new)
-    photos = load_session(folder).stations[0].photographs
+    photos = load_session(folder).stations[0].images
     assert [photo.configuration for photo in photos] == [0, 1]
 
 
-def test_hidden_files_are_no_photographs(folder):
+def test_hidden_files_are_no_images(folder):
     (folder / "images/front/._0001.png").write_bytes(b"what some systems leave behind")
-    assert len(load_session(folder).stations[0].photographs) == 3
+    assert len(load_session(folder).stations[0].images) == 3
 
 
 def test_a_mechanism_file_beside_the_session(folder):
@@ -309,10 +309,10 @@ EDITS = [
      ["placeholder is not known; found {configration}, expected {configuration}"]),
     ("session.yaml", "{configuration}", "{configuration", ["the braces do not match"]),
     ("session.yaml", "images/front/{", "images/back/{",
-     ["line 7, stations.front.images: there is no photograph", "no folder ", "images/back",
+     ["line 7, stations.front.images: there is no image", "no folder ", "images/back",
       "expected files images/back/{configuration}.png"]),
     ("session.yaml", "{configuration}.png", "{configuration}.PNG",
-     ["there is no photograph", "3 other entries, such as 0000.png"]),
+     ["there is no image", "3 other entries, such as 0000.png"]),
     # rough pose
     ("session.yaml", "up: [0, 0, 1]", "up: [0, 1, 0]",
      ["line 9, stations.front.pose: up does not fix", "0 degrees from the line of sight"]),
@@ -332,7 +332,7 @@ EDITS = [
     ("joints.csv", "0001,", "1,",
      ["images/front/0001.png is of a configuration without joint readings",
       "session.yaml, line 7, stations.front.images", "found configuration 0001",
-      "The table has 1 where the photograph says 0001", "leading zeros"]),
+      "The table has 1 where the image says 0001", "leading zeros"]),
     ("joints.csv", JOINTS[JOINTS.index("0001"):], "",
      ["joints.csv: there is only one configuration; found 0000, expected two"]),
 ]  # fmt: skip
@@ -444,13 +444,13 @@ def test_all_configurations_alike(folder):
     assert "joints.noise, 3e-06" in message
 
 
-def test_only_one_configuration_photographed(folder):
+def test_only_one_configuration_imaged(folder):
     for name in ("0001", "0002"):
         (folder / f"images/front/{name}.png").unlink()
-    assert "only one configuration has photographs; found 0000" in fault(load_session, folder)
+    assert "only one configuration has images; found 0000" in fault(load_session, folder)
 
 
-def test_a_photograph_without_readings(folder):
+def test_a_image_without_readings(folder):
     image(folder / "images/front/0003.png")
     image(folder / "images/front/0004.png")
     message = fault(load_session, folder)
@@ -459,10 +459,10 @@ def test_a_photograph_without_readings(folder):
     assert "expected one of the table's 3: 0000, 0001 and 0002" in message
 
 
-def test_a_photograph_of_another_size(folder):
+def test_a_image_of_another_size(folder):
     image(folder / "images/front/0001.png", 16, 12)
     message = fault(load_session, folder)
-    assert "images/front/0001.png: the photograph has another size than its camera" in message
+    assert "images/front/0001.png: the image has another size than its camera" in message
     assert "found 16x12, expected 8x6 (cameras/front.yaml)" in message
     assert "unscaled" in message
 
@@ -472,17 +472,17 @@ def test_a_file_that_is_no_image(folder):
     assert fault(load_session, folder).startswith("images/front/0001.png: the image file is empty")
 
 
-def test_one_stations_photographs_under_two_names(folder):
+def test_one_stations_images_under_two_names(folder):
     station = SESSION[SESSION.index("  front:") :]
     with (folder / "session.yaml").open("a") as stream:
         stream.write(station.replace("  front:", "  left:"))
     message = fault(load_session, folder)
-    assert "stations.left.images: station left has the photographs of station front" in message
+    assert "stations.left.images: station left has the images of station front" in message
 
 
-def test_photographs_of_another_ending_are_told(folder):
+def test_images_of_another_ending_are_told(folder):
     for path in (folder / "images" / "front").iterdir():
         path.rename(path.with_suffix(".JPG"))
-    assert "Photographs there end in .JPG: write images/front/{configuration}.JPG." in fault(
+    assert "Images there end in .JPG: write images/front/{configuration}.JPG." in fault(
         load_session, folder
     )

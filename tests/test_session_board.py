@@ -28,7 +28,7 @@ def joined(folder):
     return folder
 
 
-def test_legs_and_board_in_the_same_photographs(joined):
+def test_legs_and_board_in_the_same_images(joined):
     session = load_session(joined)
     assert session.warnings == ()
     assert (session.board, session.board_body) == (joined / "board.yaml", "base")
@@ -58,7 +58,7 @@ def test_a_board_on_the_base_joins_two(joined):
         ("observe: [legs, board]", "observe: {legs: board}", ["no station can observe this"]),
         ("observe: [board, legs]", "observe: board",
          ["stations.left.observe: the board is fixed to the base, which does not move, and station"
-          " left observes no legs; found board, expected [legs, board], in the same photographs",
+          " left observes no legs; found board, expected [legs, board], in the same images",
           "write board: {file: board.yaml, fixed_to: platform}"]),
         ("fixed_to: base", "fixed_to: table",
          ["line 2, board.fixed_to", "found 'table', expected 'base' or 'platform'"]),

@@ -14,7 +14,7 @@ from pkmcal.calibration import handheld, refinement
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_refinement import edges_by_camera
 from pkmcal.calibration.camera_responses import _normal_turn
-from pkmcal.calibration.localization import platform_poses, read_photographs
+from pkmcal.calibration.localization import platform_poses, read_images
 from pkmcal.calibration.refinement import (
     RefinementResult,
     _scatter_of,
@@ -54,8 +54,8 @@ def views(folder):
     """Each image's view, with a machine that is known exactly, and its true pose."""
     session = load_session(folder)
     poses, truth = platform_poses(session), load_truth(folder, session.machine)
-    photographs = read_photographs(session)
-    views = [finest_view(session.machine, p, session.joints, poses) for p in photographs]
+    images = read_images(session)
+    views = [finest_view(session.machine, p, session.joints, poses) for p in images]
     return list(zip(views, truth.T_camera_base, strict=True))
 
 
@@ -198,7 +198,7 @@ def test_looks_scatter_by_their_variance_in_that_of_noise(tripod_calibration):
     assert _variance(2 * changes, measurements, estimate) == pytest.approx(4, rel=0.1)
 
 
-def turns_of(calibration, shading, photographs):
+def turns_of(calibration, shading, images):
     """Result of the last measurement pass, with its edges shaded by so many px, as light moves
     them.
     """
@@ -209,7 +209,7 @@ def turns_of(calibration, shading, photographs):
         calibration.measurements,
         replace(estimate, edge_noise=noise),
         calibration.cameras,
-        photographs=photographs,
+        images=images,
         start=estimate.state,
     )
 
@@ -221,8 +221,8 @@ def looked_from_machines_as_likely(calibration, value):
 
 @pytest.mark.parametrize(("times", "asked"), [(0.9, False), (1.1, True)])
 def test_painted_legs_on_a_tripod_are_not_looked_for_again(tripod_calibration, times, asked):
-    photographs = read_photographs(tripod_calibration.session)
-    value = turns_of(tripod_calibration, times * POLISHED_SHADING, photographs)
+    images = read_images(tripod_calibration.session)
+    value = turns_of(tripod_calibration, times * POLISHED_SHADING, images)
     ended = looked_from_machines_as_likely(tripod_calibration, value)
     assert (ended is value) != asked
     assert (ended.measurements.imputation_covariance > 0) == asked
@@ -232,7 +232,7 @@ def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibratio
     """In images without content no measurement pass finds an edge."""
     empty = [
         replace(p, images=[np.full_like(image, 90) for image in p.images])
-        for p in read_photographs(tripod_calibration.session)
+        for p in read_images(tripod_calibration.session)
     ]
     value = turns_of(tripod_calibration, 2 * POLISHED_SHADING, empty)
     ended = looked_from_machines_as_likely(tripod_calibration, value)
@@ -257,30 +257,30 @@ def beside(folder, tmp_path_factory):
     return out / "both", np.concatenate([truth.T_camera_base for truth in truths])
 
 
-def test_of_a_camera_on_a_tripod_the_first_photograph_stands_for_all(beside, monkeypatch):
+def test_of_a_camera_on_a_tripod_the_first_image_stands_for_all(beside, monkeypatch):
     """Silhouettes are matched in one image of a pose: edges of others are elsewhere."""
     session = load_session(beside[0])
-    photographs, T = read_photographs(session), beside[1]
-    assert [len(p.images) for p in photographs] == [1, 1, 1, 1, 4]
+    images, T = read_images(session), beside[1]
+    assert [len(p.images) for p in images] == [1, 1, 1, 1, 4]
     found_with(monkeypatch, SimpleNamespace(T_camera_base=T), [1e-4] * 4)
-    case = handheld.localize_case(session, photographs, Boards(), np.random.default_rng(0))
+    case = handheld.localize_case(session, images, Boards(), np.random.default_rng(0))
     scene = case.scene
-    assert [len(p.images) for p in case.photographs] == [1, 1, 1, 1, 4]
+    assert [len(p.images) for p in case.images] == [1, 1, 1, 1, 4]
     assert sorted(scene.edges) == [0, 1, 2, 3, 4]
-    for k, p in enumerate(photographs):
+    for k, p in enumerate(images):
         assert set(scene.edges[k].configuration.tolist()) == {p.configuration[0]}
     # and lie there where the machine truly is
-    one = photographs[4].select(np.arange(1))
+    one = images[4].select(np.arange(1))
     poses = platform_poses(session)
     view = finest_view(session.machine, one, session.joints, poses)
     off = off_truth(view, T[4], scene.edges[4])
     assert np.median(np.abs(off)) < 1
 
 
-def test_without_photographs_by_hand_none_is_searched(tripod_calibration):
+def test_without_images_by_hand_none_is_searched(tripod_calibration):
     session = tripod_calibration.session
     rng = np.random.default_rng(0)
-    value = handheld.localize(session, read_photographs(session), Boards(), rng)
+    value = handheld.localize(session, read_images(session), Boards(), rng)
     assert value.recognition is not None
     assert value.places == {}
 
@@ -297,7 +297,7 @@ def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
     np.testing.assert_allclose(away[::2], -away[1::2], atol=1e-4)
     for one in drawn:
         cameras = calibration.cameras.updated(one)
-        case = [replace(p, camera=cameras.at_station(p.station)) for p in read_photographs(session)]
+        case = [replace(p, camera=cameras.at_station(p.station)) for p in read_images(session)]
         passes = refinement._measurement_pass(session, case, one, {}, 1.0, True)
         shifted = [station_edges.shift for station_edges in passes]
         assert 0.01 < np.median(shifted) < 0.4

@@ -29,7 +29,7 @@ from pkmcal.simulation import (
 )
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SETTINGS, demo_camera
 from pkmcal.simulation.placement import draw_configurations, usable
-from pkmcal.simulation.render import PixelRays, Scene, ScenePart, photograph, render_light
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, render_light
 from pkmcal.simulation.scene import CABLE_PIECES, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulation.surfaces import Lamp, Lighting, Material, SmoothNoise
@@ -272,9 +272,9 @@ def test_a_style_changes_the_legs_alone_and_no_silhouette(machine):
     assert 0.02 < np.mean(np.abs(in_view(built) - usual)[on_legs] > 0.05) < 0.5
 
 
-def test_noise_of_a_photograph_is_as_stated():
+def test_noise_of_a_image_is_as_stated():
     sensor = Sensor(blur=0.0, exposure=200.0, read_noise=1.5, shot_noise=0.02)
-    flat = photograph(np.full((200, 200), 0.5), sensor, np.random.default_rng(1)).astype(float)
+    flat = image(np.full((200, 200), 0.5), sensor, np.random.default_rng(1)).astype(float)
     assert flat.mean() == pytest.approx(100, abs=0.05)
     # rounding to whole grey levels adds a twelfth
     assert flat.var() == pytest.approx(1.5**2 + 0.02 * 100 + 1 / 12, rel=0.05)
@@ -341,12 +341,12 @@ def test_an_outward_shift_moves_edges_by_pixels(setting):
     assert np.abs(off).max() < 0.02
 
 
-def test_seen_edges_are_those_that_a_photograph_shows(setting, view):
+def test_seen_edges_are_those_that_a_image_shows(setting, view):
     machine, T_camera_base, poses = setting
     k, station = 1, 1  # leg 2 stands behind leg 5
     edges, joints = simulate_edges(
         machine, T_camera_base, CAMERA, poses, EdgeNoise(1e-9, 1e-9), np.random.default_rng(0),
-        photographs=np.array([[station, k]]), joint_noise=0.0,
+        images=np.array([[station, k]]), joint_noise=0.0,
     )  # fmt: skip
     noise = SmoothNoise.from_rng(np.random.default_rng(0))
     parts = machine_parts(machine, discs_of(machine), Finish.from_noise(noise), poses[k], joints[k])
@@ -375,7 +375,7 @@ def _on_leg(machine, shape, leg):
     return off < 1e-6 and np.abs(radii - shape.radius).min() < 1e-12
 
 
-def test_wrong_edges_are_other_legs_of_the_same_photograph(setting):
+def test_wrong_edges_are_other_legs_of_the_same_image(setting):
     machine, T_camera_base, poses = setting
     right, wrong = (
         simulate_edges(
@@ -436,10 +436,8 @@ def test_a_session_loads_back(simulated, machine):
     np.testing.assert_array_equal(session.joints, truth.readings)
     np.testing.assert_array_equal(session.machine.values, machine.values)
     assert [s.name for s in session.stations] == list(truth.stations)
-    results = [
-        [s, p.configuration] for s, st in enumerate(session.stations) for p in st.photographs
-    ]
-    np.testing.assert_array_equal(results, truth.photographs)
+    results = [[s, p.configuration] for s, st in enumerate(session.stations) for p in st.images]
+    np.testing.assert_array_equal(results, truth.images)
     np.testing.assert_array_equal(session.stations[0].camera.parameters, SMALL.parameters)
     for station, T in zip(session.stations, truth.T_camera_base, strict=True):
         off = pose_difference(inverse(station.T_camera_base), inverse(T))
@@ -463,7 +461,7 @@ def test_truth_is_consistent_and_reads_back(simulated, machine):
         assert np.abs(c.rows.value).max() < 1e-12
     np.testing.assert_array_equal(again.machine.values, truth.machine.values)
     np.testing.assert_array_equal(again.T_camera_base, truth.T_camera_base)
-    np.testing.assert_array_equal(again.photographs, truth.photographs)
+    np.testing.assert_array_equal(again.images, truth.images)
     assert np.abs(truth.readings - truth.joints).max() < 2e-5
     assert np.abs(truth.machine.values - machine.values).max() > 1e-3
 
@@ -483,7 +481,7 @@ def test_the_seed_decides_everything_and_the_number_of_workers_nothing(
     assert (folder / first).read_bytes() != (tmp_path / "other" / first).read_bytes()
 
 
-def test_photographs_have_grey_levels_of_a_photograph(simulated):
+def test_images_have_grey_levels_of_a_image(simulated):
     import cv2
 
     folder, _ = simulated
@@ -492,12 +490,10 @@ def test_photographs_have_grey_levels_of_a_photograph(simulated):
         assert levels[0] < 40 < levels[1] + 15 < 140 < levels[2] + 20
 
 
-def test_shared_configurations_are_photographed_by_all(machine):
+def test_shared_configurations_are_imaged_by_all(machine):
     truth = draw_truth(machine, (SMALL,) * 3, Settings(configurations=4, shared=True), 1)
     assert truth.T_base_platform.shape == (4, 4, 4)
-    assert {tuple(pair) for pair in truth.photographs} == {
-        (s, k) for s in range(3) for k in range(4)
-    }
+    assert {tuple(pair) for pair in truth.images} == {(s, k) for s in range(3) for k in range(4)}
 
 
 @pytest.mark.parametrize("name", ["gough-stewart", "delta"])
@@ -514,7 +510,7 @@ def test_configurations_are_of_different_poses(name, shared):
     assert 0.3 * len(place) < extreme < 0.7 * len(place) or extreme == 8
 
 
-def test_photographs_by_hand_are_of_different_poses():
+def test_images_by_hand_are_of_different_poses():
     settings = Settings(configurations=12, repeats=2, handheld=True)
     truth = draw_truth(load_mechanism("delta"), (demo_camera(),) * 24, settings, 1)
     assert len(np.unique(same_pose(truth.readings, settings.joint_noise))) == 12
@@ -547,7 +543,7 @@ def test_the_demonstration_can_be_drawn():
     camera = demo_camera()
     machine = load_mechanism(DEMO_MECHANISM)
     truth = draw_truth(machine, (camera,) * DEMO_SETTINGS.n_stations, DEMO_SETTINGS, 7)
-    assert len(truth.photographs) == 18
+    assert len(truth.images) == 18
 
 
 def test_importing_is_quick():

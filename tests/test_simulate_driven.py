@@ -244,7 +244,7 @@ def test_the_command_writes_cylinders_into_the_sessions_drawing(tmp_path):
 # in images
 
 
-def photographed(folder, name, camera, configurations, board, seed):
+def imaged(folder, name, camera, configurations, board, seed):
     settings = Settings(
         stations=1, configurations=configurations, joint_noise=1e-5, board=board,
         board_on="platform",
@@ -268,10 +268,10 @@ def mixed(tmp_path_factory):
               "dictionary": "DICT_4X4_50"}  # fmt: skip
     folder = tmp_path_factory.mktemp("mixed") / "session"
     camera = camera_of_size((560, 420))
-    return photographed(folder, "h4", camera, 8, board_from_fields(fields), 1)
+    return imaged(folder, "h4", camera, 8, board_from_fields(fields), 1)
 
 
-def test_forearms_and_board_in_photographs(mixed):
+def test_forearms_and_board_in_images(mixed):
     value = pkmcal.calibrate(observing(mixed, ["legs", "board"]))
     errors = compare_with_truth(value, mixed)
     assert value.verdict.usable
@@ -282,7 +282,7 @@ def test_forearms_and_board_in_photographs(mixed):
 
 
 @pytest.mark.slow
-def test_forearms_alone_in_photographs(mixed):
+def test_forearms_alone_in_images(mixed):
     value = pkmcal.calibrate(observing(mixed, "legs"))
     errors = compare_with_truth(value, mixed)
     assert value.estimate.statistics.n_poses == 0
@@ -331,7 +331,7 @@ def test_legs_and_board_know_more_than_each(name, tmp_path):
     """
     board = board_for(with_forearms(load_mechanism(name)), "platform")
     camera = camera_of_size((800, 600))
-    folder = photographed(tmp_path / "s", name, camera, 20, board, 1)
+    folder = imaged(tmp_path / "s", name, camera, 20, board, 1)
     sigma = []
     for words in ("legs", "board", ["legs", "board"]):
         value = pkmcal.calibrate(observing(folder, words))

@@ -169,7 +169,7 @@ def test_a_session_gives_its_cameras_stations_and_noise(demo):
     assert shifted.T_camera_base is None
 
 
-def test_a_session_without_photographs_can_be_studied(session):
+def test_a_session_without_images_can_be_studied(session):
     """Before any images exist: fifteen from each place; and its workspace is reported as
     ignored.
     """

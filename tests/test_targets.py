@@ -128,7 +128,7 @@ def test_outlying_corners_lose_their_weight(board):
     assert np.all(chi2(pose_difference(poses.T_station_target, T), poses.whiten) < 24)
 
 
-def test_photographs_without_a_board_are_rejected_with_the_reason(board):
+def test_images_without_a_board_are_rejected_with_the_reason(board):
     values = detections(board, poses_around(3))
     none = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     values[1] = Detection("0001.png", CAMERA.image_size, *none, reason="nothing is recognised")
@@ -139,7 +139,7 @@ def test_photographs_without_a_board_are_rejected_with_the_reason(board):
     assert one_a_configuration(views, 0)[0].configuration.tolist() == [4, 6]
 
 
-def test_no_photograph_shows_it(board):
+def test_no_image_shows_it(board):
     none = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     missed = Detection("0000.png", CAMERA.image_size, *none, reason="nothing is recognised")
     views = seen(board, [missed])
@@ -167,21 +167,21 @@ def test_a_board_that_looks_the_same_turned_round():
     assert caught.value.found == "a chessboard of 8x6 inner corners"
 
 
-def test_mirrored_photographs(board):
+def test_mirrored_images(board):
     results = [replace(d, mirrored=True) for d in detections(board, poses_around(2))]
     with pytest.raises(InputError, match="mirror images") as caught:
         seen(board, results)
     assert caught.value.where == "0000.png and 0001.png"
 
 
-def test_one_mirrored_photograph_is_named_alone(board):
+def test_one_mirrored_image_is_named_alone(board):
     value = detections(board, poses_around(3))
     value[1] = replace(value[1], mirrored=True)
     with pytest.raises(InputError) as caught:
         seen(board, value)
     assert caught.value.where == "0001.png"
-    assert "Flip this photograph alone" in str(caught.value)
-    assert "2 other photographs" in str(caught.value)
+    assert "Flip this image alone" in str(caught.value)
+    assert "2 other images" in str(caught.value)
 
 
 def test_corners_that_are_not_this_boards(board):
@@ -244,7 +244,7 @@ def test_a_still_board_is_one_measurement(board):
     np.testing.assert_allclose(np.mean(sigmas, axis=0), 1 / np.sqrt(8), rtol=0.1)
 
 
-def test_what_all_photographs_share_does_not_average_out(board):
+def test_what_all_images_share_does_not_average_out(board):
     """Corners printed in slightly wrong places: more images do not reduce the pose's covariance."""
     rng = np.random.default_rng(5)
     printed = replace(board, points=board.points + [1, 1, 0] * rng.normal(0, 5e-5, (48, 3)))
@@ -266,7 +266,7 @@ def test_a_trembling_camera_makes_the_pose_less_sure(board):
     assert np.all(np.diag(shaken.covariance)[3:5] > 2 * np.diag(quiet.covariance)[3:5])
 
 
-def test_one_photograph_is_enough_and_says_nothing_of_standing_still(board):
+def test_one_image_is_enough_and_says_nothing_of_standing_still(board):
     views = seen(board, still(board, n=1))
     stood = standing_board(views)
     assert np.isnan(stood.scatter)
@@ -274,13 +274,13 @@ def test_one_photograph_is_enough_and_says_nothing_of_standing_still(board):
 
 
 @pytest.mark.parametrize("odd", [0, 4, 7])
-def test_one_photograph_that_disagrees_is_left_out(board, odd):
+def test_one_image_that_disagrees_is_left_out(board, odd):
     stood = standing_board(seen(board, still(board, moves={odd: AWAY})))
     assert np.flatnonzero(~stood.agreed).tolist() == [odd]
     (item,) = stood.rejected
     assert item.configuration == odd
     assert item.reason.startswith("the board stands 1.9 px")
-    assert item.reason.endswith(" from where the other photographs show it")
+    assert item.reason.endswith(" from where the other images show it")
 
 
 @pytest.mark.parametrize(
@@ -304,7 +304,7 @@ def test_a_board_that_never_stood_still(board):
     moves = {k: (0, 0, 0, 2e-3 * k, 0, 0) for k in (1, 3, 5)}
     with pytest.raises(InputError, match="did not stand still") as caught:
         standing_board(seen(board, still(board, moves=moves)))
-    assert caught.value.found.startswith("3 of 8 photographs")
+    assert caught.value.found.startswith("3 of 8 images")
 
 
 def test_all_camera_models_see_a_still_board(board):

@@ -39,7 +39,7 @@ def view(request):
     """A lab, its image at AT, and the sight of the tracker."""
     camera, T = (PERSPECTIVE, BESIDE) if request.param == "perspective" else (MIRROR, WITHIN)
     lab = Lab(MACHINE, camera, T)
-    return lab, lab.photograph(AT, READINGS), Sight(machine_view(MACHINE, T), camera)
+    return lab, lab.image(AT, READINGS), Sight(machine_view(MACHINE, T), camera)
 
 
 def root(lines):
@@ -69,11 +69,11 @@ def test_edges_are_found_within_their_sigma(view):
     assert np.rad2deg(np.linalg.norm(off[:3])) < 0.3
 
 
-def test_large_photographs_are_binned():
+def test_large_images_are_binned():
     """With three times as many pixels across, each edge blurred over as many: the same legs."""
     import cv2
 
-    small = Lab(MACHINE, PERSPECTIVE, BESIDE).photograph(AT, READINGS)
+    small = Lab(MACHINE, PERSPECTIVE, BESIDE).image(AT, READINGS)
     image = cv2.resize(small, (1920, 1440), interpolation=cv2.INTER_LINEAR)
     larger = PERSPECTIVE.parameters * np.r_[3.0, 3, 3, 3, np.ones(len(PERSPECTIVE.parameters) - 4)]
     larger[2:4] += 1
@@ -90,7 +90,7 @@ def test_large_photographs_are_binned():
     assert np.nanmedian(apart) < 0.1  # the shift that is taken off is of whole pixels
 
 
-def test_a_photograph_late_by_a_millimetre_is_followed(view):
+def test_a_image_late_by_a_millimetre_is_followed(view):
     """The readings have changed; the next image uses the correction of this one."""
     _, image, sight = view
     later = READINGS + np.array([1, -1, 1, 1, -1, 1]) * 1.5e-3
@@ -109,9 +109,9 @@ def test_a_photograph_late_by_a_millimetre_is_followed(view):
     assert miss < 0.7 * start
 
 
-def test_a_first_photograph_several_pixels_off_is_searched():
+def test_a_first_image_several_pixels_off_is_searched():
     lab = Lab(MACHINE, PERSPECTIVE, BESIDE)
-    image = lab.photograph(AT, READINGS)
+    image = lab.image(AT, READINGS)
     sight = Sight(machine_view(MACHINE, BESIDE), PERSPECTIVE)
     # a centimetre and two degrees aside: up to nine pixels
     shifted = MACHINE.inverse(perturb(AT, np.array([0, 0, 0.03, 0.01, 0.008, 0]))[None])[0]
@@ -136,7 +136,7 @@ def test_a_leg_painted_over_is_lost_and_the_others_are_not(view):
     assert np.isnan(value.lines.normal[leg]).all()
 
 
-def test_an_empty_photograph_finds_nothing_and_keeps_to_the_readings(view):
+def test_an_empty_image_finds_nothing_and_keeps_to_the_readings(view):
     _, image, sight = view
     state = track(sight, first_track_state(sight.view), image, READINGS).state
     empty = np.full_like(image, 90)

@@ -64,7 +64,7 @@ def legs_case(seed, true=None):
     rng = np.random.default_rng(seed)
     edges, readings = simulate_edges(
         true, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(), rng,
-        photographs=truth.photographs,
+        images=truth.images,
     )  # fmt: skip
     data = Measurements(edges, readings, 3e-6, STATIONS, np.zeros(STATIONS, dtype=int))
     return nominal, true, truth.T_camera_base, data
@@ -232,7 +232,7 @@ def test_rows_that_contradict_the_verdict_are_explained(hexapod):
     assert f"(joint 3: to {promised}) that single rows" in values
     far = replace(judged, calibrated=replace(in_view, position=judged.nominal.position * 1.1))
     (values,) = validation_verdict(far, (), estimate.machine, data).warnings
-    assert values.startswith("Some directions are seen so badly in these photographs that single")
+    assert values.startswith("Some directions are seen so badly in these images that single")
 
 
 def test_a_leg_that_changed_is_named(hexapod):
@@ -397,7 +397,7 @@ def test_too_few_configurations_to_hold_out(hexapod):
         chosen(nominal, few, data, 1)
 
 
-def photographed_again(estimate, data):
+def imaged_again(estimate, data):
     """The first 22 poses of an estimate, which differ, each three times."""
     rng = np.random.default_rng(1)
     joints = np.tile(data.joints[:22], (3, 1))
@@ -413,7 +413,7 @@ def photographed_again(estimate, data):
 
 def test_a_pose_under_several_names_is_held_out_whole(hexapod):
     nominal, _, estimate, data = hexapod
-    whole, again = photographed_again(estimate, data)
+    whole, again = imaged_again(estimate, data)
     out = chosen(nominal, whole, again, 5).rows
     assert list(np.unique(out % 22, return_counts=True)[1]) == [3] * 5
     count = by_region(nominal, whole, again, 4)
@@ -467,10 +467,10 @@ def test_calibrate_with_some_held_out(kept):
     assert document["holdout"] == out
     report = Found((kept.folder / "c" / "report.html").read_text()).text
     for station in document["session"]["stations"].values():
-        names = [Path(photograph).stem for photograph in station["photographs"]]
+        names = [Path(image).stem for image in station["photographs"]]
         used = len(names) - len({*names} & {*unused})
         values = f"{used} of {len(names)}" if used < len(names) else f"{used}"
-        assert f"{station['camera']}, pinhole, {values} photographs" in report
+        assert f"{station['camera']}, pinhole, {values} images" in report
     assert (
         "held out, the calibrated machine predicts"
         in (kept.folder / "c" / "report.html").read_text()
@@ -526,7 +526,7 @@ def test_the_drawing_is_the_drawing_again(kept, demo):
     assert np.array_equal(values.parameters.free_matrix(), drawn.parameters.free_matrix())
 
 
-def test_the_same_photographs(demo, session):
+def test_the_same_images(demo, session):
     done = run("validate", demo.calibration, session)
     assert done.code == 2
     assert "the session is not independent" in done.err

@@ -92,7 +92,7 @@ def test_one_configuration_is_refused(name):
     _, _, findings, verdict = judged(scene)
     assert findings.identifiability.unidentified
     assert not verdict.usable
-    assert any("Photograph more configurations" in r for r in verdict.reasons)
+    assert any("Take images of more configurations" in r for r in verdict.reasons)
 
 
 def test_heave_alone_is_said():
@@ -108,7 +108,7 @@ def test_what_does_not_move_the_platform_is_a_note():
     scene = make("6-spu-passive")
     _, _, _, verdict = judged(scene, *[(1, 2, 3, 4, 5, 6)] * 3)
     assert verdict.usable, verdict.reasons
-    assert any("leg 7 is in no photograph" in a for a in verdict.advice)
+    assert any("leg 7 is in no image" in a for a in verdict.advice)
 
 
 def test_axes_that_nothing_shows_do_not_refuse_a_3_upu():

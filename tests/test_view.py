@@ -159,13 +159,13 @@ def test_the_page_asks_for_nothing_outside(page):
 # ------------------------------------------------------------------ what is shown
 
 
-def test_all_photographs_are_named(page, demo):
+def test_all_images_are_named(page, demo):
     text = Found(page.get().text).text
     session = page.subject.session
     assert all(name in text for name in (*session.configurations, *session.station_names))
 
 
-def test_a_photograph_is_sent(page):
+def test_a_image_is_sent(page):
     image = cv2.imdecode(np.frombuffer(page.get("photograph/1/2").content, np.uint8), 0)
     assert image.shape[::-1] == page.subject.station(1).camera.image_size
     assert np.abs(image.astype(int) - page.subject.image(1, 2)).mean() < 3
@@ -175,11 +175,11 @@ def test_nothing_is_decoded_before_it_is_looked_at(demo):
     opened = Page(demo.session)
     opened.get()
     opened.get("photograph/0/1")
-    opened.ask("overlay", photograph=1)
+    opened.ask("overlay", image=1)
     assert opened.subject.image.cache_info().misses == 1
 
 
-def test_a_large_photograph_is_sent_at_the_screens_size(page, monkeypatch):
+def test_a_large_image_is_sent_at_the_screens_size(page, monkeypatch):
     monkeypatch.setattr("pkmcal.view.content.WIDEST_VIEWED_PICTURE", 100)
     image = cv2.imdecode(np.frombuffer(page.get("photograph/0/0").content, np.uint8), 0)
     assert image.shape[1] == 100
@@ -187,11 +187,11 @@ def test_a_large_photograph_is_sent_at_the_screens_size(page, monkeypatch):
 
 def test_faults_are_told_in_words(page, session):
     (session / "images" / "station1").mkdir(exist_ok=True)
-    broken = load_session(session).stations[0].photographs[0].path
+    broken = load_session(session).stations[0].images[0].path
     broken.write_bytes(broken.read_bytes()[:-40])
     answer = Page(session).get("photograph/0/0")
     assert answer.status == 422
-    assert answer.json()["message"].startswith(f"{broken.relative_to(session)}: the photograph")
+    assert answer.json()["message"].startswith(f"{broken.relative_to(session)}: the image")
     assert page.get("photograph/0/99").json()["found"] == "100"
     for body, words in (
         ({"station": 9}, "there is no such station"),
@@ -234,12 +234,12 @@ def test_a_joint_comes_to_where_it_is_pulled(page):
     answer = page.ask("overlay", pins=[first])
     shifted = next(j for j in answer["joints"] if (j["end"], j["leg"]) == ("platform", 2))
     assert (shifted["x"], shifted["y"]) == (300, 200)
-    base = page.ask("overlay", photograph=1, pose=answer["pose"])["joints"]
+    base = page.ask("overlay", image=1, pose=answer["pose"])["joints"]
     other = next(j for j in base if (j["end"], j["leg"]) == ("base", 5))
     second = {"photograph": 1, "end": "base", "leg": 5, "pixel": [other["x"] + 20, other["y"] - 9]}
     answer = page.ask("overlay", pose=answer["pose"], pins=[first, second])
-    for photograph, pin in ((0, first), (1, second)):
-        joints = page.ask("overlay", photograph=photograph, pose=answer["pose"])["joints"]
+    for image, pin in ((0, first), (1, second)):
+        joints = page.ask("overlay", image=image, pose=answer["pose"])["joints"]
         at = next(j for j in joints if (j["end"], j["leg"]) == (pin["end"], pin["leg"]))
         np.testing.assert_allclose([at["x"], at["y"]], pin["pixel"], atol=0.051)
 
@@ -298,7 +298,7 @@ def test_the_machine_snaps_to_its_place(page, truth):
     assert off(rough, true)[1] > 50
     value = page.ask("fit", pose=rough.tolist())
     assert value["recognised"]
-    assert value["said"].startswith("Recognised in 4 photographs")
+    assert value["said"].startswith("Recognised in 4 images")
     angle, distance = off(value["pose"], true)
     assert angle < 1.0
     assert distance < 15
@@ -318,7 +318,7 @@ def test_the_machine_is_found_from_nowhere(page, truth):
 def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
     loaded = load_session(session)
     rng = np.random.default_rng(3)
-    for photo in loaded.stations[0].photographs:
+    for photo in loaded.stations[0].images:
         image = cv2.imread(str(photo.path), 0)
         noise = rng.normal(128, 40, (image.shape[0] // 8, image.shape[1] // 8))
         cv2.imwrite(str(photo.path), cv2.resize(noise, image.shape[::-1]).clip(0, 255).astype("u1"))
@@ -510,7 +510,7 @@ def test_what_cannot_be_shown_is_told_before(demo, session, tmp_path):
     tracker = "{poses: poses.csv, noise: {position: 1.0e-5, rotation: 1.0e-5}}"
     (session / "session.yaml").write_text(f"{text}stations: {{t: {{tracker: {tracker}}}}}\n")
     done = run("view", session)
-    assert (done.code, "there are no photographs to be shown" in done.err) == (2, True)
+    assert (done.code, "there are no images to be shown" in done.err) == (2, True)
 
 
 # ------------------------------------------------------------------ in a browser

@@ -60,14 +60,14 @@ def made_calibration():
     truth = draw_truth(nominal, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
     edges, readings = simulate_edges(
         truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
-        np.random.default_rng(1), photographs=truth.photographs,
+        np.random.default_rng(1), images=truth.images,
     )  # fmt: skip
     data = Measurements(edges, readings, 3e-6, 3, np.zeros(3, dtype=int))
     start = start_state(nominal, data, truth.T_camera_base)
     return bundle(nominal, data, start, robust=False, scale_noise=False)
 
 
-def photographs_of(machine):
+def images_of(machine):
     """One camera and thirty poses, of which the watches use some."""
     settings = Settings(stations=1, configurations=30, tolerance=0.0)
     return draw_truth(machine, (CAMERA,), settings, 5)
@@ -89,7 +89,7 @@ class Watched:
         made = made_calibration()
         self.true, self.covariance = made.machine, made.covariance
         self.half = half_of(made.covariance)
-        self.pool = photographs_of(self.true)
+        self.pool = images_of(self.true)
 
     def calibrated(self, rng):
         """The true machine with a calibration's errors."""

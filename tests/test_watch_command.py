@@ -35,7 +35,7 @@ from pkmcal.simulation.truth import draw_truth
 from rendered import rendered
 
 
-def photographed(folder, nominal, machine, camera, seed, **settings):
+def imaged(folder, nominal, machine, camera, seed, **settings):
     """New images of a machine, beside its nominal model; the truth is not used otherwise."""
     wanted = {"stations": 1, "configurations": 4, "tolerance": 0.0, **settings}
     rendered(folder, machine, camera, Settings(**wanted), seed)
@@ -61,7 +61,7 @@ def later(demo, tmp_path_factory):
     nominal = load_mechanism(demo.session / "mechanism.yaml")
     true = load_truth(demo.session, nominal).machine
     camera = load_camera(next((demo.session / "cameras").iterdir()))
-    same = photographed(folder / "same", nominal, true, camera, 34)
+    same = imaged(folder / "same", nominal, true, camera, 34)
     off = shutil.copytree(same, folder / "off")
     table = read_csv(same / "joints.csv")
     readings = table.values - 2.5e-3 * (np.arange(6) == 2)
@@ -150,7 +150,7 @@ def test_the_calibrations_own_session(demo, session):
     done = run("watch", demo.calibration, session)
     assert done.code == 2
     assert "there is nothing new in this session" in done.err
-    assert "Take five or more new photographs" in done.err
+    assert "Take five or more new images" in done.err
 
 
 def test_a_calibration_that_was_refused(again, calibration):
@@ -204,7 +204,7 @@ def stayed(demo, later):
     camera = load_camera(next((demo.session / "cameras").iterdir()))
     place = StationPlace.of(truth.T_camera_base[0])
     folder = later.folder / "stayed"
-    photographed(folder, nominal, truth.machine, camera, 35, stations=(place,))
+    imaged(folder, nominal, truth.machine, camera, 35, stations=(place,))
     assert load_session(folder).station_names == truth.stations[:1]
     return SimpleNamespace(folder=folder, name=truth.stations[0])
 
@@ -225,7 +225,7 @@ def test_a_camera_that_was_left_in_place_finds_less(demo, stayed, tmp_path):
     assert "Left in place" not in (tmp_path / "0" / "watch.html").read_text()
 
 
-def test_stations_are_numbered_without_photographs_that_were_not_placed(demo, stayed, monkeypatch):
+def test_stations_are_numbered_without_images_that_were_not_placed(demo, stayed, monkeypatch):
     """As those by hand are; the camera that was left in place is then another one's number."""
     session = load_session(stayed.folder)
     lost = replace(session.stations[0], name="by hand/1")
@@ -298,7 +298,7 @@ def test_a_cameras_magnification_is_told():
     truth = draw_truth(nominal, (camera,) * 2, settings, 4)
     edges, readings = simulate_edges(
         truth.machine, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(),
-        np.random.default_rng(4), photographs=truth.photographs,
+        np.random.default_rng(4), images=truth.images,
     )  # fmt: skip
     cause, got = magnification(nominal, 0), []
     for through in (camera, real):
@@ -320,7 +320,7 @@ def test_a_cameras_magnification_is_told():
 
 
 @pytest.mark.slow
-def test_half_a_millimetre_in_five_photographs(tmp_path):
+def test_half_a_millimetre_in_five_images(tmp_path):
     """Rendered at 800x600: five machines that did not change, and a leg's zero off by 0.5 mm."""
     nominal, camera = load_mechanism("gough-stewart"), demo_camera()
     settings = Settings(stations=3, configurations=8)
@@ -329,10 +329,10 @@ def test_half_a_millimetre_in_five_photographs(tmp_path):
     retained = load(tmp_path / "calibration")
     for seed in range(5):
         folder = tmp_path / f"same{seed}"
-        photographed(folder, nominal, truth.machine, camera, 100 + seed, configurations=5)
+        imaged(folder, nominal, truth.machine, camera, 100 + seed, configurations=5)
         assert watch_machine(retained, folder).verdict.usable
     off = changed(truth.machine, "legs[3].length.offset", 0.5e-3)
-    folder = photographed(tmp_path / "off", nominal, off, camera, 303, stations=2, configurations=5)
+    folder = imaged(tmp_path / "off", nominal, off, camera, 303, stations=2, configurations=5)
     value = watch_machine(retained, folder)
     first = value.judged.findings[0].suspect
     assert not value.verdict.usable

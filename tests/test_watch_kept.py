@@ -20,7 +20,7 @@ from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.judge.watch import tests_with_fixed_stations as judged_with_kept
 from pkmcal.measurements import Measurements
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from test_watch import ALPHA, CAMERA, half_of, made_calibration, moved, photographs_of
+from test_watch import ALPHA, CAMERA, half_of, images_of, made_calibration, moved
 
 SESSIONS = 30
 FEW = 5
@@ -40,7 +40,7 @@ class Left:
         self.n = len(made.covariance)
         self.joint = made.joint_covariance
         self.half = half_of(self.joint)
-        self.poses = photographs_of(self.true).T_base_platform
+        self.poses = images_of(self.true).T_base_platform
 
     def looked(self, machine, rng, by=None, few=FEW):
         """A calibration with errors, fixed against the first camera's data of a machine; by :

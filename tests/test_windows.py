@@ -12,7 +12,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pkmcal.calibration import localization, refinement
-from pkmcal.calibration.localization import mistake_in, platform_poses, read_photographs
+from pkmcal.calibration.localization import mistake_in, platform_poses, read_images
 from pkmcal.geometry.rigid import perturb
 from pkmcal.observe import image_batches as passing
 from pkmcal.observe import legs
@@ -78,9 +78,9 @@ def same(edges, other):
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 @pytest.mark.parametrize("window", [1, 4])
 def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", window)
-    photographs, visible, fresh = many()
-    look(photographs, visible)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", window)
+    images, visible, fresh = many()
+    look(images, visible)
     assert fresh.most == window
     assert fresh.alive == 0
     # each once, and a window's for the blur where that is not known
@@ -89,30 +89,30 @@ def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
 
 @pytest.mark.parametrize("name", ["search", "refine"])
 def test_windows_change_nothing(monkeypatch, name):
-    photographs, visible, _ = many()
-    whole = LOOKS[name](photographs, visible)
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
-    value = LOOKS[name](photographs, visible)
+    images, visible, _ = many()
+    whole = LOOKS[name](images, visible)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", 4)
+    value = LOOKS[name](images, visible)
     same(value, whole)
 
 
 def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypatch):
-    photographs, visible, _ = many()
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", 4)
-    few = photographs.spread(4)
+    images, visible, _ = many()
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", 4)
+    few = images.spread(4)
     assert few.tolist() == [0, 5, 11, 17]
-    of_few = LOOKS["measure"](photographs.select(few), visible[few]).blur
-    assert LOOKS["measure"](photographs, visible).blur == of_few
+    of_few = LOOKS["measure"](images.select(few), visible[few]).blur
+    assert LOOKS["measure"](images, visible).blur == of_few
 
 
-def test_large_photographs_have_small_windows(monkeypatch):
-    photographs, visible, _ = many()
-    width, height = photographs.camera.image_size
+def test_large_images_have_small_windows(monkeypatch):
+    images, visible, _ = many()
+    width, height = images.camera.image_size
     monkeypatch.setattr(passing, "WINDOW_BYTES", 5 * width * height)
-    placed = [Placed(photographs, FRONT, visible)]
+    placed = [Placed(images, FRONT, visible)]
     assert [len(window.images) for window in windows(placed)] == [5, 5, 5, 3]
     monkeypatch.setattr(passing, "WINDOW_BYTES", 1)  # one may take more
-    assert photographs.window == 1
+    assert images.window == 1
 
 
 def stations():
@@ -140,23 +140,23 @@ def stations():
     ],
 )
 def test_stations_of_one_camera_share_windows(monkeypatch, most, expected):
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", most)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", most)
     counted = [np.unique(w.station, return_counts=True) for w in windows(stations())]
     assert [dict(zip(*map(np.ndarray.tolist, c), strict=True)) for c in counted] == expected
 
 
 @pytest.mark.parametrize("other", [{"response": "srgb"}, {"binning": 2}])
-def test_photographs_that_are_looked_at_otherwise_do_not(other):
+def test_images_that_are_looked_at_otherwise_do_not(other):
     usual = Placed(taken(), FRONT, poses())
     others = replace(taken(), station=1, **other)
-    case = [(w.response, w.binning) for w in windows([usual, usual._replace(photographs=others)])]
-    assert case == [(p.response, p.binning) for p in (usual.photographs, others)]
+    case = [(w.response, w.binning) for w in windows([usual, usual._replace(images=others)])]
+    assert case == [(p.response, p.binning) for p in (usual.images, others)]
 
 
 @pytest.mark.parametrize("most", [8, 32])
 @pytest.mark.parametrize("known", [{}, {2: 0.7, 5: 0.55, 7: 0.8}], ids=["blur", "known"])
 def test_together_stations_are_seen_as_each_alone(monkeypatch, known, most):
-    monkeypatch.setattr(passing, "PHOTOGRAPHS_A_WINDOW", most)
+    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", most)
     drawn = redrawn(0, 0.0005)
     coarse, fine = search_stations(stations(), drawn), measure_stations(stations(), drawn, known)
     for (p, T, in_view), whole, exact in zip(stations(), coarse, fine, strict=True):
@@ -168,7 +168,7 @@ def test_together_stations_are_seen_as_each_alone(monkeypatch, known, most):
     assert known or entries[5] > entries[7] + 0.1
 
 
-def test_tables_look_at_each_photograph_once_and_share_their_memory():
+def test_tables_look_at_each_image_once_and_share_their_memory():
     _, _, fresh = many()
     tables = distance_tables(fresh)
     assert (fresh.most, fresh.looks) == (2, len(fresh))
@@ -186,7 +186,7 @@ def test_tables_look_at_each_photograph_once_and_share_their_memory():
 def test_stations_are_looked_at_beside_one_another_or_together(monkeypatch, enough, each):
     """With the same result, in their order."""
     monkeypatch.setattr(refinement, "CACHED_IMAGE_BYTES", enough)
-    photographs = [replace(many()[0], station=number) for number in range(3)]
+    images = [replace(many()[0], station=number) for number in range(3)]
     threads: set[int] = set()
     counts: list[int] = []
 
@@ -195,7 +195,7 @@ def test_stations_are_looked_at_beside_one_another_or_together(monkeypatch, enou
         counts.append(len(some))
         return [legs.joined_passes([], 0.5 + one.station, 0.0) for one in some]
 
-    assert [in_view.blur for in_view in refinement._search_pass(photographs, measure)] == [
+    assert [in_view.blur for in_view in refinement._search_pass(images, measure)] == [
         0.5,
         1.5,
         2.5,
@@ -215,18 +215,17 @@ def session(demo):
 
 def test_so_many_bytes_of_a_session_stay_decoded(session, monkeypatch):
     sizes = [np.prod(station.camera.image_size) for station in session.stations]
-    each = len(session.stations[0].photographs)
+    each = len(session.stations[0].images)
     monkeypatch.setattr(localization, "CACHED_IMAGE_BYTES", int(sizes[0] * each + sizes[1]))
     retained = [
-        [p.images[k] is p.images[k] for k in range(len(p.images))]
-        for p in read_photographs(session)
+        [p.images[k] is p.images[k] for k in range(len(p.images))] for p in read_images(session)
     ]
     assert retained[0] == [True] * each
     assert retained[1] == [True] + [False] * (each - 1)
     assert not any(retained[2])
 
 
-def test_the_machine_is_looked_for_in_some_of_many_photographs(session, monkeypatch):
+def test_the_machine_is_looked_for_in_some_of_many_images(session, monkeypatch):
     """Spread over all of them, each under its own name."""
     monkeypatch.setattr(localization, "MOST_AT_A_STATION", 3)
     monkeypatch.setattr(localization, "FEWEST_AT_A_STATION", 2)
@@ -238,22 +237,22 @@ def test_the_machine_is_looked_for_in_some_of_many_photographs(session, monkeypa
 
     monkeypatch.setattr(localization, "distance_tables", counted)
     monkeypatch.setattr(localization, "mistake", lambda stations, _rng: in_view.extend(stations))
-    photographs, rng = read_photographs(session), np.random.default_rng(0)
-    assert all(len(p.images) == 4 for p in photographs)
-    rngs = rng.spawn(len(photographs))
-    results = localization.recognise(session, photographs, platform_poses(session), rngs)
-    assert tables == [3] * len(photographs)
-    assert [numbers.tolist() for numbers in results.used] == [[0, 1, 3]] * len(photographs)
-    mistake_in(session, photographs, results, rng)
+    images, rng = read_images(session), np.random.default_rng(0)
+    assert all(len(p.images) == 4 for p in images)
+    rngs = rng.spawn(len(images))
+    results = localization.recognise(session, images, platform_poses(session), rngs)
+    assert tables == [3] * len(images)
+    assert [numbers.tolist() for numbers in results.used] == [[0, 1, 3]] * len(images)
+    mistake_in(session, images, results, rng)
     for station in in_view:
         names = [session.configurations[k] for k in station.view.configuration]
         assert [name in file for name, file in zip(names, station.files, strict=True)] == [True] * 3
 
 
-def test_many_stations_share_the_photographs_that_are_looked_at(session, monkeypatch):
+def test_many_stations_share_the_images_that_are_looked_at(session, monkeypatch):
     monkeypatch.setattr(localization, "MOST_IN_ALL", 2 * len(session.stations))
     monkeypatch.setattr(localization, "FEWEST_AT_A_STATION", 1)
-    photographs = read_photographs(session)
-    rngs = np.random.default_rng(0).spawn(len(photographs))
-    results = localization.recognise(session, photographs, platform_poses(session), rngs)
-    assert [len(numbers) for numbers in results.used] == [2] * len(photographs)
+    images = read_images(session)
+    rngs = np.random.default_rng(0).spawn(len(images))
+    results = localization.recognise(session, images, platform_poses(session), rngs)
+    assert [len(numbers) for numbers in results.used] == [2] * len(images)

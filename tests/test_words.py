@@ -187,10 +187,10 @@ def test_a_leg_nobody_sees_stands_on_its_readings():
     scene = make("gough-stewart", n=4)
     without = [1, 2, 4, 5, 6]
     rows, _, sentences = told_of(scene, without, without, without)
-    assert [s.text.split(";")[0] for s in sentences] == ["Leg 3 is in no photograph"]
+    assert [s.text.split(";")[0] for s in sentences] == ["Leg 3 is in no image"]
     assert sentences[0].dimensions == len(rows.unidentified) == 5
     assert sentences[0].matters
-    assert sentences[0].advice.startswith("Photograph leg 3")
+    assert sentences[0].advice.startswith("Image leg 3")
     assert all(name.startswith("legs[3]") for name in sentences[0].parameters)
 
 
@@ -198,7 +198,7 @@ def test_a_passive_leg_nobody_sees_moves_nothing():
     values, _, sentences = told_of(make("6-spu-passive"), *[[1, 2, 3, 4, 5, 6]] * 3)
     assert len(sentences) == 1
     assert sentences[0].text == (
-        "Leg 7 is in no photograph, so that nothing tells where its joints are."
+        "Leg 7 is in no image, so that nothing tells where its joints are."
         " This does not move the platform."
     )
     assert not sentences[0].matters
@@ -545,7 +545,7 @@ def test_what_a_carrier_names_is_said(monkeypatch):
     changes = [{f"legs[{j}].base.center.x": 1.0, f"legs[{j}].base.axis.x": -2.0} for j in (1, 3)]
     null = np.array([unit(machine, change) for change in changes])
     poses = moved(machine, np.random.default_rng(1), 5)
-    around = Situation(machine, np.ones((1, 3), bool), poses, photographed=False)
+    around = Situation(machine, np.ones((1, 3), bool), poses, imaged=False)
     (sentence,) = describe(around, null)
     assert sentence.text.startswith("How legs 1 and 3 drift is free. Within the nominal model's")
     assert sentence.dimensions == 2

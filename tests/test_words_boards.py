@@ -172,7 +172,7 @@ def test_weak_and_free_are_told_together():
 @pytest.mark.parametrize(
     "case", [("h4",), ("h4", "rods"), ("delta",), ("linear-delta",), ("delta", None, "straight")]
 )
-def test_no_sentence_speaks_of_tubes_or_photographs_of_legs(case):
+def test_no_sentence_speaks_of_tubes_or_images_of_legs(case):
     values, findings, _ = told_of(*case)
     sentences = (*findings.unidentified, *findings.weak)
     text = " ".join(f"{s.text} {s.advice}" for s in sentences)

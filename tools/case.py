@@ -10,8 +10,8 @@ import numpy as np
 import pkmcal
 from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration
-from pkmcal.calibration.localization import platform_poses, read_photographs, recognise
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.calibration.localization import platform_poses, read_images, recognise
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Truth, load_truth, simulate_session
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
@@ -39,9 +39,9 @@ class Case:
         return load_truth(self.folder, self.session.machine)
 
     @cached_property
-    def photographs(self) -> list[Photographs]:
+    def images(self) -> list[StationImages]:
         """Decoded images by station."""
-        return read_photographs(self.session)
+        return read_images(self.session)
 
     @cached_property
     def result(self) -> Calibration:
@@ -52,8 +52,8 @@ class Case:
     def looks(self) -> list[Array]:
         """Rough and localized poses of the stations, T_camera_base (S, 4, 4) each."""
         poses = platform_poses(self.session)
-        rngs = np.random.default_rng(0).spawn(len(self.photographs) + 1)
-        results = recognise(self.session, self.photographs, poses, rngs[1:])
+        rngs = np.random.default_rng(0).spawn(len(self.images) + 1)
+        results = recognise(self.session, self.images, poses, rngs[1:])
         by_hand = [s.T_camera_base for s in self.session.stations if s.T_camera_base is not None]
         return [np.stack(by_hand), np.stack([f.T_camera_base for f in results.localizations])]
 

@@ -20,7 +20,7 @@ from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe import legs, profiles
-from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed
+from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.simulation import Truth
 
@@ -141,9 +141,9 @@ def edge_planes() -> str:
 def looks(case: Case) -> str:
     """Three panels: a rough pose, the localized station, the result."""
     s, k = 1, 5
-    photographs, session, result = case.photographs[s], case.session, case.result
-    row = int(photographs.configuration[k])
-    image = photographs.images[k]
+    images, session, result = case.images[s], case.session, case.result
+    row = int(images.configuration[k])
+    image = images.images[k]
     by_hand, recognised = (T[s] for T in case.looks)
     drawn = session.machine.forward(session.joints[row])
     state = result.estimate.state
@@ -157,20 +157,20 @@ def looks(case: Case) -> str:
     parts: list[str] = []
     for panel, (view, crop) in enumerate(zip(views, crops, strict=True)):
         machine, T, pose, colour, title = view
-        lines = edge_lines(machine, photographs, T, pose, k)
+        lines = edge_lines(machine, images, T, pose, k)
         frame = (10 + panel * 385, 34, 370, 316)
         parts.append(_panel(image, crop, frame, lines, colour, title, panel))
     return svg(1160, 360, *parts)
 
 
 def edge_lines(
-    machine: Machine, photographs: Photographs, T_camera_base: Array, pose: Array, k: int
+    machine: Machine, images: StationImages, T_camera_base: Array, pose: Array, k: int
 ) -> Array:
     """Predicted edges in image k, (E, n, 2) px; NaN where nothing is visible."""
     tubes = tubes_of(machine)
-    in_view = legs_in_camera(machine, T_camera_base, pose[None], photographs.joints[k][None])
-    points = edge_points(machine, photographs.camera, in_view, tubes, 60)
-    clear = unobstructed(machine, photographs.camera, in_view, tubes, points, 0.5)
+    in_view = legs_in_camera(machine, T_camera_base, pose[None], images.joints[k][None])
+    points = edge_points(machine, images.camera, in_view, tubes, 60)
+    clear = unobstructed(machine, images.camera, in_view, tubes, points, 0.5)
     return np.where(clear[0][..., None], points.pixel[0], np.nan)
 
 
@@ -220,9 +220,9 @@ def measured_places(case: Case) -> Places:
     """All profiles of the session, taken about the edges that truth predicts."""
     results: list[tuple[Array, ...]] = []
     truth = case.truth
-    for p in case.photographs:
+    for p in case.images:
         poses = truth.T_camera_base[p.station], truth.T_base_platform[p.configuration]
-        prediction = legs._predicted_edges(PhotographWindow.of([Placed(p, *poses)]), truth.machine)
+        prediction = legs._predicted_edges(ImageWindow.of([Placed(p, *poses)]), truth.machine)
         blur = {p.station: profiles.estimate_blur(prediction.across)}
         dull, _ = profiles.without_highlights(prediction.across, blur)
         curves = profiles.residual_curves(dull, blur)
@@ -306,17 +306,17 @@ def position_errors(places: Places) -> str:
     return _beside(*plots)
 
 
-def repeats(edges: Array, photographs: Array) -> str:
+def repeats(edges: Array, images: Array) -> str:
     """Histograms of errors over standard deviations, beside the normal density."""
     x = np.linspace(-5, 5, 201)
     normal = np.exp(-x * x / 2) / np.sqrt(2 * np.pi)
     plots: list[Plot] = []
     borders = np.arange(-5, 5.1, 0.5)
-    high = max(np.histogram(v, borders, density=True)[0].max() for v in (edges, photographs))
+    high = max(np.histogram(v, borders, density=True)[0].max() for v in (edges, images))
     top = float(np.ceil(10 * high)) / 10
     for values, title in (
         (edges, "Edges simulated with their stated noise"),
-        (photographs, "Rendered photographs, whole program"),
+        (images, "Rendered images, whole program"),
     ):
         label = "error of a centre's coordinate, in its σ"
         plot = Plot((-5, 5), (0, top), (label, "density"), (430, 320), title)

@@ -50,7 +50,7 @@ def calibrated(folder: Path, holdout: int = 0) -> Calibration:
     return pkmcal.calibrate(folder, holdout=holdout)
 
 
-def photographs(work: Path) -> str:
+def images(work: Path) -> str:
     """The first image of each station."""
     shots = [sorted(folder.iterdir())[0] for folder in sorted((session(work) / "images").iterdir())]
     figures = "".join(

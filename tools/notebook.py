@@ -24,7 +24,7 @@ CELLS = (
     (
         SAY,
         "# A calibration in Python\n\nA simulated hexapod, built a little off its drawing, is"
-        " photographed and calibrated. With your own machine, `pkmcal new DIR` makes a session to"
+        " imaged and calibrated. With your own machine, `pkmcal new DIR` makes a session to"
         " fill in, `pkmcal.load_session(DIR)` loads it, and all the rest is the same.",
     ),
     (
@@ -62,7 +62,7 @@ CELLS = (
     (
         SAY,
         "`bench/calibration/report.html` is the page for people, `mechanism.yaml` the machine for"
-        " controllers (`pkmcal export`). Which photographs would tell most next, and how sure the"
+        " controllers (`pkmcal export`). Which images would tell most next, and how sure the"
         " tool is now and would be then, m:",
     ),
     (

@@ -101,7 +101,7 @@ def result(case: Case) -> Shot:
     shot = replace(shot, jpeg=shot.large)
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}'
-        '<div class="grid"><div>{{ draw.picture(shot) }}<p>A photograph, the edges fitted in it,'
+        '<div class="grid"><div>{{ draw.picture(shot) }}<p>An image, the edges fitted in it,'
         " and the joints of the calibrated machine (rings) and of the nominal model"
         " (crosses)</p></div>"
         '<div class="right">{{ draw.view(view) }}<p>The machine from above, mm: joints by'
@@ -190,13 +190,13 @@ def repeats(case: Case) -> Shot:
     edges = np.concatenate([_edge_scores(case, k) for k in range(EDGE_REPEATS)])
     groups: dict[str, list[Array]] = {}
     for k in range(REPEATS):
-        for name, values in _photograph_scores(case, 100 + k).items():
+        for name, values in _image_scores(case, 100 + k).items():
             groups.setdefault(name, []).append(values)
-    photographs = {name: np.concatenate(values) for name, values in groups.items()}
+    images = {name: np.concatenate(values) for name, values in groups.items()}
     tell(f"edges only: error / sigma of centres {rms(edges):.2f}, n {edges.size}")
-    for name, values in photographs.items():
+    for name, values in images.items():
         tell(f"photographs: error / sigma of {name} {rms(values):.2f}, n {values.size}")
-    return whole_page(drawings.repeats(edges, photographs["centres"]), 880, 330)
+    return whole_page(drawings.repeats(edges, images["centres"]), 880, 330)
 
 
 def _edge_scores(case: Case, seed: int) -> Array:
@@ -215,7 +215,7 @@ def _edge_scores(case: Case, seed: int) -> Array:
         truth.T_base_platform,
         EdgeNoise(),
         rng,
-        photographs=truth.photographs,
+        images=truth.images,
     )
     cameras = np.zeros(len(truth.stations), dtype=int)
     measured = Measurements(edges, joints, 3e-6, len(cameras), cameras)
@@ -227,7 +227,7 @@ def _edge_scores(case: Case, seed: int) -> Array:
     return np.concatenate([normalised(body) for body in centres])
 
 
-def _photograph_scores(case: Case, seed: int) -> dict[str, Array]:
+def _image_scores(case: Case, seed: int) -> dict[str, Array]:
     """Errors over standard deviations by kind of parameter, from rendered images."""
     folder = simulated(case.work / f"repeat{seed}", seed)
     estimate = pkmcal.calibrate(folder).estimate
@@ -280,7 +280,7 @@ def tell(words: str) -> None:
     sys.stdout.write(words + "\n")
 
 
-def photograph(shot: Shot, path: Path) -> None:
+def image(shot: Shot, path: Path) -> None:
     """The page as a PNG file, small."""
     browser = next(
         filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
@@ -331,9 +331,9 @@ def view(case: Case) -> Shot:
     return Shot("", 1180, 640, case.session)
 
 
-def tutorial_photographs(case: Case) -> Shot:
+def tutorial_images(case: Case) -> Shot:
     """An image from each place of the tutorial's session."""
-    return whole_page(guide.photographs(case.work), 1180, 330)
+    return whole_page(guide.images(case.work), 1180, 330)
 
 
 def tutorial_check(case: Case) -> Shot:
@@ -395,7 +395,7 @@ PICTURES: dict[str, Callable[[Case], Shot]] = {
         repeats,
         plan,
         view,
-        tutorial_photographs,
+        tutorial_images,
         tutorial_check,
         tutorial_report,
         tutorial_workspace,
@@ -421,7 +421,7 @@ def main() -> None:
         if name == "accuracy":
             accuracy(case)
         else:
-            photograph(PICTURES[name](case), args.out / f"{name}.png")
+            image(PICTURES[name](case), args.out / f"{name}.png")
 
 
 if __name__ == "__main__":

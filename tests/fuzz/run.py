@@ -152,9 +152,9 @@ def _look_at(folder: Path) -> None:
     viewed = Viewed(load_session(folder), None)
     view_page_html(viewed)
     for k, station in enumerate(viewed.session.stations):
-        if station.photographs:
+        if station.images:
             viewed.jpeg(k, 0)
-            edges = ViewRequest(station=k, photograph=0)
+            edges = ViewRequest(station=k, image=0)
             overlay_after_gesture(viewed, edges)
             edge_search(viewed, edges)
 

@@ -94,7 +94,7 @@ def calibrate(
         progress=progress,
     )
     # release the images, which a long-lived result need not keep in memory
-    without_images = replace(calibration, photographs={})
+    without_images = replace(calibration, images={})
     return CalibrationResult(
         **{one.name: getattr(without_images, one.name) for one in fields(without_images)}
     )

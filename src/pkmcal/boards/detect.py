@@ -92,7 +92,7 @@ def _detect_in_file(path: Path, size: tuple[int, int], board: Board, *, quick: b
 def _common_size(files: Sequence[Path]) -> tuple[int, int]:
     """Common size of the images; raises InputError naming images of another size."""
     if not files:
-        raise InputError("no photographs were named", expected="photographs of the board")
+        raise InputError("no images were named", expected="images of the board")
     sizes = {path: image_header(path) for path in files}
     counts = {size: list(sizes.values()).count(size) for size in sizes.values()}
     usual = max(counts, key=lambda size: counts[size])
@@ -101,13 +101,13 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
         return usual
     turned = all(sizes[path] == usual[::-1] for path in odd)
     raise InputError(
-        "the photographs differ in size, so one camera as it was calibrated did not take them",
+        "the images differ in size, so one camera as it was calibrated did not take them",
         where=listed([path.name for path in odd]),
         found="{}x{} pixels".format(*sizes[odd[0]]),
         expected="{}x{}, as the other {}".format(*usual, counts[usual]),
-        next_step="They were turned by a quarter; keep photographs as the sensor gives them"
+        next_step="They were turned by a quarter; keep images as the sensor gives them"
         if turned
-        else "Calibrate each resolution on its own, from unscaled, uncropped photographs",
+        else "Calibrate each resolution on its own, from unscaled, uncropped images",
     )
 
 
@@ -147,11 +147,11 @@ def check_boards(
             raise _other_board_error(path, other, board)
         if other is not None:
             raise InputError(
-                "photographs of two boards are mixed",
+                "images of two boards are mixed",
                 where=path.name,
                 found=other,
                 expected=f"{board.described}, as in {listed([f.name for f in with_board], 3)}",
-                next_step="Calibrate with the photographs of one board",
+                next_step="Calibrate with the images of one board",
             )
 
 
@@ -159,7 +159,7 @@ def check_any(detections: Sequence[Detection], board: Board) -> None:
     """Raise `InputError` if no image shows the board."""
     if not any(detection.success for detection in detections):
         raise InputError(
-            "the board is in none of the photographs",
+            "the board is in none of the images",
             where=listed([detection.name for detection in detections], 3),
             found=detections[0].reason,
             expected=board.described,
@@ -173,7 +173,7 @@ def _other_board_error(path: Path, other: str, board: Board) -> InputError:
     grid = board.type == "aruco_grid"
     first = f" with first_id: {board.document.get('first_id', 0)}" if grid else ""
     return InputError(
-        "the photographs show another board than the one described",
+        "the images show another board than the one described",
         where=path.name,
         found=other,
         expected=f"{board.described}{first}, as the board file says",

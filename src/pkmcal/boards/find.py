@@ -1,4 +1,4 @@
-"""A board's corners in one photograph: found by OpenCV's detectors, then fitted to sub-pixel.
+"""A board's corners in one image: found by OpenCV's detectors, then fitted to sub-pixel.
 
 A detector says which corners there are and where they lie to a pixel; of boards with markers also
 whether the picture is a mirror image. Each corner is then fitted to the grey levels around it.
@@ -9,7 +9,7 @@ the blur, the picture of a chessboard's corner is ``c + a g(e1 / s) g(e2 / s)`` 
 directions, blur and grey levels are fitted to all pixels of a window that follows the board's
 local scale, so that it stays short where a lens or mirror makes the board small and bends its
 lines. This is the maximum-likelihood place of the corner, and measures the same on a slanted
-board as on a straight one. All corners of a photograph are fitted at once.
+board as on a straight one. All corners of an image are fitted at once.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def detect_board(
     quick: bool = False,
     options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS,
 ) -> Detection:
-    """Find the board's corners in one photograph, grey levels (height, width) uint8.
+    """Find the board's corners in one image, grey levels (height, width) uint8.
 
     quick : only the first way of finding a chessboard.
     """
@@ -186,7 +186,7 @@ def marker_bits(name: str) -> int:
 
 
 class Markers(NamedTuple):
-    """Markers in a photograph: ids (k,) and corners (k, 4, 2) px."""
+    """Markers in an image: ids (k,) and corners (k, 4, 2) px."""
 
     ids: Integers
     corners: Array
@@ -269,7 +269,7 @@ def _attempts(
 def _pictures(
     image: Integers, quick: bool, options: BoardDetectionOptions
 ) -> Iterator[tuple[Any, float]]:
-    """The photograph; with its contrast evened out; smaller; larger; each with its scale."""
+    """The image; with its contrast evened out; smaller; larger; each with its scale."""
     import cv2
 
     yield image, 1.0

@@ -75,7 +75,7 @@ BOARD_POSE_OPTIONS = BoardPoseOptions()
 
 UNSURE_BOARD_REASON = "the board: too few corners agree on one pose, or its tilt is not sure"
 """Reason for the rejection of a pose."""
-_EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
+_EXPECTED = "a board fixed to the base, and a camera that stands still: all images of a " \
     "station show the board in one place"  # fmt: skip
 ODD_BOARD_REASON = "the board lies {:.1f} standard deviations from where the repeats show it"
 
@@ -115,9 +115,9 @@ class BoardViews:
         unsure = [(int(k), UNSURE_BOARD_REASON) for k in self.numbers[~self.usable]]
         return tuple(self.rejection(k, why) for k, why in sorted(missed + unsure))
 
-    def rejection(self, photograph: int, reason: str) -> Rejection:
-        """Rejection of the board in one image; photograph : index among the K images."""
-        return Rejection(self.station, int(self.configuration[photograph]), -1, -1, -1, reason)
+    def rejection(self, image: int, reason: str) -> Rejection:
+        """Rejection of the board in one image; image : index among the K images."""
+        return Rejection(self.station, int(self.configuration[image]), -1, -1, -1, reason)
 
 
 def detect_in(
@@ -233,19 +233,18 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
     if mirrored and others:
         one = len(mirrored) == 1
         raise InputError(
-            "this photograph is a mirror image" if one else "these photographs are mirror images",
+            "this image is a mirror image" if one else "these images are mirror images",
             where=listed(mirrored, 3),
-            found=f"the board's markers reversed, and not in {count(others, 'other photograph')}",
-            next_step=f"Flip {'this photograph' if one else 'these photographs'} alone, or take"
+            found=f"the board's markers reversed, and not in {count(others, 'other image')}",
+            next_step=f"Flip {'this image' if one else 'these images'} alone, or take"
             f" {'it' if one else 'them'} again",
         )
     if mirrored:
         raise InputError(
-            "the photographs are mirror images",
+            "the images are mirror images",
             where=listed(mirrored, 3),
-            expected="photographs in which the board's markers are not reversed",
-            next_step="Flip all photographs of this camera, and calibrate the camera from flipped"
-            " ones",
+            expected="images in which the board's markers are not reversed",
+            next_step="Flip all images of this camera, and calibrate the camera from flipped ones",
         )
 
 
@@ -323,7 +322,7 @@ def standing_board(
         tuple(
             views.rejection(
                 int(views.numbers[k]),
-                f"the board stands {distance[k]:.1f} px from where the other photographs show it",
+                f"the board stands {distance[k]:.1f} px from where the other images show it",
             )
             for k in np.flatnonzero(odd)
         ),
@@ -376,7 +375,7 @@ def _check_still(
         raise InputError(
             "the board, or the camera, did not stand still",
             where=views.names[0].rpartition("/")[0] or views.names[0],
-            found=f"{odd} of {len(used)} photographs show it in other places than the rest",
+            found=f"{odd} of {len(used)} images show it in other places than the rest",
             expected=_EXPECTED,
         )
 
@@ -398,7 +397,7 @@ def _movement_error(
         found=f"the board {pixels:.1f} px away ({metres * 1e3:.1f} mm, {np.rad2deg(turn):.2f}"
         " degrees)",
         expected=_EXPECTED,
-        next_step=f"Make the photographs from {names[after[0]]} on a station of their own, if only"
+        next_step=f"Make the images from {names[after[0]]} on a station of their own, if only"
         " the camera was moved; take them again, if the board was",
     )
 

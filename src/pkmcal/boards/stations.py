@@ -42,7 +42,7 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
             continue
         # Hand-held images need not all show the board.
         detection, views = _board_by_hand(session, board, number, images[number])
-        path = station.photographs[0].path
+        path = station.images[0].path
         by_hand.setdefault(station.entry, []).append((path, detection))
         if views is not None:
             boards[number] = views
@@ -65,21 +65,21 @@ def station_board(
 ) -> StationBoard:
     """Board in the images of one fixed station."""
     station = session.stations[number]
-    labels = [label_of(session.folder, image.path) for image in station.photographs]
+    labels = [label_of(session.folder, image.path) for image in station.images]
     moves = session.board_body == "platform"
     detections = detect_in(images, board, labels)
     nowhere = not any(detection.success for detection in detections)
-    _check_another(board, station.name, [p.path for p in station.photographs], detections)
+    _check_another(board, station.name, [p.path for p in station.images], detections)
     # Each image of a moving board is a new measurement; of a still one, a few are enough.
     most = len(images) if moves else SLOW_SEARCH_IMAGES if nowhere else 0
     detections = detect_again(images, board, detections, most)
     _check_visible(station.name, board, detections)
-    rows = np.array([image.configuration for image in station.photographs])
+    rows = np.array([image.configuration for image in station.images])
     views = board_views(number, station.camera, rows, board, detections)
     stood = None if moves else standing_board(views)
     if not moves and stood is None:
         raise InputError(
-            "no photograph shows the board well enough for its pose",
+            "no image shows the board well enough for its pose",
             where=f"session.yaml, stations.{station.name}",
             found=views.rejected[0].reason,
             expected="one at least in which the board is large, sharp and little hidden",
@@ -91,7 +91,7 @@ def _check_visible(name: str, board: Board, detections: Sequence[Detection]) -> 
     """Raise `InputError` if no image of a station shows the board."""
     if not any(detection.success for detection in detections):
         raise InputError(
-            f"the board is in none of the photographs of station {name}",
+            f"the board is in none of the images of station {name}",
             where=detections[0].name,
             found=detections[0].reason,
             expected=f"{board.described}, sharp, and not hidden by the machine",
@@ -105,11 +105,11 @@ def _board_by_hand(
 ) -> tuple[Detection, StationBoard | None]:
     """Detection in a hand-held image, and the board's pose if it is usable."""
     station = session.stations[number]
-    labels = [label_of(session.folder, image.path) for image in station.photographs]
+    labels = [label_of(session.folder, image.path) for image in station.images]
     detections = detect_again(images, board, detect_in(images, board, labels), len(images))
     if not detections[0].success:
         return detections[0], None
-    rows = np.array([image.configuration for image in station.photographs])
+    rows = np.array([image.configuration for image in station.images])
     views = board_views(number, station.camera, rows, board, detections)
     if session.board_body == "platform":
         return detections[0], StationBoard(views, None)

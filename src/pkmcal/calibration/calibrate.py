@@ -40,7 +40,7 @@ from pkmcal.calibration.localization import (
     check_observable,
     legs_stations,
     platform_poses,
-    read_photographs,
+    read_images,
 )
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
@@ -95,7 +95,7 @@ class Calibration(CalibrationSummary):
     not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them. violations :
     detected model violations. model_errors : smooth model errors without a name, which the
     covariance contains. upside_down : cameras, turned by half, by which upside-down images were
-    measured. photographs : images of stations whose legs were observed, by the station's number;
+    measured. images : images of stations whose legs were observed, by the station's number;
     those that fitted into memory are decoded.
     """
 
@@ -114,9 +114,7 @@ class Calibration(CalibrationSummary):
     violations: tuple[DetectedViolation, ...] = ()
     model_errors: tuple[ModelError, ...] = ()
     upside_down: tuple[UpsideDown, ...] = ()
-    photographs: Mapping[int, Sequence[Integers]] = field(
-        default_factory=dict[int, Sequence[Integers]]
-    )
+    images: Mapping[int, Sequence[Integers]] = field(default_factory=dict[int, Sequence[Integers]])
 
     @property
     def machine(self) -> Machine:
@@ -222,7 +220,7 @@ def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
         return None if refined.verdict.usable else doubtful("camera.refinement_refused")
     taken = refined.session.images_taken
     retained, more = (
-        taken - sum(len(one.station.photographs) for one in candidate.session.rejected)
+        taken - sum(len(one.station.images) for one in candidate.session.rejected)
         for candidate in (refined, held)
     )
     if retained != more:
@@ -382,13 +380,13 @@ def _observe(session: Session, seed: int, clock: Clock) -> Case:
     """The case of a session with its stations localized, without hand-held images that could not be
     placed.
     """
-    clock.progress("Reading photographs", 0.0)
-    photographs = read_photographs(session)
+    clock.progress("Reading images", 0.0)
+    images = read_images(session)
     clock.lap("decode")
     if any("board" in station.observe for station in session.stations):
         clock.progress("Looking for the board", 0.1)
-    boards = boards_of(session, photographs)
-    case = localize_case(session, photographs, boards, np.random.default_rng(seed), clock.progress)
+    boards = boards_of(session, images)
+    case = localize_case(session, images, boards, np.random.default_rng(seed), clock.progress)
     clock.lap("observe")
     return case
 
@@ -399,7 +397,7 @@ def _identify(case: Case, refine_camera: bool, seed: int, clock: Clock) -> Refin
     """
     session, cameras = case.session, refinement_of(case.session, refine_camera)
     try:
-        if case.photographs:
+        if case.images:
             turns = refine_alternating(case, cameras, clock.progress, clock.lap)
         else:
             turns = identify_poses(
@@ -500,7 +498,7 @@ def _judge(
         violations=detections,
         model_errors=errors,
         upside_down=tuple(one for one in turned if one.sure),
-        photographs={one.station: one.images for one in case.photographs},
+        images={one.station: one.images for one in case.images},
     )
 
 

@@ -1,8 +1,8 @@
-"""What a session's photographs and tables measured, put together; cameras refined with it.
+"""What a session's images and tables measured, put together; cameras refined with it.
 
 A camera's intrinsics, where they are refined, are those of its calibration plus F u: F F^T is the
 calibration's covariance, and the u are unknowns of the estimate with unit variance. The focal
-lengths of photographs by hand breathe besides: each photograph's are larger than its camera's by an
+lengths of images by hand breathe besides: each image's are larger than its camera's by an
 unknown of its own.
 """
 
@@ -37,7 +37,7 @@ class CameraRefinement:
 
     files, calibrated : names and cameras as calibrated, C of them. factor : (C, n, r) the F above,
     r = 0 where cameras are held. at : (C, r). of_station : (S,) file of each station's camera.
-    breathes : (S,) whether the station is a photograph by hand. breath : (S,) excess of its focal
+    breathes : (S,) whether the station is an image by hand. breath : (S,) excess of its focal
     lengths, relative.
     """
 
@@ -63,7 +63,7 @@ class CameraRefinement:
 
     @property
     def active(self) -> bool:
-        """Whether there is anything to refine, of a camera or of a photograph."""
+        """Whether there is anything to refine, of a camera or of an image."""
         return self.refined or bool(self.breathes.any())
 
     def camera(self, file: str) -> Camera:
@@ -236,7 +236,7 @@ def measurements_of(
 
 
 def _with_focal(measured: Set, cameras: CameraRefinement) -> Set:
-    """What was measured, with what the excess of each photograph's focal lengths does to it."""
+    """What was measured, with what the excess of each image's focal lengths does to it."""
     each = [
         cameras.camera(file) if breathes else None
         for file, breathes in zip(cameras.of_station, cameras.breathes, strict=True)

@@ -24,7 +24,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import ScoreTests
 from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import Column, EdgeSet, Measurements, concatenate
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import OPTIONS
 from pkmcal.session.load import Session
@@ -95,11 +95,11 @@ def overruled(responses: Sequence[ResponseEstimate]) -> dict[str, Response]:
 
 def responses_by_edges(
     session: Session,
-    photographs: Sequence[Photographs],
+    images: Sequence[StationImages],
     measurements: Measurements,
     estimate: Estimate,
-    roughly: Callable[[list[Photographs]], EdgeSet],
-    measured: Callable[[list[Photographs]], EdgeSet],
+    roughly: Callable[[list[StationImages]], EdgeSet],
+    measured: Callable[[list[StationImages]], EdgeSet],
     of_edges: Callable[[EdgeSet], Measurements],
 ) -> tuple[ResponseEstimate, ...]:
     """Cameras without a response in session.yaml whose edges are against the usual one, or do not
@@ -109,8 +109,8 @@ def responses_by_edges(
     where those of ``measurements`` were, with the same blur or with their own. of_edges :
     measurements with these edges instead.
     """
-    usual: dict[_Camera, list[Photographs]] = {}
-    for p in photographs:
+    usual: dict[_Camera, list[StationImages]] = {}
+    for p in images:
         station = session.stations[p.station]
         if not station.response_given:
             usual.setdefault((station.camera_file, p.response), []).append(p)
@@ -149,16 +149,16 @@ def responses_by_edges(
     return tuple(one for one in rows if one.log_odds > -OPTIONS.report)
 
 
-def _entries(session: Session, photographs: Sequence[Photographs]) -> tuple[str, ...]:
+def _entries(session: Session, images: Sequence[StationImages]) -> tuple[str, ...]:
     """Entries of images' stations in session.yaml, each once."""
-    return tuple(dict.fromkeys(session.stations[p.station].entry for p in photographs))
+    return tuple(dict.fromkeys(session.stations[p.station].entry for p in images))
 
 
 def _questionable(
     measurements: Measurements,
     estimate: Estimate,
-    usual: Mapping[_Camera, Sequence[Photographs]],
-    roughly: Callable[[list[Photographs]], EdgeSet],
+    usual: Mapping[_Camera, Sequence[StationImages]],
+    roughly: Callable[[list[StationImages]], EdgeSet],
 ) -> list[_Camera]:
     """Cameras all of whose images are to be measured by the other response: a few images gain by
     it, or do not determine the change, as with polished legs.
@@ -177,32 +177,32 @@ def _questionable(
     ]
 
 
-def _otherwise(photographs: Sequence[Photographs]) -> list[Photographs]:
-    return [replace(p, response=OTHER_RESPONSE[p.response]) for p in photographs]
+def _otherwise(images: Sequence[StationImages]) -> list[StationImages]:
+    return [replace(p, response=OTHER_RESPONSE[p.response]) for p in images]
 
 
-def _select(photographs: Sequence[Photographs], which: Sequence[Booleans]) -> list[Photographs]:
+def _select(images: Sequence[StationImages], which: Sequence[Booleans]) -> list[StationImages]:
     """Some images of each station, where there are any."""
-    pairs = zip(photographs, which, strict=True)
+    pairs = zip(images, which, strict=True)
     return [p.select(np.flatnonzero(some)) for p, some in pairs if some.any()]
 
 
-def _test_images(photographs: Sequence[Photographs]) -> list[Booleans]:
+def _test_images(images: Sequence[StationImages]) -> list[Booleans]:
     """Masks of each station's images: those of some configurations, spread evenly over the stations
     of a camera.
     """
-    visible = [np.unique(p.configuration) for p in photographs]
+    visible = [np.unique(p.configuration) for p in images]
     first = np.cumsum([0, *map(len, visible)])
     some = evenly(int(first[-1]), RESPONSE_TEST_CONFIGURATIONS)
     return [
         np.isin(p.configuration, here[some[(some >= since) & (some < end)] - since])
-        for p, here, since, end in zip(photographs, visible, first[:-1], first[1:], strict=True)
+        for p, here, since, end in zip(images, visible, first[:-1], first[1:], strict=True)
     ]
 
 
 def _edge_mask(
     edges: EdgeSet,
-    usual: Mapping[_Camera, Sequence[Photographs]],
+    usual: Mapping[_Camera, Sequence[StationImages]],
     queries: Mapping[_Camera, Sequence[Booleans]],
 ) -> Booleans:
     """Mask (N,) of edges in the images that are tested, or of cameras that are not tested."""

@@ -11,7 +11,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.identify.bundle import MarginalPrior
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.outcome.finding import Finding
 from pkmcal.session.load import Session
 
@@ -50,6 +50,6 @@ class Case(NamedTuple):
     """
 
     session: Session
-    photographs: list[Photographs]
+    images: list[StationImages]
     boards: Boards
     scene: PriorScene

@@ -47,7 +47,7 @@ def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
     """A reason against the result where its edges may be chance matches; tested only where less
     than a third of the edges in sight were measured.
     """
-    offered = _offered(turns, [p.station for p in turns.photographs])
+    offered = _offered(turns, [p.station for p in turns.images])
     if offered is None:
         return ()
     return (
@@ -72,7 +72,7 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
     """
     boards = set(turns.measurements.poses.station.tolist())
     wrong: dict[int, str] = {}
-    for k in (p.station for p in turns.photographs):
+    for k in (p.station for p in turns.images):
         station = session.stations[k]
         if station.handheld or k in boards:
             continue
@@ -83,7 +83,7 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
                 f" the machine has them, and chance offers as many {how_often(offered.chance)}: it"
                 f" may stand elsewhere{advice}"
             )
-    return wrong if len(wrong) < len(turns.photographs) else {}
+    return wrong if len(wrong) < len(turns.images) else {}
 
 
 def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | None:
@@ -99,7 +99,7 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     )
     given_up = int(np.sum(mine & (turns.estimate.edge_weights < 0.5)))  # which are among both
     in_sight = int(np.sum(mine)) + missed - given_up
-    if not turns.photographs or measured >= FEW_MEASURED * in_sight:
+    if not turns.images or measured >= FEW_MEASURED * in_sight:
         return None
     angle = 2 * np.pi * np.arange(OFFSET_DIRECTIONS) / OFFSET_DIRECTIONS
     lateral = IMAGE_OFFSET * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -121,7 +121,7 @@ def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> i
     state = turns.estimate.state
     shifted = [
         replace(p, camera=p.camera.shifted(p.binning * offset))
-        for p in turns.photographs
+        for p in turns.images
         if p.station in stations
     ]
     placed = placed_at(shifted, state.T_camera_base, state.T_base_platform)

@@ -36,7 +36,7 @@ from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.observe import legs
 from pkmcal.observe.background import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.image_localization import PoseHypotheses, localize_image
 from pkmcal.observe.pose_candidates import SAME_POSE_TURN, same_pose
 from pkmcal.observe.pose_likelihood import StationView
@@ -53,9 +53,9 @@ whatever their score by the image alone: a wrong pose corrupts the estimate."""
 RESCORING_GROWTH = 1.25
 """Ratio by which the number of images that determine the machine must grow before the poses of
 an image are scored anew."""
-EDGES_DISAGREE_REASON = "too few of its edges agree with the other photographs"
+EDGES_DISAGREE_REASON = "too few of its edges agree with the other images"
 """Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
-CAMERA_TURNED_REASON = "all photographs together turn its camera by more than ten degrees"
+CAMERA_TURNED_REASON = "all images together turn its camera by more than ten degrees"
 """Reason for rejecting an image that has a single candidate pose and does not belong there."""
 MOST_TURN = SAME_POSE_TURN / 2
 """Largest rotation (rad) by which the joint estimate may change the localized pose of an image."""
@@ -81,7 +81,7 @@ class Localization:
 
 def localize_case(
     session: Session,
-    photographs: list[Photographs],
+    images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
@@ -91,7 +91,7 @@ def localize_case(
     Raises `InputError` or `ResultError` if the pose of a station on a tripod is undetermined, or if
     no hand-held image is localized.
     """
-    value = localize(session, photographs, boards, rng, progress).result
+    value = localize(session, images, boards, rng, progress).result
     if isinstance(value, PkmcalError):
         raise value
     return value
@@ -99,18 +99,18 @@ def localize_case(
 
 def localize(
     session: Session,
-    photographs: list[Photographs],
+    images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
 ) -> Localization:
     """Poses of all stations; hand-held images that are not localized are rejected with a reason.
 
-    photographs : images of all stations that observe legs.
+    images : images of all stations that observe legs.
     progress : called with the step as text and the share done.
     """
     # stations on tripods first; if they fail, hand-held images are not searched
-    fixed = [p for p in photographs if not session.stations[p.station].handheld]
+    fixed = [p for p in images if not session.stations[p.station].handheld]
     search = locate_stations(session, fixed, boards, rng, progress)
     places: dict[int, PoseHypotheses] = {}
     if search.error is not None:
@@ -118,8 +118,8 @@ def localize(
     scene = PriorScene.as_drawn(session.machine, search.T_camera_base, session.joints)
     # hand-held images, and the reasons of those without a pose or with a contradictory one
     lost: dict[int, str] = {}
-    if len(fixed) < len(photographs):
-        places, scene = search_by_hand(session, photographs, boards, scene, progress)
+    if len(fixed) < len(images):
+        places, scene = search_by_hand(session, images, boards, scene, progress)
         nowhere = {k for k in places if np.isnan(scene.T_camera_base[k]).any()}
         sure = _sure(places, len(places))
         lost = {k: EDGES_DISAGREE_REASON if k in sure else why_lost(places[k]) for k in nowhere}
@@ -128,8 +128,8 @@ def localize(
             if turn > MOST_TURN and k in sure:
                 lost[k] = CAMERA_TURNED_REASON
     # remove the rejected images
-    case = Case(session, photographs, boards, scene)
-    if len(fixed) < len(photographs):
+    case = Case(session, images, boards, scene)
+    if len(fixed) < len(images):
         try:
             case = _without(case, lost)
         except PkmcalError as error:
@@ -139,7 +139,7 @@ def localize(
 
 def search_by_hand(
     session: Session,
-    photographs: list[Photographs],
+    images: list[StationImages],
     boards: Boards,
     scene: PriorScene,
     progress: CalibrationProgress | None = None,
@@ -149,13 +149,13 @@ def search_by_hand(
 
     T_camera_base of the scene is NaN for images without an accepted pose.
 
-    photographs : images of all stations that observe legs.
+    images : images of all stations that observe legs.
     scene : of the nominal model, with T_camera_base of the stations localized already and NaN for
         the others.
     progress : called with the step as text and the share done.
     """
     first = np.zeros(1, dtype=int)  # one image represents a camera on a tripod
-    at = {p.station: p.select(first) for p in photographs}
+    at = {p.station: p.select(first) for p in images}
     by_hand = [k for k in at if session.stations[k].handheld]
     room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
     answers: dict[int, _CachedHypotheses] = {}
@@ -181,14 +181,14 @@ def search_by_hand(
         alone = pool.map(partial(_image_hypotheses, session, scene), [at[k] for k in by_hand])
         for k, one in zip(by_hand, alone, strict=True):
             answers[k] = _CachedHypotheses(one, one)
-            step(f"Placing photographs by hand: {len(answers)} of {len(by_hand)}", 0.2)
+            step(f"Placing images by hand: {len(answers)} of {len(by_hand)}", 0.2)
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = (len(clearer) + 1) // 2
-        step(f"Asking the {half} clearest of {len(by_hand)} photographs", 0.25)
+        step(f"Asking the {half} clearest of {len(by_hand)} images", 0.25)
         rescore(clearer[:half])
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
-        step(f"Asking the others, with {len(so_far.placed)} photographs placed", 0.25)
+        step(f"Asking the others, with {len(so_far.placed)} images placed", 0.25)
         rescore(clearer[half:])
         # join the images of a board, and repeat until no image is added
         for k, one in _on_board(hypotheses(), boards).items():
@@ -198,7 +198,7 @@ def search_by_hand(
             before, T = so_far, believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
             placed = len(by_hand) - len(unsure)
-            step(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
+            step(f"Asking again, with {placed} of {len(by_hand)} images placed", 0.3)
             rescore(unsure)
             so_far = _with_sure(session, at, room, so_far, believed(), boards)
     out = believed()
@@ -264,7 +264,7 @@ class _CachedHypotheses:
 
 def _with_sure(
     session: Session,
-    photographs: Mapping[int, Photographs],
+    images: Mapping[int, StationImages],
     room: Surroundings,
     so_far: _LocalizationState,
     believed: Array,
@@ -275,49 +275,47 @@ def _with_sure(
     believed : T_camera_base (S, 4, 4), NaN for images without an accepted pose.
     """
     scene = so_far.scene
-    sure = {k: T for k, T in enumerate(believed) if k in photographs and not np.isnan(T).any()}
+    sure = {k: T for k, T in enumerate(believed) if k in images and not np.isnan(T).any()}
     new = {k: T for k, T in sure.items() if k not in scene.edges}
     if not new:
         return so_far
     try:
-        joined = register_images(session, photographs, scene, new, boards)
+        joined = register_images(session, images, scene, new, boards)
         # silhouettes match anywhere, legs can be measured at the correct pose only
         bare = frozenset(
             k
             for k in new
             if session.stations[k].handheld
             and k not in boards.stations
-            and _too_few_edges(joined, photographs[k])
+            and _too_few_edges(joined, images[k])
         )
         if bare == new.keys():
             return so_far._replace(bare=bare) if bare != so_far.bare else so_far
         if bare:
             rest = {k: T for k, T in new.items() if k not in bare}
-            joined = register_images(session, photographs, scene, rest, boards)
+            joined = register_images(session, images, scene, rest, boards)
         scene = joined
     except PkmcalError as error:
         return so_far._replace(failure=str(error))
     # legs and landmarks of all accepted images with the new machine
     placed: dict[int, Neighbour] = {}
     for k in sorted(scene.edges):
-        p, T = photographs[k], scene.T_camera_base[k]
+        p, T = images[k], scene.T_camera_base[k]
         placed[k] = Neighbour(p.camera, T, _legs(session, p, scene, T)[0])
     return _LocalizationState(scene, placed, room.landmarks(placed), bare)
 
 
-def _too_few_edges(scene: PriorScene, photograph: Photographs) -> bool:
+def _too_few_edges(scene: PriorScene, image: StationImages) -> bool:
     """Whether fewer legs than FEWEST_LEGS can be measured in an image at its pose."""
-    p, machine = photograph, scene.machine
+    p, machine = image, scene.machine
     T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
     return len(visible) < min(FEWEST_LEGS, machine.n_legs)
 
 
-def _image_hypotheses(
-    session: Session, scene: PriorScene, photograph: Photographs
-) -> PoseHypotheses:
+def _image_hypotheses(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
     """Pose hypotheses from one image alone."""
-    p = photograph
+    p = image
     view = StationView(
         scene.machine, p.camera, p.configuration, session.joints, scene.T_base_platform,
         distance_tables([p.images[0]]),
@@ -329,7 +327,7 @@ def _search(
     session: Session,
     room: Surroundings,
     so_far: _LocalizationState,
-    photograph: Photographs,
+    image: StationImages,
     before: _CachedHypotheses,
 ) -> _CachedHypotheses:
     """Pose hypotheses of an image, weighted by its legs and by the background.
@@ -339,7 +337,7 @@ def _search(
     once more; later images change the machine little. Poses that were scored with a similar machine
     are not scored again.
     """
-    p, scene, placed, k = photograph, so_far.scene, so_far.placed, photograph.station
+    p, scene, placed, k = image, so_far.scene, so_far.placed, image.station
     alone, scores, by, beside = before.hypotheses, None, scene.prior, len(placed)
     # localize anew with the first machine from images; reuse the scores of a similar machine
     if scene.prior is not None:
@@ -361,12 +359,12 @@ def _search(
 
 
 def _legs(
-    session: Session, photograph: Photographs, joined: PriorScene, T_camera_base: Array
+    session: Session, image: StationImages, joined: PriorScene, T_camera_base: Array
 ) -> LegsInCamera:
     """Leg axes (H, L, 3) in the frames of an image's candidate poses (H, 4, 4), or (1, L, 3) for
     one.
     """
-    first = photograph.configuration[:1]
+    first = image.configuration[:1]
     pose, readings = joined.T_base_platform[first], session.joints[first]
     return legs_in_camera(joined.machine, T_camera_base, pose, readings)
 
@@ -483,7 +481,7 @@ def without_misplaced(
     edges : measurements of the estimate.
     """
     state = estimate.state
-    mine = {p.station: edges.select(edges.station == p.station) for p in case.photographs}
+    mine = {p.station: edges.select(edges.station == p.station) for p in case.images}
     scene = case.scene._replace(
         machine=estimate.machine, T_camera_base=state.T_camera_base,
         T_base_platform=state.T_base_platform, edges=mine,
@@ -511,12 +509,12 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
     # an error if no hand-held image, or a single configuration, remains
     if by_hand and lost.keys() >= set(by_hand):
         raise InputError(
-            "the machine is recognised in none of the photographs by hand",
+            "the machine is recognised in none of the images by hand",
             where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
             found=f"{session.label(by_hand[0])}: {lost[by_hand[0]]}",
             expected="one place for each where its legs lie on edges of the picture far oftener"
             " than elsewhere",
-            next_step="Check that these photographs show this machine's legs, large and sharp, that"
+            next_step="Check that these images show this machine's legs, large and sharp, that"
             " each bears the name of its configuration, and that the nominal model is this"
             " machine's",
         )
@@ -525,23 +523,23 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
     number = {k: new for new, k in enumerate(retained)}
     trackers = range(len(session.stations), len(scene.T_camera_base))
     remainder = session.without(lost)
-    rows = {photo.configuration for s in remainder.stations for photo in s.photographs}
+    rows = {photo.configuration for s in remainder.stations for photo in s.images}
     if len(rows) < 2:
         names = [session.configurations[k] for k in sorted(rows)]
         raise InputError(
-            "the photographs that are recognised show one configuration only",
+            "the images that are recognised show one configuration only",
             where=f"session.yaml, stations.{session.stations[(by_hand or [*lost])[0]].entry}",
             found=f"{listed(names)}; {remainder.rejected[0].finding.text}"
             if remainder.rejected
             else listed(names),
             expected="two at least",
-            next_step="Take photographs in which all legs are large and before a plain background",
+            next_step="Take images in which all legs are large and before a plain background",
         )
     T_camera_base = scene.T_camera_base[[*retained, *trackers]]
     edges = {number[k]: results for k, results in scene.edges.items() if k in number}
     return Case(
         remainder,
-        [replace(p, station=number[p.station]) for p in case.photographs if p.station in number],
+        [replace(p, station=number[p.station]) for p in case.images if p.station in number],
         case.boards.of(np.array(retained, dtype=int)),
         scene._replace(T_camera_base=T_camera_base, edges=edges, prior=None),
     )

@@ -200,7 +200,7 @@ def _check(n: int, remainder: int, total: int, what: str) -> None:
             found=f"{count(total, 'pose')} seen",
             expected=f"{2 * FEWEST_TO_CALIBRATE} at least; configurations whose readings"
             " are equal within their noise are of one pose",
-            next_step="Photograph more configurations",
+            next_step="Take images of more configurations",
         )
     raise InputError(
         f"this number of {what} is not possible",

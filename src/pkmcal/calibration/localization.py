@@ -18,7 +18,7 @@ from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.hypotheses import SuspectStation, mistake
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, fitting
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.station_localization import LocalizedPose, find_station
@@ -56,18 +56,18 @@ def check_observable(session: Session) -> None:
         )
 
 
-def read_photographs(session: Session) -> list[Photographs]:
+def read_images(session: Session) -> list[StationImages]:
     """Image batches of the stations that observe legs, checked to be decodable; the first images
     that fit into CACHED_IMAGE_BYTES bytes stay decoded.
     """
 
-    def read(number: int, most: int) -> Photographs:
+    def read(number: int, most: int) -> StationImages:
         station = session.stations[number]
-        paths, labels = photograph_files(session, station)
+        paths, labels = image_files(session, station)
         images = Pictures.read(paths, station.camera.image_size, labels, most)
-        rows = np.array([p.configuration for p in station.photographs])
+        rows = np.array([p.configuration for p in station.images])
         readings = session.joints[rows]
-        return Photographs(
+        return StationImages(
             number, station.camera, rows, readings, images, station.response,
             legs.first_binning(station.camera.image_size),
         )  # fmt: skip
@@ -76,15 +76,15 @@ def read_photographs(session: Session) -> list[Photographs]:
     for number in numbers:
         station = session.stations[number]
         size = station.camera.image_size
-        retained.append(min(fitting(size, room), len(station.photographs)))
+        retained.append(min(fitting(size, room), len(station.images)))
         room -= retained[-1] * size[0] * size[1]
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(read, numbers, retained))
 
 
-def photograph_files(session: Session, station: Station) -> tuple[list[Path], list[str]]:
+def image_files(session: Session, station: Station) -> tuple[list[Path], list[str]]:
     """Paths of a station's images, and their names in messages."""
-    paths = [photo.path for photo in station.photographs]
+    paths = [photo.path for photo in station.images]
     return paths, [label_of(session.folder, path) for path in paths]
 
 
@@ -192,7 +192,7 @@ class Recognition:
 
 def recognise(
     session: Session,
-    photographs: list[Photographs],
+    images: list[StationImages],
     poses: Array,
     rngs: list[np.random.Generator],
     boards: Boards | None = None,
@@ -200,7 +200,7 @@ def recognise(
 ) -> Recognition:
     """Localize every station that observes legs; nothing is raised.
 
-    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``photographs``.
+    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``images``.
     boards : on the base, give stations without a pose by hand a start, from those that were
     localized. starts : (S, 4, 4) of all stations, where there are better starts than by hand; NaN
     elsewhere. A station that is not recognised from its start is searched anywhere. For stations
@@ -208,14 +208,14 @@ def recognise(
     """
     boards = boards or Boards()
     machine = session.machine
-    most = min(MOST_AT_A_STATION, MOST_IN_ALL // max(len(photographs), 1))
-    in_view = tuple(p.spread(max(most, FEWEST_AT_A_STATION)) for p in photographs)
+    most = min(MOST_AT_A_STATION, MOST_IN_ALL // max(len(images), 1))
+    in_view = tuple(p.spread(max(most, FEWEST_AT_A_STATION)) for p in images)
 
-    def view(p: Photographs) -> StationView:
+    def view(p: StationImages) -> StationView:
         tables = distance_tables(p.images)
         return StationView(machine, p.camera, p.configuration, session.joints, poses, tables)
 
-    at = [p.station for p in photographs]
+    at = [p.station for p in images]
     start_poses = [station.T_camera_base for station in session.stations]
     if starts is not None:
         start_pairs = zip(start_poses, starts[: len(start_poses)], strict=True)
@@ -223,7 +223,7 @@ def recognise(
             T if T is not None or np.isnan(start).any() else start for T, start in start_pairs
         ]
     # one station after the other: what works its tables out uses all threads
-    views = tuple(view(p.select(numbers)) for p, numbers in zip(photographs, in_view, strict=True))
+    views = tuple(view(p.select(numbers)) for p, numbers in zip(images, in_view, strict=True))
     solution = _searched(views, [start_poses[s] for s in at], [None] * len(at), rngs)
     # Through the board a pose by hand would be off by its angle times the stations' distance, so
     # the rest are searched from where the search has ended with those that were found.
@@ -279,7 +279,7 @@ def _better(one: LocalizedPose, other: Search) -> LocalizedPose:
 
 def mistake_in(
     session: Session,
-    photographs: list[Photographs],
+    images: list[StationImages],
     recognition: Recognition,
     rng: np.random.Generator,
 ) -> InputError | None:
@@ -290,12 +290,12 @@ def mistake_in(
     still = frozen_in(session)
     if still is not None and not recognition.complete:  # an error in any case, and cheaper
         return still
-    stations = [session.stations[p.station] for p in photographs]
+    stations = [session.stations[p.station] for p in images]
     error = mistake(
         [
             SuspectStation(
                 station.name,
-                [label_of(session.folder, station.photographs[k].path) for k in visible],
+                [label_of(session.folder, station.images[k].path) for k in visible],
                 session.configurations,
                 view,
                 station.T_camera_base,
@@ -335,7 +335,7 @@ class StationSearch(NamedTuple):
 
 def localize_stations(
     session: Session,
-    photographs: list[Photographs],
+    images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
@@ -344,7 +344,7 @@ def localize_stations(
 
     Raises `InputError`, or `ResultError`, where nothing determines one that is not hand-held.
     """
-    value = locate_stations(session, photographs, boards, rng, progress)
+    value = locate_stations(session, images, boards, rng, progress)
     if value.error is not None:
         raise value.error
     return value.T_camera_base
@@ -352,7 +352,7 @@ def localize_stations(
 
 def locate_stations(
     session: Session,
-    photographs: list[Photographs],
+    images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
     progress: CalibrationProgress | None = None,
@@ -360,27 +360,27 @@ def locate_stations(
     """Poses of all stations, each by the first source that determines it: the session and boards,
     localization by the legs, measured poses. Nothing is raised.
 
-    photographs : in which the machine is localized, none hand-held. progress : called with the step
+    images : in which the machine is localized, none hand-held. progress : called with the step
     in words and the share done.
     """
     nowhere = np.full((len(session.station_names), 4, 4), np.nan)
     value: Recognition | None = None
     try:
         start_poses = prior_station_poses(session, boards)
-        poses = platform_poses(session) if photographs else nowhere
+        poses = platform_poses(session) if images else nowhere
     except PkmcalError as error:
         return StationSearch(None, nowhere, error)
-    if photographs:
-        rngs = rng.spawn(len(photographs) + 1)
+    if images:
+        rngs = rng.spawn(len(images) + 1)
         progress = progress or (lambda _text, _share: None)
-        count = sum(len(p.images) for p in photographs)
-        progress(f"Recognising the machine in {count} photographs", 0.2)
-        value = recognise(session, photographs, poses, rngs[1:], boards, start_poses)
+        count = sum(len(p.images) for p in images)
+        progress(f"Recognising the machine in {count} images", 0.2)
+        value = recognise(session, images, poses, rngs[1:], boards, start_poses)
         progress("Comparing with what is often mixed up", 0.3)
-        mixed_up = mistake_in(session, photographs, value, rngs[0])
+        mixed_up = mistake_in(session, images, value, rngs[0])
         if mixed_up is not None:
             return StationSearch(value, start_poses, mixed_up)
-        start_poses[[p.station for p in photographs]] = [
+        start_poses[[p.station for p in images]] = [
             pose.T_camera_base for pose in value.localizations
         ]
         visible = [None if np.isnan(T).any() else T for T in start_poses[: len(session.stations)]]
@@ -442,7 +442,7 @@ def _tracker_starts(session: Session) -> list[Array | None]:
     return [table.start(poses) for table in session.trackers]
 
 
-def boards_of(session: Session, photographs: list[Photographs]) -> Boards:
+def boards_of(session: Session, images: list[StationImages]) -> Boards:
     """The session's board in its images; see :func:`pkmcal.boards.stations.find_boards`.
 
     Images that only show the board are decoded one by one, on access.
@@ -451,14 +451,16 @@ def boards_of(session: Session, photographs: list[Photographs]) -> Boards:
         return Boards()
     from pkmcal.boards.stations import find_boards
 
-    return find_boards(session, board_images(session, photographs))
+    return find_boards(session, board_images(session, images))
 
 
-def board_images(session: Session, photographs: list[Photographs]) -> dict[int, Sequence[Integers]]:
-    """All stations' photographs by their number: decoded already, or when they are looked at."""
-    images: dict[int, Sequence[Integers]] = {p.station: p.images for p in photographs}
+def board_images(
+    session: Session, station_images: list[StationImages]
+) -> dict[int, Sequence[Integers]]:
+    """All stations' station_images by their number: decoded already, or when they are looked at."""
+    images: dict[int, Sequence[Integers]] = {p.station: p.images for p in station_images}
     for number, station in enumerate(session.stations):
         if number not in images:
-            paths, labels = photograph_files(session, station)
+            paths, labels = image_files(session, station)
             images[number] = Pictures(paths, station.camera.image_size, labels)
     return images

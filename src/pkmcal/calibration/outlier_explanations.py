@@ -3,7 +3,7 @@
 A pose that was measured tells what all motors should have read, whatever they did read. Where a
 configuration disagrees and all of its readings but one agree, that reading is wrong; where its pose
 agrees with the readings of another configuration, names were mixed up. Either is outvoted by the
-other configurations, so the result is right; but whoever took the photographs wants to know.
+other configurations, so the result is right; but whoever took the images wants to know.
 """
 
 from __future__ import annotations

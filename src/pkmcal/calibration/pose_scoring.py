@@ -33,7 +33,7 @@ from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, of_stations
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.image_localization import (
     PoseHypotheses,
     distinct,
@@ -72,7 +72,7 @@ scene."""
 
 def register_images(
     session: Session,
-    photographs: Mapping[int, Photographs],
+    images: Mapping[int, StationImages],
     scene: PriorScene,
     places: Mapping[int, Array],
     boards: Boards,
@@ -82,12 +82,12 @@ def register_images(
     The silhouettes of images registered earlier are measured again too, because theirs depend on
     the machine assumed at the time. Raises a `PkmcalError` if nothing can be estimated.
 
-    photographs : by station.
+    images : by station.
     boards : boards in these images.
     """
 
     def view(k: int, scene: PriorScene) -> StationView:
-        return finest_view(scene.machine, photographs[k], session.joints, scene.T_base_platform)
+        return finest_view(scene.machine, images[k], session.joints, scene.T_base_platform)
 
     n_passes = PASSES_FROM_PRIOR if scene.edges else PASSES_FROM_NOMINAL
     every = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
@@ -197,7 +197,7 @@ class ScoredPoses(NamedTuple):
 
 def rescore_poses(
     session: Session,
-    photograph: Photographs,
+    image: StationImages,
     before: PriorScene,
     hypotheses: PoseHypotheses,
     others: Array,
@@ -212,7 +212,7 @@ def rescore_poses(
     others : (n, 4, 4) further poses to score.
     scores : earlier ones with the same machine; their poses are not scored again.
     """
-    p = photograph.decoded()
+    p = image.decoded()
     one = np.zeros(1, dtype=int)
     view = finest_view(before.machine, p, session.joints, before.T_base_platform)
     # candidates, refined with the machine as it is known

@@ -1,6 +1,6 @@
 """Observation and identification in turns: what is known so far predicts where to look.
 
-The nominal model and the rough poses find the machine in the photographs; legs found to a pixel
+The nominal model and the rough poses find the machine in the images; legs found to a pixel
 give a first estimate; that predicts edges to a pixel, whose sub-pixel positions give the next.
 Boards and tables of poses need no prediction: they are measured once.
 """
@@ -44,7 +44,7 @@ from pkmcal.measurements import (
 from pkmcal.measurements.effects import FOCAL_EXCESS, INTRINSICS
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs, placed_at
+from pkmcal.observe.image_batches import StationImages, placed_at
 from pkmcal.observe.image_localization import finest_view
 from pkmcal.observe.images import CACHED_IMAGE_BYTES
 from pkmcal.observe.profiles import PROFILE_OPTIONS, BlurByStation
@@ -81,18 +81,18 @@ IMPUTATION_PASSES = 6
 """Looks from machines as likely as the one that was found: with some thirty numbers told in each,
 the deviations that they make larger are known to a twentieth."""
 MOST_BINNING = 4
-"""Times that photographs are binned as at first, at most: to pictures of 256 pixels, in which a
+"""Times that images are binned as at first, at most: to pictures of 256 pixels, in which a
 machine is still recognised."""
 FEW_MEASURED = 1 / 3
 """Share of the edges by which the machine was found below which too few of them can be measured one
 by one, so that it is asked whether they are too blurred."""
-PHOTOGRAPHS_FOR_WIDTH = 4
-"""Photographs of a station that are asked about that: a lens blurs all alike."""
+IMAGES_FOR_WIDTH = 4
+"""StationImages of a station that are asked about that: a lens blurs all alike."""
 NEARLY_ALL = 0.9
 """Share of the legs, found where all others put them, above which a second look for the rest would
 hardly move the estimate, from which edges are looked for next."""
 FEWEST_EDGES_TO_IDENTIFY = 24
-"""Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
+"""Edges without which there is nothing to identify: one image of a hexapod shows as many."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
 _OFF = (
     "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
@@ -105,7 +105,7 @@ _POINT_OFF = "the measurement lies {:.0f} standard deviations from where all oth
 class RefinementResult(NamedTuple):
     """What the last turn left.
 
-    photographs : as they were looked at. blur : px, of their edges, by station. scatter : of coarse
+    images : as they were looked at. blur : px, of their edges, by station. scatter : of coarse
     edges, see :class:`PriorScene`. start : from where the estimate was sought. change : by how
     many of its deviations the last look has moved the machine, as SETTLED_MACHINE_CHANGE has it.
     failures : why passes from machines as likely gave no estimate.
@@ -116,7 +116,7 @@ class RefinementResult(NamedTuple):
     estimate: Estimate
     cameras: CameraRefinement
     responses: tuple[ResponseEstimate, ...] = ()
-    photographs: Sequence[Photographs] = ()
+    images: Sequence[StationImages] = ()
     blur: BlurByStation = MappingProxyType({})
     scatter: float = 1.0
     start: State | None = None
@@ -147,8 +147,8 @@ def refine_alternating(
 
     lap : called with the name of a step that is done.
     """
-    session, photographs, boards, _ = case
-    total, machine = sum(len(p.images) for p in photographs), session.machine
+    session, images, boards, _ = case
+    total, machine = sum(len(p.images) for p in images), session.machine
     estimate = _first_estimate(case, total, progress, lap)
     blur: BlurByStation = {}
     passes: list[legs.StationEdges] = []
@@ -160,9 +160,9 @@ def refine_alternating(
         share = 0.45 + 0.35 * min(turn / MOST_MEASUREMENT_PASSES, 0.9)
         done = _counted(progress, "Measuring edges", total, share)
         cameras = cameras.updated(estimate)
-        photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
-        passes, photographs, blur = _checked_pass(
-            session, photographs, estimate, blur, scatter, cameras.active, done
+        images = [replace(p, camera=cameras.at_station(p.station)) for p in images]
+        passes, images, blur = _checked_pass(
+            session, images, estimate, blur, scatter, cameras.active, done
         )
         measurements = measurements_of(session, boards, _edges(passes), cameras)
         lap("observe")
@@ -178,10 +178,10 @@ def refine_alternating(
         scatter *= _scatter_of(measurements.edges.coarse, estimate)
         lap("identify")
         if turn == 0:
-            progress("Asking how the photographs code light", share + 0.1)
+            progress("Asking how the images code light", share + 0.1)
 
             def measured(
-                some: list[Photographs],
+                some: list[StationImages],
                 blur: BlurByStation,
                 before: Estimate = before,
                 refine: bool = cameras.active,
@@ -194,7 +194,7 @@ def refine_alternating(
 
             responses = responses_by_edges(
                 session,
-                photographs,
+                images,
                 measurements,
                 estimate,
                 partial(measured, blur=blur),  # nearly the same by the other response
@@ -203,9 +203,9 @@ def refine_alternating(
             )
             lap("identify")
             if results := overruled(responses):
-                photographs = [
+                images = [
                     replace(p, response=results.get(session.stations[p.station].entry, p.response))
-                    for p in photographs
+                    for p in images
                 ]
                 blur = {}
                 continue
@@ -215,14 +215,14 @@ def refine_alternating(
             away = (estimate.state.theta - before.state.theta)[None]
             change = float(np.sqrt(_variance(away, measurements, estimate)))
             if change < (SETTLED_MACHINE_CHANGE if last else SETTLED_AT_ONCE):
-                finer = _binned(session, photographs, blur, more=False)
+                finer = _binned(session, images, blur, more=False)
                 if not finer or turn + 1 == MOST_BAD_PASSES:
                     break
-                photographs = finer
+                images = finer
                 blur = {}
-    observation = observation_of(session, passes, boards, measurements, estimate, photographs)
+    observation = observation_of(session, passes, boards, measurements, estimate, images)
     return RefinementResult(
-        observation, measurements, estimate, cameras, responses, photographs, blur, scatter, start,
+        observation, measurements, estimate, cameras, responses, images, blur, scatter, start,
         change,
     )  # fmt: skip
 
@@ -241,7 +241,7 @@ def imputation_variance(
     too. Of painted legs on a tripod the edges are the same from anywhere, and nothing is asked.
     """
     session, estimate = case.session, turns.estimate
-    by_hand = any(session.stations[p.station].handheld for p in turns.photographs)
+    by_hand = any(session.stations[p.station].handheld for p in turns.images)
     if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
         return turns
     offsets: list[Array] = []
@@ -249,10 +249,10 @@ def imputation_variance(
     for number, drawn in enumerate(_as_likely(session, turns.measurements, estimate, rng)):
         progress(f"Looking by a machine as likely: {number + 1} of {IMPUTATION_PASSES}", 0.87)
         cameras = turns.cameras.updated(drawn)
-        photographs = [replace(p, camera=cameras.at_station(p.station)) for p in turns.photographs]
+        images = [replace(p, camera=cameras.at_station(p.station)) for p in turns.images]
         try:
             passes = _measurement_pass(
-                session, photographs, drawn, turns.blur, turns.scatter, cameras.active
+                session, images, drawn, turns.blur, turns.scatter, cameras.active
             )
             measurements = measurements_of(session, case.boards, _edges(passes), cameras)
             ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
@@ -315,61 +315,61 @@ def _variance(changes: Array, measurements: Measurements, estimate: Estimate) ->
 
 def _measurement_pass(
     session: Session,
-    photographs: Sequence[Photographs],
+    images: Sequence[StationImages],
     estimate: Estimate,
     blur: BlurByStation,
     scatter: float,
     refine: bool,
     done: legs.ImageBatchesInUse | None = None,
 ) -> list[legs.StationEdges]:
-    """The edges of all photographs, where an estimate has them."""
+    """The edges of all images, where an estimate has them."""
     whole = partial(_with_silhouettes, session, estimate, scatter, refine)
 
-    def station_edges(some: Sequence[Photographs]) -> list[legs.StationEdges]:
+    def station_edges(some: Sequence[StationImages]) -> list[legs.StationEdges]:
         passes = _measure(some, estimate, blur, refine, done)
         return [whole(p, one) for p, one in zip(some, passes, strict=True)]
 
-    return _search_pass(photographs, station_edges)
+    return _search_pass(images, station_edges)
 
 
 def _checked_pass(
     session: Session,
-    photographs: Sequence[Photographs],
+    images: Sequence[StationImages],
     estimate: Estimate,
     blur: BlurByStation,
     scatter: float,
     refine: bool,
     done: legs.ImageBatchesInUse,
-) -> tuple[list[legs.StationEdges], Sequence[Photographs], BlurByStation]:
-    """A look, the photographs as they were looked at, and their blur: binned more where edges are
+) -> tuple[list[legs.StationEdges], Sequence[StationImages], BlurByStation]:
+    """A look, the images as they were looked at, and their blur: binned more where edges are
     too blurred to be measured, which must not lead an estimate astray.
     """
     measure = partial(_measurement_pass, session, estimate=estimate, scatter=scatter, refine=refine)
-    passes = measure(photographs, blur=blur, done=done)
-    blur_by_station = _blur_of(passes, photographs)
+    passes = measure(images, blur=blur, done=done)
+    blur_by_station = _blur_of(passes, images)
     if sum(len(one.edges) for one in passes) < FEW_MEASURED * len(estimate.edge_weights):
-        blur_by_station |= _width_of_edges(photographs, estimate)
-    while coarser := _binned(session, photographs, blur_by_station, more=True):
-        photographs = coarser
-        passes = measure(photographs, blur={})
-        blur_by_station = _blur_of(passes, photographs)
-    return passes, photographs, blur_by_station
+        blur_by_station |= _width_of_edges(images, estimate)
+    while coarser := _binned(session, images, blur_by_station, more=True):
+        images = coarser
+        passes = measure(images, blur={})
+        blur_by_station = _blur_of(passes, images)
+    return passes, images, blur_by_station
 
 
 def _blur_of(
-    passes: Sequence[legs.StationEdges], photographs: Sequence[Photographs]
+    passes: Sequence[legs.StationEdges], images: Sequence[StationImages]
 ) -> dict[int, float]:
     """Px, by station."""
-    return {p.station: edges.blur for p, edges in zip(photographs, passes, strict=True)}
+    return {p.station: edges.blur for p, edges in zip(images, passes, strict=True)}
 
 
-def _width_of_edges(photographs: Sequence[Photographs], estimate: Estimate) -> dict[int, float]:
-    """Px, by station, by how far the steps of some photographs reach: profiles tell no blur that is
+def _width_of_edges(images: Sequence[StationImages], estimate: Estimate) -> dict[int, float]:
+    """Px, by station, by how far the steps of some images reach: profiles tell no blur that is
     wider than they are. Nothing of stations whose edges do not tell it.
     """
     out: dict[int, float] = {}
-    for p in photographs:
-        few = p.select(p.spread(PHOTOGRAPHS_FOR_WIDTH))
+    for p in images:
+        few = p.select(p.spread(IMAGES_FOR_WIDTH))
         T = estimate.state.T_camera_base[p.station]
         poses = estimate.state.T_base_platform[few.configuration]
         blur = quality(few, estimate.machine, T, poses).blur
@@ -380,40 +380,40 @@ def _width_of_edges(photographs: Sequence[Photographs], estimate: Estimate) -> d
 
 def _binned(
     session: Session,
-    photographs: Sequence[Photographs],
+    images: Sequence[StationImages],
     blur: BlurByStation,
     *,
     more: bool,
-) -> list[Photographs]:
-    """The photographs as they should be looked at, where their edges, so blurred (px) by station,
+) -> list[StationImages]:
+    """The images as they should be looked at, where their edges, so blurred (px) by station,
     ask for ``more`` pixels as one, or for fewer; nothing where none does. All of one camera alike,
     for its lens is the same.
     """
     of_camera: dict[str, list[float]] = {}
-    files = [session.stations[p.station].camera_file for p in photographs]
-    for file, p in zip(files, photographs, strict=True):
+    files = [session.stations[p.station].camera_file for p in images]
+    for file, p in zip(files, images, strict=True):
         of_camera.setdefault(file, []).append(blur[p.station])
-    out: list[Photographs] = []
-    for file, p in zip(files, photographs, strict=True):
+    out: list[StationImages] = []
+    for file, p in zip(files, images, strict=True):
         binning = legs.sharp_binning(p.binning, float(np.median(of_camera[file])))
         most = MOST_BINNING * legs.first_binning(p.camera.image_size)
         wanted = max(binning, p.binning) if more else min(binning, p.binning)
         out.append(replace(p, binning=min(wanted, most)))
-    changed = any(one.binning != p.binning for one, p in zip(out, photographs, strict=True))
+    changed = any(one.binning != p.binning for one, p in zip(out, images, strict=True))
     return out if changed else []
 
 
 def _counted(
     progress: CalibrationProgress, text: str, total: int, share: float
 ) -> legs.ImageBatchesInUse:
-    """A callback of photographs looked at, told with how many there are of them."""
+    """A callback of images looked at, told with how many there are of them."""
     lock, done_count = Lock(), [0]
     progress(text, share)
 
     def done(more: int) -> None:
         with lock:  # stations are looked at beside one another
             done_count[0] += more
-            progress(f"{text}: {done_count[0]} of {total} photographs", share)
+            progress(f"{text}: {done_count[0]} of {total} images", share)
 
     return done
 
@@ -497,13 +497,13 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
 def _first_estimate(
     case: Case, total: int, progress: CalibrationProgress, lap: Callable[[str], None]
 ) -> Estimate:
-    """Of photographs by hand, from what was measured when they were placed; else from legs that are
+    """Of images by hand, from what was measured when they were placed; else from legs that are
     looked for as wholes, where they should be, and, unless nearly all were there, again where the
     first look has put them.
     """
-    session, photographs, boards, reference_values = case
-    if all(p.station in reference_values.edges for p in photographs):
-        placed = of_stations({p.station: reference_values.edges[p.station] for p in photographs})
+    session, images, boards, reference_values = case
+    if all(p.station in reference_values.edges for p in images):
+        placed = of_stations({p.station: reference_values.edges[p.station] for p in images})
         measurements = measurements_of(session, boards, placed)
         start = start_state(reference_values.machine, measurements, reference_values.T_camera_base)
         return bundle(session.machine, measurements, start)
@@ -514,7 +514,7 @@ def _first_estimate(
     ):
         done = _counted(progress, text, total, share)
         search = partial(_whole_legs, scene=reference_values, reach=reach, done=done)
-        passes = _search_pass(photographs, search)
+        passes = _search_pass(images, search)
         measurements = measurements_of(session, boards, _edges(passes))
         lap("observe")
         start = start or start_state(
@@ -541,24 +541,24 @@ def _share_agreeing(passes: list[legs.StationEdges], edges: EdgeSet, estimate: E
 
 
 def _whole_legs(
-    photographs: Sequence[Photographs],
+    images: Sequence[StationImages],
     scene: PriorScene,
     reach: float,
     done: legs.ImageBatchesInUse,
 ) -> list[legs.StationEdges]:
-    placed = placed_at(photographs, scene.T_camera_base, scene.T_base_platform)
+    placed = placed_at(images, scene.T_camera_base, scene.T_base_platform)
     return legs.search_stations(placed, scene.machine, reach, done)
 
 
 def _measure(
-    photographs: Sequence[Photographs],
+    images: Sequence[StationImages],
     estimate: Estimate,
     blur: BlurByStation,
     refine: bool,
     done: legs.ImageBatchesInUse | None = None,
 ) -> list[legs.StationEdges]:
     state = estimate.state
-    placed = placed_at(photographs, state.T_camera_base, state.T_base_platform)
+    placed = placed_at(images, state.T_camera_base, state.T_base_platform)
     return legs.measure_stations(placed, estimate.machine, blur, refine, done)
 
 
@@ -567,20 +567,20 @@ def _with_silhouettes(
     estimate: Estimate,
     scatter: float,
     refine: bool,
-    photographs: Photographs,
+    images: StationImages,
     edges: legs.StationEdges,
 ) -> legs.StationEdges:
-    """A look at a photograph by hand, and where an edge could not be measured in it, where its
-    silhouettes lie, coarse: what has a place of its own in each photograph is told by few edges.
+    """A look at an image by hand, and where an edge could not be measured in it, where its
+    silhouettes lie, coarse: what has a place of its own in each image is told by few edges.
 
     scatter : by how much more or less these scatter than each says.
     """
-    if not session.stations[photographs.station].handheld:
+    if not session.stations[images.station].handheld:
         return edges
     state = estimate.state
-    view = finest_view(estimate.machine, photographs, session.joints, state.T_base_platform)
-    T_camera_base = state.T_camera_base[photographs.station]
-    coarse = silhouette_edges(view, T_camera_base, photographs.station, refine)
+    view = finest_view(estimate.machine, images, session.joints, state.T_base_platform)
+    T_camera_base = state.T_camera_base[images.station]
+    coarse = silhouette_edges(view, T_camera_base, images.station, refine)
 
     more = np.ones(len(coarse.edges), dtype=bool)
     more[coarse.edges.same_as(edges.edges)[0]] = False
@@ -607,26 +607,26 @@ def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
 
 
 def _search_pass(
-    photographs: Sequence[Photographs],
-    measure: Callable[[Sequence[Photographs]], list[legs.StationEdges]],
+    images: Sequence[StationImages],
+    measure: Callable[[Sequence[StationImages]], list[legs.StationEdges]],
 ) -> list[legs.StationEdges]:
-    """A look at all stations, repeats as one: together, or two at a time where photographs have to
+    """A look at all stations, repeats as one: together, or two at a time where images have to
     be decoded for it, which runs beside Python.
     """
-    pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in photographs)
+    pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in images)
     if pixels <= CACHED_IMAGE_BYTES:
-        return [combine_repeats(one) for one in measure(photographs)]
+        return [combine_repeats(one) for one in measure(images)]
     with ThreadPoolExecutor(THREADS) as pool:
-        return [combine_repeats(one) for (one,) in pool.map(measure, ([p] for p in photographs))]
+        return [combine_repeats(one) for (one,) in pool.map(measure, ([p] for p in images))]
 
 
 def _edges(passes: list[legs.StationEdges]) -> EdgeSet:
     edges = concatenate([station_edges.edges for station_edges in passes])
     if len(edges) < FEWEST_EDGES_TO_IDENTIFY:
         raise ResultError(
-            f"only {len(edges)} edges of legs were found in all photographs",
+            f"only {len(edges)} edges of legs were found in all images",
             expected=f"at least {FEWEST_EDGES_TO_IDENTIFY}",
-            next_step="Look whether the photographs show the legs sharply and brightly enough",
+            next_step="Look whether the images show the legs sharply and brightly enough",
         )
     return edges
 
@@ -637,13 +637,13 @@ def observation_of(
     boards: Boards,
     measurements: Measurements,
     estimate: Estimate,
-    photographs: Sequence[Photographs] = (),
+    images: Sequence[StationImages] = (),
 ) -> Observation:
-    """The last looks joined, with what the estimate gave up among the rejected. photographs : as
+    """The last looks joined, with what the estimate gave up among the rejected. images : as
     they were looked at.
     """
     # a station that observes a board alone has that of its camera, whose edge shift is in it
-    of_camera = {session.stations[p.station].camera_file: p.binning for p in photographs}
+    of_camera = {session.stations[p.station].camera_file: p.binning for p in images}
     binning = np.ones(len(estimate.state.T_camera_base), dtype=int)
     for k, station in enumerate(session.stations):
         binning[k] = of_camera.get(station.camera_file, 1)

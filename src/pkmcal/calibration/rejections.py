@@ -138,7 +138,7 @@ def _name(session: Session, measurements: Measurements, unit: RejectedUnit) -> s
         first, second = (session.configurations[c] for c in links.configuration[k])
         return f"{first} to {second}"
     if unit.station < len(session.stations):
-        for photo in session.stations[unit.station].photographs:
+        for photo in session.stations[unit.station].images:
             if photo.configuration == unit.configuration:
                 return label_of(session.folder, photo.path)
     return session.configurations[unit.configuration]

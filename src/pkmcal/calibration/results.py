@@ -153,17 +153,17 @@ def calibration_document(
     not_identified: Sequence[str] = (),
     holdout: dict[str, Any] | None = None,
     over: ToolMap | str | None = None,
-    photographs: Mapping[str, Sequence[str]] | None = None,
+    images: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Any]:
     """The content of calibration.json, plain data without NaN and dates.
 
     not_identified : sentences about unidentifiable directions, as in the report. holdout :
     residuals of held-out configurations, beside those in use. over : the tool over the workspace,
-    or why there is no map of it. photographs : digests of the images, computed unless given.
+    or why there is no map of it. images : digests of the images, computed unless given.
     """
     session, estimate = calibration.session, calibration.estimate
     bed = calibration.findings.bed
-    in_view = digests(session) if photographs is None else photographs
+    in_view = digests(session) if images is None else images
     document = {
         FORMAT_KEY: CALIBRATION_FORMAT,
         "conventions": CALIBRATION_CONVENTIONS,
@@ -256,7 +256,7 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = []
     session = calibration.session
     sources: list[tuple[str, str, int, str | None]] = [
-        (x.name, x.camera_file, len(x.photographs), x.response if "legs" in x.observe else None)
+        (x.name, x.camera_file, len(x.images), x.response if "legs" in x.observe else None)
         for x in session.stations
     ]
     sources += [(x.name, x.label, len(x.configuration), None) for x in session.trackers]
@@ -484,7 +484,7 @@ def rejected_photographs(session: Session) -> list[dict[str, Any]]:
             "reason": one.reason,
         }
         for one in session.rejected
-        for photo in one.station.photographs
+        for photo in one.station.images
     ]
 
 

@@ -180,7 +180,7 @@ class SavedCalibration(CalibrationSummary):
                 where=str(self.path),
                 found=name,
                 expected=listed(self.placed, 8) or "a calibration that tells it",
-                next_step="A photograph by hand is no place that a camera is left in"
+                next_step="A image by hand is no place that a camera is left in"
                 if hand
                 else "Calibrate once more with this pkmcal, or name a station of the calibration",
             )
@@ -230,7 +230,7 @@ class _StationCovariance(_Part):
 
 class _Configuration(_Part):
     name: str
-    photographs: tuple[str, ...] = ()
+    images: tuple[str, ...] = ()
     used: bool
     joints: tuple[float, ...]
     T_base_platform: Matrix4

@@ -44,12 +44,12 @@ def check_radii(
     """
     agree = SUSPECT_NOISE_SHARE * TOO_NOISY
     bad = estimate is None or by_chance or estimate.statistics.noise_scale > agree
-    if not bad or not case.photographs:
+    if not bad or not case.images:
         return ()
     thinner = replace(case.session, machine=_of_half_the_radii(case.session.machine))
     try:
         rng = np.random.default_rng(seed)
-        again = localize_case(thinner, case.photographs, case.boards, rng)
+        again = localize_case(thinner, case.images, case.boards, rng)
         cameras = refinement_of(again.session, refine_camera)
         turns = refine_alternating(again, cameras, lambda _text, _share: None, lambda _step: None)
     except PkmcalError as error:  # it is not found in these images, or they do not determine it

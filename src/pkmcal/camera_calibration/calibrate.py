@@ -177,7 +177,7 @@ class CameraCalibration:
         }
 
 
-def calibrate_photographs(
+def calibrate_images(
     paths: Sequence[Path | str],
     board: Board,
     model: str = "auto",
@@ -265,7 +265,7 @@ def check_enough(
     """Raise `InputError` if too few images show the board."""
     if len(used) < options.least_views:
         raise InputError(
-            "too few photographs show the board",
+            "too few images show the board",
             found=f"{len(used)} of {taken}",
             expected=f"{options.least_views} at least, better ten,"
             " with the board tilted differently",
@@ -276,10 +276,10 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
     """Error about a model for which no starting value gives finite pixels."""
     other = min(pool, key=lambda c: c.left_out) if pool else None
     return InputError(
-        f"the model {model} does not fit the photographs",
+        f"the model {model} does not fit the images",
         expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
         if other
-        else "photographs of one flat board by one camera",
+        else "images of one flat board by one camera",
     )
 
 
@@ -297,7 +297,7 @@ def check_model(
     ratio = chosen.left_out / best.left_out
     if ratio > options.unfit_ratio:
         raise InputError(
-            f"the model {model} does not fit the photographs",
+            f"the model {model} does not fit the images",
             found=f"an error of {chosen.left_out:.2g} px on views left out",
             expected=f"{best.model}, with {best.left_out:.2g} px",
         )
@@ -335,11 +335,11 @@ def check_determined(
         return
     tilt = tilts(fit.T_camera_board, views.points)
     raise ResultError(
-        "the photographs do not tell the focal length, because the board looks much the same in"
+        "the images do not tell the focal length, because the board looks much the same in"
         " all of them",
         found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
-        next_step="Take photographs with the board tilted by 20 to 45 degrees, each to another"
+        next_step="Take images with the board tilted by 20 to 45 degrees, each to another"
         " side, and near the picture's corners",
     )
 
@@ -373,11 +373,11 @@ def check_explained(rms: float, camera: Camera) -> None:
     if rms <= limit:
         return
     raise ResultError(
-        "no camera model explains these photographs",
+        "no camera model explains these images",
         found=f"an error of {rms:.2g} px on views left out ({camera.model} fits best)",
         expected=f"{limit:.2g} px at most, usually a tenth of that",
         next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
-        " photographs of two cameras",
+        " images of two cameras",
     )
 
 

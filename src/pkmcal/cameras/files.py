@@ -478,5 +478,5 @@ def _unsupported(where: str, text: str, models: Any) -> InputError:
         where=where,
         found=text,
         expected=listed(list(models)),
-        next_step="Calibrate again from photographs of a board: pkmcal camera",
+        next_step="Calibrate again from images of a board: pkmcal camera",
     )

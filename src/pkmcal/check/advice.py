@@ -65,7 +65,7 @@ def _second_station(forecast: Forecast | None) -> list[Finding]:
     return [
         note(
             "images.second_place",
-            number=forecast.photographs,
+            number=forecast.images,
             tool_sigma=forecast.second,
             tool_sigma_before=forecast.position,
         )
@@ -78,7 +78,7 @@ def _from_one_side(inspection: Inspection) -> list[Finding]:
     What one camera determines badly, along its line of sight, another determines by the sine of the
     angle between the two lines.
     """
-    cameras = [station.photographs.camera for station in inspection.stations]
+    cameras = [station.images.camera for station in inspection.stations]
     if len(cameras) < 2 or any(view_angle(camera) >= PANORAMIC_HALF_VIEW for camera in cameras):
         return []
     centres = inspection.session.machine.base_centers()
@@ -148,9 +148,7 @@ def _lost_edges(
     expected, lost = int(edges.expected.sum()), edges.expected & ~edges.valid
     if station.quality is None or not expected or lost.sum() <= INFORMATION_LOST_SHARE * expected:
         return []
-    level, behind = (
-        part[edges.photographs] for part in (station.quality.level, station.quality.behind)
-    )
+    level, behind = (part[edges.images] for part in (station.quality.level, station.quality.behind))
     # Causes of lost edges by the brightness of the leg and of its background.
     contrast = np.abs(level - behind)
     usual = contrast[edges.valid & np.isfinite(contrast)]
@@ -199,7 +197,7 @@ def _sheet(station: StationInspection) -> str:
 def forecast_figure(forecast: Forecast) -> Figure:
     """Key figure of the forecast."""
     return Figure(
-        f"What would {forecast.photographs} such photographs a station give?",
+        f"What would {forecast.images} such images a station give?",
         ((brief(forecast.position * 1e3), "mm"), (brief(math.degrees(forecast.orientation)), "°")),
         "1σ of the platform's pose at given readings, mean over the joints' ranges",
     )
@@ -261,14 +259,14 @@ def forecast_part(forecast: Forecast) -> Part:
 
 def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
     """Sentences on the forecast, and on the legs with the least information and their causes."""
-    photographs = sum(len(edges.photographs) for edges in forecast.edges)
+    images = sum(len(edges.images) for edges in forecast.edges)
     out = [
-        f"{forecast.photographs} such photographs a station, over the joints' ranges, would"
+        f"{forecast.images} such images a station, over the joints' ranges, would"
         " tell the"
         f" platform's position to {brief(forecast.position * 1e3)} mm and its orientation to"
         f" {brief(math.degrees(forecast.orientation))}° (standard deviations at given"
         " readings, by the"
-        f" edges of {count(photographs, 'photograph')}). Of its variance"
+        f" edges of {count(images, 'image')}). Of its variance"
         f" {sum(leg.variance for leg in forecast.legs):.0%} comes from the edges,"
         f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from what is"
         " known beforehand,"

@@ -50,7 +50,7 @@ from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.station_localization import LocalizedPose
@@ -60,7 +60,7 @@ from pkmcal.session.load import Session, Station, load_session
 from pkmcal.starter import untouched_files
 from pkmcal.wording import listed
 
-BROKEN_PHOTOGRAPHS_NAMED = 10
+BROKEN_IMAGES_NAMED = 10
 """Number of broken images of a station that are reported individually; the others are counted."""
 OTHER_MODE = np.deg2rad(20.0)
 """Rotation to another assembly mode below which one can be mistaken for the other, rad."""
@@ -89,17 +89,17 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
     except PkmcalError as error:
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
-    progress("Reading photographs", 0.1)
-    photographs, broken = _decode_images(session)
+    progress("Reading images", 0.1)
+    images, broken = _decode_images(session)
     progress("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
     # Images, readings, links and numbering of the legs.
-    observed = _check_images(session, photographs, motion.poses, seed, progress)
+    observed = _check_images(session, images, motion.poses, seed, progress)
     stations, joints = observed.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
     findings += numbering_note(session)
-    progress("What such photographs will give", 0.8)
+    progress("What such images will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no station for further images
     expected = None
     if observed.inspection and not by_hand:
@@ -136,11 +136,11 @@ def _workspace(session: Session) -> list[Finding]:
     return []
 
 
-def _decode_images(session: Session) -> tuple[list[Photographs | None], list[Finding]]:
+def _decode_images(session: Session) -> tuple[list[StationImages | None], list[Finding]]:
     """Images of legs by station, None for a station without any, and findings on those that cannot
     be decoded.
     """
-    out: list[Photographs | None] = []
+    out: list[StationImages | None] = []
     findings: list[Finding] = []
     room = CACHED_IMAGE_BYTES
     for number, station in enumerate(session.stations):
@@ -152,26 +152,26 @@ def _decode_images(session: Session) -> tuple[list[Photographs | None], list[Fin
         files: list[tuple[Path, str]] = []
         cache: dict[int, Integers] = {}
         broken = 0
-        for photo in station.photographs:
+        for photo in station.images:
             label = label_of(session.folder, photo.path)
             try:
                 image = decode(photo.path, station.camera.image_size, label)
             except InputError as error:
                 broken += 1
-                if broken <= BROKEN_PHOTOGRAPHS_NAMED:
+                if broken <= BROKEN_IMAGES_NAMED:
                     findings.append(of_error(error, station=station.name))
                 continue
             if image.size <= room:
                 cache[len(rows)], room = image, room - image.size
             rows.append(photo.configuration)
             files.append((photo.path, label))
-        if broken > BROKEN_PHOTOGRAPHS_NAMED:
-            more = _more_broken_error(session, number, broken - BROKEN_PHOTOGRAPHS_NAMED)
+        if broken > BROKEN_IMAGES_NAMED:
+            more = _more_broken_error(session, number, broken - BROKEN_IMAGES_NAMED)
             findings.append(of_error(more, station=station.name))
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
                           [label for _, label in files], cache)  # fmt: skip
-        whole = Photographs(
+        whole = StationImages(
             number, station.camera, at, session.joints[at], images, station.response,
             legs.first_binning(station.camera.image_size),
         )  # fmt: skip
@@ -183,7 +183,7 @@ def _more_broken_error(session: Session, number: int, count: int) -> InputError:
     """Error on the broken images of a station that are not reported individually."""
     name = session.stations[number].name
     return InputError(
-        "photographs cannot be decoded",
+        "images cannot be decoded",
         where=f"session.yaml, stations.{name}",
         found=f"{count} more of this station",
         expected="whole PNG or JPEG files",
@@ -241,7 +241,7 @@ class _ImageChecks(NamedTuple):
 
 def _check_images(
     session: Session,
-    photographs: list[Photographs | None],
+    images: list[StationImages | None],
     poses: Array | None,
     seed: int,
     progress: CalibrationProgress,
@@ -249,11 +249,11 @@ def _check_images(
     """Checks of the images of every station: boards, localization, and the start of a
     calibration.
     """
-    whole = [p for p in photographs if p is not None]
+    whole = [p for p in images if p is not None]
 
     def unsearched() -> tuple[StationCheck, ...]:
         """Checks of stations in which the machine cannot be searched for."""
-        n_legs, observed = session.machine.n_legs, zip(session.stations, photographs, strict=True)
+        n_legs, observed = session.machine.n_legs, zip(session.stations, images, strict=True)
         return tuple(
             _station_check(
                 station, unrecognised_quality(p.images if p else [], n_legs), recognised=False
@@ -268,7 +268,7 @@ def _check_images(
     if poses is None or len(whole) < len(legs_stations(session)):
         return _ImageChecks(unsearched(), ())
     # Broken images have been reported already.
-    lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
+    lost = any(len(p.images) < len(session.stations[p.station].images) for p in whole)
     boards = BoardsCheck()
     if not lost:
         boards = look_for_boards(session, board_images(session, whole))
@@ -301,7 +301,7 @@ def _check_images(
         heights = settled.case.session.heights_alone
         findings += _height_findings(settled) if heights else _pose_scale_findings(settled)
     stations = [  # default for stations that observe no legs
-        StationCheck(station.name, len(station.photographs), k in boards.checks)
+        StationCheck(station.name, len(station.images), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
     places = _search_results(session, whole, located)
@@ -345,10 +345,10 @@ def _refusal(error: PkmcalError) -> Finding:
 
 
 def _search_results(
-    session: Session, photographs: list[Photographs], located: Localization
+    session: Session, images: list[StationImages], located: Localization
 ) -> dict[int, LocalizedPose]:
     """Localized poses by station number, without stations that were not searched."""
-    fixed = [p.station for p in photographs if not session.stations[p.station].handheld]
+    fixed = [p.station for p in images if not session.stations[p.station].handheld]
     localizations = located.recognition.localizations if located.recognition else ()
     places = dict(zip(fixed, localizations, strict=bool(localizations)))
     # for a hand-held image, the probability of a rival pose takes the place of that of chance
@@ -365,18 +365,18 @@ def _search_results(
 
 def _check_station(
     session: Session,
-    photographs: Photographs,
+    images: StationImages,
     pose: LocalizedPose,
     poses: Array,
     recognised: bool,
 ) -> tuple[StationCheck, StationInspection]:
     """Check and inspection of a station in which the machine was searched for."""
-    station, machine = session.stations[photographs.station], session.machine
+    station, machine = session.stations[images.station], session.machine
     T_camera_base, by_hand = pose.T_camera_base, station.T_camera_base
     leg_quality = (
-        quality(photographs, machine, T_camera_base, poses[photographs.configuration])
+        quality(images, machine, T_camera_base, poses[images.configuration])
         if recognised
-        else unrecognised_quality(photographs.images, machine.n_legs)
+        else unrecognised_quality(images.images, machine.n_legs)
     )
     summary = replace(
         _station_check(station, leg_quality, recognised=recognised),
@@ -388,7 +388,7 @@ def _check_station(
         distance, angle = (float(np.linalg.norm(part)) for part in (change[3:], change[:3]))
         summary = replace(summary, moved=distance, turned=angle)
     return summary, StationInspection(
-        station.name, photographs, by_hand, T_camera_base, leg_quality if recognised else None
+        station.name, images, by_hand, T_camera_base, leg_quality if recognised else None
     )
 
 
@@ -397,7 +397,7 @@ def _station_check(station: Station, what: Quality, recognised: bool) -> Station
     blur = what.blur[np.isfinite(what.blur)]
     return StationCheck(
         name=station.name,
-        photographs=len(station.photographs),
+        images=len(station.images),
         recognised=recognised,
         legs=float(what.legs.sum(axis=1).mean()) if some else 0.0,
         saturated=float(what.saturated.mean()) if some else math.nan,

@@ -57,7 +57,7 @@ class LegForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Predicted accuracy with ``photographs`` images at each station.
+    """Predicted accuracy with ``images`` images at each station.
 
     position, orientation : standard deviations of the platform's pose at given readings, mean over
     poses, m and rad, as `calibrate` states them. readings, drawing : shares of the position's
@@ -66,7 +66,7 @@ class Forecast:
     camera. edges : by station, for advice.
     """
 
-    photographs: int
+    images: int
     position: float
     orientation: float
     readings: float
@@ -76,9 +76,7 @@ class Forecast:
     edges: tuple[EdgesOf, ...] = ()
 
 
-def forecast(
-    inspection: Inspection, photographs: int = CONFIGURATIONS_A_CAPTURE
-) -> Forecast | None:
+def forecast(inspection: Inspection, images: int = CONFIGURATIONS_A_CAPTURE) -> Forecast | None:
     """Forecast by the first images; None if the machine was not recognized at all stations.
 
     Only legs are used, not boards and trackers. Raises a `PkmcalError` or a `LinAlgError` if these
@@ -91,19 +89,19 @@ def forecast(
         return None
     first = first_edges(
         inspection.session,
-        [station.photographs for station in stations],
+        [station.images for station in stations],
         inspection.measured,
         np.stack([station.T_camera_base for station in stations]),
         inspection.poses,
     )
-    capture = _planned_capture(inspection, first, photographs)
+    capture = _planned_capture(inspection, first, images)
     information = _capture_information(capture)
     second = np.nan
-    one = stations[0].photographs
+    one = stations[0].images
     if len(stations) == 1 and view_angle(one.camera) < PANORAMIC_HALF_VIEW:
         second = _capture_information(_with_second_station(capture)).position
     return Forecast(
-        photographs=photographs,
+        images=images,
         position=information.position,
         orientation=information.orientation,
         readings=information.readings,
@@ -134,7 +132,7 @@ class _CaptureInformation(NamedTuple):
     drawing: float
 
 
-def _planned_capture(inspection: Inspection, first: FirstEdges, photographs: int) -> _Capture:
+def _planned_capture(inspection: Inspection, first: FirstEdges, images: int) -> _Capture:
     """Capture with configurations over the joints' ranges, with the present share of extreme
     ones.
     """
@@ -144,23 +142,23 @@ def _planned_capture(inspection: Inspection, first: FirstEdges, photographs: int
     margin = NEAR_END * (high - low)
     joints = inspection.session.joints
     ends = np.all((joints < low + margin) | (joints > high - margin), axis=1)
-    rows = [set(s.photographs.configuration.tolist()) for s in stations]
+    rows = [set(s.images.configuration.tolist()) for s in stations]
     shared = len(rows) > 1 and len(set.union(*rows)) < sum(map(len, rows)) / 2
-    wanted = photographs * (1 if shared else len(stations))
+    wanted = images * (1 if shared else len(stations))
     rng = np.random.default_rng(FORECAST_SEED)
     poses, readings = draw_configurations(machine, wanted, float(ends.mean()), rng)
-    number = np.arange(photographs)
-    pairs = [all_pairs([s], number + (0 if shared else photographs * s)) for s in range(len(rows))]
+    number = np.arange(images)
+    pairs = [all_pairs([s], number + (0 if shared else images * s)) for s in range(len(rows))]
     T_camera_base = first.estimate.state.T_camera_base
     cameras = zip(stations, T_camera_base, first.pools, strict=True)
     rig = Rig(
         machine,
         tuple(station.name for station in stations),
         T_camera_base,
-        numbered(inspection.session.camera_of_station[[s.photographs.station for s in stations]]),
+        numbered(inspection.session.camera_of_station[[s.images.station for s in stations]]),
         inspection.session.joint_noise,
         tuple(
-            LegsFrom(k, s.photographs.camera, T, pools, s.photographs.binning)
+            LegsFrom(k, s.images.camera, T, pools, s.images.binning)
             for k, (s, T, pools) in enumerate(cameras)
         ),
         shading=first.estimate.statistics.shading,

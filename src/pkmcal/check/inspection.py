@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.quality import Quality
 from pkmcal.planning.first import spread_over
 from pkmcal.session.load import Session
@@ -15,13 +15,13 @@ from pkmcal.session.load import Session
 class StationInspection:
     """Station in whose images the machine was searched for.
 
-    name : of the station. photographs : decoded images; ``photographs.station`` is the station's
+    name : of the station. images : decoded images; ``photographs.station`` is the station's
     number. by_hand : T_camera_base (4, 4) of the session, None without one. T_camera_base : (4, 4)
     end of the search. quality : of the legs, None if the machine was not recognized.
     """
 
     name: str
-    photographs: Photographs
+    images: StationImages
     by_hand: Array | None
     T_camera_base: Array
     quality: Quality | None
@@ -33,7 +33,7 @@ class StationInspection:
 
     def few(self) -> Integers:
         """Indices of the images that are shown."""
-        return spread_over(self.photographs.configuration)
+        return spread_over(self.images.configuration)
 
 
 @dataclass(frozen=True)
@@ -50,4 +50,4 @@ class Inspection:
     def measured(self) -> tuple[Integers, ...]:
         """Indices of the images that are measured for the forecast, by station."""
         n = len(self.stations)
-        return tuple(spread_over(s.photographs.configuration, n) for s in self.stations)
+        return tuple(spread_over(s.images.configuration, n) for s in self.stations)

@@ -36,16 +36,14 @@ def with_pictures(inspection: Inspection) -> Part:
     pairs: list[tuple[Picture, ...]] = []
     for station in inspection.stations:
         for k in station.few():
-            configuration = int(station.photographs.configuration[k])
-            photo = inspection.session.stations[station.photographs.station].photographs[k]
-            width, height = station.photographs.camera.image_size
+            configuration = int(station.images.configuration[k])
+            photo = inspection.session.stations[station.images.station].images[k]
+            width, height = station.images.camera.image_size
             shot = jpeg(photo.path, (width, height))
             pictures: list[Picture] = []
             for text, T_camera_base in poses_of(station):
-                eye = station.photographs.camera
-                edges, spots = drawing_over_photograph(
-                    inspection, station, eye, T_camera_base, int(k)
-                )
+                eye = station.images.camera
+                edges, spots = nominal_over_image(inspection, station, eye, T_camera_base, int(k))
                 pictures.append(
                     Picture(
                         station=station.name,
@@ -63,9 +61,7 @@ def with_pictures(inspection: Inspection) -> Part:
     html = page.filled_template(
         "overlay.html.j2", n_legs=inspection.session.machine.n_legs, pairs=pairs
     )
-    return Part(
-        "photographs", "The nominal model over the photographs", html=html, menu="Photographs"
-    )
+    return Part("photographs", "The nominal model over the images", html=html, menu="Photographs")
 
 
 def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
@@ -75,14 +71,14 @@ def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
     return *by_hand, (after, station.T_camera_base)
 
 
-def drawing_over_photograph(
+def nominal_over_image(
     inspection: Inspection, station: StationInspection, camera: Camera, T_camera_base: Array, k: int
 ) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
     """Visible silhouettes of the nominal tubes in image k, and the joint centres.
 
     camera : of the station, or of its binned images.
     """
-    configuration = int(station.photographs.configuration[k])
+    configuration = int(station.images.configuration[k])
     return machine_laid_over(
         inspection.session.machine,
         camera,
@@ -99,9 +95,9 @@ def picture_names(inspection: Inspection) -> dict[tuple[int, int], str]:
     """File names by station and image."""
     out: dict[tuple[int, int], str] = {}
     for s, station in enumerate(inspection.stations):
-        photographs = inspection.session.stations[station.photographs.station].photographs
-        for k in range(len(photographs)):
-            out[s, k] = re.sub(r"[/\\]", "-", f"{station.name}-{photographs[k].path.stem}.png")
+        images = inspection.session.stations[station.images.station].images
+        for k in range(len(images)):
+            out[s, k] = re.sub(r"[/\\]", "-", f"{station.name}-{images[k].path.stem}.png")
     return out
 
 
@@ -121,12 +117,12 @@ def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:
     """Image k in colour with its overlays, (h, w, 3) uint8, in cv2's order BGR."""
     import cv2
 
-    name = inspection.session.configurations[int(station.photographs.configuration[k])]
-    small = station.photographs.select(np.array([k])).binned()
+    name = inspection.session.configurations[int(station.images.configuration[k])]
+    small = station.images.select(np.array([k])).binned()
     panes: list[Any] = []
     for words, T_camera_base in poses_of(station):
         pane: Any = cv2.cvtColor(np.asarray(small.images[0]), cv2.COLOR_GRAY2BGR)
-        edges, spots = drawing_over_photograph(inspection, station, small.camera, T_camera_base, k)
+        edges, spots = nominal_over_image(inspection, station, small.camera, T_camera_base, k)
         _draw(pane, edges, spots)
         bar = np.full((CAPTION_BAR_HEIGHT, pane.shape[1], 3), 32, dtype=np.uint8)
         text = f"{station.name} / {name}: {words}"

@@ -58,7 +58,7 @@ class StationCheck:
     """
 
     name: str
-    photographs: int
+    images: int
     recognised: bool
     mismatch: float = math.nan
     moved: float = math.nan

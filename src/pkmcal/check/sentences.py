@@ -38,14 +38,14 @@ FEW_CONFIGURATIONS = 8
 detected.
 """
 STATION_LEGEND = (
-    "By chance: probability of other readings fitting as well (of a photograph by",
+    "By chance: probability of other readings fitting as well (of an image by",
     "hand, another place); good below 0.001, or 0.01 near a pose or by hand.",
-    "Moved: from the pose by hand to the one found. Legs: found in a photograph.",
+    "Moved: from the pose by hand to the one found. Legs: found in an image.",
     "White, black: of the legs' pixels. Blur: of the sharpest edges.",
 )
 BOARD_LEGEND = (
-    "Seen: photographs that show it. Off: corners from their predicted places.",
-    "Wander: of the board on the base between photographs; a still one stays below 0.1 px.",
+    "Seen: images that show it. Off: corners from their predicted places.",
+    "Wander: of the board on the base between images; a still one stays below 0.1 px.",
 )
 KINEMATICS_SENTENCE = (
     "The nominal model's machine closes at all readings, {0.singularity:.2f} from a"
@@ -102,7 +102,7 @@ def board_findings(session: Session, number: int, check: BoardCheck) -> list[Fin
         findings.append(doubtful("board.corners_off", **at, rms=check.rms))
     if check.unseen:
         findings.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
-    if session.board_body == "base" and check.found == 1 and len(station.photographs) > 1:
+    if session.board_body == "base" and check.found == 1 and len(station.images) > 1:
         findings.append(note("board.seen_once", **at))
     return findings
 
@@ -139,8 +139,8 @@ def _repeated_pose_findings(session: Session) -> list[Finding]:
     again = {
         station.entry or station.name
         for station in session.stations
-        if len({owner[photo.configuration] for photo in station.photographs})
-        < len({photo.configuration for photo in station.photographs})
+        if len({owner[photo.configuration] for photo in station.images})
+        < len({photo.configuration for photo in station.images})
     }
     if not session.stations:  # a tracker's table has one row for each configuration
         return [note("configurations.equal_rows", **facts)]
@@ -182,12 +182,12 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         )
     if check.forecast:
         parts = (*parts, forecast_part(check.forecast))
-    photographs = sum(station.photographs for station in check.stations)
+    images = sum(station.images for station in check.stations)
     return Outcome(
         command="check",
         title=f"Check of {name}",
         subject=f"{name}: {check.machine}, {check.n_legs} legs,"
-        f" {check.configurations} configurations, {photographs} photographs"
+        f" {check.configurations} configurations, {images} images"
         if check.machine
         else "",
         verdict=Verdict(code == 0, headlines[2 if refused else code], check.advice),
@@ -211,7 +211,7 @@ def _stations_table(check: SessionCheck) -> Table:
         motion = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
         finite = station.recognised and math.isfinite(station.legs)
         cells = (
-            str(station.photographs),
+            str(station.images),
             _number(station.by_chance, "{:.0e}"),
             motion if math.isfinite(station.moved) else "–",
             f"{station.legs:.1f}/{check.n_legs}" if finite else "–",
@@ -229,7 +229,7 @@ def _boards_table(check: SessionCheck) -> Table:
         Row(
             station.name,
             (
-                f"{board.found} of {station.photographs}",
+                f"{board.found} of {station.images}",
                 f"{board.corners:.0f}/{board.corners_of}",
                 f"{board.rms:.3f} px",
                 _number(board.scatter, "{:.3f} px"),

@@ -38,7 +38,7 @@ def camera(
         list[Path],
         typer.Argument(
             metavar="SESSION|IMAGES...",
-            help="A session whose stations observe a board, or photographs, or their folder.",
+            help="A session whose stations observe a board, or images, or their folder.",
         ),
     ],
     board: Annotated[
@@ -56,24 +56,24 @@ def camera(
     ] = None,
     as_json: console.Json = False,
 ) -> int:
-    """Calibrate a camera from photographs of a board."""
+    """Calibrate a camera from images of a board."""
     from dataclasses import replace
 
     from pkmcal.boards.board import load_board
-    from pkmcal.camera_calibration.calibrate import calibrate_photographs
+    from pkmcal.camera_calibration.calibrate import calibrate_images
     from pkmcal.files import check_writable, default_output
     from pkmcal.report.camera import outcome_of
 
     if len(images) == 1 and (images[0] / "session.yaml").is_file():
-        paths, there = session_board_photographs(images[0])
+        paths, there = session_board_images(images[0])
     else:
-        paths, there = photographs(images), board or board_file_of(images)
+        paths, there = image_files(images), board or board_file_of(images)
     described = load_board(board or there)
     check_writable(default_output(out) if out == CAMERA_FOLDER else out)
     others = [(OTHER_CAMERA_FILES[form.value], form.value) for form in to or []]
     with console.progress(as_json) as progress:
-        progress(f"Looking for the board in {len(paths)} photographs", 0.1)
-        calibration = calibrate_photographs(paths, described, model)
+        progress(f"Looking for the board in {len(paths)} images", 0.1)
+        calibration = calibrate_images(paths, described, model)
         progress("Writing the report", 0.9)
         outcome = outcome_of(calibration, paths, others)
     files = {**CAMERA_FILES, **{name: "for that program" for name, _ in others}}
@@ -81,7 +81,7 @@ def camera(
     return finish(outcome, out, files, as_json=as_json)
 
 
-def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
+def session_board_images(folder: Path) -> tuple[list[Path], Path]:
     """Image files of a session's board, all of one camera, and the board's file.
 
     Raises InputError if no station observes a board, several cameras do, or there are no files.
@@ -99,7 +99,7 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
             "no station of this session observes a board",
             where=session.where("stations"),
             expected="observe: board on a station, and board: board.yaml",
-            next_step="Name the board's photographs instead: pkmcal camera IMAGES... --board FILE",
+            next_step="Name the board's images instead: pkmcal camera IMAGES... --board FILE",
         )
     board = folder / schema.board.file
     if not board.exists():
@@ -122,11 +122,11 @@ def session_board_photographs(folder: Path) -> tuple[list[Path], Path]:
     wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]
     paths = sorted({folder / name for text in wild for name in glob.glob(text, root_dir=folder)})
     if not paths:
-        raise InputError("no photographs found", where=session.where("stations"), found=wild[0])
+        raise InputError("no images found", where=session.where("stations"), found=wild[0])
     return paths, board
 
 
-def photographs(images: list[Path]) -> list[Path]:
+def image_files(images: list[Path]) -> list[Path]:
     """Image files of the arguments in the order of their names, with folders replaced by their
     content.
     """
@@ -139,7 +139,7 @@ def photographs(images: list[Path]) -> list[Path]:
             inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_FILE_ENDINGS)
             if not inside:
                 raise InputError(
-                    "the folder holds no photographs",
+                    "the folder holds no images",
                     where=str(path),
                     expected=f"some in it ({', '.join(sorted(IMAGE_FILE_ENDINGS))}), or a"
                     " session.yaml that names them",
@@ -148,7 +148,7 @@ def photographs(images: list[Path]) -> list[Path]:
         elif path.is_file():
             out.append(path)
         else:
-            raise InputError("there is no such photograph or folder", where=str(path))
+            raise InputError("there is no such image or folder", where=str(path))
     return list(dict.fromkeys(out))
 
 

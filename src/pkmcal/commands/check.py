@@ -12,19 +12,19 @@ from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, write_outcome
 
 CHECK_FILES = {"check.html": PAGE_DESCRIPTION, "check.json": NUMBERS_DESCRIPTION}
-DRAWINGS_DESCRIPTION = "the nominal model over each photograph"
+DRAWINGS_DESCRIPTION = "the nominal model over each image"
 
 
 def check(
     session: console.SessionFolder,
-    out: Annotated[Path | None, console.folder("Write a page with photographs there.")] = None,
+    out: Annotated[Path | None, console.folder("Write a page with images there.")] = None,
     pictures: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write the nominal model over each photograph, as PNG."),
+        typer.Option(metavar="DIR", help="Write the nominal model over each image, as PNG."),
     ] = None,
     repeat: Annotated[
         bool,
-        typer.Option("--repeat", help="Measure the accuracy by repeated photographs as well."),
+        typer.Option("--repeat", help="Measure the accuracy by repeated images as well."),
     ] = False,
     seed: console.Seed = 0,
     as_json: console.Json = False,

@@ -117,7 +117,7 @@ def _top(
         ),
     ] = False,
 ) -> None:
-    """Calibrate parallel machines from photographs of their own legs."""
+    """Calibrate parallel machines from images of their own legs."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -173,7 +173,7 @@ def _as_pkmcal_error(error: BaseException, words: list[str]) -> tuple[PkmcalErro
     if isinstance(error, MemoryError):
         message = InputError(
             "there is not enough memory",
-            next_step="Close other programs, or use fewer or smaller photographs",
+            next_step="Close other programs, or use fewer or smaller images",
         )
         return message, message.exit_code
     if isinstance(error, OSError):  # no space, no permission, a disk taken away

@@ -244,7 +244,7 @@ def _progress_lines() -> Generator[TextProgress]:
 
 def counted(progress: TextProgress, upto: float = 1.0) -> Callable[[int, int], None]:
     """Callback of the numbers of finished and of all images, as progress from 0 to `upto`."""
-    return lambda done, total: progress(f"Photograph {done} of {total}", upto * done / total)
+    return lambda done, total: progress(f"Image {done} of {total}", upto * done / total)
 
 
 def can_show() -> bool:

@@ -31,7 +31,7 @@ def demo(
     no_open: Annotated[
         bool, typer.Option("--no-open", help="Do not open the report in a browser.")
     ] = False,
-    fast: Annotated[bool, typer.Option("--fast", help="Fewer and smaller photographs.")] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Fewer and smaller images.")] = False,
     as_json: console.Json = False,
 ) -> int:
     """Simulate, calibrate, compare with the truth, open the report."""
@@ -72,7 +72,7 @@ def demo(
         write_outcome(outcome, result, CALIBRATION_FILES)
     # The truth is read only now, when everything is written.
     comparison = compare_with_truth(calibration, session)
-    n_images = sum(len(station.photographs) for station in calibration.session.stations)
+    n_images = sum(len(station.images) for station in calibration.session.stations)
     outcome = replace(
         outcome,
         subject=f"A {calibration.machine.name}, not built quite as drawn, in {n_images}"

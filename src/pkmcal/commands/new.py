@@ -28,7 +28,7 @@ FELT_FILE_DESCRIPTIONS = {
     "poses.csv": "the tool's height above the bed there",
 }
 """Descriptions of the files of a complete session of a printer."""
-PHOTOGRAPHS_DESCRIPTION = "where the photographs go"
+IMAGES_DESCRIPTION = "where the images go"
 
 
 def new(
@@ -129,7 +129,7 @@ def _print_session(
     described = [name for name in what if name in names]
     others = sorted(set(names) - set(described))
     rows = [(name, what[name]) for name in described] + [
-        (name, PHOTOGRAPHS_DESCRIPTION) for name in others
+        (name, IMAGES_DESCRIPTION) for name in others
     ]
     console.print_files(out, [(str(folder / name), what) for name, what in rows])
     place = console.escaped(str(folder))

@@ -31,8 +31,8 @@ def reproduce(
     long: Annotated[
         bool, typer.Option("--long", help="Accuracy by number of poses too; a minute.")
     ] = False,
-    photographs: Annotated[
-        bool, typer.Option("--photographs", help="Measure Table 1 on rendered photographs.")
+    images: Annotated[
+        bool, typer.Option("--photographs", help="Measure Table 1 on rendered images.")
     ] = False,
     out: Annotated[Path, console.folder("Where the pages go.")] = REPRODUCTION_FOLDER,
     as_json: console.Json = False,
@@ -56,7 +56,7 @@ def reproduce(
     check_own_folder(out, ours, "reproductions", "earlier reproductions")
     wanted = [paper.value for paper in dict.fromkeys(papers or list(Paper))]
     with console.progress(as_json) as progress:
-        options = Options(runs, seed, long, photographs, progress)
+        options = Options(runs, seed, long, images, progress)
         outcomes = {paper: computed(paper, options) for paper in wanted}
     texts = {
         name: text

@@ -30,19 +30,19 @@ def simulate(
     camera: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A camera file, instead of --size.")
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of a photograph.")] = "800x600",
+    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image.")] = "800x600",
     stations: Annotated[
         int, console.number_option("simulate", "stations", "N", "Places of the camera.")
     ] = 3,
     configurations: Annotated[
         int,
-        console.number_option("simulate", "configurations", "N", "Photographs from each place."),
+        console.number_option("simulate", "configurations", "N", "Images from each place."),
     ] = 15,
     shared: Annotated[
         bool, typer.Option("--shared", help="The same configurations from all places.")
     ] = False,
     repeats: Annotated[
-        int, console.number_option("simulate", "repeats", "N", "Photographs of each configuration.")
+        int, console.number_option("simulate", "repeats", "N", "Images of each configuration.")
     ] = 1,
     tolerance: Annotated[
         float,
@@ -79,7 +79,7 @@ def simulate(
     handheld: Annotated[
         bool,
         typer.Option(
-            "--handheld", help="Each photograph from its own place, --repeats of a configuration."
+            "--handheld", help="Each image from its own place, --repeats of a configuration."
         ),
     ] = False,
     plan: Annotated[
@@ -89,7 +89,7 @@ def simulate(
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
-    """Simulate a session with photographs and known truth."""
+    """Simulate a session with images and known truth."""
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.simulation import Sensor, Settings, board_for, simulate_session, to_simulate
@@ -126,7 +126,7 @@ def simulate(
         truth = simulate_session(
             folder, machine, cameras, settings, seed=seed, progress=console.counted(progress)
         )
-    count = len(truth.photographs) * truth.repeats
+    count = len(truth.images) * truth.repeats
     if as_json:
         console.print_json(
             {"folder": str(folder), "photographs": count, "stations": truth.stations, "seed": seed}
@@ -137,7 +137,7 @@ def simulate(
     points = [
         (
             console.MARK_SIGNS["good"],
-            f"{count} photographs of {machine.name} from {places} in {folder}; the"
+            f"{count} images of {machine.name} from {places} in {folder}; the"
             " truth is in its truth.json, which no calibration reads.",
         )
     ]
@@ -161,7 +161,7 @@ def parsed_size(text: str) -> tuple[int, int]:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:
         raise InputError(
-            "no size of a photograph",
+            "no size of an image",
             where="--size",
             found=text,
             expected=f"width x height, each {SMALLEST_PICTURE_SIDE} to {LARGEST_PICTURE_SIDE},"

@@ -17,7 +17,7 @@ def validate(
     calibration: console.CalibrationFolder,
     session: Annotated[
         Path,
-        typer.Argument(metavar="SESSION", help="A session with photographs that it never saw."),
+        typer.Argument(metavar="SESSION", help="A session with images that it never saw."),
     ],
     out: Annotated[Path | None, console.folder("SESSION/validation unless given.")] = None,
     regions: Annotated[

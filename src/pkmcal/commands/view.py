@@ -25,7 +25,7 @@ def view(
     ] = False,
     as_json: console.Json = False,
 ) -> int:
-    """Show photographs with the machine laid over; move it there."""
+    """Show images with the machine laid over; move it there."""
     from pkmcal.errors import InputError
     from pkmcal.session.load import load_session
     from pkmcal.view.content import Viewed
@@ -40,7 +40,7 @@ def view(
     loaded = load_session(session)
     if not loaded.stations:
         raise InputError(
-            "there are no photographs to be shown",
+            "there are no images to be shown",
             where=f"{loaded.folder / 'session.yaml'}, stations",
             expected="a station with a camera",
         )

@@ -18,7 +18,7 @@ def watch(
     session: Annotated[
         Path,
         typer.Argument(
-            metavar="SESSION", help="Five new photographs from one place, with their readings."
+            metavar="SESSION", help="Five new images from one place, with their readings."
         ),
     ],
     out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,

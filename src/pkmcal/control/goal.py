@@ -130,7 +130,7 @@ def leaving(
 
 
 @dataclass(frozen=True)
-class GoalPhotograph:
+class GoalImage:
     """Image of the machine at the goal, (height, width) uint8, and its readings (m,)."""
 
     image: Integers
@@ -149,14 +149,14 @@ class Goal:
     aspect: float
 
 
-def goal_of(sight: Sight | None, view: MachineView, goal: Array | GoalPhotograph) -> Goal:
+def goal_of(sight: Sight | None, view: MachineView, goal: Array | GoalImage) -> Goal:
     """Goal from a platform pose (4, 4), edges (s, 2, 3) or an image.
 
     Raises InputError for any other array, for an unreachable or singular pose, and for an image
     without a camera; GeometryError for an image in which no leg is found.
     """
-    if isinstance(goal, GoalPhotograph):
-        return _of_photograph(sight, view, goal)
+    if isinstance(goal, GoalImage):
+        return _of_image(sight, view, goal)
     array = np.asarray(goal, dtype=float)
     if array.shape == (4, 4):
         return _of_pose(view, array)
@@ -271,21 +271,19 @@ def _check_closes(view: MachineView, T_base_platform: Array) -> None:
         )
 
 
-def _of_photograph(sight: Sight | None, view: MachineView, goal: GoalPhotograph) -> Goal:
+def _of_image(sight: Sight | None, view: MachineView, goal: GoalImage) -> Goal:
     if sight is None:
-        raise InputError(
-            "a goal photograph needs the camera", next_step="give camera to VisualServo"
-        )
+        raise InputError("a goal image needs the camera", next_step="give camera to VisualServo")
     readings = np.asarray(goal.readings, dtype=float)
     value = track(sight, first_track_state(view), goal.image, readings)
     if not value.closed:
         raise GeometryError(
-            what="no pose of the machine fits the readings of the goal photograph",
+            what="no pose of the machine fits the readings of the goal image",
             next_step="check that they are in metres or radians, in the order of the motors",
         )
     if not value.valid.any():
         raise GeometryError(
-            what="no leg was found in the goal photograph",
+            what="no leg was found in the goal image",
             found=value.reasons[0],
             next_step="check the camera, its place and the light",
         )

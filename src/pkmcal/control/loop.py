@@ -12,7 +12,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.control.goal import (
     Goal,
-    GoalPhotograph,
+    GoalImage,
     Status,
     Step,
     aspect_of,
@@ -53,7 +53,7 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe.legs import first_binning
 from pkmcal.wording import named
 
-__all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
+__all__ = ["GoalImage", "Status", "Step", "VisualServo"]
 
 GOAL_READING_TOLERANCE = 5e-4
 """Difference of a reading, in m or rad, from the goal's that counts as converged: one image of
@@ -72,7 +72,7 @@ OTHER_PLACE_ANGLE = 0.02
 """RMS angle, in rad, that is more than noise: with readings at rest and edges this far from the
 goal, the law has reached another equilibrium."""
 NO_EDGES_TEXT = (
-    "likely causes: another assembly than the start's, readings of another photograph, a camera"
+    "likely causes: another assembly than the start's, readings of another image, a camera"
     " that was moved, too little light"
 )
 
@@ -98,7 +98,7 @@ class VisualServo:
     """Controller of a calibrated machine by its legs in one camera, [B] III with the errata.
 
     machine : with calibrated values. camera : required for images only. T_camera_base : (4, 4).
-    goal : a platform pose (4, 4), edges (s, 2, 3) of the seen legs, or a :class:`GoalPhotograph`.
+    goal : a platform pose (4, 4), edges (s, 2, 3) of the seen legs, or a :class:`GoalImage`.
     law : "edges" or "directions". gain : 1/s; less than the inverse of the time between samples,
     delay included. rate_limits : largest velocity of all motors, or (m,) of each. legs : (s,) seen
     legs from 0, by default all with tubes. start : (4, 4) a pose near the machine's first pose, by
@@ -114,7 +114,7 @@ class VisualServo:
         machine: Machine,
         camera: Camera | None,
         T_camera_base: Array,
-        goal: Array | GoalPhotograph,
+        goal: Array | GoalImage,
         *,
         law: str = "edges",
         gain: float = 1.0,
@@ -147,7 +147,7 @@ class VisualServo:
         cls,
         folder: Path | str,
         station: str,
-        goal: Array | GoalPhotograph,
+        goal: Array | GoalImage,
         *,
         session: Path | None = None,
         **options: Any,
@@ -216,7 +216,7 @@ class VisualServo:
         Raises InputError for an image of another size or type than the camera's.
         """
         if self._sight is None:
-            raise InputError("a photograph needs the camera", next_step="give it to VisualServo")
+            raise InputError("a image needs the camera", next_step="give it to VisualServo")
         check_image(image, self._sight.camera)
         q = self._checked(readings)
         at = track(self._sight, self._track, image, q)
@@ -385,7 +385,7 @@ class VisualServo:
         out = self._lost(sample, used)
         if sample.beside > UNEXPLAINED_READINGS_LAG:
             out.append(
-                f"the photograph contradicts the readings by {sample.beside * 1e3:.1f} mm in a"
+                f"the image contradicts the readings by {sample.beside * 1e3:.1f} mm in a"
                 " rod's length: they are of another time, or not this machine's"
             )
         if slowed:

@@ -22,7 +22,7 @@ from pkmcal.geometry.rigid import apply, cross, dot, perturb, pose_difference, s
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.legs import (
     StationEdges,
     measure,
@@ -268,10 +268,10 @@ class Sight:
     edge_shift: float = 0.0
     binning: int = 1
 
-    def photograph(self, image: Integers, readings: Array) -> Photographs:
+    def binned(self, image: Integers, readings: Array) -> StationImages:
         """Binned image, as edges are measured in it."""
         station = np.zeros(1, dtype=int)
-        one = Photographs(0, self.camera, station, readings[None], [image], binning=self.binning)
+        one = StationImages(0, self.camera, station, readings[None], [image], binning=self.binning)
         return one.binned()
 
     def misfits(self, readings: Array, T_base_platform: Array, edges: EdgeSet) -> EdgeMisfits:
@@ -353,14 +353,14 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
         return TrackedLegs(lines, lines.valid, reasons, state.T_base_platform, False, 0.0, lost)
     closed, first, blur = forward.T_base_platform, np.isnan(state.blur), state.blur
     # measurement pass; for the first image also after a wide search, the better of the two
-    photograph = sight.photograph(image, readings)
+    station_images = sight.binned(image, readings)
     predicted = perturb(closed, state.correction)
     searched = not first and _poor(state.valid) and not state.searched
     if searched:
-        predicted = _searched(sight, photograph, predicted)
-    at = _edge_pass(sight, photograph, predicted, blur)
+        predicted = _searched(sight, station_images, predicted)
+    at = _edge_pass(sight, station_images, predicted, blur)
     if first:
-        again = _edge_pass(sight, photograph, _searched(sight, photograph, predicted), blur)
+        again = _edge_pass(sight, station_images, _searched(sight, station_images, predicted), blur)
         searched = again.quality > at.quality
         at = again if searched else at
     # blur from the first image, and the correction for the next
@@ -400,22 +400,24 @@ class _EdgePass:
         return (0 if self.far else len(self.rows.leg), -self.station_edges.shift)
 
 
-def _edge_pass(sight: Sight, photograph: Photographs, predicted: Array, blur: float) -> _EdgePass:
+def _edge_pass(
+    sight: Sight, station_images: StationImages, predicted: Array, blur: float
+) -> _EdgePass:
     view = sight.view
     reference = None if np.isnan(blur) else blur
     station_edges = measure(
-        photograph, view.machine, view.T_camera_base, predicted[None], reference
+        station_images, view.machine, view.T_camera_base, predicted[None], reference
     )
-    rows = sight.misfits(photograph.joints[0], predicted, station_edges.edges)
+    rows = sight.misfits(station_images.joints[0], predicted, station_edges.edges)
     far = station_edges.shift > LOST_EDGE_DISTANCE
     lines = LegLines.nothing(len(view.legs)) if far else leg_lines(view, rows)
     return _EdgePass(predicted, station_edges, rows, lines, far)
 
 
-def _searched(sight: Sight, photograph: Photographs, predicted: Array) -> Array:
+def _searched(sight: Sight, station_images: StationImages, predicted: Array) -> Array:
     """Pose (4, 4) from the wide search."""
-    view, readings = sight.view, photograph.joints[0]
-    station_edges = search(photograph, view.machine, view.T_camera_base, predicted[None])
+    view, readings = sight.view, station_images.joints[0]
+    station_edges = search(station_images, view.machine, view.T_camera_base, predicted[None])
     every = np.ones(len(view.legs), dtype=bool)
     for _ in range(SEARCH_ROUNDS):
         rows = sight.misfits(readings, predicted, station_edges.edges)
@@ -439,7 +441,7 @@ def check_image(image: Integers, camera: Camera) -> None:
     """Raise InputError for an image that is not one grey-level image of this camera."""
     if image.dtype != np.uint8 or image.ndim != 2:
         raise InputError(
-            what="the photograph is not an array of grey levels",
+            what="the image is not an array of grey levels",
             found=f"{image.dtype} of shape {image.shape}",
             expected="uint8 of shape (height, width)",
             next_step="convert it, for example with cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)",
@@ -447,10 +449,10 @@ def check_image(image: Integers, camera: Camera) -> None:
     size = (image.shape[1], image.shape[0])
     if size != tuple(camera.image_size):
         raise InputError(
-            what="the photograph has another size than its camera",
+            what="the image has another size than its camera",
             found=f"{size[0]}x{size[1]} pixels",
             expected=f"{camera.image_size[0]}x{camera.image_size[1]}, as the camera file says",
-            next_step="set the camera to that size; scaled photographs do not fit its calibration",
+            next_step="set the camera to that size; scaled images do not fit its calibration",
         )
 
 

@@ -45,7 +45,7 @@ WHY_RESTRICTED = {
     "schoenflies": "The platform stays upright by its own three slides and its hinge, which stand "
     "for the parallelograms that hold it.",
 }
-NOT_WEIGHED = "NOT KNOWN: masses and inertias, since photographs weigh nothing"
+NOT_WEIGHED = "NOT KNOWN: masses and inertias, since images weigh nothing"
 """Beginning of the convention line in which each format states how it treats missing masses."""
 
 

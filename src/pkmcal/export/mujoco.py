@@ -38,7 +38,7 @@ CONVENTIONS = (
     " that + angle. An actuator's gear is 1 / scale; without one the scale is 1.",
     "The keyframe 'home' is closed by pkmcal's kinematics, and is the model as drawn (qpos0)."
     " Loops are closed by the equality constraints named after the legs.",
-    "PLACEHOLDERS: masses, inertias, damping and the actuators' gains. Photographs weigh nothing,"
+    "PLACEHOLDERS: masses, inertias, damping and the actuators' gains. Images weigh nothing,"
     " so this model is for kinematics. Gravity and contacts are off for that reason.",
 )
 

@@ -136,8 +136,7 @@ def _check(machine: Machine, measurements: Measurements) -> None:
     if measurements.n_stations and not in_view:
         raise InputError(
             what="there is neither an edge nor a board's pose to calibrate from",
-            next_step="check the photographs, the stations' poses and the tubes of the"
-            " nominal model",
+            next_step="check the images, the stations' poses and the tubes of the nominal model",
         )
     if joints.shape[-1] != machine.n_joints:
         raise InputError(

@@ -404,7 +404,7 @@ def bundle(
     """The joint estimate of one session.
 
     start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
-    use_drawing : take the nominal model's values as measurements with their tolerances; radii and
+    use_prior : take the nominal model's values as measurements with their tolerances; radii and
         edge shifts keep theirs in any case. marginal_prior : what other measurements told of the
         machine, with the nominal model in it, in the nominal model's place, whether that is taken
         or not.
@@ -542,7 +542,7 @@ def _estimate(
 def _with_unseen_poses(
     machine: Machine, measurements: Measurements, assembled: Assembled, state: State
 ) -> State:
-    """Poses of the configurations that no photograph shows: by the readings alone."""
+    """Poses of the configurations that no image shows: by the readings alone."""
     unseen = ~assembled.observed
     if not unseen.any():
         return state

@@ -59,7 +59,7 @@ class Situation:
     machine : with its present values.
     observed : (S, L) legs that each station measures.
     T_base_platform : (K, 4, 4) poses of the session.
-    photographed : whether legs are in images; otherwise only boards, poses or heights were
+    imaged : whether legs are in images; otherwise only boards, poses or heights were
     measured.
     heights : whether nothing but heights was measured.
     """
@@ -67,7 +67,7 @@ class Situation:
     machine: Machine
     observed: Booleans
     T_base_platform: Array
-    photographed: bool = True
+    imaged: bool = True
     heights: bool = False
 
     @cached_property
@@ -166,12 +166,12 @@ def candidates(s: Situation) -> Iterator[NamedChanges]:
     own = [motion for j in s.legs for motion in _of_one_leg(s, j)]
     shared = [*(motion for motion, _ in carried), *_sizes(s)]
     # images measure legs one by one; poses leave open changes that all legs have in common
-    yield from (*own, *shared) if s.photographed else (*shared, *own)
+    yield from (*own, *shared) if s.imaged else (*shared, *own)
     for group in movable_leg_groups(s.observed):
         yield from _group(s, group)
     for j in s.legs:
         yield from _whole_leg(s, j)
-    if s.photographed and any("tubes" in fields for fields in s.fields):
+    if s.imaged and any("tubes" in fields for fields in s.fields):
         yield from (_spread(s, group) for group in (*movable_leg_groups(s.observed), s.legs))
     yield _everything(s)
     yield from _all_together(s, carried)
@@ -192,8 +192,8 @@ def _unseen(s: Situation, leg: int) -> NamedChanges:
     return NamedChanges(
         (leg,),
         s.one_hot(s.rows(leg, "")),
-        "{legs} is in no photograph" + read,
-        "{legs} are in no photograph" + all_read,
+        "{legs} is in no image" + read,
+        "{legs} are in no image" + all_read,
         advice="photograph",
     )
 
@@ -212,7 +212,7 @@ def _conventions(s: Situation) -> Iterator[NamedChanges]:
     shifts = shifts.reshape(len(shifts), -1)
     layout = s.machine.layout
     bars = any(g.carrier.floats or g.carrier.turns for g in layout.platform)
-    if s.photographed or (layout.motion[:3].any() and not bars):
+    if s.imaged or (layout.motion[:3].any() and not bars):
         shifts = shifts[:, :0]  # images, or the platform's rotations, determine both ends
     else:
         one = "of {how}: both can shift alike {ways}"
@@ -358,7 +358,7 @@ def _whole_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     own = s.rows(leg, "base", "platform", "length", "scale")
     one = "of the values of {legs}, {combinations}{mostly}"
     yield NamedChanges((leg,), s.one_hot(own), one)
-    if "tubes" in s.fields[leg] and s.photographed:
+    if "tubes" in s.fields[leg] and s.imaged:
         one = "the tubes' radii of {legs} and the distance to the camera cannot be told apart"
         every = s.one_hot(s.rows(leg, ""))
         yield NamedChanges((leg,), every, one + "{better}", advice="caliper")

@@ -197,11 +197,11 @@ def advice_on(
     if not matters:
         return f"Nothing needs to be done; {held} silences this."
     legs = open_motion.legs
-    more, take = _more(around, legs), "Photograph" if around.photographed else "Measure"
+    more, take = _more(around, legs), "Take images of" if around.imaged else "Measure"
     caliper = f"Measure the tubes of {named(legs)} with a caliper"
     do = {
         "more": more,
-        "photograph": f"Photograph {named(legs)}, from another station if need be",
+        "photograph": f"Take images of {named(legs)}, from another station if need be",
         "tie": _tying(around, legs),
         "caliper": f"{caliper} and give a small tolerance.radius",
         "more or caliper": f"{more}; or measure the tubes with a caliper",
@@ -232,7 +232,7 @@ def _more(around: Situation, legs: tuple[int, ...]) -> str:
     """Advice on missing configurations."""
     if around.heights:  # more heights of the same bed would not help
         return "Measure x and y too, by a board on the platform (observe: board) or a tracker"
-    take, poses = "Photograph" if around.photographed else "Measure", around.T_base_platform
+    take, poses = "Take images of" if around.imaged else "Measure", around.T_base_platform
     those = named(legs) if len(legs) < len(around.legs) else "all legs"
     elsewhere = f"{those} {'points' if len(legs) == 1 else 'point'} elsewhere"
     if len(poses) == 1:

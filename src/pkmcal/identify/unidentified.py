@@ -116,8 +116,8 @@ def explain(
     machine, table = estimate.machine, estimate.machine.parameters
     # situation of the session, and effect of the parameters on the platform
     poses = estimate.state.T_base_platform[estimate.configurations]
-    photographed = estimate.edge_weights.size > 0
-    around = Situation(machine, visible, poses, photographed, only_heights(estimate))
+    imaged = estimate.edge_weights.size > 0
+    around = Situation(machine, visible, poses, imaged, only_heights(estimate))
     effect = platform_by_parameters(machine, poses)
     unseen = {id(d) for d in ranks.unidentified}
 
@@ -131,7 +131,7 @@ def explain(
     weak = tuple(d for d in ranks.weak if d.information >= WEAK_INFORMATION)
     # poses and heights mix weakly identified directions with unidentified ones: only both together
     # have names
-    sentences = (*text(lost), *text(weak)) if photographed else text((*lost, *weak))
+    sentences = (*text(lost), *text(weak)) if imaged else text((*lost, *weak))
     conventional, others = conventions_held(machine, effect)
     return Findings(
         ranks,
@@ -249,7 +249,7 @@ def describe(
         return ()
     if effect is None:
         effect = platform_by_parameters(machine, around.T_base_platform)
-    if not around.photographed:  # boards and trackers do not measure tubes
+    if not around.imaged:  # boards and trackers do not measure tubes
         space = _without(space, _within(all_radii(around).columns, space, INSIDE_OPEN_SHARES[0]))
     results = _merged(around, _explained(around, space))
     text = [sentence(around, part, space.unit, *_moves(part, space, effect)) for part in results]

@@ -254,8 +254,8 @@ def _shared_data(both: list[SavedCalibration]) -> tuple[int, float]:
 
 def _identity(saved: SavedCalibration, k: int) -> set[object]:
     """Identity of a configuration: its images, or its readings."""
-    photographs = saved.document["configurations"][k].get("photographs", ())
-    return set(photographs) or {tuple(saved.joints[k].tolist())}
+    images = saved.document["configurations"][k].get("photographs", ())
+    return set(images) or {tuple(saved.joints[k].tolist())}
 
 
 def _region(both: list[SavedCalibration]) -> Region | None:

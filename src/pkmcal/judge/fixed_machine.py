@@ -211,7 +211,7 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
     moved = np.flatnonzero((layout.actuated >= 0) & ~layout.rod_reads)
     if len(measurements.edges) and not measurements.on_platform.any() and moved.size:
         return InputError(
-            f"the readings of {machine.name} cannot be predicted from photographs of its legs yet",
+            f"the readings of {machine.name} cannot be predicted from images of its legs yet",
             found=f"{named(moved, layout.n_legs)} on cranks or sliders, where edges are located"
             " with the readings that are to be predicted",
             expected="a board on the platform, or a tracker's table of its poses, besides",
@@ -221,7 +221,7 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
     return ResultError(
         "too little was seen to predict readings: some poses follow from their own readings alone",
         expected="legs, a board or whole poses in several more configurations; heights tell none",
-        next_step="Photograph more configurations from each station",
+        next_step="Take images of more configurations from each station",
     )
 
 

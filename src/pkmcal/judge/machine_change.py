@@ -4,7 +4,7 @@ Frames are conventions, so the two are told in those in which they differ least:
 over all free parameters, each in its tolerance. What is then left, y, has no frames in it.
 
 Both estimates lean on the same nominal model where they have the same one, and on the same
-photographs as far as they share them. With the nominal model's covariance 1 (in tolerances), and
+images as far as they share them. With the nominal model's covariance 1 (in tolerances), and
 what the data of each add to it, I_a and I_b, their covariances are C = (1 + I)^-1, and
 
     cov(y_b - y_a) = C_a + C_b - C_a J C_b - C_b J C_a,    J = 1 + I_shared,
@@ -78,7 +78,7 @@ def machine_change(
     """What differs between two machines of the same parameters.
 
     covariances : (P, P) of either's parameters in any frames; None for a nominal model, which is
-    taken at its word. one_drawing : whether both calibrations lean on the same one. shared : of the
+    taken at its word. same_nominal : whether both calibrations lean on the same one. shared : of the
     data of the one that has less, the share that the other saw as well.
     """
     held = replace(a, parameters=replace(a.parameters, nominal=a.values))

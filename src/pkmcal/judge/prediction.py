@@ -96,7 +96,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     if not measurements.n_stations:
         raise ResultError(
             "nothing but readings was measured, and readings are not predicted from themselves",
-            expected="a session with photographs, or with a table of poses",
+            expected="a session with images, or with a table of poses",
             next_step="To see whether the machine is as it was, use pkmcal watch with new readings",
         )
     # links determine the difference of two poses, not the pose at either's readings

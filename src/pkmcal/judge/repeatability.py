@@ -16,14 +16,14 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, rms
 from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
-from pkmcal.calibration.localization import read_photographs
+from pkmcal.calibration.localization import read_images
 from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, skew
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
     Groups,
@@ -56,7 +56,7 @@ to a few hundredths."""
 PAPER_AXIS_NOISE = AxisNoise(images=1)
 """[A] Table 1, upper bounds, in degrees where the paper prints rad (errata)."""
 REPEATS_TABLE_LEGEND = (
-    "Standard deviations of one photograph, pooled over the configurations.",
+    "Standard deviations of one image, pooled over the configurations.",
     "ψ: of the leg's direction in the image. θ: towards the camera. x, z: of its",
     "point with y = 0, camera frame; – for a leg level in the image, without one.",
     "θ and z come from the leg's width in the image, so they scatter most.",
@@ -76,7 +76,7 @@ class LegScatter:
     shift, tilt : of an edge, px, as a whole and at its ends.
     promised : ratio of the edges' scatter to the standard deviations estimated from each image
         alone.
-    photographs, freedom : number of images in which the leg was measured, and how many of these are
+    images, freedom : number of images in which the leg was measured, and how many of these are
         repeats.
     """
 
@@ -89,7 +89,7 @@ class LegScatter:
     shift: float
     tilt: float
     promised: float
-    photographs: int
+    images: int
     freedom: int
 
 
@@ -100,12 +100,12 @@ class StationScatter:
     shift, promised : as for a leg (px, ratio), over all legs.
     camera, platform, legs : share of the squared scatter, above chance, that is explained by a
         motion of the camera, of the platform, or of each leg separately.
-    photographs, configurations : numbers of images, and of configurations with repeats.
+    images, configurations : numbers of images, and of configurations with repeats.
     dropped : number of rejected repeats of edges.
     """
 
     station: str
-    photographs: int
+    images: int
     configurations: int
     shift: float
     promised: float
@@ -163,8 +163,8 @@ def study_repeats(
     require_repeats(session)
     calibration = calibrate_session(session, seed=seed, progress=progress)
     session = calibration.session  # without hand-held images that were not localized
-    observed = [p for p in read_photographs(session) if _sees_legs(session.stations[p.station])]
-    parts = [_StationEdges.of(calibration, photographs) for photographs in observed]
+    observed = [p for p in read_images(session) if _sees_legs(session.stations[p.station])]
+    parts = [_StationEdges.of(calibration, images) for images in observed]
     parts = [station_edges for station_edges in parts if np.any(station_edges.same.count > 1)]
     names = [station.name for station in session.stations]
     legs = tuple(
@@ -182,26 +182,26 @@ def study_repeats(
 def require_repeats(session: Session) -> None:
     """Raise InputError, with the needed entry, if no station that observes legs has repeats."""
     for station in session.stations:
-        rows = [photo.configuration for photo in station.photographs]
+        rows = [photo.configuration for photo in station.images]
         if _sees_legs(station) and len(set(rows)) < len(rows):
             return
     name = next((s.name for s in session.stations if not s.handheld), None)
     if name is None:
         raise InputError(
-            "the session has no repeated photographs",
+            "the session has no repeated images",
             where="session.yaml, stations",
             found="no camera that stands in one place",
-            expected="a station from which configurations were photographed several times",
-            next_step="Put a camera on a tripod and photograph some configurations several times,"
+            expected="a station from which configurations were imaged several times",
+            next_step="Put a camera on a tripod and image some configurations several times,"
             " moving nothing in between",
         )
     raise InputError(
-        "the session has no repeated photographs",
+        "the session has no repeated images",
         where=f"session.yaml, stations.{name}.images",
-        found=f"{session.document['stations'][name]['images']}, one photograph a configuration",
+        found=f"{session.document['stations'][name]['images']}, one image a configuration",
         expected=f"a pattern such as images/{name}/{{configuration}}_{{repeat}}.png",
         next_step="Photograph some configurations several times, moving nothing in between, and"
-        f" name the photographs images/{name}/0001_1.png, images/{name}/0001_2.png and so on",
+        f" name the images images/{name}/0001_1.png, images/{name}/0001_2.png and so on",
     )
 
 
@@ -232,15 +232,15 @@ class _StationEdges:
     dropped: int
 
     @classmethod
-    def of(cls, calibration: Calibration, photographs: Photographs) -> _StationEdges:
+    def of(cls, calibration: Calibration, images: StationImages) -> _StationEdges:
         """Measure a station's images from the calibrated scene."""
         state, machine = calibration.estimate.state, calibration.machine
-        s, rows = photographs.station, photographs.configuration
+        s, rows = images.station, images.configuration
         camera = calibration.cameras.at_station(int(s))
         binning = int(calibration.observation.binning[s])
         # each image as a configuration by itself, so that repeats are not combined
         numbered = replace(
-            photographs, camera=camera, configuration=np.arange(len(rows)), binning=binning
+            images, camera=camera, configuration=np.arange(len(rows)), binning=binning
         )
         poses, T_camera_base = state.T_base_platform[rows], state.T_camera_base[s]
         edges = legs.measure(numbered, machine, T_camera_base, poses).edges
@@ -253,7 +253,7 @@ class _StationEdges:
         same = same_edges(edges)
         # deviations from the means
         turn = turns_from_first(edges, same)
-        ends = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
+        ends = legs_in_camera(machine, T_camera_base, poses, images.joints)
         radius = machine.radii_of(edges.leg, edges.tube)
         return cls(
             station=s,
@@ -357,7 +357,7 @@ def _station_row(station_edges: _StationEdges, station: str) -> StationScatter:
     photo = groups_of(station_edges.photo)
     return StationScatter(
         station=station,
-        photographs=len(photo.first),
+        images=len(photo.first),
         configurations=len(np.unique(edges.configuration[same.first[same.count > 1]])),
         shift=float(shift[0]),
         promised=rms(promised),
@@ -518,7 +518,7 @@ def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
         shift=quantile("shift"),
         tilt=quantile("tilt"),
         promised=quantile("promised"),
-        photographs=sum(row.photographs for row in rows),
+        images=sum(row.images for row in rows),
         freedom=sum(row.freedom for row in rows),
     )
 
@@ -532,9 +532,7 @@ def part_of(study: RepeatStudy) -> Part:
     paper = (_degrees(noise.psi), _degrees(noise.theta), _mm(noise.x), _mm(noise.z))
     rows.append(Row("[A] Table 1", ("", "", *paper, "", ""), "paper"))
     columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
-    table = Table(
-        "Scatter of repeated photographs", columns, tuple(rows), legend=REPEATS_TABLE_LEGEND
-    )
+    table = Table("Scatter of repeated images", columns, tuple(rows), legend=REPEATS_TABLE_LEGEND)
     return Part("repeats", "Repeats", tables=(table,))
 
 
@@ -542,7 +540,7 @@ def _cells(row: LegScatter) -> tuple[str, ...]:
     """Cells of a row: number of images, axis and edges."""
     axis = (_degrees(row.psi), _degrees(row.theta), _mm(row.x), _mm(row.z))
     edges = (f"{v:.3f} px" if math.isfinite(v) else "–" for v in (row.shift, row.tilt))
-    return str(row.photographs), *axis, *edges
+    return str(row.images), *axis, *edges
 
 
 def _degrees(value: float) -> str:

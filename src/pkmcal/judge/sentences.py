@@ -44,7 +44,7 @@ MOSTLY_NOISE = 2**0.5
 """Factor on the noise of images within which noise is more than half of the mean square."""
 POOR_REGION_FACTOR = 2.0
 """Ratio of a region's errors to those of the used configurations from which it is reported."""
-NOISIER_PHOTOGRAPHS_FACTOR = 1.5
+NOISIER_IMAGES_FACTOR = 1.5
 """Ratio to the calibration's noise from which images are no longer of the same kind."""
 STEEL_EXPANSION = 12e-6
 """Thermal expansion of steel, 1/K, to illustrate a common scale."""
@@ -380,7 +380,7 @@ def _change_verdict(
     lens = all(f.suspect.cause.part == "camera" for f in findings)
     if lens:
         headline = (
-            "The photographs do not fit the calibration, and a camera explains that better than"
+            "The images do not fit the calibration, and a camera explains that better than"
             " the machine: whether the machine is as calibrated cannot be told."
         )
     else:
@@ -492,7 +492,7 @@ def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
     if both.any():
         names = [*compress(around.configurations, both)]
         out.append(doubtful("watch.known_configurations", listed(names, 4), names=names))
-    if around.noisier > NOISIER_PHOTOGRAPHS_FACTOR:
+    if around.noisier > NOISIER_IMAGES_FACTOR:
         out.append(doubtful("watch.noisier", scale=around.noisier))
     return tuple(out)
 

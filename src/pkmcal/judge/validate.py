@@ -34,9 +34,9 @@ from pkmcal.session.load import Session
 
 VALIDATION_FORMAT = 1
 NOT_INDEPENDENT = (
-    "the session is not independent: the calibration was made from these photographs",
-    "photographs that the calibration did not see",
-    "Take new photographs, calibrate with --holdout N, or hold out regions of this session with"
+    "the session is not independent: the calibration was made from these images",
+    "images that the calibration did not see",
+    "Take new images, calibrate with --holdout N, or hold out regions of this session with"
     " --regions N",
 )
 
@@ -166,5 +166,5 @@ def _has_image(session: Session) -> Booleans:
     """
     out = np.full(len(session.configurations), bool(session.trackers or not session.stations))
     for station in session.stations:
-        out[[photo.configuration for photo in station.photographs]] = True
+        out[[photo.configuration for photo in station.images]] = True
     return out

@@ -41,7 +41,7 @@ WATCH_ALPHA = 0.01
 NOTHING_NEW = (
     "there is nothing new in this session: the calibration was made from it",
     "photographs, or poses, that were taken after the calibration",
-    "Take five or more new photographs from one place, with their readings",
+    "Take five or more new images from one place, with their readings",
 )
 
 

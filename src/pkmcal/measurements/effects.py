@@ -24,7 +24,7 @@ FOCAL_EXCESS, BOARD_SIZE = "station.focal", "board.size"
 SHIFT_SIGMA = 0.3
 """Standard deviation (px) of a camera's constant edge shift before any data: errata, B."""
 FOCAL_SIGMA = 1.5e-3
-"""Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
+"""Standard deviation of a hand-held image's focal length, relative to the camera's. A lens of
 focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
 mm) changes by 0.3 % from 3 m to 1 m, as one walks about a machine, so half of that to each side."""
 
@@ -139,7 +139,7 @@ def columns_of_effects(measurements: Measurements) -> Iterator[Column]:
 
 def lines(measurements: Measurements) -> tuple[Integers, Integers]:
     """Each line's station, leg, tube and side (n, 4), and the number (N,) of each edge's line; none
-    if nothing is shaded, and -1 at stations of one photograph, where each edge is a line of its
+    if nothing is shaded, and -1 at stations of one image, where each edge is a line of its
     own.
     """
     e = measurements.edges
@@ -154,6 +154,6 @@ def lines(measurements: Measurements) -> tuple[Integers, Integers]:
 
 
 def _alone(edges: EdgeSet, n_stations: int) -> Booleans:
-    """(N,) edges of stations that saw one configuration alone, as photographs by hand do."""
+    """(N,) edges of stations that saw one configuration alone, as images by hand do."""
     pair = np.unique(np.stack([edges.station, edges.configuration], axis=1), axis=0)
     return np.bincount(pair[:, 0], minlength=n_stations)[edges.station] == 1

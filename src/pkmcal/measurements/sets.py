@@ -95,7 +95,7 @@ class Measurements:
     refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
     those units from the calibration's values. poses : of boards or targets, each on one of the
     ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
-    gives edges in photographs. focal_at : (S,) relative excess of the stations' focal lengths at
+    gives edges in images. focal_at : (S,) relative excess of the stations' focal lengths at
     which they were measured; empty where none is held by hand. effects : further effects beside
     those that every estimate counts (:mod:`pkmcal.measurements.effects`). links : measurements that
     link two configurations, one set for each kind. level : (S,) stations whose z

@@ -243,13 +243,11 @@ class Surroundings:
 
     def __init__(
         self,
-        photograph: Callable[[int], tuple[Integers, Camera]],
+        image: Callable[[int], tuple[Integers, Camera]],
         options: BackgroundOptions = BACKGROUND_OPTIONS,
     ) -> None:
         self.options = options
-        self.texture: Callable[[int], Texture] = cache(
-            lambda k: texture_of(*photograph(k), options)
-        )
+        self.texture: Callable[[int], Texture] = cache(lambda k: texture_of(*image(k), options))
         self._pairs: Callable[[int, int], Integers] = cache(
             lambda j, k: partners(self.texture(j), self.texture(k), options)
         )

@@ -157,21 +157,21 @@ class DistanceTables:
         return direction_of(normal, len(self.tables.ready))
 
     def look_up(
-        self, direction: Integers, pixel: Array, photograph: Integers, between: bool = False
+        self, direction: Integers, pixel: Array, image: Integers, between: bool = False
     ) -> tuple[Array, Booleans]:
         """Distances (reduced px) at full-size pixels (..., 2), and which of these lie in the image.
 
-        direction, photograph : (...) direction numbers and image numbers.
+        direction, image : (...) direction numbers and image numbers.
         between : interpolate bilinearly between table entries; otherwise take the nearest.
         """
         import cv2
 
-        x, y, inside = self._place(direction, pixel, photograph)
+        x, y, inside = self._place(direction, pixel, image)
         how = cv2.INTER_LINEAR if between else cv2.INTER_NEAREST
         return self._interpolated(x, y, how), inside
 
     def look_along(
-        self, direction: Integers, pixel: Array, outward: Array, photograph: Integers
+        self, direction: Integers, pixel: Array, outward: Array, image: Integers
     ) -> tuple[Array, Array, Booleans]:
         """Distances as in :meth:`look_up`, bilinear, with their derivatives along unit vectors
         (..., 2).
@@ -181,14 +181,14 @@ class DistanceTables:
         """
         import cv2
 
-        x, y, inside = self._place(direction, pixel, photograph)
+        x, y, inside = self._place(direction, pixel, image)
         right, down = outward[..., 0], outward[..., 1]
         here = self._interpolated(x, y, cv2.INTER_LINEAR)
         ahead = self._interpolated(x + right, y + down, cv2.INTER_LINEAR)
         behind = self._interpolated(x - right, y - down, cv2.INTER_LINEAR)
         return here, np.clip((ahead - behind) / 2, -1, 1) / np.float32(self.scale), inside
 
-    def brighter(self, pixel: Array, photograph: Integers) -> tuple[Integers, Booleans]:
+    def brighter(self, pixel: Array, image: Integers) -> tuple[Integers, Booleans]:
         """Sign of the difference from the median image at full-size pixels (..., 2), and which lie
         inside.
 
@@ -199,10 +199,10 @@ class DistanceTables:
         with np.errstate(invalid="ignore"):
             inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
         x, y = (np.where(inside, v, 0.0).astype(np.intp) for v in (x, y))
-        return np.where(inside, self.against[self.row[photograph], y, x], 0), inside
+        return np.where(inside, self.against[self.row[image], y, x], 0), inside
 
     def _place(
-        self, direction: Integers, pixel: Array, photograph: Integers
+        self, direction: Integers, pixel: Array, image: Integers
     ) -> tuple[Array, Array, Booleans]:
         """Column and row (...) in the mosaic of all tables, and whether the pixel lies in its
         image.
@@ -213,7 +213,7 @@ class DistanceTables:
         with np.errstate(invalid="ignore"):
             inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
         # single precision is exact for columns and rows below 2**15 and sufficient for a search
-        number = self.row[photograph].astype(np.int32)
+        number = self.row[image].astype(np.int32)
         column = ((number // rows * count + direction) * width).astype(np.float32)
         line = (number % rows * height).astype(np.float32)
         x, y = (np.where(inside, v, 0.0) for v in (x + column, y + line))
@@ -233,12 +233,12 @@ class DistanceTables:
         )
         return self.tables.chance.take(direction * bins + number)
 
-    def select(self, photographs: Integers) -> DistanceTables:
+    def select(self, images: Integers) -> DistanceTables:
         """Tables of some of the images; ``moving`` and the chance densities stay those of all
         images.
         """
-        edges = tuple(self.edges[k] for k in photographs)
-        return replace(self, row=self.row[photographs], edges=edges)
+        edges = tuple(self.edges[k] for k in images)
+        return replace(self, row=self.row[images], edges=edges)
 
     def mirrored(self) -> DistanceTables:
         """Tables of the images with left and right exchanged."""

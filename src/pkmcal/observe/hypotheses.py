@@ -62,7 +62,7 @@ NAMING_ROUNDS = 3
 """Rounds of names for images, and of the pose by these names."""
 FEW_CONFIGURATIONS = 4
 """Images in which all hypotheses about the readings are compared."""
-ENOUGH_PHOTOGRAPHS_ALONE, USUAL_PHOTOGRAPHS = 4, 15
+ENOUGH_IMAGES_ALONE, USUAL_IMAGES = 4, 15
 """Images below which there are no two halves, one to search and one to confirm, and one of little
 evidence leaves it open whether the machine is there; and how many are usual."""
 NUMBERING = "readings.numbering_"
@@ -127,20 +127,20 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
         return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
-    few = len(worst.view.configuration) < ENOUGH_PHOTOGRAPHS_ALONE
+    few = len(worst.view.configuration) < ENOUGH_IMAGES_ALONE
     return InputError(
-        f"the machine is not recognised in the photographs of {worst.name}{at}",
+        f"the machine is not recognised in the images of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
         found=_little(worst),
         expected="one place where its legs lie on edges of the picture far oftener than any"
         " machine's would",
         next_step=(
-            f"Take more photographs from there, {USUAL_PHOTOGRAPHS} are usual: of so few it"
+            f"Take more images from there, {USUAL_IMAGES} are usual: of so few it"
             " cannot be said whether anything is mixed up. If there are more, check"
             if few
             else "Check"
         )
-        + " that these photographs show this machine's legs, that each bears the name"
+        + " that these images show this machine's legs, that each bears the name"
         " of its configuration, and that the nominal model is this machine's"
         + ("" if worst.by_hand is not None else "; a pose by hand, right to 20 cm, may help"),
         code="station.not_recognised",
@@ -154,8 +154,8 @@ def _little(station: SuspectStation) -> str:
         return "legs that fit nearly as well at another place"
     count = len(station.view.configuration)
     if count < 2:
-        return "one photograph alone, and none to confirm what it seems to show"
-    few = f"{count} photographs alone, and " if count < ENOUGH_PHOTOGRAPHS_ALONE else ""
+        return "one image alone, and none to confirm what it seems to show"
+    few = f"{count} images alone, and " if count < ENOUGH_IMAGES_ALONE else ""
     often = how_often(localization.by_chance)
     return f"{few}legs that readings of other configurations fit as well {often}"
 
@@ -183,7 +183,7 @@ def _swapped_stations(
             return InputError(
                 f"stations {one.name} and {other.name} are mixed up",
                 where="session.yaml, stations",
-                found="the photographs of each fit the pose of the other",
+                found="the images of each fit the pose of the other",
                 next_step=f"Exchange the poses of {one.name} and {other.name} in session.yaml,"
                 " or their image folders",
                 code="station.exchanged",
@@ -398,7 +398,7 @@ def _best_names(score: Array) -> Integers:
     """The name (n,) of each image, each used once, with the largest sum of scores (n, n)."""
     others = np.where(np.eye(len(score), dtype=bool), -np.inf, score).max(axis=1)
     gain = np.sort(others - np.diag(score))
-    # two photographs at least have to leave their own names for others; where that loses, as a
+    # two images at least have to leave their own names for others; where that loses, as a
     # rule, all keep theirs, and SciPy's, which takes a while to import, is not asked
     if gain[-2:].sum() < 0:
         return np.arange(len(score))
@@ -422,7 +422,7 @@ def _reading_error(hypothesis: ReadingHypothesis, units: Sequence[str]) -> Input
     return InputError(
         f"the readings of motor {motor + 1} count the other way",
         where="joints.csv",
-        found=f"the photographs fit with {less}",
+        found=f"the images fit with {less}",
         next_step=f"Turn the motor's direction round where it is set, or write {less} into this"
         " column; what is left of a constant is calibrated",
         code=hypothesis.code,
@@ -433,7 +433,7 @@ def _two_legs(a: int, b: int) -> InputError:
     return InputError(
         f"the readings of legs {a} and {b} are mixed up",
         where="joints.csv",
-        found="the photographs fit with these two columns exchanged",
+        found="the images fit with these two columns exchanged",
         next_step=f"Exchange the columns of legs {a} and {b} in joints.csv, or the two legs in"
         " the nominal model",
         code="readings.exchanged",
@@ -446,7 +446,7 @@ def _numbering(order: Integers) -> InputError:
     return InputError(
         "the legs are numbered differently in the readings and in the nominal model",
         where="joints.csv",
-        found=f"the photographs fit when leg 1 takes the readings of column {order[0] + 1},"
+        found=f"the images fit when leg 1 takes the readings of column {order[0] + 1},"
         f" leg 2 those of column {order[1] + 1}, and so on {'round' if rising else 'backwards'}",
         next_step="Give the columns of joints.csv the order of the legs in the nominal model",
         code="readings.numbering_turned" if rising else "readings.numbering_reversed",
@@ -455,25 +455,25 @@ def _numbering(order: Integers) -> InputError:
 
 def _shifted(step: int) -> InputError:
     return InputError(
-        "the photographs are shifted against the readings",
+        "the images are shifted against the readings",
         where="joints.csv",
-        found="each photograph fits the readings of the configuration"
+        found="each image fits the readings of the configuration"
         f" {'before' if step > 0 else 'after'} its own",
-        next_step="Look for a row or a photograph that is missing or was taken twice, and name the"
-        " photographs by the readings at which they were taken",
+        next_step="Look for a row or an image that is missing or was taken twice, and name the"
+        " images by the readings at which they were taken",
         code="image.shifted",
     )
 
 
-def _misnamed(station: SuspectStation, photographs: Integers, fitting: Integers) -> InputError:
+def _misnamed(station: SuspectStation, images: Integers, fitting: Integers) -> InputError:
     """The error about images, by index, that fit other rows of the readings."""
-    files = [station.files[k] for k in photographs]
+    files = [station.files[k] for k in images]
     fit = [station.configurations[k] for k in fitting]
     return InputError(
-        f"photographs of {station.name} bear each other's names",
+        f"images of {station.name} bear each other's names",
         where=files[0],
         found="; ".join(f"{f} fits configuration {c}" for f, c in zip(files, fit, strict=True)),
-        next_step="Give these photographs, or the rows of joints.csv, the right names",
+        next_step="Give these images, or the rows of joints.csv, the right names",
         code="image.exchanged",
     )
 
@@ -481,18 +481,18 @@ def _misnamed(station: SuspectStation, photographs: Integers, fitting: Integers)
 def _mirrored(station: SuspectStation) -> InputError:
     if len(station.files) == 1:
         return InputError(
-            f"this photograph of {station.name} is mirrored",
+            f"this image of {station.name} is mirrored",
             where=station.files[0],
             found="the machine is recognised with left and right exchanged",
-            next_step="Flip this photograph, or take it again without mirroring",
+            next_step="Flip this image, or take it again without mirroring",
             code="image.mirrored",
         )
     return InputError(
-        f"the photographs of {station.name} are mirrored",
+        f"the images of {station.name} are mirrored",
         where=f"session.yaml, stations.{station.name}",
         found="the machine is recognised with left and right exchanged",
         next_step="Switch mirroring off in the camera or in the program that saved them, or flip"
-        " the photographs and the camera's calibration alike",
+        " the images and the camera's calibration alike",
         code="image.mirrored",
     )
 
@@ -502,7 +502,7 @@ def diameters(mechanism: str) -> InputError:
     return InputError(
         "the tubes' radii look like diameters",
         where=f"{mechanism}, tubes",
-        found="the photographs fit with radii half as large",
+        found="the images fit with radii half as large",
         next_step="Divide the radii by 2",
         code="tube.diameter",
     )

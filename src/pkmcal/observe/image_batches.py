@@ -18,14 +18,14 @@ from pkmcal.cameras import Camera
 from pkmcal.cameras.response import Response
 from pkmcal.observe.images import Selected, binned, fitting
 
-PHOTOGRAPHS_A_WINDOW = 32
+IMAGES_A_WINDOW = 32
 """Largest number of images in a window; their profiles take some 20 MB."""
 WINDOW_BYTES = 96 * 2**20
 """Largest size of a window's grey levels in bytes; a single image may be larger."""
 
 
 @dataclass(frozen=True)
-class Photographs:
+class StationImages:
     """Images of one station.
 
     station : its number in the session.
@@ -45,7 +45,7 @@ class Photographs:
     response: Response = "linear"
     binning: int = 1
 
-    def select(self, numbers: Integers) -> Photographs:
+    def select(self, numbers: Integers) -> StationImages:
         """The images with these numbers."""
         return replace(
             self,
@@ -61,13 +61,13 @@ class Photographs:
     @property
     def window(self) -> int:
         """Number of images in a window."""
-        return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), PHOTOGRAPHS_A_WINDOW)
+        return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), IMAGES_A_WINDOW)
 
-    def decoded(self) -> Photographs:
+    def decoded(self) -> StationImages:
         """A copy with all images decoded; for at most one window of images."""
         return replace(self, images=list(self.images))
 
-    def binned(self) -> Photographs:
+    def binned(self) -> StationImages:
         """A copy with all images decoded and binned; for at most one window of images.
 
         The grey levels are averaged instead of the light that they encode: over the pixels of a
@@ -76,7 +76,7 @@ class Photographs:
         images = [binned(image, self.binning) for image in self.images]
         return replace(self, camera=self.camera.binned(self.binning), images=images, binning=1)
 
-    def same_camera(self, other: Photographs) -> bool:
+    def same_camera(self, other: StationImages) -> bool:
         """Whether the other station has the same camera parameters, image size, response and
         binning.
         """
@@ -96,28 +96,26 @@ class Placed(NamedTuple):
     poses : T_base_platform (K, 4, 4), one for each image.
     """
 
-    photographs: Photographs
+    images: StationImages
     T_camera_base: Array
     poses: Array
 
     def select(self, numbers: Integers) -> Placed:
         """The images with these numbers."""
-        return Placed(self.photographs.select(numbers), self.T_camera_base, self.poses[numbers])
+        return Placed(self.images.select(numbers), self.T_camera_base, self.poses[numbers])
 
 
-def placed_at(
-    photographs: Sequence[Photographs], T_camera_base: Array, poses: Array
-) -> list[Placed]:
+def placed_at(images: Sequence[StationImages], T_camera_base: Array, poses: Array) -> list[Placed]:
     """Images of stations with their poses.
 
     T_camera_base : (S, 4, 4) of all stations of the session.
     poses : T_base_platform (N, 4, 4) of all its configurations.
     """
-    return [Placed(p, T_camera_base[p.station], poses[p.configuration]) for p in photographs]
+    return [Placed(p, T_camera_base[p.station], poses[p.configuration]) for p in images]
 
 
 @dataclass(frozen=True)
-class PhotographWindow:
+class ImageWindow:
     """Images that are processed together, decoded and binned.
 
     camera, response : common to all images; the camera is that of the binned images.
@@ -139,14 +137,14 @@ class PhotographWindow:
     poses: Array
 
     @classmethod
-    def of(cls, placed: Sequence[Placed]) -> PhotographWindow:
+    def of(cls, placed: Sequence[Placed]) -> ImageWindow:
         """The window of stations with the same camera whose images fit into one window."""
-        count = [len(one.photographs.images) for one in placed]
-        in_view = [one.photographs.binned() for one in placed]
+        count = [len(one.images.images) for one in placed]
+        in_view = [one.images.binned() for one in placed]
         return cls(
             camera=in_view[0].camera,
             response=in_view[0].response,
-            binning=placed[0].photographs.binning,
+            binning=placed[0].images.binning,
             station=np.repeat([p.station for p in in_view], count),
             configuration=np.concatenate([p.configuration for p in in_view]),
             joints=np.concatenate([p.joints for p in in_view]),
@@ -156,22 +154,20 @@ class PhotographWindow:
         )
 
 
-def windows(placed: Sequence[Placed]) -> Iterator[PhotographWindow]:
+def windows(placed: Sequence[Placed]) -> Iterator[ImageWindow]:
     """Windows over the images of several stations, in order; the stations' numbers must differ.
 
     Consecutive stations with the same camera share a window as long as their images fit.
     """
     together: list[Placed] = []
     for one in placed:
-        most, total = one.photographs.window, len(one.photographs.images)
+        most, total = one.images.window, len(one.images.images)
         for first in range(0, total, most):
             part = one.select(np.arange(first, min(first + most, total)))
-            count = sum(len(other.photographs.images) for other in (*together, part))
-            if together and (
-                count > most or not together[0].photographs.same_camera(part.photographs)
-            ):
-                yield PhotographWindow.of(together)
+            count = sum(len(other.images.images) for other in (*together, part))
+            if together and (count > most or not together[0].images.same_camera(part.images)):
+                yield ImageWindow.of(together)
                 together = []
             together.append(part)
     if together:
-        yield PhotographWindow.of(together)
+        yield ImageWindow.of(together)

@@ -29,7 +29,7 @@ from pkmcal.observe.distance_tables import (
     DistanceTableOptions,
     distance_tables,
 )
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.pose_candidates import (
     CANDIDATE_OPTIONS,
     CandidateOptions,
@@ -217,7 +217,7 @@ def distinct(view: StationView, values: Array) -> Integers:
 
 def finest_view(
     machine: Machine,
-    photograph: Photographs,
+    image: StationImages,
     joints: Array,
     poses: Array,
     options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
@@ -226,8 +226,8 @@ def finest_view(
 
     joints, poses : of all configurations of the session; the latter are T_base_platform.
     """
-    tables = distance_tables([photograph.images[0]], options.tables_at(4))
-    return StationView(machine, photograph.camera, photograph.configuration, joints, poses, tables)
+    tables = distance_tables([image.images[0]], options.tables_at(4))
+    return StationView(machine, image.camera, image.configuration, joints, poses, tables)
 
 
 def refine_local(

@@ -59,11 +59,11 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
     size = sensor_size(image)  # before decoding, which takes memory for the header's size
     if tuple(image_size) not in (size, size[::-1]):
         raise InputError(
-            "the photograph has another size than its camera",
+            "the image has another size than its camera",
             where=label,
             found=f"{size[0]}x{size[1]} pixels",
             expected=f"{image_size[0]}x{image_size[1]}, the camera file's image_size",
-            next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
+            next_step="Use the image as the camera gave it, neither scaled nor cropped",
         )
     exif = read_exif(image) if size != tuple(image_size) else None
     grey = _checked_grey(data, image, label)
@@ -133,11 +133,11 @@ def _scan_is_whole(data: bytes, grey: Integers, label: str) -> bool:
 
 def _undecodable(label: str, found: str) -> InputError:
     return InputError(
-        "the photograph cannot be decoded",
+        "the image cannot be decoded",
         where=label,
         found=found,
         expected="a whole PNG or JPEG file",
-        next_step="Copy it again from the camera, or remove it: an absent photograph is allowed",
+        next_step="Copy it again from the camera, or remove it: an absent image is allowed",
     )
 
 
@@ -147,17 +147,17 @@ def _too_dark(label: str, highest: int) -> InputError:
     """
     bits = next(bits for bits in CAMERA_BIT_DEPTHS if highest < 2**bits)
     return InputError(
-        f"the photograph is nearly black: a 16-bit file whose grey levels fill {bits} bits",
+        f"the image is nearly black: a 16-bit file whose grey levels fill {bits} bits",
         where=label,
         found=f"levels up to {highest}",
         expected="levels up to 65535, or an 8-bit file",
         next_step=f"If the camera measures {bits} bits, multiply by {2 ** (16 - bits)} when they"
-        " are saved, or save 8 bits; if this photograph alone is dark, remove it",
+        " are saved, or save 8 bits; if this image alone is dark, remove it",
     )
 
 
 class LazyPictures(Sequence[Integers], ABC):
-    """Photographs as grey levels (height, width), none of which is looked at before it is asked
+    """Images as grey levels (height, width), none of which is looked at before it is asked
     for.
     """
 
@@ -170,13 +170,13 @@ class LazyPictures(Sequence[Integers], ABC):
     @overload
     def __getitem__(self, index: slice) -> Sequence[Integers]: ...
     def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
-        """One photograph; of a slice, those that it picks."""
+        """One image; of a slice, those that it picks."""
         numbers = range(len(self))[index]
         return self.image_of(numbers) if isinstance(numbers, int) else Selected(self, numbers)
 
 
 class Selected(LazyPictures):
-    """Some of a sequence of photographs."""
+    """Some of a sequence of images."""
 
     def __init__(self, images: Sequence[Integers], numbers: Sequence[int] | Integers) -> None:
         self._images, self._numbers = images, [int(number) for number in numbers]
@@ -190,7 +190,7 @@ class Selected(LazyPictures):
 
 
 class Pictures(LazyPictures):
-    """Photographs of one camera, each decoded when it is looked at.
+    """Images of one camera, each decoded when it is looked at.
 
     paths, labels : of all of them. cache : those that stay decoded, by their number.
     """
@@ -209,7 +209,7 @@ class Pictures(LazyPictures):
     def read(
         cls, paths: Sequence[Path], image_size: tuple[int, int], labels: Sequence[str], most: int
     ) -> Pictures:
-        """The photographs, each decoded once, of which the first ``most`` stay so; decoding runs
+        """The images, each decoded once, of which the first ``most`` stay so; decoding runs
         beside Python on a few threads. Raises InputError for the first that cannot be decoded.
         """
         out = cls(paths, image_size, labels)
@@ -234,12 +234,12 @@ class Pictures(LazyPictures):
 
 
 def fitting(image_size: tuple[int, int], room: int) -> int:
-    """How many decoded photographs fit into so many bytes."""
+    """How many decoded images fit into so many bytes."""
     return room // (image_size[0] * image_size[1])
 
 
 def binned(image: Integers, count: int) -> Integers:
-    """A photograph with ``count`` x ``count`` pixels averaged to one; see `Camera.binned`."""
+    """A image with ``count`` x ``count`` pixels averaged to one; see `Camera.binned`."""
     if count == 1:
         return image
     import cv2

@@ -32,7 +32,7 @@ from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
 from pkmcal.observe.grey_levels import levels_at
-from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed, windows
+from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages, windows
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -361,7 +361,7 @@ class StationEdges:
 
 
 def search(
-    photographs: Photographs,
+    images: StationImages,
     machine: Machine,
     T_camera_base: Array,
     poses: Array,
@@ -369,9 +369,9 @@ def search(
     options: LegSearchOptions = LEG_SEARCH_OPTIONS,
 ) -> StationEdges:
     """:func:`search_stations` for one station's images; poses : T_base_platform (K, 4, 4)."""
-    return search_stations(
-        [Placed(photographs, T_camera_base, poses)], machine, reach, options=options
-    )[0]
+    return search_stations([Placed(images, T_camera_base, poses)], machine, reach, options=options)[
+        0
+    ]
 
 
 def search_stations(
@@ -390,11 +390,11 @@ def search_stations(
             done(len(window.images))
         del window  # free before the next one is decoded
     every = joined_passes(passes, float("nan"), reach)
-    return [every.of_station(one.photographs.station) for one in placed]
+    return [every.of_station(one.images.station) for one in placed]
 
 
 def _searched(
-    window: PhotographWindow, machine: Machine, reach: float, options: LegSearchOptions
+    window: ImageWindow, machine: Machine, reach: float, options: LegSearchOptions
 ) -> StationEdges:
     """Edges of one window of images by :func:`search_stations`."""
     tubes, points, clear = predicted(window, machine, options.samples, options.clearance)
@@ -424,7 +424,7 @@ def _searched(
 
 
 def measure(
-    photographs: Photographs,
+    images: StationImages,
     machine: Machine,
     T_camera_base: Array,
     poses: Array,
@@ -433,8 +433,8 @@ def measure(
     options: EdgeOptions = EDGE_OPTIONS,
 ) -> StationEdges:
     """:func:`measure_stations` for one station's images; poses : T_base_platform (K, 4, 4)."""
-    blur_by_station = {} if blur is None else {photographs.station: blur}
-    placed = Placed(photographs, T_camera_base, poses)
+    blur_by_station = {} if blur is None else {images.station: blur}
+    placed = Placed(images, T_camera_base, poses)
     return measure_stations([placed], machine, blur_by_station, refine_camera, options=options)[0]
 
 
@@ -455,7 +455,7 @@ def measure_stations(
     # blur of stations with several windows, from images spread over all of them
     numbers = dict(blur)
     for one in placed:
-        p = one.photographs
+        p = one.images
         if p.station not in numbers and len(p.images) > p.window:
             few = next(windows([one.select(p.spread(p.window))]))
             numbers |= _blur_in(
@@ -478,7 +478,7 @@ def measure_stations(
     away, at = np.concatenate(shifted), every.edges.station[every.point_edge]
     out: list[StationEdges] = []
     for one in placed:
-        station = one.photographs.station
+        station = one.images.station
         own = away[at == station]
         station_blur = numbers.get(station, options.profiles.usual_blur)
         middle = float(np.median(own)) if own.size else 0.0
@@ -530,7 +530,7 @@ class _PredictedEdges:
 
 
 def _predicted_edges(
-    window: PhotographWindow, machine: Machine, options: EdgeOptions
+    window: ImageWindow, machine: Machine, options: EdgeOptions
 ) -> _PredictedEdges:
     """Middles of all segments, and the mean profiles of those with enough clear points."""
     samples = options.segments * options.segment_points
@@ -545,7 +545,7 @@ def _predicted_edges(
 
 
 def _measured(
-    window: PhotographWindow,
+    window: ImageWindow,
     prediction: _PredictedEdges,
     blur: BlurByStation,
     refine_camera: bool,
@@ -581,7 +581,7 @@ def _measured(
 
 
 def predicted(
-    window: PhotographWindow,
+    window: ImageWindow,
     machine: Machine,
     samples: int,
     clearance: float = EdgeOptions.clearance,
@@ -599,7 +599,7 @@ def predicted(
 
 
 def _segment_profiles(
-    window: PhotographWindow,
+    window: ImageWindow,
     points: EdgePoints,
     clear: Booleans,
     half_width: Array,

@@ -106,7 +106,7 @@ def global_candidates(
     radius: Array,
     legs: LegsInCamera,
     tables: DistanceTables,
-    photographs: Integers,
+    images: Integers,
     keep: int,
     options: CandidateOptions = CANDIDATE_OPTIONS,
 ) -> Array:
@@ -115,7 +115,7 @@ def global_candidates(
     radius : (E,) m of the tubes of each edge.
     legs : (K, L) in the base frame, of all configurations.
     tables : of the same K images.
-    photographs : numbers of the images that are scored.
+    images : numbers of the images that are scored.
     """
     # angular extent of the moving region: solid angle of each pixel, times the share of images in
     # which it moves
@@ -130,8 +130,8 @@ def global_candidates(
     in_view = _spread(weight @ rays[:, 0], weight.sum())
     frame = frame_of(in_view.middle)
     places, spread = _places(tubes, radius, legs, float(in_view.width), options)
-    chart = _chart_tables(camera, tables, photographs, frame, float(in_view.width), options)
-    scores = _scores(chart, places, spread, tubes, legs, photographs, float(in_view.width), options)
+    chart = _chart_tables(camera, tables, images, frame, float(in_view.width), options)
+    scores = _scores(chart, places, spread, tubes, legs, images, float(in_view.width), options)
     best = np.argpartition(scores.ravel(), keep)[:keep]
     best = best[np.argsort(scores.ravel()[best])]
     place, turn, shift = np.unravel_index(best, scores.shape)
@@ -238,15 +238,15 @@ def _on_chart(rays: Array, width: float, options: CandidateOptions) -> Array:
 def _chart_tables(
     camera: Camera,
     tables: DistanceTables,
-    photographs: Integers,
+    images: Integers,
     frame: Array,
     width: float,
     options: CandidateOptions,
 ) -> Integers:
     """Distance tables (K, directions, n, n) uint8 on the chart, in cells, of some images."""
     n = 2 * options.half_cells + 1
-    out = np.empty((len(photographs), options.edge_directions, n, n), dtype=np.float32)
-    for row, k in enumerate(photographs):
+    out = np.empty((len(images), options.edge_directions, n, n), dtype=np.float32)
+    for row, k in enumerate(images):
         edges = tables.edges[k]
         # each edge point as a chord of one reduced pixel, which gives its direction on the chart
         along = np.stack([-edges.normal[:, 1], edges.normal[:, 0]], axis=-1) / 2
@@ -273,7 +273,7 @@ def _scores(
     spread: AngularExtent,
     tubes: TubeList,
     legs: LegsInCamera,
-    photographs: Integers,
+    images: Integers,
     width: float,
     options: CandidateOptions,
 ) -> Array:
@@ -281,7 +281,7 @@ def _scores(
     edges of the same direction, weighted by the chords' lengths.
     """
     leg = np.unique(tubes.leg)
-    a, b, u = (v[photographs][:, leg] for v in (legs.a, legs.b, legs.u))
+    a, b, u = (v[images][:, leg] for v in (legs.a, legs.b, legs.u))
     # chords along the visible part of each leg, on the chart
     low = np.array([tubes.start[tubes.leg == j].min() for j in leg])
     high = np.array([tubes.stop[tubes.leg == j].max() for j in leg])

@@ -122,11 +122,11 @@ class StationView:
         """
         return legs_in_camera(self.machine, np.eye(4), poses, joints).single()
 
-    def legs(self, photographs: Integers) -> LegsInCamera:
+    def legs(self, images: Integers) -> LegsInCamera:
         """Leg axes (n, L) in some images, (n,); (H, n, L) for hypothetical legs."""
         if self.guessed is not None:
-            return self.guessed[:, photographs]
-        return self.all_legs[self.configuration[photographs]]
+            return self.guessed[:, images]
+        return self.all_legs[self.configuration[images]]
 
     def guess(self, which: slice | Integers) -> StationView:
         """View with some of the hypothetical legs; unchanged if there is one set or none."""
@@ -143,13 +143,13 @@ class StationView:
         fk = self.machine.forward_result(joints).T_base_platform
         return replace(self, all_joints=joints, all_poses=fk)
 
-    def select(self, photographs: Integers) -> StationView:
+    def select(self, images: Integers) -> StationView:
         """View of some of the images."""
         return replace(
             self,
-            configuration=self.configuration[photographs],
-            tables=self.tables.select(photographs),
-            guessed=self.guessed and self.guessed[:, photographs],
+            configuration=self.configuration[images],
+            tables=self.tables.select(images),
+            guessed=self.guessed and self.guessed[:, images],
         )
 
     def rivals(self, rng: np.random.Generator) -> LegsInCamera:
@@ -172,14 +172,14 @@ class StationView:
         return others.joined(self.legs_at(perturb(self.poses, away), self.joints))
 
 
-def distinct_silhouettes(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
+def distinct_silhouettes(view: StationView, candidates: Array, images: Integers) -> list[int]:
     """Indices of the candidates (H, 4, 4), best first, that are not the same as a better one.
 
     Two poses are the same if the median distance of their silhouettes is small.
     """
     if len(candidates) < 2:
         return list(range(len(candidates)))
-    legs = view.legs(photographs).under(candidates)
+    legs = view.legs(images).under(candidates)
     pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
     retained: list[int] = []
     for h in range(len(candidates)):
@@ -191,7 +191,7 @@ def distinct_silhouettes(view: StationView, candidates: Array, photographs: Inte
 
 
 def score(
-    view: StationView, T_camera_base: Array, photographs: Integers, reach: float, samples: int = 5
+    view: StationView, T_camera_base: Array, images: Integers, reach: float, samples: int = 5
 ) -> Array:
     """Mean truncated distance of predicted edges from image edges, relative to ``reach``: (H,), 0
     to 1.
@@ -203,13 +203,13 @@ def score(
     reach : truncation distance, reduced pixels.
     samples : points along an edge.
     """
-    parts = _parts(view, len(T_camera_base), len(photographs) * samples)
+    parts = _parts(view, len(T_camera_base), len(images) * samples)
     if len(parts) > 1:
         return np.concatenate(
-            [score(view.guess(k), T_camera_base[k], photographs, reach, samples) for k in parts]
+            [score(view.guess(k), T_camera_base[k], images, reach, samples) for k in parts]
         )
     tubes = view.tubes
-    legs = view.legs(photographs).under(T_camera_base)
+    legs = view.legs(images).under(T_camera_base)
     a, b, u = of_edges(legs, tubes)
     radius = view.machine.values[tubes.radius].astype(a.dtype)
     normal, ok = normals_of_edges(a, u, radius, tubes)
@@ -220,7 +220,7 @@ def score(
     direction = view.tables.direction(of_components(-chord[..., 1], chord[..., 0]))
     fraction = ((np.arange(samples) + 0.5) / samples).astype(a.dtype)
     points = begin + fraction[:, None, None, None, None] * chord  # (n, H, K, E, 2)
-    number = np.arange(len(view.configuration))[photographs][:, None]
+    number = np.arange(len(view.configuration))[images][:, None]
     distance, inside = view.tables.look_up(direction, points, number)
     cost = np.where(inside & ok, np.minimum(distance, reach) / reach, 1.0).mean(axis=0)
     weight = np.nan_to_num(np.hypot(chord[..., 0], chord[..., 1]))
@@ -344,7 +344,7 @@ def _summed(values: Array) -> Array:
 def refine_lm(
     view: StationView,
     candidates: Array,
-    photographs: Integers,
+    images: Integers,
     samples: int,
     reaches: tuple[float, ...],
 ) -> Array:
@@ -352,7 +352,7 @@ def refine_lm(
 
     Vertical legs hardly determine the camera's position along them; undamped steps diverge there.
     """
-    linearization = linearize_distances(view, candidates, photographs, samples)
+    linearization = linearize_distances(view, candidates, images, samples)
     damping = Damping.first(len(candidates))
     for reach in reaches:
         trial = _step(
@@ -362,7 +362,7 @@ def refine_lm(
             damping,
             view.options.longest_step,
         )
-        in_view = linearize_distances(view, trial, photographs, samples)
+        in_view = linearize_distances(view, trial, images, samples)
         better = in_view.cost(reach) < linearization.cost(reach)
         candidates = np.where(better[:, None, None], trial, candidates)
         linearization = in_view.where(better, linearization)
@@ -373,7 +373,7 @@ def refine_lm(
 def refine_ml(
     view: StationView,
     candidates: Array,
-    photographs: Integers,
+    images: Integers,
     samples: int,
     steps: int,
     widest: float | None = None,
@@ -383,7 +383,7 @@ def refine_ml(
     Levenberg-Marquardt steps; the scatter of the edges, up to ``widest`` reduced pixels (None for
     the options' limit), is estimated in alternation.
     """
-    linearization = linearize_distances(view, candidates, photographs, samples)
+    linearization = linearize_distances(view, candidates, images, samples)
     damping = Damping.first(len(candidates))
     mixture = first_mixture(len(candidates), view.options)
     last = float("inf")
@@ -397,7 +397,7 @@ def refine_ml(
             damping,
             view.options.longest_step,
         )
-        in_view = linearize_distances(view, trial, photographs, samples)
+        in_view = linearize_distances(view, trial, images, samples)
         gain = _summed(in_view.distances.log_likelihood(mixture)) - _summed(
             linearization.distances.log_likelihood(mixture)
         )
@@ -427,15 +427,15 @@ def mixture_of(distances: Distances, options: LikelihoodOptions = LIKELIHOOD_OPT
 
 
 def log_likelihood_of(
-    view: StationView, candidates: Array, photographs: Integers, samples: int
+    view: StationView, candidates: Array, images: Integers, samples: int
 ) -> Array:
     """Log-likelihood ratio (H, K) of candidates (H, 4, 4) in each image."""
-    distances = distances_under(view, candidates, photographs, samples)
+    distances = distances_under(view, candidates, images, samples)
     mixture = mixture_of(distances, view.options)
-    return by_photograph(distances.log_likelihood(mixture), len(photographs))
+    return by_image(distances.log_likelihood(mixture), len(images))
 
 
-def by_photograph(log_likelihood_ratio: Array, count: int) -> Array:
+def by_image(log_likelihood_ratio: Array, count: int) -> Array:
     """Sums (H, K) over the points of each image, or each configuration, from (H, E, n) in a row."""
     return log_likelihood_ratio.reshape(len(log_likelihood_ratio), count, -1).sum(
         axis=-1, dtype=float
@@ -461,7 +461,7 @@ def log_likelihood_by_name(view: StationView, T_camera_base: Array, names: Integ
         number = every[part, None, None, None]
         distance, inside = view.tables.look_up(direction, points.pixel, number, between=True)
         named = _distances(view, points, direction, distance, inside & points.valid)
-        fits.append(by_photograph(named.log_likelihood(mixture), len(names)))
+        fits.append(by_image(named.log_likelihood(mixture), len(names)))
     return np.concatenate(fits)
 
 
@@ -504,31 +504,29 @@ def _parts(view: StationView, count: int, places: int) -> list[slice]:
 
 
 def distances_under(
-    view: StationView, candidates: Array, photographs: Integers, samples: int
+    view: StationView, candidates: Array, images: Integers, samples: int
 ) -> Distances:
     """Distances at the edges predicted from poses (H, 4, 4)."""
-    parts = _parts(view, len(candidates), len(photographs) * samples)
+    parts = _parts(view, len(candidates), len(images) * samples)
     if len(parts) > 1:
-        each = [distances_under(view.guess(k), candidates[k], photographs, samples) for k in parts]
+        each = [distances_under(view.guess(k), candidates[k], images, samples) for k in parts]
         return Distances(*map(np.concatenate, zip(*each, strict=True)))
-    points, direction, number = _edges_under(view, candidates, photographs, samples)
+    points, direction, number = _edges_under(view, candidates, images, samples)
     distance, inside = view.tables.look_up(direction, points.pixel, number, between=True)
     return _distances(view, points, direction, distance, inside & points.valid)
 
 
 def linearize_distances(
-    view: StationView, candidates: Array, photographs: Integers, samples: int
+    view: StationView, candidates: Array, images: Integers, samples: int
 ) -> _Linearization:
     """Distances at the edges predicted from poses (H, 4, 4), with their derivatives."""
-    parts = _parts(view, len(candidates), len(photographs) * samples)
+    parts = _parts(view, len(candidates), len(images) * samples)
     if len(parts) > 1:
-        passes = [
-            linearize_distances(view.guess(k), candidates[k], photographs, samples) for k in parts
-        ]
+        passes = [linearize_distances(view.guess(k), candidates[k], images, samples) for k in parts]
         distances, *rest = zip(*passes, strict=True)
         every = Distances(*map(np.concatenate, zip(*distances, strict=True)))
         return _Linearization(every, *map(np.concatenate, rest))
-    points, direction, number = _edges_under(view, candidates, photographs, samples)
+    points, direction, number = _edges_under(view, candidates, images, samples)
     distance, slope, inside = view.tables.look_along(
         direction, points.pixel, points.outward, number
     )
@@ -545,11 +543,11 @@ def linearize_distances(
 
 
 def _edges_under(
-    view: StationView, candidates: Array, photographs: Integers, samples: int
+    view: StationView, candidates: Array, images: Integers, samples: int
 ) -> tuple[EdgePoints, Integers, Integers]:
     """Predicted edges (H, K, E, n), their direction numbers, and the images' numbers (K, 1, 1)."""
-    number = np.arange(len(view.configuration))[photographs][:, None, None]
-    legs = view.legs(photographs).under(candidates)
+    number = np.arange(len(view.configuration))[images][:, None, None]
+    legs = view.legs(images).under(candidates)
     points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
     return points, view.tables.direction(points.outward), number
 

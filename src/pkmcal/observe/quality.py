@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.grey_levels import levels_at
-from pkmcal.observe.image_batches import Photographs, PhotographWindow, Placed, windows
+from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages, windows
 from pkmcal.observe.legs import LEG_SEARCH_OPTIONS, LegSearchOptions, predicted, search_legs
 from pkmcal.observe.profiles import PROFILE_OPTIONS
 
@@ -79,7 +79,7 @@ class Quality:
 
 
 def quality(
-    photographs: Photographs,
+    images: StationImages,
     machine: Machine,
     T_camera_base: Array,
     poses: Array,
@@ -90,7 +90,7 @@ def quality(
     T_camera_base : (4, 4).
     poses : T_base_platform (K, 4, 4), one for each image.
     """
-    placed = Placed(photographs, T_camera_base, poses)
+    placed = Placed(images, T_camera_base, poses)
     parts = [_quality(window, machine, options) for window in windows([placed])]
     each = (f.name for f in fields(Quality))
     return Quality(
@@ -101,7 +101,7 @@ def quality(
     )
 
 
-def _quality(window: PhotographWindow, machine: Machine, options: QualityOptions) -> Quality:
+def _quality(window: ImageWindow, machine: Machine, options: QualityOptions) -> Quality:
     """Quality on the legs in one window of images."""
     # edges found by the search, and the widths of their legs
     tubes, points, clear = predicted(

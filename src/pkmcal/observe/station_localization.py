@@ -25,7 +25,7 @@ from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
 from pkmcal.observe.pose_candidates import CANDIDATE_OPTIONS, CandidateOptions, global_candidates
 from pkmcal.observe.pose_likelihood import (
     StationView,
-    by_photograph,
+    by_image,
     correlation_length,
     distances_under,
     distinct_silhouettes,
@@ -340,24 +340,24 @@ def _search(
 def _best_about(
     view: StationView,
     candidates: Array,
-    photographs: Integers,
+    images: Integers,
     rng: np.random.Generator,
     options: LocalizationOptions,
 ) -> Array:
     """Likeliest poses (H, 4, 4) among refined candidates and perturbations
     of them.
     """
-    candidates = refine_lm(view, candidates, photographs, 5, options.candidate_reaches)
-    candidates = _best(view, candidates, photographs, reach=3, keep=options.retained)
+    candidates = refine_lm(view, candidates, images, 5, options.candidate_reaches)
+    candidates = _best(view, candidates, images, reach=3, keep=options.retained)
     candidates = candidates[
-        distinct_silhouettes(view, candidates, photographs)[: options.perturbed_about]
+        distinct_silhouettes(view, candidates, images)[: options.perturbed_about]
     ]
     # the likelihood has many local maxima: a pose beside a good one may be better
     beside = candidates[rng.integers(0, len(candidates), options.perturbed)]
     steps = rng.normal(size=(options.perturbed, 6)) * options.shaken_spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
     candidates, log_likelihood_ratio = refine_ml(
-        view, np.concatenate([candidates, turned]), photographs, 3, 2
+        view, np.concatenate([candidates, turned]), images, 3, 2
     )
     return candidates[np.argsort(-log_likelihood_ratio)[: options.perturbed_retained]]
 
@@ -401,11 +401,9 @@ def _random_search(
     return shifted(likely(np.concatenate([best, again]), second_reach, descending))
 
 
-def _best(
-    view: StationView, candidates: Array, photographs: Integers, reach: float, keep: int
-) -> Array:
+def _best(view: StationView, candidates: Array, images: Integers, reach: float, keep: int) -> Array:
     """The ``keep`` candidates with the smallest mean distance."""
-    order = np.argsort(score(view, candidates, photographs, reach))
+    order = np.argsort(score(view, candidates, images, reach))
     return candidates[order[:keep]]
 
 
@@ -496,7 +494,7 @@ def _z_scores(
     places = np.broadcast_to(T_camera_base, (len(guessed), 4, 4))
     distances = distances_under(replace(view, guessed=guessed), places, other, 8)
     # own readings against the others
-    own, *rivals = by_photograph(distances.log_likelihood(mixture), len(other))
+    own, *rivals = by_image(distances.log_likelihood(mixture), len(other))
     count, fits = len(rivals), np.stack(rivals)
     scatter = np.maximum(fits.std(axis=0, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
     away = (own - fits.mean(axis=0)) / scatter

@@ -33,19 +33,19 @@ def jpeg(path: Path | None, size: tuple[int, int]) -> str:
 
 
 def small_and_large(
-    photographs: Sequence[tuple[Sequence[Integers], int]], room: int
+    images: Sequence[tuple[Sequence[Integers], int]], room: int
 ) -> Iterator[tuple[str, str]]:
     """Base64 JPEGs of each image, small and large, within ``room`` characters in all.
 
     The large one is empty where the budget does not suffice, both where the file cannot be read.
     Iteration ends where the budget does not hold even a small one.
 
-    photographs : a station's images, and the index of one of them, for each image.
+    images : a station's images, and the index of one of them, for each image.
     """
-    remainder, waiting = room, len(photographs)
+    remainder, waiting = room, len(images)
     with ThreadPoolExecutor(THREADS) as pool:
-        for first in range(0, len(photographs), JPEGS_DECODED_AT_ONCE):
-            some = photographs[first : first + JPEGS_DECODED_AT_ONCE]
+        for first in range(0, len(images), JPEGS_DECODED_AT_ONCE):
+            some = images[first : first + JPEGS_DECODED_AT_ONCE]
             for small, large in pool.map(
                 lambda one: _base64_jpegs(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)),
                 some,

@@ -186,7 +186,7 @@ def measured_curves(
     machine: Machine,
     camera: Camera,
     legs: LegsInCamera,
-    photograph: Integers,
+    image: Integers,
     edges: EdgeSet,
     fraction: Array = EDGE_CURVE_FRACTIONS,
 ) -> Array:
@@ -195,13 +195,13 @@ def measured_curves(
     The rays of the predicted contour, each projected into the measured plane: r - (r . n) n.
 
     legs : (K, L, 3) axes in each image, camera frame.
-    photograph : (n,) index of each edge's image.
+    image : (n,) index of each edge's image.
     fraction : (m,) positions along the edges' spans.
     """
     # rays to the contour, moved from the axis to the measured side
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * fraction
     radius = machine.radii_of(edges.leg, edges.tube)
-    at = photograph, edges.leg
+    at = image, edges.leg
     axis = legs.a[at][:, None] + along[..., None] * legs.u[at][:, None]
     normal = edges.normal[:, None]
     rays = axis + radius[:, None, None] * normal
@@ -209,14 +209,12 @@ def measured_curves(
     return camera.project(rays)
 
 
-def own_edges(
-    machine: Machine, legs: LegsInCamera, photograph: Integers, edges: EdgeSet
-) -> EdgeSet:
+def own_edges(machine: Machine, legs: LegsInCamera, image: Integers, edges: EdgeSet) -> EdgeSet:
     """Edges with the normals that the machine predicts; arguments as :func:`measured_curves`."""
     radius = machine.layout.radius_of(edges.leg, edges.tube)
     start, stop = edges.span.T
     each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
-    at = photograph, edges.leg
+    at = image, edges.leg
     own, _ = normals_of_edges(legs.a[at], legs.u[at], machine.values[radius], each)
     return replace(edges, normal=own)
 

@@ -45,8 +45,8 @@ def can_be_tried(machine: Machine, edges: int) -> None:
         )
     if not edges:
         raise ResultError(
-            what="the four steps need photographs of the legs, and no edge of one was measured",
-            next_step=f"photograph the legs, or {USE_JOINT_METHOD} with a board on the platform",
+            what="the four steps need images of the legs, and no edge of one was measured",
+            next_step=f"take images of the legs, or {USE_JOINT_METHOD} with a board on the platform",
         )
 
 
@@ -133,7 +133,7 @@ def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, for
             f"{named(names[b])}",
             found="no configurations that show enough of both at once",
             expected="each leg seen at once with others that fix the platform, [A] 3.5",
-            next_step=f"photograph the same configurations from more stations,"
+            next_step=f"take images of the same configurations from more stations,"
             f" or {USE_JOINT_METHOD}",
         )
     _needs_poses(legs, visible & posed[:, None])
@@ -148,7 +148,7 @@ def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
         what="no configuration shows enough legs with a length at once to place the platform",
         found=f"{at_once.sum(axis=1).max(initial=0)} at most",
         expected=f"{need}, [A] 3.5",
-        next_step=f"let a station see more legs, photograph one configuration from several "
+        next_step=f"let a station see more legs, image one configuration from several "
         f"stations, or {USE_JOINT_METHOD}",
     )
 
@@ -196,7 +196,7 @@ def lengths_are_fixed(
     part = np.abs(vectors[:, free]).max(axis=1)
     names = np.flatnonzero(legs.closing)[part > 0.3 * part.max()]
     raise ResultError(
-        what=f"the photographs do not tell the lengths of {named(names)}",
+        what=f"the images do not tell the lengths of {named(names)}",
         found="distances between platform joints that do not depend on a combination of them",
         expected="legs that change their directions against each other, seen at once, [A] 3.4",
         next_step=f"add configurations that tilt and turn the platform more, or {USE_JOINT_METHOD}",
@@ -211,7 +211,7 @@ def not_collapsed(legs: DrawnLegs, q0: Array) -> None:
             what=f"leg {short[0] + 1} of constant length shrank to nothing in the third step",
             found=f"{1e3 * q0[short[0]]:.0f} mm",
             expected=f"about {1e3 * legs.rod[short[0]]:.0f} mm as drawn; at zero length both its "
-            "joints fall together, which fits the photographs for a wrong reason",
+            "joints fall together, which fits the images for a wrong reason",
             next_step=f"check the nominal model's length, add configurations, or"
             f" {USE_JOINT_METHOD}",
         )

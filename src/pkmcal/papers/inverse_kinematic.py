@@ -353,7 +353,7 @@ def fit_machine_to_poses(
     """Estimate of B runs.
 
     noise : (N, 6, 6) covariance of the poses for whitening; None for the printed form, in which the
-    boards' axis of rotation is estimated first and fixed, [C] III.B. use_drawing : use the nominal
+    boards' axis of rotation is estimated first and fixed, [C] III.B. use_prior : use the nominal
     values as measurements.
     """
     if use_prior:

@@ -91,9 +91,8 @@ def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
     """
     if not len(measurements.edges):
         raise ResultError(
-            what="the linear solution needs photographs of the legs, and no edge of one was"
-            " measured",
-            next_step="photograph the legs, or use the joint method (bundle)",
+            what="the linear solution needs images of the legs, and no edge of one was measured",
+            next_step="take images of the legs, or use the joint method (bundle)",
         )
     base = base_together(machine, measurements)
     poses = machine.with_values(base.theta).forward_result(measurements.joints, machine.home())

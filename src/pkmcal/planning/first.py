@@ -24,16 +24,16 @@ from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs, placed_at
+from pkmcal.observe.image_batches import StationImages, placed_at
 from pkmcal.observe.predict import tubes_of
 from pkmcal.session.load import Session
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 
-FIRST_PHOTOGRAPHS_A_STATION = 3
+FIRST_IMAGES_A_STATION = 3
 """Number of first images of a station that are measured, as users take them before the main
 capture.
 """
-FIRST_PHOTOGRAPHS_MEASURED = 6
+FIRST_IMAGES_MEASURED = 6
 """Number of measured images of all stations together: those of a hexapod show forty edges of each
 kind, enough to know their scatter to a tenth.
 """
@@ -91,11 +91,11 @@ Pools = tuple[EdgePool, ...]
 class EdgesOf:
     """Edges (k, E) of a station's first images, in the order of ``tubes_of``.
 
-    photographs : (k,) numbers of the images. expected : edges whose larger part is visible. valid :
+    images : (k,) numbers of the images. expected : edges whose larger part is visible. valid :
     expected edges that were measured and are inliers.
     """
 
-    photographs: Integers
+    images: Integers
     expected: Booleans
     valid: Booleans
 
@@ -115,40 +115,38 @@ class FirstEdges:
 
 
 def spread_over(
-    configuration: Integers, n_stations: int = 1, most: int = FIRST_PHOTOGRAPHS_A_STATION
+    configuration: Integers, n_stations: int = 1, most: int = FIRST_IMAGES_A_STATION
 ) -> Integers:
     """Indices of a station's images to be measured: of different configurations, spread over all of
     them.
 
     configuration : (n,) of the images. most : maximum for each station; the maximum for all
-    stations together is in the ratio of FIRST_PHOTOGRAPHS_MEASURED to FIRST_PHOTOGRAPHS_A_STATION
+    stations together is in the ratio of FIRST_IMAGES_MEASURED to FIRST_IMAGES_A_STATION
     to it.
     """
-    most = min(
-        most, -(-most * FIRST_PHOTOGRAPHS_MEASURED // (FIRST_PHOTOGRAPHS_A_STATION * n_stations))
-    )
+    most = min(most, -(-most * FIRST_IMAGES_MEASURED // (FIRST_IMAGES_A_STATION * n_stations)))
     first = np.sort(np.unique(configuration, return_index=True)[1])
     return first[np.unique(np.linspace(0, len(first) - 1, min(most, len(first))).astype(int))]
 
 
 def first_edges(
     session: Session,
-    photographs: Sequence[Photographs],
+    station_images: Sequence[StationImages],
     rows: Sequence[Integers],
     T_camera_base: Array,
     poses: Array,
 ) -> FirstEdges:
     """Measure the edges of the first images, by a search and one measurement pass.
 
-    photographs : of S stations. rows : indices of the images to be measured, by station.
+    station_images : of S stations. rows : indices of the images to be measured, by station.
     T_camera_base : (S, 4, 4) localized poses. poses : T_base_platform (K, 4, 4) by the nominal
     model. Raises PkmcalError if there are too few edges for an estimate.
     """
     machine = session.machine
-    numbers = numbered(session.camera_of_station[[p.station for p in photographs]])
+    numbers = numbered(session.camera_of_station[[p.station for p in station_images]])
     images = [
         replace(p.select(own), station=number)
-        for number, (p, own) in enumerate(zip(photographs, rows, strict=True))
+        for number, (p, own) in enumerate(zip(station_images, rows, strict=True))
     ]
 
     def measurements(edges: EdgeSet) -> Measurements:
@@ -177,7 +175,7 @@ def first_edges(
 
 
 def _edge_information(
-    images: Sequence[Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
+    images: Sequence[StationImages], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
 ) -> FirstEdges:
     """Information of each expected edge; lost edges have none."""
     machine, state = estimate.machine, estimate.state
@@ -194,7 +192,7 @@ def _edge_information(
         state.T_base_platform,
         EXACT_EDGE_NOISE,
         np.random.default_rng(FIRST_EDGES_SEED),
-        photographs=pairs,
+        images=pairs,
     )
 
     shape = (len(images), len(state.T_base_platform), n_edges)

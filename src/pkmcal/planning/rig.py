@@ -79,7 +79,7 @@ class LegsFrom:
             at.T_base_platform,
             EXACT_EDGE_NOISE,
             np.random.default_rng(FIRST_EDGES_SEED),
-            photographs=pairs,
+            images=pairs,
         )
         edges = drawn_edges(at.machine, edges, [self.pools], rng)
         return replace(edges, station=np.full(len(edges), self.station))

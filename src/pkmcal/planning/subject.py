@@ -19,7 +19,7 @@ from pkmcal.calibration.localization import (
     boards_of,
     localize_stations,
     platform_poses,
-    read_photographs,
+    read_images,
 )
 from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE
@@ -51,7 +51,7 @@ from pkmcal.simulation.board import place_board
 from pkmcal.simulation.placement import default_stations, draw_configurations
 from pkmcal.wording import brief, listed
 
-PLAN_PHOTOGRAPHS_A_STATION = 12
+PLAN_IMAGES_A_STATION = 12
 """Maximum number of a station's images whose edges are measured; twice as many of all stations
 together. A plan is made once, and few edges determine the shading badly.
 """
@@ -351,7 +351,7 @@ def _first_camera_session(session: Session) -> Session:
         )
     first = session.stations[0]
     if first.handheld:
-        first = replace(first, handheld=False, T_camera_base=None, photographs=())
+        first = replace(first, handheld=False, T_camera_base=None, images=())
     return replace(session, stations=(first,), trackers=())
 
 
@@ -361,7 +361,7 @@ class _SessionImages(NamedTuple):
     T_camera_base : None without images, or with a calibration that has the stations.
     """
 
-    photographs: list[Any]
+    images: list[Any]
     boards: Boards
     T_camera_base: Array | None
 
@@ -369,13 +369,13 @@ class _SessionImages(NamedTuple):
     def of(
         cls, session: Session, saved: SavedCalibration | None, rng: np.random.Generator
     ) -> _SessionImages:
-        if not any(station.photographs for station in session.stations):
+        if not any(station.images for station in session.stations):
             return cls([], Boards(), None)
-        photographs = read_photographs(session)
-        boards = boards_of(session, photographs)
+        images = read_images(session)
+        boards = boards_of(session, images)
         if saved is not None and _saved_station_poses(session, saved) is not None:
-            return cls(photographs, boards, None)
-        return cls(photographs, boards, localize_stations(session, photographs, boards, rng))
+            return cls(images, boards, None)
+        return cls(images, boards, localize_stations(session, images, boards, rng))
 
 
 def _saved_station_poses(session: Session, saved: SavedCalibration) -> Array | None:
@@ -415,8 +415,7 @@ def _station_poses(
             raise InputError(
                 f"nothing tells where station {station.name} stands",
                 where=f"session.yaml, stations.{station.name}",
-                expected="pose: {position: [...], look_at: [...]}, three photographs, or a"
-                " calibration",
+                expected="pose: {position: [...], look_at: [...]}, three images, or a calibration",
                 next_step="Give its pose, or let places be chosen: --places 3",
             )
         out.append(station.T_camera_base)
@@ -427,22 +426,21 @@ def _edge_noise(
     session: Session, legs: list[int], images: _SessionImages, T_camera_base: Array, edge: float
 ) -> tuple[tuple[int, ...], tuple[Pools, ...], float, str]:
     """Binning and pools of each station with legs, the shading, and a sentence on their source."""
-    why = "no photograph tells it yet"
-    if len(images.photographs) == len(legs):
+    why = "no image tells it yet"
+    if len(images.images) == len(legs):
         rows = [
-            spread_over(p.configuration, len(legs), PLAN_PHOTOGRAPHS_A_STATION)
-            for p in images.photographs
+            spread_over(p.configuration, len(legs), PLAN_IMAGES_A_STATION) for p in images.images
         ]
         try:
             poses = platform_poses(session)
-            first = first_edges(session, images.photographs, rows, T_camera_base[legs], poses)
+            first = first_edges(session, images.images, rows, T_camera_base[legs], poses)
         except (PkmcalError, np.linalg.LinAlgError):
             # `check` and `calibrate` report what is wrong with these images; the plan uses defaults
-            why = "the photographs that there are do not tell it; pkmcal check says why"
+            why = "the images that there are do not tell it; pkmcal check says why"
         else:
             count = sum(len(row) for row in rows)
-            words = f"How good edges are is told by {count} of the photographs that there are."
-            pixels = tuple(p.binning for p in images.photographs)
+            words = f"How good edges are is told by {count} of the images that there are."
+            pixels = tuple(p.binning for p in images.images)
             return pixels, first.pools, first.estimate.statistics.shading, words
     # without images their sharpness is not known
     pixels = tuple(first_binning(session.stations[s].camera.image_size) for s in legs)
@@ -458,9 +456,9 @@ def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
         if s.views.views.visible.any()
     ]
     if not sigma:
-        return corner, f"Corners are taken to be good to {corner:g} px: no photograph tells it yet."
+        return corner, f"Corners are taken to be good to {corner:g} px: no image tells it yet."
     median = float(np.median(sigma))
-    return median, f"Corners of the board are good to {brief(median)} px in the photographs."
+    return median, f"Corners of the board are good to {brief(median)} px in the images."
 
 
 def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:

@@ -61,8 +61,8 @@ CARRIED_BOARD_SESSION_TEXT = """\
 #   3. cameras/front.yaml  the calibration of your camera
 #   4. Put the camera in place. Home. Move to 25 places over the whole bed and half of the height,
 #      also where a carriage is near its lowest or highest; wait until the tool hangs still, take a
-#      photograph and note where the carriages are. Do not touch the camera in between.
-#   5. images/front/       the photographs, each under the name of its configuration
+#      image and note where the carriages are. Do not touch the camera in between.
+#   5. images/front/       the images, each under the name of its configuration
 #   6. joints.csv          the carriages' heights in mm, one row a configuration: {where}
 #   7. pkmcal check, in this folder's place, until it finds nothing wrong; then pkmcal calibrate
 pkmcal: 1                     # the format's version; leave it

@@ -330,7 +330,7 @@ def _data(
             ((f"{n - quiet} of {n}", " and ".join(kinds)),),
             f"measured without a camera; {quiet} of them given less than half their weight",
         )
-    used = sum(provenance.used_photographs(session, observation, estimate))
+    used = sum(provenance.used_images(session, observation, estimate))
     coarse = int(observation.edges.coarse.sum())
     beside = f" and {coarse} from silhouettes" if coarse else ""
     parts = [
@@ -343,8 +343,8 @@ def _data(
         )
         if len(weights)
     ]
-    lost = taken - sum(len(station.photographs) for station in session.stations)
-    remainder = f"; {count(lost, 'photograph')} left out whole" if lost else ""
+    lost = taken - sum(len(station.images) for station in session.stations)
+    remainder = f"; {count(lost, 'image')} left out whole" if lost else ""
     return Figure(
         "What is it based on?",
         ((f"{used} of {taken}", "photographs"),),

@@ -44,8 +44,8 @@ CAMERA_MODELS_TEXT = (
 )
 CAMERA_SIGMA_TEXT = (
     "The standard deviations are those with which the intrinsics would scatter if other"
-    " photographs of this kind were taken. They hold the noise of the corners and the views'"
-    " disagreement beyond it. They do not contain what all photographs share: a board whose"
+    " images of this kind were taken. They hold the noise of the corners and the views'"
+    " disagreement beyond it. They do not contain what all images share: a board whose"
     " squares are not as long as its file says leaves the intrinsics alone and scales every"
     " distance; a focus that moves afterwards makes it another camera."
 )
@@ -118,7 +118,7 @@ def camera_headline(c: CameraCalibration) -> str:
     kind = {"unified": "unified (mirror or wide-lens)"}.get(c.camera.model, c.camera.model)
     return (
         f"A {kind} camera, focal length {number(focal, decimals(sigma))} ± {brief(sigma)} px;"
-        f" photographs outside the fit are predicted to {brief(c.held_out.rms)} px."
+        f" images outside the fit are predicted to {brief(c.held_out.rms)} px."
     )
 
 
@@ -169,7 +169,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "How sure is the focal length?",
             ((brief(share), "%"),),
-            f"1σ, from {count(len(c.views), 'photograph')}; "
+            f"1σ, from {count(len(c.views), 'image')}; "
             + (
                 f"the views disagree by {c.spread:.1f} times the corners' noise, which is in it"
                 if c.spread > 1
@@ -177,7 +177,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
             ),
         ),
         Figure(
-            "How well does it predict other photographs?",
+            "How well does it predict other images?",
             ((brief(c.held_out.rms), "px"),),
             f"length of a residual, root mean square, camera fitted to the other views;"
             f" {brief(c.rms)} px on the views that it was fitted to",
@@ -233,7 +233,7 @@ def _image(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
     n_rejected = sum(corner.quiet for corner in corners)
     caption = f"{count(len(finite), 'corner')}" + (f", {n_rejected} rejected" if n_rejected else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
-    caption += "" if jpeg else "; the photograph is not at hand"
+    caption += "" if jpeg else "; the image is not at hand"
     width, height = c.camera.image_size
     return Picture(
         station="",
@@ -294,8 +294,8 @@ def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
         for name, out, own in zip(c.views, c.held_out.by_view, fitted, strict=True)
     ]
     return charts.bar_chart(
-        "Held-out error of each photograph", "photographs; root mean square, px", bars, (),
-        f"Bars of {len(bars)} photographs, the middle one {brief(middle)} px",
+        "Held-out error of each image", "images; root mean square, px", bars, (),
+        f"Bars of {len(bars)} images, the middle one {brief(middle)} px",
     )  # fmt: skip
 
 

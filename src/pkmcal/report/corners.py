@@ -19,7 +19,7 @@ class BoardCorners:
     """Corners (N of them).
 
     station, configuration : (N,).
-    photograph : (N,) index of the image in its station.
+    image : (N,) index of the image in its station.
     name : (N,) number on the board.
     pixel : (N, 2) detected.
     off : (N, 2) px, detected minus predicted.
@@ -28,7 +28,7 @@ class BoardCorners:
 
     station: Integers
     configuration: Integers
-    photograph: Integers
+    image: Integers
     name: Integers
     pixel: Array
     off: Array

@@ -52,7 +52,7 @@ FIELD_READING_TEXT = (
     " mean of each cell of the picture. Without order where the camera's file is right; arrows that"
     " grow with the distance from the middle, or go round it, are a lens that the file does not"
     " describe. Strong: more than chance makes in one cell of a hundred. A click leads to the"
-    " photograph that differs most there."
+    " image that differs most there."
 )
 
 
@@ -148,18 +148,18 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
     state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
     mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= INLIER_WEIGHT))
     some = edges.select(mine)
-    rows, photograph = np.unique(some.configuration, return_inverse=True)
+    rows, image = np.unique(some.configuration, return_inverse=True)
     # predicted edges with the estimated edge shift, from which measured ones are offset
     legs = legs_in_camera(
         machine, state.T_camera_base[s], state.T_base_platform[rows], session.joints[rows]
     )
-    own = own_edges(machine, legs, photograph, some)
+    own = own_edges(machine, legs, image, some)
     outward = state.columns[EDGE_SHIFT][session.camera_of_station[s]]
     normal = own.normal + outward * (some.basis @ some.shift[..., None])[..., 0]
     normal /= np.sqrt(dot(normal, normal))[..., None]
     shifted = replace(own, normal=normal)
     measured, expected = (
-        measured_curves(machine, camera, legs, photograph, part, FIELD_EDGE_FRACTIONS)
+        measured_curves(machine, camera, legs, image, part, FIELD_EDGE_FRACTIONS)
         for part in (some, shifted)
     )
     direction, value = offsets_across_curves(expected, measured)

@@ -81,7 +81,7 @@ def plot(
         "photographed",
         "In space, true to scale",
         f"Drag to turn, wheel or pinch to come nearer. The slider takes the machine through"
-        f" {count(len(some), 'pose')}{fewer}; a click on a pose's point leads to its photograph.",
+        f" {count(len(some), 'pose')}{fewer}; a click on a pose's point leads to its image.",
         "The calibrated machine in three dimensions with its tubes, its cameras' fields of view,"
         " and the poses that were measured; the table has the cameras' places.",
         {"data": data, "layout": layout, "config": {"scrollZoom": True}},

@@ -57,8 +57,8 @@ LATEX_SIGNS = {
 }  # fmt: skip
 """Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
-    "data": "the photographs decide",
-    "drawing": "the nominal model decides more than the photographs",
+    "data": "the images decide",
+    "drawing": "the nominal model decides more than the images",
     "frame": "defines the frame",
     "fixed": "kept at the nominal model's value",
 }

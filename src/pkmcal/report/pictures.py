@@ -35,7 +35,7 @@ from pkmcal.pages.overlays import (
 )
 from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.links import Links, Place
-from pkmcal.session.image_files import Photograph
+from pkmcal.session.image_files import Image
 from pkmcal.session.load import Session, Station
 from pkmcal.wording import brief, count, number
 
@@ -94,14 +94,14 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     every = [
         (s, photo)
         for s, station in enumerate(session.stations)
-        for photo in {p.configuration: p for p in reversed(station.photographs)}.values()
+        for photo in {p.configuration: p for p in reversed(station.images)}.values()
     ]
     ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
     images = {s: _decoded(station) for s, station in enumerate(session.stations)} | {
-        **calibration.photographs
+        **calibration.images
     }
     files = [
-        (images[s], session.stations[s].photographs.index(photo))
+        (images[s], session.stations[s].images.index(photo))
         for s, photo in ordered[:MOST_PAGE_IMAGES]
     ]
     # JPEGs until the budget is spent; overlays for the images that have one
@@ -129,9 +129,9 @@ def _rejected(session: Session, room: int) -> Iterator[Picture]:
 
     Images without room are listed without their JPEG.
     """
-    lost = [(one, photo) for one in session.rejected for photo in one.station.photographs]
+    lost = [(one, photo) for one in session.rejected for photo in one.station.images]
     files = [
-        (_decoded(one.station), one.station.photographs.index(photo))
+        (_decoded(one.station), one.station.images.index(photo))
         for one, photo in lost[:MOST_PAGE_IMAGES]
     ]
     shots = list(small_and_large(files, room))
@@ -152,7 +152,7 @@ def _rejected(session: Session, room: int) -> Iterator[Picture]:
 
 def _decoded(station: Station) -> Pictures:
     """Images of a station that need not be in the session any more, decoded on access."""
-    paths = [photo.path for photo in station.photographs]
+    paths = [photo.path for photo in station.images]
     return Pictures(paths, station.camera.image_size, [path.name for path in paths])
 
 
@@ -185,7 +185,7 @@ class _ImageOverlays:
         calibration: Calibration,
         shifts: Array,
         centres: tuple[Centres, ...],
-        chosen: Iterable[tuple[int, Photograph]],
+        chosen: Iterable[tuple[int, Image]],
     ) -> None:
         self.calibration = calibration
         session, estimate = calibration.session, calibration.estimate
@@ -217,13 +217,13 @@ class _ImageOverlays:
                 self._spots(centres, s, configurations)
 
     def picture(
-        self, s: int, photo: Photograph, shot: tuple[str, str], anchor: str, level: float
+        self, s: int, photo: Image, shot: tuple[str, str], anchor: str, level: float
     ) -> Picture:
         """Image with its overlays."""
         session = self.calibration.session
         k, station = photo.configuration, session.stations[s]
-        p, c = station.photographs.index(photo), self.corners
-        mine = c.select((c.station == s) & (c.photograph == p))
+        p, c = station.images.index(photo), self.corners
+        mine = c.select((c.station == s) & (c.image == p))
         width, height = station.camera.image_size
         edges, missed = self.edges[s, k], self.missed[s, k]
         n_rejected = sum(edge.quiet for edge in edges)
@@ -291,7 +291,7 @@ class _ImageOverlays:
         legs, tubes = _legs(self.calibration, s, configurations), tubes_of(machine)
         pixel = edge_points(machine, camera, legs, tubes, EDGE_CURVE_POINTS).pixel
         inside = np.where(camera.in_image(pixel)[..., None], pixel, np.nan)
-        curves = [straightened(of_photograph) for of_photograph in inside]
+        curves = [straightened(of_image) for of_image in inside]
         for one in some:
             at = row[one.configuration]
             meant = (tubes.leg == one.leg) & ((one.tube < 0) | (tubes.tube == one.tube))
@@ -330,8 +330,8 @@ class _ImageOverlays:
 def edge_curves(c: Calibration, mine: Integers, s: int) -> Array:
     """Curves (n, EDGE_CURVE_POINTS, 2) px of the edges ``mine`` (n,) in the images of station s."""
     edges, camera = c.observation.edges.select(mine), c.session.stations[s].camera
-    rows, photograph = np.unique(edges.configuration, return_inverse=True)
-    return measured_curves(c.machine, camera, _legs(c, s, rows), photograph, edges)
+    rows, image = np.unique(edges.configuration, return_inverse=True)
+    return measured_curves(c.machine, camera, _legs(c, s, rows), image, edges)
 
 
 def _legs(c: Calibration, s: int, rows: Integers) -> LegsInCamera:

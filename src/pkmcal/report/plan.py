@@ -44,10 +44,10 @@ PLAN_METHOD_TEXT = (
     "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
     " corners, poses and readings, with the platform's pose of that configuration eliminated."
     " Stations, edge shifts, shading and boards stay unknown, so what is promised is what calibrate"
-    " then states, as far as the photographs turn out as good as assumed.",
+    " then states, as far as the images turn out as good as assumed.",
     "Configurations are taken greedily, then each is exchanged for the best of all others until"
     " nothing gains (Fedorov), then moved by a part of the motors' ranges and exchanged again. Two"
-    " of a place differ by a tenth of some motor's range at least: a photograph taken twice errs by"
+    " of a place differ by a tenth of some motor's range at least: an image taken twice errs by"
     " the same. They are within the joints' ranges, in home's assembly, away from singular poses,"
     " with legs clear of each other; what lies outside the image or behind a leg adds nothing.",
 )

@@ -22,7 +22,7 @@ MOST_WORST_POSES = 12
 """Poses in the list of the worst."""
 POSE_JUMPS_TEXT = (
     "Bars by configuration: a jump that stays means that something was moved, a single tall bar"
-    " that this one photograph, or its readings, are wrong."
+    " that this one image, or its readings, are wrong."
 )
 
 

@@ -37,9 +37,7 @@ MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
 
-def used_photographs(
-    session: Session, observation: Observation, estimate: Estimate
-) -> tuple[int, ...]:
+def used_images(session: Session, observation: Observation, estimate: Estimate) -> tuple[int, ...]:
     """Number of images of each station that are in use.
 
     An image is in use if its board's pose is an inlier, or at least half of its edges are.
@@ -57,7 +55,7 @@ def used_photographs(
         most = 2 * inliers >= np.bincount(own.ravel(), minlength=len(pairs))
         in_use |= {(s, c) for s, c in pairs[most].tolist()}
     return tuple(
-        sum((s, photo.configuration) in in_use for photo in station.photographs)
+        sum((s, photo.configuration) in in_use for photo in station.images)
         for s, station in enumerate(session.stations)
     )
 
@@ -74,24 +72,24 @@ def stations(
         return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
-    used = used_photographs(session, observation, estimate)
+    used = used_images(session, observation, estimate)
     for s, station in enumerate(session.stations):
-        taken = len(station.photographs)
-        photographs = count(taken, "photograph")
+        taken = len(station.images)
+        images = count(taken, "photograph")
         if used[s] < taken:
-            photographs = f"{used[s]} of {photographs} in use"
+            images = f"{used[s]} of {images} in use"
         # edge shifts are estimated in binned pixels
         pixels = int(observation.binning[s])
         shift = float(estimate.state.columns[EDGE_SHIFT][camera[s]]) * pixels
         sigma = float(estimate.column_sigma(EDGE_SHIFT)[camera[s]]) * pixels
         if pixels > 1:
-            photographs += f", {pixels} × {pixels} pixels as one"
+            images += f", {pixels} × {pixels} pixels as one"
         places = decimals(sigma)
         cells = (
             *_pose_cells(estimate, s),
             *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
             _distance_cell(station.T_camera_base, estimate.state.T_camera_base[s]),
-            f"{station.camera_file}, {station.camera.model}, {photographs}",
+            f"{station.camera_file}, {station.camera.model}, {images}",
         )
         rows.append(Row(station.name, cells))
     # trackers come after the cameras' stations
@@ -238,13 +236,13 @@ class Reason:
     """Reason of rejections.
 
     count : number of rejections.
-    photographs : number of images concerned.
+    images : number of images concerned.
     cases : (image, rejected part) of the first of them.
     """
 
     text: str
     count: int
-    photographs: int
+    images: int
     cases: tuple[tuple[str, str], ...]
 
     @property
@@ -284,7 +282,7 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
     return Reason(
         text=items[0].reason if same else text,
         count=len(items),
-        photographs=len({(i.station, i.configuration) for i in items}),
+        images=len({(i.station, i.configuration) for i in items}),
         cases=tuple(
             (
                 f"{stations[i.station]} / {configurations[i.configuration]}",
@@ -299,7 +297,7 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
 def _rejected_part(item: Rejection) -> str:
     """Rejected part in words; -1 stands for all."""
     if item.leg < 0:
-        return "board" if item.reason.startswith("the board") else "whole photograph"
+        return "board" if item.reason.startswith("the board") else "whole image"
     words = [f"leg {item.leg + 1}"]
     if item.tube >= 0:
         words.append(f"tube {item.tube + 1}")

@@ -188,7 +188,7 @@ def _image(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     at, session, estimate = k + 1, c.session, c.estimate
     station = session.stations[s]
     path = ("machine", "cameras", station.name, "image")
-    photo = next((p for p in station.photographs if p.configuration == k), None)
+    photo = next((p for p in station.images if p.configuration == k), None)
     if photo is None:
         # a black image, because rerun's viewer still shows an encoded image after it was cleared
         # (its issue 12793)

@@ -261,7 +261,7 @@ def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array)
     shaded = _shaded(edges, estimate, shifts)
     if shaded:
         out.append(
-            f"Edges that lie off in the same way in every photograph, {joined(shaded)}: shading, a "
+            f"Edges that lie off in the same way in every image, {joined(shaded)}: shading, a "
             "surface that is not round, or a neighbour taken for the edge."
         )
     if scatter := estimate.statistics.look_scatter:
@@ -288,7 +288,7 @@ def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[
     outstanding = sorted(outstanding, key=lambda g: -level[g])[:4]
     return [
         f"The residuals of {names[g]} are {number(level[g] / middle, 1)} times those of the "
-        "middle one: check its photographs first."
+        "middle one: check its images first."
         for g in outstanding
     ]
 

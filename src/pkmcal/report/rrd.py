@@ -106,7 +106,7 @@ def _blueprint(stations: tuple[str, ...]) -> Any:
     """Layout: the machine in space beside the images, with residuals and texts below these."""
     rr: Any = import_module("rerun")
     rrb: Any = import_module("rerun.blueprint")
-    photographs = [
+    images = [
         rrb.Spatial2DView(
             origin=rr.new_entity_path(["machine", "cameras", name, "image"]), name=name
         )
@@ -117,7 +117,7 @@ def _blueprint(stations: tuple[str, ...]) -> Any:
         rrb.Horizontal(
             rrb.Spatial3DView(origin="/machine", name="Machine"),
             rrb.Vertical(
-                beside(*photographs) if photographs else rrb.TextDocumentView(),
+                beside(*images) if images else rrb.TextDocumentView(),
                 rrb.TimeSeriesView(origin="/residuals", name="Residuals, standard deviations"),
                 rrb.Tabs(
                     rrb.TextDocumentView(origin="/result/summary", name="Result"),

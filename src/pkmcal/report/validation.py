@@ -17,15 +17,15 @@ from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, decimals, number
 
 VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
-    " platform are estimated from the photographs; a configuration's own readings have no part in"
-    " its pose, and where photographs leave open where a camera or a board is, the readings of the"
+    " platform are estimated from the images; a configuration's own readings have no part in"
+    " its pose, and where images leave open where a camera or a board is, the readings of the"
     " other configurations decide. The readings are then predictions. The nominal model is"
     " judged in the"
     " same way, frames laid over each other, on the poses that suit it best.",
     "The uncertainty of “times better” is from nominal model the configurations again at random"
-    " (bootstrap). Directions count by how well the photographs see them: one photograph"
+    " (bootstrap). Directions count by how well the images see them: one image"
     " determines depth poorly, and there any two machines look the same.",
-    "The promise holds the calibration's covariance and the noise of these photographs and"
+    "The promise holds the calibration's covariance and the noise of these images and"
     " readings. It is broken where chance explains the residuals less than once in a thousand times"
     " even if all deviations were half as large again.",
 )
@@ -37,7 +37,7 @@ def outcome_of(v: Validation) -> Outcome:
     again = [n for n, flag in zip(v.session.configurations, v.repeated, strict=True) if flag]
     sentences = (
         ("Left out, for the calibration had seen them", prior),
-        ("At poses that the calibration used, photographed anew", again),
+        ("At poses that the calibration used, imaged anew", again),
     )
     notes = tuple(f"{what}: {', '.join(names)}." for what, names in sentences if names)
     parts = (
@@ -69,7 +69,7 @@ def _cards(judged: NominalComparison, v: Validation) -> tuple[Figure, ...]:
     weighed = ""
     if unit:
         weighed = (
-            f"; {against(judged.after, judged.before, unit)}, weighed by how well the photographs"
+            f"; {against(judged.after, judged.before, unit)}, weighed by how well the images"
             " see each direction"
         )
     return (
@@ -84,7 +84,7 @@ def _cards(judged: NominalComparison, v: Validation) -> tuple[Figure, ...]:
                 (_magnitude(value, unit), DISPLAY_UNITS[unit][1])
                 for value, unit in ((calibrated.position, "m"), (calibrated.orientation, "rad"))
             ),
-            "root mean square distance from where the photographs see it, their noise included; by"
+            "root mean square distance from where the images see it, their noise included; by"
             f" the nominal model {amount(nominal.position, 'm')} and"
             f" {amount(nominal.orientation, 'rad')}",
         ),
@@ -122,19 +122,19 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
             )
             for k, (name, unit) in enumerate(_joints(session))
         ),
-        "Predicted from poses that the photographs show, without their own readings; weighed by"
-        " how well each was seen. Promised: what the calibration's deviations and the photographs'"
+        "Predicted from poses that the images show, without their own readings; weighed by"
+        " how well each was seen. Promised: what the calibration's deviations and the images'"
         " noise let one expect. In common: what all configurations are off alike.",
     )
     tool = Table(
-        "Tool point: forward kinematics of the readings against the photographs",
+        "Tool point: forward kinematics of the readings against the images",
         ("Machine", "Position, mm", "Orientation, °"),
         tuple(
             Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))
             for name, f in (("Drawing", nominal), ("Calibrated", calibrated))
         ),
         "Root mean squares, frames laid over each other for the nominal model. The"
-        " photographs' own noise"
+        " images' own noise"
         " is in both.",
     )
     pictures = charts.panels(_by_configuration(judged, session), _by_joint(judged, session))
@@ -169,7 +169,7 @@ def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
             "× promise",
         ),
         tuple(rows),
-        "Residuals of the readings, root mean square, weighed by how well the photographs see each"
+        "Residuals of the readings, root mean square, weighed by how well the images see each"
         " direction. A region far worse than the configurations in use is extrapolated badly.",
     )  # fmt: skip
 
@@ -188,7 +188,7 @@ def paths_table(paths: tuple[LinePath, ...]) -> Table:
         "Straight paths: distance of the tool points from the line through them, rms (largest), mm",
         ("Path", "Points", "As seen", "By nominal model", "By calibration"),
         tuple(rows),
-        "As seen: where the photographs show the tool. By nominal model and by calibration: forward"
+        "As seen: where the images show the tool. By nominal model and by calibration: forward"
         " kinematics of the readings, for a tool that was led along a ruler.",
     )
 
@@ -234,7 +234,7 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         "Residuals of configurations in use and held out",
         ("Joint", "In use, mean", "rms", "Held out, mean", "rms", "by the nominal model, rms"),
         tuple(rows),
-        "Readings measured less predicted from poses that the photographs show, weighed by how well"
+        "Readings measured less predicted from poses that the images show, weighed by how well"
         " each was seen; their noise is in all columns.",
         brief=False,
     )

@@ -46,7 +46,7 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
             focal = read_exif(open_image(stream, label)).focal_35mm
         if focal is None:
             raise InputError(
-                "the photograph does not tell the focal length it was taken with",
+                "the image does not tell the focal length it was taken with",
                 where=label,
                 found="no EXIF FocalLengthIn35mmFilm",
                 expected=f"a JPEG file as the camera wrote it, for {where} says camera: exif",
@@ -57,11 +57,11 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
     if len(labels) > 1:
         (one, first), (other, second) = list(labels.items())[:2]
         raise InputError(
-            "the photographs of one camera tell different focal lengths or sizes",
+            "the images of one camera tell different focal lengths or sizes",
             where=second,
             found=f"{_description(*other)}, where {first} has {_description(*one)}",
-            expected="one lens, not zoomed, and uncropped photographs",
-            next_step="Give photographs by another lens a station of their own",
+            expected="one lens, not zoomed, and uncropped images",
+            next_step="Give images by another lens a station of their own",
         )
     size = max(sizes, key=sizes.count)  # the others are rotated by 90 degrees
     return _pinhole_camera(next(iter(labels))[0] / FILM_DIAGONAL * hypot(*size), size)

@@ -27,7 +27,7 @@ _FIELDS = ("configuration", "repeat")
 
 
 @dataclass(frozen=True)
-class Photograph:
+class Image:
     """One image file.
 
     configuration : row of the session's joint readings that the image belongs to.
@@ -41,7 +41,7 @@ class Photograph:
 
 def find_images(
     folder: Path, pattern: str, names: Sequence[str], where: str, *, needed: bool = True
-) -> tuple[Photograph, ...]:
+) -> tuple[Image, ...]:
     """Find the image files of a pattern such as ``images/front/{configuration}.png``.
 
     folder : the session's folder.
@@ -77,7 +77,7 @@ def find_images(
         return ()
     if not files:
         raise _no_images_error(folder, wildcard, pattern, where)
-    images: list[Photograph] = []
+    images: list[Image] = []
     unknown: list[str] = []
     for name in sorted(files):
         match = matched(name)
@@ -86,7 +86,7 @@ def find_images(
             continue
         fields = match.groupdict()
         row = rows[fields["configuration"]]
-        images.append(Photograph(row, fields.get("repeat"), folder / name))
+        images.append(Image(row, fields.get("repeat"), folder / name))
     if unknown:
         raise _unknown_configuration(unknown, parts, names, where)
     return tuple(sorted(images, key=lambda image: (image.configuration, image.repeat or "")))
@@ -184,11 +184,11 @@ def _no_images_error(folder: Path, wildcard: str, pattern: str, where: str) -> I
     counts = Counter(_image_suffixes(folder, wildcard.removesuffix(suffix)))
     others = [other for other, _ in counts.most_common() if other != suffix]
     return InputError(
-        "there is no photograph under this pattern",
+        "there is no image under this pattern",
         where=where,
         found=content,
         expected=f"files {pattern}",
-        next_step=f"Photographs there end in {others[0]}: write"
+        next_step=f"Images there end in {others[0]}: write"
         f" {pattern.removesuffix(suffix)}{others[0]}"
         if others
         else None,
@@ -212,10 +212,10 @@ def _unknown_configuration(
     name = match["configuration"] if match else files[0]
     more = f" (one of {len(files)} such files)" if len(files) > 1 else ""
     short = {entry.lstrip("0"): entry for entry in names}
-    next_step = "Add its readings to the table, or move the photograph away"
+    next_step = "Add its readings to the table, or move the image away"
     if name.lstrip("0") in short:
         next_step = (
-            f"The table has {short[name.lstrip('0')]} where the photograph says {name}: "
+            f"The table has {short[name.lstrip('0')]} where the image says {name}: "
             "write the names alike; spreadsheets drop leading zeros"
         )
     return InputError(

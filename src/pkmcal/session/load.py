@@ -49,7 +49,7 @@ from pkmcal.mechanisms import Machine, catalogue, check_plausible, load_mechanis
 from pkmcal.mechanisms.region import Region
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.session.exif import EXIF_CAMERA_WORD, camera_by_exif
-from pkmcal.session.image_files import Photograph, find_images, image_header, label_of
+from pkmcal.session.image_files import Image, find_images, image_header, label_of
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
 from pkmcal.session.schema import (
@@ -72,7 +72,7 @@ class Station:
 
     camera_file : as named in session.yaml; a made-up name if the camera comes from EXIF data.
     T_camera_base : (4, 4) rough pose, base to camera coordinates in m; None if not given.
-    photographs : images, sorted by configuration and repeat.
+    images : images, sorted by configuration and repeat.
     observe : legs, board, or both, in this order.
     entry : name of the entry in session.yaml. A hand-held entry has one station for each image.
     handheld : whether the camera was held by hand.
@@ -86,7 +86,7 @@ class Station:
     camera: Camera
     camera_file: str
     T_camera_base: Array | None
-    photographs: tuple[Photograph, ...]
+    images: tuple[Image, ...]
     observe: tuple[str, ...]
     entry: str = ""
     handheld: bool = False
@@ -213,13 +213,13 @@ class Session:
         station = self.stations[number]
         if not station.handheld:
             return station.name
-        return label_of(self.folder, station.photographs[0].path)
+        return label_of(self.folder, station.images[0].path)
 
     @property
     def images_taken(self) -> int:
         """Number of images of all stations, rejected stations included."""
         stations = (*self.stations, *(one.station for one in self.rejected))
-        return sum(len(station.photographs) for station in stations)
+        return sum(len(station.images) for station in stations)
 
     def other_model(self, name: str | None) -> Machine:
         """Machine with another model from the same mechanism file."""
@@ -418,7 +418,7 @@ def _check_redundant(document: Document, machine: Machine) -> None:
         where=document.where("stations"),
         found=f"{machine.n_joints} readings for {machine.n_joints - machine.redundancy} freedoms",
         expected="stations: a camera or a tracker, or a machine with more readings than freedoms",
-        next_step="Photograph the machine, or measure its platform, and name that under stations",
+        next_step="Take images of the machine, or measure its platform, and name that under stations",
     )
 
 
@@ -473,7 +473,7 @@ def _check_base_board(document: Document, schema: SessionDocument, users: list[s
         f"the board is fixed to the base, which does not move, and {who}",
         where=document.where("stations", alone[0], "observe"),
         found="board",
-        expected="[legs, board], in the same photographs",
+        expected="[legs, board], in the same images",
         next_step="If the board is on the platform, write board: {file: "
         f"{schema.board.file if schema.board else 'board.yaml'}, fixed_to: platform}}",
     )
@@ -553,9 +553,9 @@ def _stations(
     )  # fmt: skip
     if not station.handheld:
         return [whole]
-    check_count(len(images), MOST_HANDHELD_IMAGES, "photographs by hand", where)
+    check_count(len(images), MOST_HANDHELD_IMAGES, "images by hand", where)
     return [
-        replace(whole, name="-".join(filter(None, called)), photographs=(image,))
+        replace(whole, name="-".join(filter(None, called)), images=(image,))
         for image in images
         for called in [(name, names[image.configuration], image.repeat)]
     ]
@@ -570,11 +570,11 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
             where=document.where(*keys, "pose"),
             found="handheld: true, and a pose",
             expected="one of them",
-            next_step="Remove the pose, or handheld where all photographs are from one place",
+            next_step="Remove the pose, or handheld where all images are from one place",
         )
     if "legs" not in station.observe:
         raise InputError(
-            "photographs by hand of a board alone tell nothing of the machine",
+            "images by hand of a board alone tell nothing of the machine",
             where=document.where(*keys, "observe"),
             found="board",
             expected="legs, or [legs, board]: only the legs tell where the board or the camera is",
@@ -586,17 +586,16 @@ def _rotated_images(folder: Path, stations: tuple[Station, ...]) -> list[Finding
     image whose size differs from its camera's.
     """
     turned: list[str] = []
-    for station, image in ((s, image) for s in stations for image in s.photographs):
+    for station, image in ((s, image) for s in stations for image in s.images):
         label, wanted = label_of(folder, image.path), tuple(station.camera.image_size)
         width, height = size = image_header(image.path, label)
         if wanted not in (size, (height, width)):
             raise InputError(
-                "the photograph has another size than its camera",
+                "the image has another size than its camera",
                 where=label,
                 found=f"{width}x{height}",
                 expected=f"{wanted[0]}x{wanted[1]} ({station.camera_file})",
-                next_step="Use unscaled, uncropped photographs, or the camera file of this"
-                " resolution",
+                next_step="Use unscaled, uncropped images, or the camera file of this resolution",
             )
         if wanted != size:
             turned.append(label)
@@ -611,15 +610,15 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
     """
     owners: dict[tuple[str, str], str] = {}
     for station in stations:
-        for image in station.photographs:
+        for image in station.images:
             path = os.path.realpath(image.path)
             others = {owners.setdefault((path, w), station.name) for w in station.observe}
             for other in others - {station.name}:
                 raise InputError(
-                    f"station {station.name} has the photographs of station {other}",
+                    f"station {station.name} has the images of station {other}",
                     where=document.where("stations", station.name, "images"),
                     found=image.path.name,
-                    expected="its own photographs; a station is one camera in one place",
+                    expected="its own images; a station is one camera in one place",
                 )
 
 
@@ -683,10 +682,10 @@ def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) 
     twice = next((name for name, count in many.items() if count > 1), None)
     if twice is not None:
         raise InputError(
-            "two stations, or photographs by hand, have the same name",
+            "two stations, or images by hand, have the same name",
             where=document.where("stations"),
             found=twice,
-            expected="names that differ; a photograph by hand is called by its station,"
+            expected="names that differ; an image by hand is called by its station,"
             " configuration and repeat",
         )
 
@@ -700,14 +699,14 @@ def _unmeasured(
     """Warning about configurations without measurements; raises InputError if fewer than two have
     any.
     """
-    measured = {image.configuration for station in stations for image in station.photographs}
+    measured = {image.configuration for station in stations for image in station.images}
     measured |= {int(k) for tracker in trackers for k in tracker.configuration}
     measured |= {int(k) for one in links for k in one.configuration.ravel()}
     if len(measured) < 2:
         raise InputError(
             "only one configuration was measured"
             if trackers or links
-            else "only one configuration has photographs",
+            else "only one configuration has images",
             where=table.label,
             found=table.names[min(measured)],
             expected="two at least; one cannot tell a joint's place from its offset",
@@ -740,7 +739,7 @@ def _resolved_document(
     for station in stations:
         entry = document["stations"][station.entry]
         entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe
-        files = [label_of(folder, image.path) for image in station.photographs]
+        files = [label_of(folder, image.path) for image in station.images]
         entry["photographs"] = entry.get("photographs", []) + files
     return document
 
@@ -749,18 +748,18 @@ def digests(session: Session) -> dict[str, list[str]]:
     """Short digests of the image files, by configuration."""
     out: dict[str, list[str]] = {}
     for station in session.stations:
-        for image in station.photographs:
+        for image in station.images:
             name = session.configurations[image.configuration]
             digest = blake2b(image.path.read_bytes(), digest_size=8).hexdigest()
             out.setdefault(name, []).append(digest)
     return out
 
 
-def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -> str:
+def session_digest(session: Session, images: Mapping[str, Sequence[str]]) -> str:
     """Short digest of everything that a result depends on: readings, nominal model, cameras, board,
     tables of trackers and links, and images.
 
-    photographs : :func:`digests` of the session.
+    images : :func:`digests` of the session.
 
     The digest is of values, not of the files' bytes (board and images excepted): comments and the
     user's notes do not change it.
@@ -779,7 +778,7 @@ def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -
         session.model,
         cameras,
         tables,
-        photographs,
+        images,
     ]
     text = json_text(all_of_it) + blake2b(board).hexdigest()
     return blake2b(text.encode("utf-8"), digest_size=8).hexdigest()

@@ -58,7 +58,7 @@ def check_readings(
             where=table.label,
             found=listed(table.names),
             expected="two at least; one cannot tell a joint's place from its offset",
-            next_step="Move the machine and take more photographs; 15 configurations are usual",
+            next_step="Move the machine and take more images; 15 configurations are usual",
         )
     _check_units(table, ranges, units)
     _check_signs(table, ranges)

@@ -64,7 +64,7 @@ class StationDocument(Schema):
     handheld: bool = False
     response: Response | None = Field(
         default=None,
-        description="how the photographs code light: linear, as sensors count it, or srgb, as"
+        description="how the images code light: linear, as sensors count it, or srgb, as"
         " telephones write it; found out where it is left out",
     )
 

@@ -63,24 +63,24 @@ def simulate_edges(
     noise: EdgeNoise,
     rng: np.random.Generator,
     *,
-    photographs: Integers | None = None,
+    images: Integers | None = None,
     joint_noise: float = 3e-6,
 ) -> tuple[EdgeSet, Array]:
     """Edges that a true machine would give, and its readings (K, m).
 
     T_camera_base : (S, 4, 4). camera : one for all stations, or one for each.
-    T_base_platform : (K, 4, 4). photographs : (M, 2) pairs of station and configuration; all pairs
+    T_base_platform : (K, 4, 4). images : (M, 2) pairs of station and configuration; all pairs
     by default. Edges outside the image or hidden behind other legs are omitted; a partly hidden
     edge keeps its longest visible stretch.
     """
     cameras = one_a_station(camera, len(T_camera_base))
     joints = machine.inverse(T_base_platform)
-    if photographs is None:
-        photographs = np.argwhere(np.ones((len(cameras), len(joints)), dtype=bool))
+    if images is None:
+        images = np.argwhere(np.ones((len(cameras), len(joints)), dtype=bool))
     tubes = tubes_of(machine)
     sets: list[EdgeSet] = []
     for station, one in enumerate(cameras):
-        rows = photographs[photographs[:, 0] == station, 1]
+        rows = images[images[:, 0] == station, 1]
         ends = machine.ends_at(joints[rows], T_base_platform[rows])
         a, b = apply(T_camera_base[station], ends.a), apply(T_camera_base[station], ends.b)
         exact, rays = visible_edges(one, tubes, machine.values[tubes.radius], a, b)

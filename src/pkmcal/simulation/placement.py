@@ -69,7 +69,7 @@ HANDHELD_DISTANCES = (1.0, 1.35)
 image."""
 MOST_HANDHELD_ROLL = np.deg2rad(15)
 """Largest roll, in rad, of a phone held upright or on its side."""
-UPRIGHT_PHOTOGRAPH_SHARE = 1 / 3
+UPRIGHT_IMAGE_SHARE = 1 / 3
 """Share of images for which the phone is held upright, so that its sensor lies on its side."""
 
 
@@ -320,7 +320,7 @@ def places_by_hand(
         target = centre + rng.uniform(-0.08, 0.08, 3) * radius
         forward = (target - position) / np.linalg.norm(target - position)
         roll = rng.uniform(-MOST_HANDHELD_ROLL, MOST_HANDHELD_ROLL)
-        if rng.uniform() < UPRIGHT_PHOTOGRAPH_SHARE:
+        if rng.uniform() < UPRIGHT_IMAGE_SHARE:
             roll += np.pi / 2 * rng.choice([-1, 1])
         up = rotation(roll * forward) @ np.array([0.0, 0.0, 1.0])
         up = up - (up @ forward) * forward

@@ -276,7 +276,7 @@ def render_light(
     return light
 
 
-def photograph(light: Array, sensor: Sensor, rng: np.random.Generator) -> Integers:
+def sensor_image(light: Array, sensor: Sensor, rng: np.random.Generator) -> Integers:
     """8-bit image (H, W) of the light on each pixel."""
     from scipy.ndimage import gaussian_filter
 

@@ -22,7 +22,7 @@ from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS
 from pkmcal.simulation.board import board_part, holder_part
 from pkmcal.simulation.placement import check_drawable, one_a_station
-from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, photograph, render_light
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, render_light, sensor_image
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
 from pkmcal.simulation.truth import (
@@ -35,7 +35,7 @@ from pkmcal.simulation.truth import (
     truth_document,
 )
 
-PhotographProgress = Callable[[int, int], None]
+ImageProgress = Callable[[int, int], None]
 HANDHELD_JPEG_QUALITY = 95
 """Quality of the JPEG files of a hand-held camera, as phones write them."""
 
@@ -48,7 +48,7 @@ def simulate_session(
     *,
     seed: int = 0,
     workers: int = 2,
-    progress: PhotographProgress | None = None,
+    progress: ImageProgress | None = None,
 ) -> Truth:
     """Write a simulated session into a new folder, completely or not at all.
 
@@ -68,7 +68,7 @@ def simulate_session(
         lenses = tuple(_breathed(one, float(scale)) for one, scale in pairs)
     with staged_folder(folder) as stage:
         _write_texts(stage, nominal, cameras, settings, truth)
-        _write_photographs(stage, lenses, settings, truth, workers, progress)
+        _write_images(stage, lenses, settings, truth, workers, progress)
     return truth
 
 
@@ -121,30 +121,30 @@ class Studio:
         board, built, eyes = settings.board, settings.as_built, tuple(cameras)
         return cls(truth, discs, finish, room, eyes, views, settings.sensor, fixed, board, built)
 
-    def photographs(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
+    def images(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
         """Repeats, 8 bits (H, W) each, of the session's image number ``index``.
 
         Images of a camera at rest receive the same light and differ by noise only. shake : standard
         deviations of the camera's motion between repeats, m and rad.
         """
-        seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.photographs))[index]
+        seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.images))[index]
         children = (seeds, *seeds.spawn(self.truth.repeats - 1))
         rngs = [np.random.default_rng(child) for child in children]
-        still = self.truth.T_camera_base[self.truth.photographs[index, 0]]
+        still = self.truth.T_camera_base[self.truth.images[index, 0]]
         if not any(shake):
             light = self._light(index, still, rngs[0])
-            return [photograph(light, self.sensor, rng) for rng in rngs]
+            return [sensor_image(light, self.sensor, rng) for rng in rngs]
         # a camera that shakes about its own position
         lights: list[Array] = []
         for rng in rngs:
             turn, move = rng.standard_normal((2, 3))
             motion = pose(rotation(shake[1] * turn), shake[0] * move)
             lights.append(self._light(index, motion @ still, rng))
-        return [photograph(x, self.sensor, rng) for x, rng in zip(lights, rngs, strict=True)]
+        return [sensor_image(x, self.sensor, rng) for x, rng in zip(lights, rngs, strict=True)]
 
     def _light(self, index: int, T_camera_base: Array, rng: np.random.Generator) -> Array:
         """Light (H, W) on a camera at T_camera_base for image number ``index``."""
-        station, k = self.truth.photographs[index]
+        station, k = self.truth.images[index]
         poses, joints = self.truth.T_base_platform, self.truth.joints
         parts = machine_parts(
             self.truth.machine, self.discs, self.finish, poses[k], joints[k], self.as_built
@@ -170,7 +170,7 @@ def _check(folder: Path, nominal: Machine) -> None:
         )
     if not any(len(radii) for radii in nominal.radii()):
         raise InputError(
-            what=f"mechanism {nominal.name!r} has no tubes, so its photographs would show no legs",
+            what=f"mechanism {nominal.name!r} has no tubes, so its images would show no legs",
             expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
         )
     check_drawable(nominal)
@@ -241,19 +241,19 @@ def _session_document(
     }
 
 
-def _write_photographs(
+def _write_images(
     stage: Path,
     cameras: Sequence[Camera],
     settings: Settings,
     truth: Truth,
     workers: int,
-    progress: PhotographProgress | None,
+    progress: ImageProgress | None,
 ) -> None:
     """Render and write all images; NumPy releases the interpreter lock, so threads suffice."""
     studio = Studio.of(truth, cameras, settings)
     for name in [HANDHELD_STATION_NAME] if settings.handheld else truth.stations:
         (stage / "images" / name).mkdir(parents=True)
-    total = len(truth.photographs)
+    total = len(truth.images)
     with ThreadPoolExecutor(max(1, workers)) as pool:
         jobs = [pool.submit(_write_one, stage, studio, settings, k) for k in range(total)]
         try:
@@ -270,9 +270,9 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
     import cv2
 
     truth = studio.truth
-    station, k = truth.photographs[index]
+    station, k = truth.images[index]
     if settings.handheld:
-        (picture,) = studio.photographs(index)
+        (picture,) = studio.images(index)
         name = truth.stations[station].removeprefix(f"{HANDHELD_STATION_NAME}-")
         path = stage / "images" / HANDHELD_STATION_NAME / f"{name}.jpg"
         camera, T_camera_base = studio.cameras[station], truth.T_camera_base[station]
@@ -281,7 +281,7 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
         path.write_bytes(_as_by_telephone(picture, camera, T_camera_base))
         return
     folder = stage / "images" / truth.stations[station]
-    for repeat, picture in enumerate(studio.photographs(index, settings.shake)):
+    for repeat, picture in enumerate(studio.images(index, settings.shake)):
         ok, data = cv2.imencode(".png", picture)
         if not ok:
             raise OSError(f"photograph {index} could not be encoded as PNG")
@@ -299,7 +299,7 @@ def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) ->
     picture = coded[picture]
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, HANDHELD_JPEG_QUALITY])
     if not ok:
-        raise OSError("a photograph could not be encoded as JPEG")
+        raise OSError("a image could not be encoded as JPEG")
     # direction of up in the stored image: viewers rotate the image by it
     right, down = T_camera_base[:2, 2]
     upright, lying = 1 if down < 0 else 3, 6 if right < 0 else 8

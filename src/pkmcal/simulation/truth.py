@@ -114,7 +114,7 @@ class Truth:
 
     machine : with its true values. stations, configurations : names, S and K.
     T_camera_base : (S, 4, 4). rough : station poses in session.yaml. T_base_platform : (K, 4, 4).
-    joints : (K, m) exact readings. readings : (K, m) with noise. photographs : (M, 2) numbers of
+    joints : (K, m) exact readings. readings : (K, m) with noise. images : (M, 2) numbers of
     the station and the configuration of each image. seed : seed of all random numbers.
     T_base_board, T_platform_board : (4, 4) pose of the board, if any. repeats : images of each
     pair. focal_scale : (S,) factors on the camera's focal lengths, for hand-held images.
@@ -128,7 +128,7 @@ class Truth:
     T_base_platform: Array
     joints: Array
     readings: Array
-    photographs: Integers
+    images: Integers
     seed: int
     T_base_board: Array | None = None
     repeats: int = 1
@@ -181,7 +181,7 @@ def draw_truth(
         )
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
-    T_base_platform, joints, photographs = _configurations(
+    T_base_platform, joints, images = _configurations(
         nominal, machine, cameras, T_camera_base, settings, rngs["configurations"]
     )
     board = None
@@ -200,7 +200,7 @@ def draw_truth(
     configurations = tuple(f"{k:04d}" for k in range(len(joints)))
     names = tuple(f"station{k + 1}" for k in range(len(poses)))
     if settings.handheld:
-        taken = enumerate(photographs[:, 1].tolist())
+        taken = enumerate(images[:, 1].tolist())
         names = tuple(
             f"{HANDHELD_STATION_NAME}-{configurations[k]}-{s % settings.repeats + 1}"
             for s, k in taken
@@ -214,7 +214,7 @@ def draw_truth(
         T_base_platform=T_base_platform,
         joints=joints,
         readings=joints + noise,
-        photographs=photographs,
+        images=images,
         seed=seed,
         T_base_board=board if settings.board_on == "base" else None,
         repeats=1 if settings.handheld else settings.repeats,
@@ -329,7 +329,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
     ``parameters`` are the true values by name; ``stations`` hold 4x4 ``T_camera_base``;
     ``configurations`` hold 4x4 ``T_base_platform`` and the exact readings ``joints``;
-    ``photographs`` are pairs of names, with ``repeats`` images of each (one by default). No
+    ``images`` are pairs of names, with ``repeats`` images of each (one by default). No
     estimator reads this file.
     """
     names = truth.machine.parameters.names
@@ -354,7 +354,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
             )
         },
         "photographs": [
-            [truth.stations[s], truth.configurations[k]] for s, k in truth.photographs.tolist()
+            [truth.stations[s], truth.configurations[k]] for s, k in truth.images.tolist()
         ],
         **({} if truth.T_base_board is None else {"T_base_board": truth.T_base_board.tolist()}),
         **(
@@ -396,7 +396,7 @@ def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
         T_base_platform=np.array([c["T_base_platform"] for c in data["configurations"].values()]),
         joints=joints,
         readings=joints,
-        photographs=np.array(
+        images=np.array(
             [[stations.index(s), configurations.index(k)] for s, k in data["photographs"]]
         ),
         seed=data["seed"],

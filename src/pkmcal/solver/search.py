@@ -56,7 +56,7 @@ class Stop(Enum):
     CONVERGED = "converged"
     STALLED = (
         "no step downhill was found; check the start, the stations' poses first, and that the "
-        "readings belong to the photographs"
+        "readings belong to the images"
     )
     STEPS = "the step limit was reached before convergence; start nearer, or allow more steps"
     NOT_FINITE = (

@@ -75,7 +75,7 @@ TOOL_ERROR_POSES = 20
 """Number of poses at which the tool's error is evaluated."""
 TIMES_MACHINES_REDRAWN = 20
 """Number of attempts to draw a machine that can take the readings of the plan."""
-PHOTOGRAPH_PLAN_STREAM, TOOL_POSES_STREAM = 1, 2
+IMAGE_PLAN_STREAM, TOOL_POSES_STREAM = 1, 2
 """Random streams of a batch, besides 0 of the simulation."""
 CALIBRATED_QUANTITIES: Mapping[str, Quantity] = {
     "position": Quantity("rms", 1e3, "mm"),
@@ -135,7 +135,7 @@ class SimulatedCalibrations:
         """
         design, rng = self.design, batch.generator(0)
         # Truth and readings; one problem with the structure of the plan for all runs.
-        capture = captured(design, batch.generator(PHOTOGRAPH_PLAN_STREAM))
+        capture = captured(design, batch.generator(IMAGE_PLAN_STREAM))
         theta, poses, internal = _machines(design, capture, batch.runs, rng)
         readings = capture.joints + design.reading_noise * rng.standard_normal(
             (batch.runs, *capture.joints.shape)

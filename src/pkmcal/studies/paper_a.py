@@ -69,7 +69,7 @@ FOUR_STEP_FORMS: dict[str, FourStepForm] = {
 }
 
 PAPER_A_STATIONS = 3
-PHOTOGRAPHS_SOLVED_AT_ONCE = 25 * 45
+IMAGES_SOLVED_AT_ONCE = 25 * 45
 """Maximum number of images of all runs in a batch; larger batches exceed the processor's cache."""
 END_EFFECTOR_POSES = 10
 """Number of poses in each run at which the end-effector is compared, [A] 4.3."""
@@ -146,7 +146,7 @@ class HexapodByAxes:
 
     def populations(self, runs: int) -> list[Population]:
         """A single population of hexapods."""
-        most = max(1, PHOTOGRAPHS_SOLVED_AT_ONCE // (PAPER_A_STATIONS * self.poses))
+        most = max(1, IMAGES_SOLVED_AT_ONCE // (PAPER_A_STATIONS * self.poses))
         return [Population("hexapod", runs, self.batch or most)]
 
     def draw(self, batch: Batch) -> SimulatedRuns:

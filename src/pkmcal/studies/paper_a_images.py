@@ -37,7 +37,7 @@ def measured_noise(seed: int, progress: Callable[[str, float], None]) -> Measure
     """Render the images, calibrate the session, and compute the scatter of the axes."""
 
     def rendered(done: int, total: int) -> None:
-        progress(f"Photograph {done} of {total}", RENDERING_PROGRESS_SHARE * done / total)
+        progress(f"Image {done} of {total}", RENDERING_PROGRESS_SHARE * done / total)
 
     with tempfile.TemporaryDirectory(prefix="pkmcal-") as name:
         folder = Path(name) / "session"

@@ -97,7 +97,7 @@ def reproduce(options: Options) -> Outcome:
     """Reproduce [A] 4."""
     began = perf_counter()
     measured, done = None, 0.0
-    if options.photographs:
+    if options.images:
         from pkmcal.studies.paper_a_images import measured_noise
 
         done = 0.6

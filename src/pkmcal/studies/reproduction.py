@@ -32,14 +32,14 @@ MONTE_CARLO_NOTE = ", its Monte-Carlo error aside"
 class Options:
     """Options of a reproduction.
 
-    runs : number of the Monte-Carlo simulation. long : include parts that take minutes. photographs
+    runs : number of the Monte-Carlo simulation. long : include parts that take minutes. images
     : include measurements on rendered images. progress : callback with a text and the share done.
     """
 
     runs: int = 100
     seed: int = 0
     long: bool = False
-    photographs: bool = False
+    images: bool = False
     progress: StudyProgress = lambda _text, _share: None
 
     def within(self, first: float, last: float) -> StudyProgress:

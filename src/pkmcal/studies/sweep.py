@@ -61,12 +61,12 @@ class Varied:
 
 
 DESIGN_NAMES_VARIED: Mapping[str, Varied] = {
-    "resolution": Varied("width of the photographs", "px", 64, 20000, whole=True),
+    "resolution": Varied("width of the images", "px", 64, 20000, whole=True),
     "focal": Varied("focal length", "px", 10, 1e6),
     "distance": Varied("from the camera to the machine's middle", "m", 1e-3, 1e3),
     "elevation": Varied("of the camera above the machine's level", "°", -85, 85),
     "stations": Varied("places of the camera", "", 1, 100, whole=True),
-    "configurations": Varied("photographs from each place", "", 2, 1000, whole=True),
+    "configurations": Varied("images from each place", "", 2, 1000, whole=True),
     "edge_noise": Varied("deviation of an edge's place and of its ends", "px", 1e-4, 100),
     "corner_noise": Varied("deviation of a board's corner", "px", 1e-4, 100),
     "shading": Varied("deviation of a tube's side by its shading", "px", 0, 100),
@@ -79,7 +79,7 @@ DESIGN_NAMES_VARIED: Mapping[str, Varied] = {
     "camera": Varied("pinhole, mirror, or a camera's file", words=("pinhole", "mirror")),
 }
 PAPER_NAMES_VARIED: Mapping[str, Varied] = {
-    "configurations": Varied("photographs from each place", "", 5, 1000, whole=True),
+    "configurations": Varied("images from each place", "", 5, 1000, whole=True),
     "legs": Varied("legs that each camera sees", "", 3, 6, whole=True),
     "axis_noise": Varied("noise of an axis, times Table 1", "", 1e-3, 1e3),
     "reading_noise": Varied("deviation of a reading", "m", 1e-12, 1),
@@ -159,7 +159,7 @@ def _of_session(session: Session) -> StudySubject:
         raise InputError(
             "a study needs cameras that stand still",
             where=str(session.folder),
-            found="photographs by hand" if session.stations else "trackers alone",
+            found="images by hand" if session.stations else "trackers alone",
             next_step="Study the machine itself: pkmcal study with its mechanism file",
         )
     # What a study leaves out of the session.
@@ -183,7 +183,7 @@ def _of_session(session: Session) -> StudySubject:
     given = [place for place in poses if place is not None]
     if len(given) < len(poses):
         findings.append(note("study.chosen_stations"))
-    by_station = [{p.configuration for p in station.photographs} for station in session.stations]
+    by_station = [{p.configuration for p in station.images} for station in session.stations]
     usual = Design.configurations
     if not any(by_station):
         findings.append(note("study.no_images", number=usual))

@@ -20,7 +20,7 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.images import decode
-from pkmcal.session.image_files import Photograph, label_of
+from pkmcal.session.image_files import Image, label_of
 from pkmcal.session.load import Session, Station
 
 if TYPE_CHECKING:
@@ -79,16 +79,16 @@ class Viewed:
             raise InputError("there is no such station", found=s + 1)
         return self.session.stations[s]
 
-    def photograph(self, s: int, k: int) -> Photograph:
+    def image(self, s: int, k: int) -> Image:
         """Image of a station by its index. Raises InputError for an index out of range."""
-        photographs = self.station(s).photographs
-        if not 0 <= k < len(photographs):
-            raise InputError(f"station {self.station(s).name} has no such photograph", found=k + 1)
-        return photographs[k]
+        images = self.station(s).images
+        if not 0 <= k < len(images):
+            raise InputError(f"station {self.station(s).name} has no such image", found=k + 1)
+        return images[k]
 
     def _image(self, s: int, k: int) -> Integers:
         """Image as grey levels (height, width). Raises InputError as `decode`."""
-        path = self.photograph(s, k).path
+        path = self.image(s, k).path
         return decode(path, self.station(s).camera.image_size, label_of(self.session.folder, path))
 
     def jpeg(self, s: int, k: int) -> bytes:
@@ -102,7 +102,7 @@ class Viewed:
 
         The camera is at the station's pose, or at a default pose without one.
         """
-        row, station = self.photograph(s, k).configuration, self.station(s)
+        row, station = self.image(s, k).configuration, self.station(s)
         machine, joints = self.session.machine, self.session.joints[row]
         T_camera_base = station.T_camera_base
         T_camera_base = self.start(s) if T_camera_base is None else T_camera_base
@@ -138,7 +138,7 @@ class Viewed:
         With the estimated pose, intrinsics and focal scale of the station. Raises InputError if
         the calibration is of another session or lacks the station.
         """
-        saved, row, station = self.saved, self.photograph(s, k).configuration, self.station(s)
+        saved, row, station = self.saved, self.image(s, k).configuration, self.station(s)
         number = self.number(s)
         T_camera_base = inverse(saved.stations[number].T_base_camera)
         refined = saved.path.parent / written_camera(station.camera_file)

@@ -15,7 +15,7 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
-from pkmcal.observe.image_batches import Photographs
+from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.predict import EdgePoints, edge_points, legs_in_camera, tubes_of
 from pkmcal.pages.overlays import (
     EDGE_CURVE_POINTS,
@@ -58,7 +58,7 @@ def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
     out: dict[str, Any] = {"edges": [], "missed": [], "corners": [], "told": texts, "median": None}
     if "legs" in viewed.station(request.station).observe and len(tubes_of(pane.machine)):
         _legs(viewed, request, pane, out)
-    detection = viewed.corners(request.station, request.photograph)
+    detection = viewed.corners(request.station, request.image)
     if detection is not None:
         out["corners"] = np.round(detection.pixels, 1)
         corners = count(len(detection.ids), "corner")
@@ -70,13 +70,13 @@ def edge_search(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
 def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any]) -> None:
     """Measure the legs' edges and add them to the answer."""
     # measure the edges in a batch of this one image
-    row = viewed.photograph(request.station, request.photograph).configuration
-    taken = Photographs(
+    row = viewed.image(request.station, request.image).configuration
+    taken = StationImages(
         request.station,
         pane.camera,
         np.array([row]),
         pane.joints[None],
-        [viewed.image(request.station, request.photograph)],
+        [viewed.image(request.station, request.image)],
         pane.response,
         legs.first_binning(pane.camera.image_size),
     )
@@ -119,7 +119,7 @@ def _calibration_results(
     if request.shown != "calibration":
         return {}, {}
     document, s = viewed.saved.document, viewed.number(request.station) + 1
-    k = viewed.photograph(request.station, request.photograph).configuration
+    k = viewed.image(request.station, request.image).configuration
     rows = (document.get("residuals") or {}).get("edges") or []
     judged = {
         (int(leg) - 1, int(tube) - 1, int(side) - 1): _EdgeResult(weight, shift, tilt)
@@ -198,7 +198,7 @@ def _agreement_text(
 ) -> list[str]:
     """Sentences on the agreement of the machine with the image."""
     if measured + missed == 0:
-        return ["No leg of the machine would be in this photograph at this pose."]
+        return ["No leg of the machine would be in this image at this pose."]
     text = f"{measured} of {measured + missed} edges of legs are found"
     if median is None:
         return [f"It does not fit: {text}."]

@@ -18,7 +18,7 @@ from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
 from pkmcal.view.requests import ViewRequest
 from pkmcal.wording import brief, count
 
-FIT_PHOTOGRAPHS = 16
+FIT_IMAGES = 16
 """Images of a station that are used.
 
 A search uses eight and verifies with the others, in about a second; `calibrate` uses up to 64.
@@ -50,9 +50,7 @@ def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
     if many:
         localized, sure, text = _from_images(view, None if request.anywhere else start)
     else:
-        localized, sure, text = _from_one_image(
-            view, viewed.image(request.station, request.photograph)
-        )
+        localized, sure, text = _from_one_image(view, viewed.image(request.station, request.image))
     pose = localized if sure else start
     # overlay at the localized pose, without the gesture and pins that led to the start
     plain = {"pose": tuple(map(tuple, pose.tolist())), "gesture": None, "pins": ()}
@@ -82,7 +80,7 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
     else:
         text = (
             f"Not recognised in {shots} about this pose. Bring two or three joints to their places"
-            " and try again, or check whether nominal model, readings and photographs"
+            " and try again, or check whether nominal model, readings and images"
             " belong together."
         )
     return pose.T_camera_base, pose.good, text
@@ -103,8 +101,8 @@ def _search_view(viewed: Viewed, s: int) -> StationView:
     views: dict[int, StationView] = viewed.views
     if s not in views:
         session, station = viewed.session, viewed.station(s)
-        rows = np.array([photo.configuration for photo in station.photographs])
-        few = np.unique(np.linspace(0, len(rows) - 1, min(FIT_PHOTOGRAPHS, len(rows))).astype(int))
+        rows = np.array([photo.configuration for photo in station.images])
+        few = np.unique(np.linspace(0, len(rows) - 1, min(FIT_IMAGES, len(rows))).astype(int))
         tables = distance_tables([viewed.image(s, int(k)) for k in few])
         views[s] = StationView(
             session.machine,

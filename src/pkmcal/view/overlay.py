@@ -31,7 +31,7 @@ STATION_POSE_DECIMALS = 4
 def pane_of(viewed: Viewed, request: ViewRequest) -> Pane:
     """Machine of a request, in front of the camera at the pose of the files."""
     pane_at = viewed.calibrated if request.shown == "calibration" else viewed.drawn
-    return pane_at(request.station, request.photograph)
+    return pane_at(request.station, request.image)
 
 
 def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def _joint(viewed: Viewed, request: ViewRequest, k: int) -> Array:
     Raises InputError for a leg that the machine lacks.
     """
     pin = request.pins[k]
-    other = request.model_copy(update={"photograph": pin.photograph})
+    other = request.model_copy(update={"photograph": pin.image})
     points = pane_of(viewed, other).points[0 if pin.end == "base" else 1]
     if pin.leg > len(points):
         raise InputError("there is no such leg", where=f"the page, pins[{k + 1}]", found=pin.leg)

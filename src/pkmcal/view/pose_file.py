@@ -33,7 +33,7 @@ class PoseFile:
             raise InputError(
                 "a camera that is held by hand has no one pose to be written",
                 where=f"{SESSION_FILE_NAME}, {'.'.join(keys[:2])}",
-                next_step="Every such photograph is placed when you calibrate",
+                next_step="Every such image is placed when you calibrate",
             )
         # one writer at a time; the file must be the one that this page read or wrote last
         with self._lock:

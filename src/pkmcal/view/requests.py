@@ -25,7 +25,7 @@ class Pin(Schema):
     leg : from 1.
     """
 
-    photograph: int
+    image: int
     end: Literal["base", "platform"]
     leg: int = Field(ge=1)
     pixel: Pixel
@@ -51,7 +51,7 @@ class ViewRequest(Schema):
     """
 
     station: int
-    photograph: int
+    image: int
     shown: DisplayMachine = "drawing"
     pose: tuple[RequestedPoseRow, RequestedPoseRow, RequestedPoseRow, RequestedPoseRow] | None = (
         None

@@ -85,7 +85,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return endpoint
 
     # files and images by GET
-    async def photograph(request: Request) -> Response:
+    async def image(request: Request) -> Response:
         s, k = request.path_params["s"], request.path_params["k"]
         return await _answered(lambda: Response(viewed.jpeg(s, k), media_type="image/jpeg"))
 
@@ -104,7 +104,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         Route("/", page),
         Route("/view.js", script),
         Route("/view.css", style),
-        Route("/photograph/{s:int}/{k:int}", photograph),
+        Route("/photograph/{s:int}/{k:int}", image),
         *(
             Route(f"/{name}", answering(answer), methods=["POST"])
             for name, answer in (
@@ -169,7 +169,7 @@ def view_page_html(viewed: Viewed) -> str:
             "posed": station.T_camera_base is not None,
             "photographs": [
                 " ".join([session.configurations[p.configuration], *filter(None, [p.repeat])])
-                for p in station.photographs
+                for p in station.images
             ],
         }
         for station in session.stations
