@@ -7,7 +7,7 @@ import pytest
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
 from pkmcal.observe.background import (
-    FEWEST_POINT_PAIRS,
+    BACKGROUND_OPTIONS,
     Neighbour,
     Surroundings,
     Texture,
@@ -130,7 +130,7 @@ def test_chance_is_not_taken_for_agreement():
 
 
 def test_few_pairs_tell_nothing():
-    ray = np.tile([0.0, 0.0, 1.0], (FEWEST_POINT_PAIRS - 1, 1))
+    ray = np.tile([0.0, 0.0, 1.0], (BACKGROUND_OPTIONS.fewest_pairs - 1, 1))
     assert agreement(ray, ray, looking(0) @ inverse(looking(20))) == 0.0
 
 

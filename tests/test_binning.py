@@ -19,7 +19,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import binned
 from pkmcal.observe.legs import first_binning, measure, sharp_binning
-from pkmcal.observe.profiles import BLURS_TRIED
+from pkmcal.observe.profiles import PROFILE_OPTIONS
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
 
@@ -58,7 +58,7 @@ def test_what_is_sharper_is_binned_less():
     """A lens of 1.6 px is as sharp as usual over two pixels; one of 0.6 px over one. Nothing is
     binned more than before but where profiles do not reach.
     """
-    blur = np.arange(0.3, BLURS_TRIED[-1] - 0.01, 0.05)
+    blur = np.arange(0.3, PROFILE_OPTIONS.blurs[-1] - 0.01, 0.05)
     for binning in (1, 2, 4):
         next_ones = [sharp_binning(binning, b) for b in blur]
         assert all(1 <= n <= binning for n in next_ones)
@@ -66,7 +66,7 @@ def test_what_is_sharper_is_binned_less():
     assert sharp_binning(4, 1.63 / 4) == 2
     assert sharp_binning(2, 1.63 / 2) == 2
     assert sharp_binning(2, 0.45) == 1
-    assert [sharp_binning(k, BLURS_TRIED[-1]) for k in (1, 2)] == [2, 4]
+    assert [sharp_binning(k, PROFILE_OPTIONS.blurs[-1]) for k in (1, 2)] == [2, 4]
 
 
 def test_binned_images_give_the_edges_of_small_ones():

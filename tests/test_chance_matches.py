@@ -13,8 +13,8 @@ from pkmcal.calibration.chance_matches import IMAGE_OFFSET, by_chance, chance_ma
 from pkmcal.calibration.refinement import RefinementResult
 from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
-from pkmcal.observe.legs import OUT_OF_SIGHT_REASON, measure
-from pkmcal.observe.profiles import USUAL_BLUR
+from pkmcal.observe.legs import measure
+from pkmcal.observe.profiles import PROFILE_OPTIONS
 from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
 
@@ -56,7 +56,7 @@ def test_edges_of_a_machine_that_is_elsewhere_are():
     (why,) = chance_match_reason(turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)))
     assert "may not be the machine in the images" in why.text
     in_view = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)).observation
-    hidden = sum(r.reason == OUT_OF_SIGHT_REASON for r in in_view.rejected)
+    hidden = sum(r.code == "edges.out_of_sight" for r in in_view.rejected)
     in_sight = len(in_view.edges) + len(in_view.rejected) - hidden
     assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why.text
 
@@ -75,7 +75,7 @@ def test_repeats_count_once():
     """
     once = aside(taken(), 2.5 * IMAGE_OFFSET)
     twice = once.select(np.repeat(np.arange(len(once.images)), 2))
-    turns = turns_of(once)._replace(blur={0: USUAL_BLUR})
+    turns = turns_of(once)._replace(blur={0: PROFILE_OPTIONS.usual_blur})
     assert chance_match_reason(turns._replace(images=[twice])) == chance_match_reason(turns) != ()
 
 

@@ -52,8 +52,8 @@ from pkmcal.observe.image_localization import (
 )
 from pkmcal.observe.images import decode
 from pkmcal.observe.pose_likelihood import StationView, log_likelihood_of
-from pkmcal.observe.station_localization import RIVAL_POSE_PROBABILITY
-from pkmcal.observe.tubes import PAIR_DIRECTIONS, SURPRISAL_STEPS, tube_chart
+from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
+from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, tube_chart
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Level
 from pkmcal.report.calibration import outcome_of
@@ -522,7 +522,7 @@ def found_with(monkeypatch, truth, faults, textured=False):
     monkeypatch.setattr(handheld, "THREADS", 1)
     if not textured:
         empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
-        monkeypatch.setattr(background, "texture_of", lambda _image, _camera: empty)
+        monkeypatch.setattr(background, "texture_of", lambda *_: empty)
 
 
 def placed(remeasured, monkeypatch, faults, textured=False):
@@ -540,7 +540,7 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
     world = rng.uniform(-1.2, 1.2, (6000, 3))
     names = rng.standard_normal((len(world), 128)).astype(np.float32)
 
-    def texture(image, camera):
+    def texture(image, camera, _options):
         k = next(k for k, p in enumerate(images) if p.images[0] is image)
         visible = apply(truth.T_camera_base[k], world)
         pixel = camera.project(np.where(visible[:, 2:] > 0.1, visible, np.nan))
@@ -688,9 +688,12 @@ def test_tubes_stand_out_of_a_chart():
     chart = tube_chart(image, camera_of_size((400, 300)))
     clear = chart.surprisal.max(axis=(2, 3))
     wide = int(chart.width_number(np.array(10.0)))
-    normal = round(np.arctan2(200, 140) % np.pi * PAIR_DIRECTIONS / np.pi)
-    assert clear[wide, normal] > SURPRISAL_STEPS * np.log(20)
-    assert clear[wide, (normal + PAIR_DIRECTIONS // 2) % PAIR_DIRECTIONS] == 0
+    normal = round(np.arctan2(200, 140) % np.pi * TUBE_CHART_OPTIONS.directions / np.pi)
+    assert clear[wide, normal] > TUBE_CHART_OPTIONS.steps * np.log(20)
+    assert (
+        clear[wide, (normal + TUBE_CHART_OPTIONS.directions // 2) % TUBE_CHART_OPTIONS.directions]
+        == 0
+    )
 
 
 @pytest.mark.slow
@@ -702,7 +705,7 @@ def test_one_image_is_found_from_nothing(looked):
     view = view_of(session, p, poses)
     value = localize_image(view, p.images[0])
     off = pose_difference(value.T_camera_base[0], truth.T_camera_base[k])
-    assert value.rival_probability < RIVAL_POSE_PROBABILITY
+    assert value.rival_probability < LOCALIZATION_OPTIONS.rival
     assert np.degrees(np.linalg.norm(off[:3])) < 4
     assert np.linalg.norm(off[3:]) < 0.1
 

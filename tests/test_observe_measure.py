@@ -11,21 +11,16 @@ from pkmcal.observe import legs as looks
 from pkmcal.observe.grey_levels import levels_at
 from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages
 from pkmcal.observe.legs import (
-    EDGE_SEGMENTS,
-    FEWEST_PROFILES_A_POINT,
-    MOST_PROFILES_A_POINT,
-    POINTS_A_SEGMENT,
+    EDGE_OPTIONS,
     _segment_profiles,
     measure,
 )
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.observe.profiles import (
-    EDGE_SIGMA_FLOOR,
-    FAINT_EDGE_SIGMA,
-    MEASUREMENTS_AN_EDGE,
+    EDGE_FIT_OPTIONS,
+    PROFILE_OPTIONS,
     edge_set,
     fit_edges,
-    sampled_offsets,
 )
 from test_observe_drawing import (
     FRONT,
@@ -93,25 +88,29 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     """
     mechanism, camera = redrawn(0, 0.0005), camera_of()
     visible = ImageWindow.of([Placed(taken(), FRONT, poses())])
-    tubes, points, clear = looks.predicted(visible, mechanism, EDGE_SEGMENTS * POINTS_A_SEGMENT)
+    tubes, points, clear = looks.predicted(
+        visible, mechanism, EDGE_OPTIONS.segments * EDGE_OPTIONS.segment_points
+    )
     clear[:, :, 7] = False
-    width = (points.gain * mechanism.values[tubes.radius][:, None])[..., 1::POINTS_A_SEGMENT]
-    full, across = _segment_profiles(visible, points, clear, width)
+    width = (points.gain * mechanism.values[tubes.radius][:, None])[
+        ..., 1 :: EDGE_OPTIONS.segment_points
+    ]
+    full, across = _segment_profiles(visible, points, clear, width, EDGE_OPTIONS)
     pitch = np.linalg.norm(np.diff(points.pixel, axis=2), axis=-1)
     kinds: set[int] = set()
     for n in np.random.default_rng(0).choice(full.sum(), 40, replace=False):
         k, e, segment = (where[n] for where in np.nonzero(full))
-        first = POINTS_A_SEGMENT * segment
-        end = first + POINTS_A_SEGMENT
+        first = EDGE_OPTIONS.segment_points * segment
+        end = first + EDGE_OPTIONS.segment_points
         furthest = np.ceil(pitch[k, e, first : end - 1].max())
-        each = int(np.clip(furthest, FEWEST_PROFILES_A_POINT, MOST_PROFILES_A_POINT))
+        each = int(np.clip(furthest, EDGE_OPTIONS.fewest_profiles, EDGE_OPTIONS.most_profiles))
         mine = [p for p in range(first, end) if clear[k, e, p]]
         step = points.point[k, e, 1] - points.point[k, e, 0]
         turns = (np.arange(each) + 0.5) / each - 0.5
         place = [points.point[k, e, p] + turn * step for p in mine for turn in turns]
         outward = np.repeat(points.outward[k, e, mine], each, axis=0)
         pixel = camera.project(np.array(place))[:, None]
-        pixel = pixel + sampled_offsets()[:, None] * outward[:, None]
+        pixel = pixel + PROFILE_OPTIONS.sampled_offsets[:, None] * outward[:, None]
         grey = levels_at(visible.images[k], pixel[..., 0], pixel[..., 1], cubic=True).mean(axis=0)
         assert across.count[n] == len(place)
         # OpenCV 4 rounds places to a 32nd of a pixel
@@ -122,7 +121,7 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     pixel = points.pixel.copy()
     pixel[:, :, 0] = np.nan
     clear[:, :, 0] = False
-    nearer = _segment_profiles(visible, replace(points, pixel=pixel), clear, width)[1]
+    nearer = _segment_profiles(visible, replace(points, pixel=pixel), clear, width, EDGE_OPTIONS)[1]
     _, _, segment = np.nonzero(full)
     np.testing.assert_array_equal(nearer.count[segment > 0], across.count[segment > 0])
 
@@ -154,8 +153,8 @@ def test_the_points_lie_on_the_true_edges():
     outward = shifted / np.linalg.norm(shifted, axis=1, keepdims=True)
     off = outward_to(normal, value.points[:, None], outward[:, None], camera)[:, 0]
     assert rms(off) < 0.06
-    # a place supports an edge within three of its sigmas, which reach FAINT_EDGE_SIGMA
-    assert np.abs(off).max() < 3 * FAINT_EDGE_SIGMA
+    # a place supports an edge within three of its sigmas, which reach PROFILE_OPTIONS.faint_sigma
+    assert np.abs(off).max() < 3 * PROFILE_OPTIONS.faint_sigma
 
 
 def test_a_image_that_shows_no_leg_leaves_the_others_as_they_are():
@@ -265,7 +264,7 @@ def test_turns_are_those_of_weighted_least_squares():
     assert set(count.ravel()) == set(range(SAMPLES + 1))
     np.testing.assert_array_equal(fits.good, count > 2)
     assert np.isfinite(fits.turn).all()
-    variance = 0.1**2 + EDGE_SIGMA_FLOOR**2
+    variance = 0.1**2 + EDGE_FIT_OPTIONS.sigma_floor**2
     for k, e in zip(*np.nonzero(fits.good), strict=True):
         visible = values[k, e]
         mine = rows[k, e, visible]
@@ -274,7 +273,9 @@ def test_turns_are_those_of_weighted_least_squares():
         scale = np.abs(solution).max()
         np.testing.assert_allclose(fits.operator[k, e][:, visible], solution, atol=1e-6 * scale)
         assert not fits.operator[k, e][:, ~visible].any()
-        expected = solution @ solution.T * variance * max(count[k, e] / MEASUREMENTS_AN_EDGE, 1)
+        expected = (
+            solution @ solution.T * variance * max(count[k, e] / EDGE_FIT_OPTIONS.effective, 1)
+        )
         np.testing.assert_allclose(fits.covariance[k, e], expected, rtol=1e-6)
 
 
@@ -291,15 +292,15 @@ def test_positions_on_a_highlight_do_not_pull_the_edge():
 
 def test_an_edge_counts_as_two_measurements_however_many_its_places():
     """Positions that err together, as shading has it: the shift's sigma is the place's over
-    the root of MEASUREMENTS_AN_EDGE, and errors that are common to an edge stay within it."""
+    the root of EDGE_FIT_OPTIONS.effective, and errors that are common to an edge stay within it."""
     rng = np.random.default_rng(1)
     sigma = 0.1
-    common = sigma / np.sqrt(MEASUREMENTS_AN_EDGE) * rng.normal(size=(6, 24, 1))
+    common = sigma / np.sqrt(EDGE_FIT_OPTIONS.effective) * rng.normal(size=(6, 24, 1))
     own = 0.02 * rng.normal(size=(6, 24, SAMPLES))
     _, points = predicted()
     _, edges = fitted(common + own, sigma)
     shift = np.sqrt(edges.covariance[:, 0, 0]) / np.abs(edges.shift[:, 0])
-    expected = np.hypot(sigma, EDGE_SIGMA_FLOOR) / np.sqrt(MEASUREMENTS_AN_EDGE)
+    expected = np.hypot(sigma, EDGE_FIT_OPTIONS.sigma_floor) / np.sqrt(EDGE_FIT_OPTIONS.effective)
     # tilt and shift are not quite independent, and weights differ a little along an edge
     np.testing.assert_allclose(shift, expected, rtol=0.15)
     turn = np.einsum("nij,ni->nj", edges.basis, edges.normal - points.normal.reshape(-1, 3))

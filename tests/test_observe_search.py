@@ -13,17 +13,16 @@ from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotat
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import pose_likelihood, station_localization
 from pkmcal.observe.distance_tables import (
-    CHANCE_DISTANCE_BIN,
-    EDGE_DIRECTIONS,
+    DISTANCE_TABLE_OPTIONS,
     direction_of,
     distance_tables,
 )
 from pkmcal.observe.image_batches import StationImages
-from pkmcal.observe.legs import LEG_SEARCH_REACH, search, search_legs
+from pkmcal.observe.legs import LEG_SEARCH_OPTIONS, search, search_legs
 from pkmcal.observe.pose_likelihood import StationView, score
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
-from pkmcal.observe.station_localization import find_station
+from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_station
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import camera_of_size
@@ -99,7 +98,7 @@ def test_a_leg_that_is_not_there_is_not_found():
 def test_a_leg_beyond_the_search_is_not_found():
     """All edges moved sideways by more than the reach: the place at its end is no place. A few
     legs meet their neighbours' edges instead."""
-    far = int(LEG_SEARCH_REACH) + 6
+    far = int(LEG_SEARCH_OPTIONS.reach) + 6
     shifted = [np.roll(image, far, axis=1) for image in images()]
     assert looked_for(machine(), shifted)[0].clear.mean() < 0.35
 
@@ -149,7 +148,7 @@ def test_images_are_asked_under_each_name_as_if_they_bore_it():
     fits = pose_likelihood.log_likelihood_by_name(view, FRONT, names)
     every = np.arange(len(images()))
     own = pose_likelihood.distances_under(view, FRONT[None], every, 8)
-    mixture = own.mixture(pose_likelihood.first_mixture(1), rounds=10)
+    mixture = pose_likelihood.mixture_of(own)
     for name, fit in zip(names, fits.T, strict=True):
         named = replace(view, configuration=np.full(len(every), name))
         count = pose_likelihood.distances_under(named, FRONT[None], every, 8).log_likelihood(
@@ -251,27 +250,27 @@ def test_a_search_goes_further_only_where_the_pose_is_not_near(monkeypatch, degr
     """
     searched, searching = [], station_localization._random_search
 
-    def noted(view, values, rng):
+    def noted(view, values, *rest):
         searched.append(values.nearness.tried)
-        return searching(view, values, rng)
+        return searching(view, values, *rest)
 
     monkeypatch.setattr(station_localization, "_random_search", noted)
     rough = rough_pose(3, degrees, distance)
     localization = find_station(view_of(images()), rough, np.random.default_rng(3))
     assert localization.sure
     assert inconsistent_poses(localization.T_camera_base) < 5
-    assert searched[0] == station_localization.NEAR.tried
-    assert (station_localization.FAR.tried in searched) == far
+    assert searched[0] == LOCALIZATION_OPTIONS.near.tried
+    assert (LOCALIZATION_OPTIONS.far.tried in searched) == far
 
 
 def test_a_near_pose_is_near_by_turn_and_shift_together():
     """Its six deviations' squares are one on average; turned and shifted by a deviation along each
     axis is the limit."""
-    step = station_localization.NEAR.spread * (1 - 1e-9)
+    step = LOCALIZATION_OPTIONS.near.spread * (1 - 1e-9)
     for size, near in ((1.0, True), (1.001, False)):
         other = inverse(inverse(FRONT) @ pose(rotation(size * step[:3]), size * step[3:]))
-        assert station_localization.NEAR.reaches(FRONT, other) == near
-        assert station_localization.NEAR.reaches(other, FRONT) == near
+        assert LOCALIZATION_OPTIONS.near.reaches(FRONT, other) == near
+        assert LOCALIZATION_OPTIONS.near.reaches(other, FRONT) == near
 
 
 def test_edges_behind_the_camera_count_as_not_found():
@@ -347,11 +346,13 @@ def test_images_of_other_configurations_are_not_recognised():
 
 # Distance tables
 
+DIRECTIONS = DISTANCE_TABLE_OPTIONS.directions
 
-@pytest.mark.parametrize("at_once", [pose_likelihood.SILHOUETTE_PLACES_AT_ONCE, 500])
-def test_places_that_are_only_weighed_find_what_those_find_that_descend(monkeypatch, at_once):
-    monkeypatch.setattr(pose_likelihood, "SILHOUETTE_PLACES_AT_ONCE", at_once)
+
+@pytest.mark.parametrize("at_once", [pose_likelihood.LIKELIHOOD_OPTIONS.places_at_once, 500])
+def test_places_that_are_only_weighed_find_what_those_find_that_descend(at_once):
     view = view_of(images())
+    view = replace(view, options=replace(view.options, places_at_once=at_once))
     at = np.stack([rough_pose(seed) for seed in range(5)])
     every = np.arange(len(view.configuration))
     weighed = pose_likelihood.distances_under(view, at, every, 6)
@@ -364,9 +365,9 @@ def test_places_that_are_only_weighed_find_what_those_find_that_descend(monkeypa
 def test_directions_are_of_lines_not_of_arrows():
     angle = np.linspace(0, 2 * np.pi, 200, endpoint=False) + 1e-3
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    number = direction_of(normal)
-    np.testing.assert_array_equal(number, direction_of(-normal))
-    np.testing.assert_array_equal(np.unique(number), np.arange(EDGE_DIRECTIONS))
+    number = direction_of(normal, DIRECTIONS)
+    np.testing.assert_array_equal(number, direction_of(-normal, DIRECTIONS))
+    np.testing.assert_array_equal(np.unique(number), np.arange(DIRECTIONS))
     assert np.all(np.diff(number[:100]) >= 0)
 
 
@@ -381,11 +382,11 @@ def test_tables_of_a_direction_are_worked_out_when_it_is_looked_for():
     chance = tables.by_chance(np.array([5]), distance)
     np.testing.assert_array_equal(np.flatnonzero(tables.tables.ready), [3, 5])
     # independent of earlier searches
-    tables.tables.get_ready(np.arange(EDGE_DIRECTIONS))
+    tables.tables.get_ready(np.arange(DIRECTIONS))
     assert tables.look_up(one, pixel, np.array(0))[0] == distance
     assert tables.by_chance(np.array([5]), distance) == chance
     np.testing.assert_allclose(
-        tables.tables.chance.sum(axis=1) * CHANCE_DISTANCE_BIN, 1.0, rtol=1e-5
+        tables.tables.chance.sum(axis=1) * DISTANCE_TABLE_OPTIONS.bin_width, 1.0, rtol=1e-5
     )
 
 
@@ -394,7 +395,7 @@ def test_tables_hold_the_distance_to_an_edge_of_that_direction():
     image = np.full((480, 640), 200, np.uint8)
     image[:, :320] = 40
     tables = distance_tables([image])
-    upright, level = direction_of(np.array([[1.0, 0.0], [0.0, 1.0]]))
+    upright, level = direction_of(np.array([[1.0, 0.0], [0.0, 1.0]]), DIRECTIONS)
     x = np.array([20.0, 200.0, 319.5, 400.0, 620.0])
     pixel = np.stack([x, np.full(5, 240.0)], axis=-1)
     distance, inside = tables.look_up(upright, pixel, np.array(0))
@@ -427,12 +428,12 @@ def test_edges_that_never_move_are_left_out_where_images_can_be_compared():
         picture = shelf.copy()
         picture[200:400, 100 + 60 * k : 130 + 60 * k] = 20
         pictures.append(picture)
-    level = direction_of(np.array([0.0, 1.0]))
+    level = direction_of(np.array([0.0, 1.0]), DIRECTIONS)
     on_shelf, number = np.array([[600.0, 100.0]]), np.zeros(1, dtype=int)
     few, many = distance_tables(pictures[:2]), distance_tables(pictures)
     assert few.look_up(level, on_shelf, number)[0] < 2
     assert many.look_up(level, on_shelf, number)[0] > 20
-    upright = direction_of(np.array([1.0, 0.0]))
+    upright = direction_of(np.array([1.0, 0.0]), DIRECTIONS)
     assert many.look_up(upright, np.array([[100.0, 300.0]]), number)[0] < 2
 
 

@@ -13,15 +13,12 @@ import numpy as np
 import pytest
 
 from pkmcal.observe.profiles import (
-    EDGE_SHIFTS,
-    SATURATED_GREY_LEVEL,
+    PROFILE_OPTIONS,
     Profiles,
     cut_of,
     estimate_blur,
     locate,
-    profile_offsets,
     residual_curves,
-    sampled_offsets,
     without_highlights,
 )
 
@@ -111,7 +108,7 @@ def make(
 ):
     """Random profiles; the signal is exact at the profile's places, the noise interpolated."""
     rng = np.random.default_rng(seed)
-    offsets = sampled_offsets()
+    offsets = PROFILE_OPTIONS.sampled_offsets
     grey, truth, widths, clipped = [], [], [], []
     for _ in range(number):
         limb = draw_limb(rng, light, albedo, ground, half_width, least_contrast, lamp)
@@ -126,9 +123,9 @@ def make(
         grey.append(samples.mean(axis=0))
         truth.append(shift)
         widths.append(limb.half_width)
-        clipped.append(np.any(samples >= SATURATED_GREY_LEVEL, axis=0))
+        clipped.append(np.any(samples >= PROFILE_OPTIONS.saturated, axis=0))
     counts = np.full(number, float(count))
-    explained = np.array(clipped)[:, -len(profile_offsets()) :]
+    explained = np.array(clipped)[:, -len(PROFILE_OPTIONS.profile_offsets) :]
     station = np.zeros(number, dtype=int)
     profiles = Profiles.of(np.array(grey), explained, counts, np.array(widths), station)
     return Made(profiles, np.array(truth))
@@ -143,7 +140,7 @@ def plain(grey, half_width):
 
 def steepest(profiles):
     """Place of the strongest gradient, to sub-pixel by a parabola."""
-    offsets, slope = profile_offsets(), np.abs(np.gradient(profiles.grey, axis=1))
+    offsets, slope = PROFILE_OPTIONS.profile_offsets, np.abs(np.gradient(profiles.grey, axis=1))
     best = np.clip(slope.argmax(axis=1), 1, len(offsets) - 2)
     left, here, right = (slope[np.arange(len(best)), best + d] for d in (-1, 0, 1))
     step = np.clip((left - right) / (2 * (left - 2 * here + right) - 1e-9), -1, 1)
@@ -157,7 +154,7 @@ def rms(values):
 def located(profiles, blur):
     """Positions of profiles each by itself: about the trial position that leaves least."""
     curves = residual_curves(profiles, {0: blur})
-    return locate(profiles, curves, EDGE_SHIFTS[curves.argmin(axis=-1)])
+    return locate(profiles, curves, PROFILE_OPTIONS.shifts[curves.argmin(axis=-1)])
 
 
 BRIGHT_TUBE = {"albedo": (120, 230), "ground": (20, 60)}
@@ -266,7 +263,7 @@ def test_clipped_samples_that_are_not_cut_would_bias():
 def test_cut_of_reaches_to_the_outermost_saturated_sample():
     saturated = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [1, 0, 1, 0], [0, 0, 0, 1]], dtype=bool)
     # profiles of four samples would be all outside: a wide leg keeps every unsaturated one
-    offsets = profile_offsets()
+    offsets = PROFILE_OPTIONS.profile_offsets
     wide = np.zeros((4, len(offsets)), dtype=bool)
     wide[:, :4] = saturated
     assert cut_of(wide, np.full(4, 40.0)).tolist() == [0, 1, 3, 4]
@@ -274,7 +271,7 @@ def test_cut_of_reaches_to_the_outermost_saturated_sample():
 
 def test_slim_legs_are_looked_at_near_their_limb_only():
     """Under half of the half width, where shading is diffuse; never less than a pixel and a bit."""
-    offsets = profile_offsets()
+    offsets = PROFILE_OPTIONS.profile_offsets
     width = np.array([2.0, 5.0, 8.0, 50.0])
     cut = cut_of(np.zeros((4, len(offsets)), dtype=bool), width)
     depth = -offsets[cut]
@@ -350,7 +347,7 @@ def test_the_place_does_not_depend_on_the_blurs_digits(blur):
     step = np.where(PLACE < 0, 180.0, 40.0)
     level = blurred(step, blur)
     truth = np.linspace(-1, 1, 9)
-    grey = np.stack([np.interp(profile_offsets() - t, PLACE, level) for t in truth])
+    grey = np.stack([np.interp(PROFILE_OPTIONS.profile_offsets - t, PLACE, level) for t in truth])
     profiles = plain(grey, 12.0)
     at = located(profiles, blur)
     assert at.valid.all()
@@ -359,7 +356,7 @@ def test_the_place_does_not_depend_on_the_blurs_digits(blur):
 
 def test_profiles_of_many_widths_cuts_and_blurs_are_worked_out_as_each_by_itself():
     profiles, rng = make(22, 60, half_width=(2, 90)).profiles, np.random.default_rng(22)
-    cut = rng.integers(0, len(profile_offsets()) - 2, len(profiles.cut))
+    cut = rng.integers(0, len(PROFILE_OPTIONS.profile_offsets) - 2, len(profiles.cut))
     mixed = replace(profiles, cut=cut, station=rng.choice([0, 3, 7], len(cut)))
     blur = {0: 0.7, 3: 0.5, 7: 1.1}
     together = residual_curves(mixed, blur)
@@ -370,7 +367,7 @@ def test_profiles_of_many_widths_cuts_and_blurs_are_worked_out_as_each_by_itself
 def test_where_there_is_no_edge_none_is_found():
     rng = np.random.default_rng(8)
     for noise in (0.2, 1.0, 5.0):
-        grey = 120 + noise * rng.normal(size=(200, len(profile_offsets())))
+        grey = 120 + noise * rng.normal(size=(200, len(PROFILE_OPTIONS.profile_offsets)))
         flat = plain(grey, 12.0)
         assert located(flat, 0.7).valid.mean() < 0.01
 
@@ -378,6 +375,6 @@ def test_where_there_is_no_edge_none_is_found():
 @pytest.mark.parametrize("away", [-2.5, -1.7, 1.7])
 def test_an_edge_out_of_reach_is_not_found(away):
     level = blurred(Limb(12, 0.8, 200, 30, 0.0).brightness(), 0.7)
-    grey = np.interp(profile_offsets() - away, PLACE, level)[None]
+    grey = np.interp(PROFILE_OPTIONS.profile_offsets - away, PLACE, level)[None]
     alone = plain(grey, 12.0)
     assert not located(alone, 0.7).valid.any()

@@ -31,7 +31,7 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.legs import StationEdges
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
-    combined,
+    combine_repeats,
     groups_of,
     mean_covariance,
     mean_edges,
@@ -115,13 +115,13 @@ def test_medians_and_exchanges_stay_inside_their_group():
 
 def test_a_look_without_repeats_is_left_as_it_is(machine, poses):
     edges = look_of(edges_of(machine, poses[:3]))
-    assert combined(edges) is edges
+    assert combine_repeats(edges) is edges
 
 
 def test_repeats_become_one_edge_at_their_mean_and_keep_their_points(machine, poses):
     edges = edges_of(machine, poses[:6])
     look = look_of(repeated(edges, 5, 0.02, np.random.default_rng(0)))
-    one = combined(look)
+    one = combine_repeats(look)
     assert np.array_equal(keys(one.edges), keys(edges.select(same_edges(edges).first)))
     assert not one.rejected
     number = one.points[:, 0].astype(int)
@@ -201,7 +201,7 @@ def spoiled(many, rows, pixels):
 def test_a_bad_repeat_is_left_out_and_told(machine, poses):
     edges = edges_of(machine, poses[:6])
     many = repeated(edges, 5, 0.02, np.random.default_rng(0))
-    good, bad = combined(look_of(many)), combined(look_of(spoiled(many, [7], 1.0)))
+    good, bad = combine_repeats(look_of(many)), combine_repeats(look_of(spoiled(many, [7], 1.0)))
     (values,) = bad.rejected
     assert (values.configuration, values.leg, values.tube, values.side) == tuple(keys(many)[7])
     assert values.reason.startswith("a repeat lies 9.")
@@ -215,7 +215,7 @@ def test_a_bad_repeat_is_left_out_and_told(machine, poses):
 def test_repeats_without_a_majority_are_left_out(machine, poses):
     edges = edges_of(machine, poses[:6])
     many = repeated(edges, 2, 0.02, np.random.default_rng(0))
-    one = combined(look_of(spoiled(many, [7], 1.0)))
+    one = combine_repeats(look_of(spoiled(many, [7], 1.0)))
     (values,) = one.rejected
     assert values.reason.startswith("its repeats lie up to 4.9 ")
     assert values.reason.endswith("standard deviations off, and no majority agrees")
@@ -227,7 +227,7 @@ def test_an_edge_that_shows_now_and_then_is_left_out(machine, poses):
     edges = edges_of(machine, poses[:6])
     many = repeated(edges, 4, 0.02, np.random.default_rng(0))
     late = np.arange(len(many)) >= 2 * len(edges)
-    one = combined(look_of(many.select(~((keys(many) == keys(many)[7]).all(axis=1) & late))))
+    one = combine_repeats(look_of(many.select(~((keys(many) == keys(many)[7]).all(axis=1) & late))))
     (values,) = one.rejected
     assert values.reason == "seen in only 2 of 4 repeats"
     assert len(one.edges) == len(edges) - 1

@@ -27,7 +27,7 @@ from pkmcal.identify.verdict import POLISHED_SHADING
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.image_localization import finest_view, refine_local
-from pkmcal.observe.pose_likelihood import LAST_REACH
+from pkmcal.observe.pose_likelihood import LIKELIHOOD_OPTIONS
 from pkmcal.observe.predict import edge_points, legs_in_camera
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.pages.page import page_html
@@ -130,11 +130,11 @@ def test_a_place_that_is_off_by_degrees_is_found_again(views, axis):
     turn = rotation(np.radians(6.0) * np.eye(3)[axis])
     middle = view.machine.base_centers().mean(axis=0) + np.array([0.0, 0.0, 0.15])
     away = T @ pose(turn, middle - turn @ middle)
-    values, log_likelihood_ratio = refine_local(view, away, LAST_REACH / 4)
+    values, log_likelihood_ratio = refine_local(view, away, LIKELIHOOD_OPTIONS.last_reach / 4)
     assert np.degrees(angle_between(values, T)) < 0.7
     eye = inverse(np.stack([values, T]))[:, :3, 3]
     assert np.linalg.norm(eye[0] - eye[1]) < 0.02
-    _, here = refine_local(view, T, LAST_REACH / 4)
+    _, here = refine_local(view, T, LIKELIHOOD_OPTIONS.last_reach / 4)
     assert log_likelihood_ratio == pytest.approx(here, rel=0.03)
 
 

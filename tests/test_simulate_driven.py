@@ -16,7 +16,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.observe.profiles import Profiles, estimate_blur, profile_offsets
+from pkmcal.observe.profiles import PROFILE_OPTIONS, Profiles, estimate_blur
 from pkmcal.simulation import (
     Settings,
     board_for,
@@ -308,7 +308,7 @@ def test_the_blur_is_not_told_by_a_few_odd_profiles():
     from test_profiles import make
 
     slim, wide = make(6, 300, blur=0.7).profiles, make(7, 5, blur=0.7).profiles
-    step = np.where(profile_offsets() < 0, 200.0, 20.0)
+    step = np.where(PROFILE_OPTIONS.profile_offsets < 0, 200.0, 20.0)
     sharp = replace(wide, grey=np.broadcast_to(step, wide.grey.shape))
     cut = np.r_[np.full(5, 0), np.full(len(slim.grey), 1)]
     both = Profiles(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
 from pkmcal.boards.find import (
-    LEAST_DETECTED_CORNERS,
+    BOARD_DETECTION_OPTIONS,
     Markers,
     charuco_detector,
     detect_board,
@@ -21,35 +22,46 @@ from pkmcal.boards.find import (
     dictionary,
     find_chessboard,
 )
-from pkmcal.boards.layout import LEAST_MARKER_SIDE, another_grid, marker_layout
+from pkmcal.boards.layout import MARKER_LAYOUT_OPTIONS, another_grid, marker_layout
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.observe.images import decode
 from pkmcal.session.image_files import image_header
 from pkmcal.wording import listed
 
-BOARD_IMAGES_EXAMINED = 3
-"""Images examined for another board; a single sharp one would be enough."""
-SQUARE_MISCOUNTS_TRIED = 2
-"""Largest miscount of a chessboard's columns or rows that is tried."""
-MOST_SQUARES = 16
-"""Columns and rows of a ChArUco board are tried up to below this number."""
-COUNTING_IMAGE_WIDTH = 512
-"""Width in px to which images are reduced to try many sizes of chessboards: a try takes a quarter
-of a second, and more than one second at full size."""
+
+@dataclass(frozen=True)
+class OtherBoardOptions:
+    """Constants of the search for a board other than the one described."""
+
+    # images examined for another board; a single sharp one would be enough
+    images: int = 3
+    # largest miscount of a chessboard's columns or rows that is tried
+    miscounts: int = 2
+    # columns and rows of a ChArUco board are tried up to below this number
+    most_squares: int = 16
+    # width in px to which images are reduced to try many sizes of chessboards: a try takes a
+    # quarter of a second, and more than one second at full size (measured)
+    width: int = 512
+    # least relative difference between measured and described markers: corners of markers are
+    # located to about half a pixel, a twentieth of the smallest markers used (derived)
+    size_difference: float = 0.1
+    # fewest markers for a measurement of their size, or for another dictionary
+    least_markers: int = 4
+
+
+OTHER_BOARD_OPTIONS = OtherBoardOptions()
+
 LARGEST_FAMILY_DICTIONARY = 1000
 """Number of markers in the largest dictionary of a family; the smaller dictionaries are its first
 ones."""
-OTHER_MARKER = 0.1
-"""Least relative difference between measured and described markers. Corners of markers are located
-to about half a pixel, a twentieth of the smallest markers used."""
-LEAST_MARKERS = 4
-"""Fewest markers for a measurement of their size."""
 NO_SIZE = 9999
 """Size of a dictionary that belongs to no family."""
 
 
-def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection, ...]:
+def detect_boards(
+    paths: Sequence[Path | str], board: Board, options: OtherBoardOptions = OTHER_BOARD_OPTIONS
+) -> tuple[Detection, ...]:
     """Detect the board in images; one detection each, with corners or with a reason.
 
     Raises `InputError` if the images differ in size, or if some or all of them show another board.
@@ -62,13 +74,13 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
         )
         if not any(detection.success for detection in detections):
             # Check for another board before the slow methods run on all images.
-            check_boards(files, detections, board)
+            check_boards(files, detections, board, options=options)
         missed = [k for k, detection in enumerate(detections) if not detection.success]
         again = pool.map(lambda k: _detect_in_file(files[k], size, board, quick=False), missed)
         for k, detection in zip(missed, again, strict=True):
             detections[k] = detection
     check_any(detections, board)  # a different board was reported above
-    check_boards(files, detections, board)
+    check_boards(files, detections, board, options=options)
     return tuple(detections)
 
 
@@ -99,7 +111,12 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
     )
 
 
-def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: Board) -> None:
+def check_boards(
+    files: Sequence[Path],
+    detections: Sequence[Detection],
+    board: Board,
+    options: OtherBoardOptions = OTHER_BOARD_OPTIONS,
+) -> None:
     """Raise `InputError` if some or all images show a board other than `board`."""
     missed = [f for f, d in zip(files, detections, strict=True) if not d.success]
     detected = [(f, d) for f, d in zip(files, detections, strict=True) if d.success]
@@ -107,23 +124,25 @@ def check_boards(files: Sequence[Path], detections: Sequence[Detection], board: 
     size = detections[0].image_size
     other: str | None = None
     if board.type == "aruco_grid":
-        _check_grid([path for path, _ in detected[:BOARD_IMAGES_EXAMINED]], size, board)
-    for path, detection in detected[:BOARD_IMAGES_EXAMINED]:
+        _check_grid([path for path, _ in detected[: options.images]], size, board, options)
+    for path, detection in detected[: options.images]:
         # A single image may show an object beside the board that looks like a continuation.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
             other = _larger_chessboard(image, board)
         else:
             markers = detect_markers(image, dictionary(board.document["dictionary"]))
-            other = _markers_beyond(image, board, markers)
+            other = _markers_beyond(image, board, markers, options)
             if other is None and board.type == "charuco":
-                _check_size(markers, board, detection, path)
+                _check_size(markers, board, detection, path, options)
         if other is None:
             break
     if other is not None:
         raise _other_board_error(with_board[0], other, board)
-    for path in missed[:BOARD_IMAGES_EXAMINED]:
-        other = other_board(decode(path, size, path.name), board, part=not with_board)
+    for path in missed[: options.images]:
+        other = other_board(
+            decode(path, size, path.name), board, part=not with_board, options=options
+        )
         if other is not None and not with_board:
             raise _other_board_error(path, other, board)
         if other is not None:
@@ -162,7 +181,9 @@ def _other_board_error(path: Path, other: str, board: Board) -> InputError:
     )
 
 
-def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> None:
+def _check_grid(
+    paths: Sequence[Path], size: tuple[int, int], board: Board, options: OtherBoardOptions
+) -> None:
     """Raise `InputError` if the layout of a grid's markers contradicts its file."""
     aruco_dictionary = dictionary(board.document["dictionary"])
     layout = marker_layout(
@@ -174,10 +195,10 @@ def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> N
     if other is not None:
         raise _other_board_error(paths[0], other, board)
     marker, gap = board.document["marker"], board.document["gap"]
-    if abs((1 + layout.gap) * marker / (marker + gap) - 1) <= OTHER_MARKER:
+    if abs((1 + layout.gap) * marker / (marker + gap) - 1) <= options.size_difference:
         return
     # Some programs state the gap as a share of the marker's side.
-    ratio = abs((1 + layout.gap) / (1 + gap) - 1) <= OTHER_MARKER
+    ratio = abs((1 + layout.gap) / (1 + gap) - 1) <= options.size_difference
     raise InputError(
         "the gaps between the board's markers are not as its file says",
         where=paths[0].name,
@@ -192,17 +213,19 @@ def _check_grid(paths: Sequence[Path], size: tuple[int, int], board: Board) -> N
     )
 
 
-def _check_size(markers: Markers, board: Board, detection: Detection, path: Path) -> None:
+def _check_size(
+    markers: Markers, board: Board, detection: Detection, path: Path, options: OtherBoardOptions
+) -> None:
     """Raise `InputError` if the markers of a ChArUco board have another size than described.
 
     A wrong size changes corners by less than 0.02 px, but corners of squares that are described as
     full, or empty, of marker get up to six times their true sigma.
     """
-    share = marker_share(markers, board, detection)
+    share = marker_share(markers, board, detection, options=options)
     if share is None:
         return
     square, marker = board.document["square"], board.document["marker"]
-    if abs(share * square / marker - 1) <= OTHER_MARKER:
+    if abs(share * square / marker - 1) <= options.size_difference:
         return
     raise InputError(
         "the board's markers have another size than its file says",
@@ -214,7 +237,12 @@ def _check_size(markers: Markers, board: Board, detection: Detection, path: Path
     )
 
 
-def marker_share(markers: Markers, board: Board, detection: Detection) -> float | None:
+def marker_share(
+    markers: Markers,
+    board: Board,
+    detection: Detection,
+    options: OtherBoardOptions = OTHER_BOARD_OPTIONS,
+) -> float | None:
     """Side of a ChArUco board's markers in units of its squares, from the detected corners; None
     for too few markers.
     """
@@ -222,9 +250,9 @@ def marker_share(markers: Markers, board: Board, detection: Detection) -> float 
 
     ids, corners = markers
     wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
-    large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER_SIDE
+    large = wide.min(axis=1, initial=np.inf) > MARKER_LAYOUT_OPTIONS.least_side
     corners, wide = corners[large], wide[large]
-    if len(corners) < LEAST_MARKERS:
+    if len(corners) < options.least_markers:
         return None
     places = board.points[detection.ids, :2] / board.document["square"]
     plane: Any = cv2.findHomography(detection.pixels, places, cv2.RANSAC, 0.05)[0]
@@ -236,7 +264,9 @@ def marker_share(markers: Markers, board: Board, detection: Detection) -> float 
     return float(np.median(shares * (wide + 1) / wide))
 
 
-def other_board(image: Integers, board: Board, part: bool) -> str | None:
+def other_board(
+    image: Integers, board: Board, part: bool, options: OtherBoardOptions = OTHER_BOARD_OPTIONS
+) -> str | None:
     """Description of the board in an image if it is not `board`; None if there is none.
 
     part : whether a part of the described chessboard counts as another board, not as a partial
@@ -244,13 +274,15 @@ def other_board(image: Integers, board: Board, part: bool) -> str | None:
     """
     if board.type == "chessboard":
         # Markers first: one search, where chessboards need one for each size.
-        return _other_markers(image, "") or _other_chessboard(image, board.counts, part)
+        return _other_markers(image, "") or _other_chessboard(image, board.counts, part, options)
     name = board.document["dictionary"]
     if board.type == "charuco":
-        best = _other_charuco(image, board, detect_markers(image, dictionary(name)))
+        best = _other_charuco(image, board, detect_markers(image, dictionary(name)), options)
         if best:
             return best
-    return _other_markers(image, name) or _other_chessboard(image, (0, 0), part=True)
+    return _other_markers(image, name) or _other_chessboard(
+        image, (0, 0), part=True, options=options
+    )
 
 
 def _larger_chessboard(image: Integers, board: Board) -> str | None:
@@ -262,7 +294,9 @@ def _larger_chessboard(image: Integers, board: Board) -> str | None:
     return None
 
 
-def _markers_beyond(image: Integers, board: Board, markers: Markers) -> str | None:
+def _markers_beyond(
+    image: Integers, board: Board, markers: Markers, options: OtherBoardOptions
+) -> str | None:
     """Description of detected markers that the described board does not have; None without at least
     two.
     """
@@ -277,11 +311,13 @@ def _markers_beyond(image: Integers, board: Board, markers: Markers) -> str | No
     if len(beyond) < 2:
         return None
     if board.type == "charuco":
-        return _other_charuco(image, board, markers)
+        return _other_charuco(image, board, markers, options)
     return f"markers {listed([str(i) for i in sorted(beyond.tolist())], 4)} beyond its {count}"
 
 
-def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> str | None:
+def _other_chessboard(
+    image: Integers, counts: tuple[int, int], part: bool, options: OtherBoardOptions
+) -> str | None:
     """Description of a chessboard whose size is near the described one and fits; with (0, 0), of
     usual sizes.
     """
@@ -290,9 +326,9 @@ def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> s
     if counts == (0, 0):
         candidates = [(9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (6, 5), (11, 8), (10, 7), (6, 4)]
     else:
-        span = range(-SQUARE_MISCOUNTS_TRIED, SQUARE_MISCOUNTS_TRIED + 1)
+        span = range(-options.miscounts, options.miscounts + 1)
         candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
-    scale = COUNTING_IMAGE_WIDTH / image.shape[1]
+    scale = options.width / image.shape[1]
     if scale < 1:
         small: Any = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         image = small
@@ -314,7 +350,9 @@ def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
     return len(detect_board(image, chessboard(counts, 1.0)).ids) == counts[0] * counts[1]
 
 
-def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | None:
+def _other_charuco(
+    image: Integers, board: Board, markers: Markers, options: OtherBoardOptions
+) -> str | None:
     """Description of the ChArUco board, by squares and pattern, with which most corners are
     detected; None if no more than with `board`.
     """
@@ -325,13 +363,17 @@ def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | Non
     # The highest marker id is a lower bound of the number of markers, rarely below half of it.
     layouts: list[dict[str, Any]] = [
         {**board.document, "squares": [columns, rows], "legacy": legacy}
-        for columns, rows in product(range(3, MOST_SQUARES), repeat=2)
+        for columns, rows in product(range(3, options.most_squares), repeat=2)
         if most <= (columns * rows) // 2 <= 2 * most + 4
         for legacy in [False, True][: 2 - rows % 2]
     ]
     scored = [(_charuco_corners(image, data, ids, corners), data) for data in layouts]
     mine = _charuco_corners(image, board.document, ids, corners)
-    scored = [item for item in scored if item[0][0] >= max(LEAST_DETECTED_CORNERS, mine[0] + 1)]
+    scored = [
+        item
+        for item in scored
+        if item[0][0] >= max(BOARD_DETECTION_OPTIONS.least_corners, mine[0] + 1)
+    ]
     if not scored:
         return None
     data = max(scored, key=lambda item: item[0])[1]

@@ -15,6 +15,7 @@ board as on a straight one. All corners of an image are fitted at once.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,71 +23,91 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.solver.marquardt import Damping
+from pkmcal.solver.ranks import column_space
 
-CORNER_FIT_STEPS = 12
-CORNER_FIT_SETTLED = 1e-3
-"""px; a thirtieth of what the noise of a good image does."""
-FARTHEST_CORNER_MOVE = 0.25
-"""Squares by which the fit may move a corner that a detector has found."""
-LEAST_RADIUS, MOST_RADIUS = 2.5, 14
-"""px; below, the window holds too few pixels for seven unknowns, above, lines bend."""
-CORNER_BLUR_RANGE = (0.25, 4.0)
-"""px; outside, the window shows something other than a corner."""
-LEAST_SHARE = 0.6
-"""Share of the window's variance that a corner explains; shadows and fingers leave less."""
-LONGEST_STEP = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
-"""Longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur."""
-CORNER_WINDOW_REACH = 0.25
-"""Squares around a corner that its fit uses: longer edges say little more, and begin to bend."""
-UNMODELLED_EDGE_BEND = 0.02
-"""px by which an edge may leave its tangent within the window before its bend is put in."""
-BLANK_BORDER_SHARE = 0.9
-"""Share of the blank border between edge and marker that the window may fill."""
-LEAST_DETECTED_CORNERS = 6
-"""Corners below which an image says nothing: four fix a board's pose, two more test it."""
-WHOLE_CHESSBOARD_SHARE = 0.75
-"""Share of a chessboard's corners that must look like corners: what is found there is the whole
-board, or something else."""
-WIDEST_AT_FULL_SIZE_ONLY = 1000
-"""px; pictures wider than this are tried at half their size as well."""
-STRAIGHT_ENOUGH = 0.35
-"""Share of a square by which a corner may lie off the middle of its two neighbours' line."""
+
+@dataclass(frozen=True)
+class BoardDetectionOptions:
+    """Constants of the detection of a board's corners and of their fit."""
+
+    # most steps of a corner's fit
+    steps: int = 12
+    # step at which a corner has settled, px: a thirtieth of what the noise of a good image does
+    settled: float = 1e-3
+    # squares by which the fit may move a corner that a detector has found
+    farthest: float = 0.25
+    # smallest radius of a window, px: a smaller window holds too few pixels for seven unknowns
+    least_radius: float = 2.5
+    # largest radius of a window, px: lines bend in a larger one
+    most_radius: int = 14
+    # range of the blur, px; outside, the window shows something other than a corner
+    blur_range: tuple[float, float] = (0.25, 4.0)
+    # share of the window's variance that a corner explains; shadows and fingers leave less
+    least_explained: float = 0.6
+    # longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur
+    longest_step: tuple[float, ...] = (1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3)
+    # squares around a corner that its fit uses: longer edges contribute little more, and begin to
+    # bend
+    reach: float = 0.25
+    # px by which an edge may leave its tangent within the window before its bend is modelled
+    straight: float = 0.02
+    # share of the blank border between edge and marker that the window may fill
+    blank_share: float = 0.9
+    # corners below which an image says nothing: four fix a board's pose, two more test it
+    # (derived)
+    least_corners: int = 6
+    # share of a chessboard's corners that must look like corners: what is found there is the whole
+    # board, or something else
+    whole_share: float = 0.75
+    # width, px, from which images are tried at half their size as well
+    half_size_from: int = 1000
+    # share of a square by which a corner may lie off the middle of its two neighbours' line
+    bend: float = 0.35
+
+
+BOARD_DETECTION_OPTIONS = BoardDetectionOptions()
+
+
 Raw = tuple[Integers, Array]
 """Corner ids (n,) and pixels (n, 2) as a detector gives them."""
 
 
-def detect_board(image: Integers, board: Board, name: str = "", quick: bool = False) -> Detection:
+def detect_board(
+    image: Integers,
+    board: Board,
+    name: str = "",
+    quick: bool = False,
+    options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS,
+) -> Detection:
     """Find the board's corners in one image, grey levels (height, width) uint8.
 
     quick : only the first way of finding a chessboard.
     """
     if board.type == "chessboard":
-        raw, mirrored, why = _chessboard(image, board, quick)
+        raw, mirrored, why = _chessboard(image, board, quick, options)
     else:
-        raw, mirrored, why = (_charuco if board.type == "charuco" else _marker_grid)(image, board)
+        detect = _charuco if board.type == "charuco" else _marker_grid
+        raw, mirrored, why = detect(image, board)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
-    if len(raw[0]) < LEAST_DETECTED_CORNERS:
+    if len(raw[0]) < options.least_corners:
         return Detection(name, size, *nothing, reason=why)
-    fitted = _fitted(image, board, raw)
+    fitted = _fitted(image, board, raw, options)
     ids, good = raw[0], fitted.good
     weak = tuple(int(i) for i in ids[~good])
     least = (
-        WHOLE_CHESSBOARD_SHARE * len(board.points)
+        options.whole_share * len(board.points)
         if board.type == "chessboard"
-        else LEAST_DETECTED_CORNERS
+        else options.least_corners
     )
-    if good.sum() < least or _on_a_line(board.points[ids[good], :2]):
+    xy = board.points[ids[good], :2]
+    # corners on one line do not determine a pose
+    if good.sum() < least or column_space(xy - xy.mean(axis=0)).shape[1] < 2:
         why = f"only {good.sum()} of {len(board.points)} corners are sharp and uncovered"
         return Detection(name, size, *nothing, reason=why, weak=weak)
     return Detection(
         name, size, ids[good], fitted.pixels[good], fitted.sigma[good], "", weak, mirrored
     )
-
-
-def _on_a_line(xy: Array) -> bool:
-    spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < 1e-6 * spread[0])
 
 
 def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
@@ -97,7 +118,7 @@ def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
         # By one threshold alone five times as fast: enough where it shows the whole board.
         for detector, enough in (
             (charuco_detector(board.document, quick=True), len(board.points)),
-            (charuco_detector(board.document), LEAST_DETECTED_CORNERS),
+            (charuco_detector(board.document), BOARD_DETECTION_OPTIONS.least_corners),
         ):
             corners, ids, _, marker_ids = detector.detectBoard(picture)
             markers = max(markers, _length(marker_ids))
@@ -197,33 +218,42 @@ def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are recognised"
 
 
-def _chessboard(image: Integers, board: Board, quick: bool) -> tuple[Raw, bool, str]:
-    pixels = find_chessboard(image, board.counts, quick)
+def _chessboard(
+    image: Integers, board: Board, quick: bool, options: BoardDetectionOptions
+) -> tuple[Raw, bool, str]:
+    pixels = find_chessboard(image, board.counts, quick, options=options)
     if pixels is None:
         why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners is recognised"
         return _raw([], [], 0, False), False, why
     return (np.arange(len(pixels)), pixels), False, ""
 
 
-def find_chessboard(image: Integers, counts: tuple[int, int], quick: bool = False) -> Array | None:
+def find_chessboard(
+    image: Integers,
+    counts: tuple[int, int],
+    quick: bool = False,
+    options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS,
+) -> Array | None:
     """Corners (rows * columns, 2) px in the board's order, None where not found.
 
     quick : the first way only, for trying many counts.
     """
-    for pixels in _attempts(image, counts, quick):
+    for pixels in _attempts(image, counts, quick, options):
         grid = pixels.reshape(counts[1], counts[0], 2)
-        if _is_grid(grid):
+        if _is_grid(grid, options):
             return _oriented(image, grid).reshape(-1, 2)
     return None
 
 
-def _attempts(image: Integers, counts: tuple[int, int], quick: bool) -> Iterator[Array]:
+def _attempts(
+    image: Integers, counts: tuple[int, int], quick: bool, options: BoardDetectionOptions
+) -> Iterator[Array]:
     """What OpenCV finds by several ways, the fastest and most successful first."""
     import cv2
 
     thorough = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    for picture, scale in _pictures(image, quick):
+    for picture, scale in _pictures(image, quick, options):
         ways = [
             lambda p=picture: cv2.findChessboardCornersSB(p, counts, flags=thorough),
             lambda p=picture: cv2.findChessboardCorners(p, counts, flags=adaptive),
@@ -236,7 +266,9 @@ def _attempts(image: Integers, counts: tuple[int, int], quick: bool) -> Iterator
                 yield (pixels + 0.5) / scale - 0.5
 
 
-def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Any, float]]:
+def _pictures(
+    image: Integers, quick: bool, options: BoardDetectionOptions
+) -> Iterator[tuple[Any, float]]:
     """The image; with its contrast evened out; smaller; larger; each with its scale."""
     import cv2
 
@@ -244,12 +276,12 @@ def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Any, float]]:
     if quick:
         return
     yield cv2.createCLAHE(3.0, (8, 8)).apply(image), 1.0
-    if image.shape[1] > WIDEST_AT_FULL_SIZE_ONLY:
+    if image.shape[1] > options.half_size_from:
         yield cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 0.5
     yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0
 
 
-def _is_grid(grid: Array) -> bool:
+def _is_grid(grid: Array, options: BoardDetectionOptions) -> bool:
     """Corners in order: every one near the middle between its neighbours, no row crossing."""
     for axis in (0, 1):
         step = np.diff(grid, axis=axis)
@@ -259,7 +291,7 @@ def _is_grid(grid: Array) -> bool:
             np.take(length, range(length.shape[axis] - 1), axis),
             np.take(length, range(1, length.shape[axis]), axis),
         ]), 2))[0]  # fmt: skip
-        if length.min() < 2 or np.any(bend > STRAIGHT_ENOUGH * 2 * near):
+        if length.min() < 2 or np.any(bend > options.bend * 2 * near):
             return False
     right = grid[:-1, 1:] - grid[:-1, :-1]
     down = grid[1:, :-1] - grid[:-1, :-1]
@@ -294,33 +326,37 @@ def _first_square_light(image: Integers, grid: Array) -> bool:
     return bool(grey[same].mean() > grey[~same].mean())
 
 
-def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
+def _fitted(image: Integers, board: Board, raw: Raw, options: BoardDetectionOptions) -> Corners:
     """The corners' fits; a grid of markers may have plain corners or touching dark squares."""
     ids, pixels = raw
     data = board.document
     if board.type == "aruco_grid":
         module = 1 / (marker_bits(data["dictionary"]) + 2)
-        reach = min(CORNER_WINDOW_REACH, 0.8 * data["gap"] / data["marker"])
+        reach = min(options.reach, 0.8 * data["gap"] / data["marker"])
         axes = _marker_axes(ids, pixels)
-        plain = refine(image, pixels, axes, Window(reach, BLANK_BORDER_SHARE * module, False))
-        touching = refine(image, pixels, axes, Window(reach, BLANK_BORDER_SHARE * module, True))
+        plain = refine(
+            image, pixels, axes, Window(reach, options.blank_share * module, False), options=options
+        )
+        touching = refine(
+            image, pixels, axes, Window(reach, options.blank_share * module, True), options=options
+        )
         # Both may be found: on a marker's inner pattern too. The right ones are the surer ones.
         right = plain.good.sum() > touching.good.sum() or (
             np.median(plain.sigma) <= np.median(touching.sigma)
         )
         return plain if right else touching
-    margin = CORNER_WINDOW_REACH
+    margin = options.reach
     if board.type == "charuco":
         margin = min(
-            CORNER_WINDOW_REACH, BLANK_BORDER_SHARE * 0.5 * (1 - data["marker"] / data["square"])
+            options.reach, options.blank_share * 0.5 * (1 - data["marker"] / data["square"])
         )
-    window = Window(CORNER_WINDOW_REACH, margin, True)
-    fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window)
+    window = Window(options.reach, margin, True)
+    fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window, options=options)
     # How lines bend is told by the fitted corners; the detector's are too rough for it.
     sides, bends = _axes(board, ids, fitted.pixels)
-    if np.abs(bends).max() * CORNER_WINDOW_REACH**2 / 2 < UNMODELLED_EDGE_BEND:
+    if np.abs(bends).max() * options.reach**2 / 2 < options.straight:
         return fitted
-    return refine(image, fitted.pixels, sides, window, bends, fitted)
+    return refine(image, fitted.pixels, sides, window, bends, fitted, options=options)
 
 
 def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
@@ -413,6 +449,7 @@ def refine(
     window: Window,
     bends: Array | None = None,
     before: Corners | None = None,
+    options: BoardDetectionOptions = BOARD_DETECTION_OPTIONS,
 ) -> Corners:
     """Fit corners near `start`.
 
@@ -426,18 +463,23 @@ def refine(
     if len(start) == 0:
         return Corners(start, np.zeros(0, dtype=bool), np.zeros(0), np.zeros((0, 7)))
     scale = np.sqrt(np.abs(np.linalg.det(axes)))
-    widened = np.maximum(1.0, LEAST_RADIUS / np.maximum(window.reach * scale, 1e-6))
-    places, weight = _window(image, start, axes, window, widened)
+    widened = np.maximum(1.0, options.least_radius / np.maximum(window.reach * scale, 1e-6))
+    places, weight = _window(image, start, axes, window, widened, options)
     grey = image[places[:, 1], places[:, 0]].astype(float)
     first = _first(grey, weight, axes, window.saddle)
     if before is not None:
         first[before.good] = before.unknowns[before.good]
     shape = _Shape(places - start[..., None], _curvature(first, axes, bends), window.saddle)
-    return _judged(start, _fit(grey, weight, shape, first), grey, weight, scale)
+    return _judged(start, _fit(grey, weight, shape, first, options), grey, weight, scale, options)
 
 
 def _window(
-    image: Integers, start: Array, axes: Array, window: Window, widened: Array
+    image: Integers,
+    start: Array,
+    axes: Array,
+    window: Window,
+    widened: Array,
+    options: BoardDetectionOptions,
 ) -> tuple[Integers, Array]:
     """Pixels x, y (n, 2, m) that count around every corner, and their weights (n, m).
 
@@ -445,7 +487,7 @@ def _window(
     """
     reach, margin = window.reach * widened[:, None], window.margin * widened[:, None]
     longest = float(np.max(reach * np.abs(axes).sum(axis=1), initial=0.0))
-    radius = int(np.clip(np.ceil(longest), 3, MOST_RADIUS))
+    radius = int(np.clip(np.ceil(longest), 3, options.most_radius))
     around = np.mgrid[-radius : radius + 1, -radius : radius + 1][::-1].reshape(2, -1)
     places = np.rint(start).astype(int)[..., None] + around
     offsets = places - start[..., None]
@@ -455,7 +497,7 @@ def _window(
     along, across = board.max(axis=1), board.min(axis=1)
     # 1, falling to 0 over the last fifth of the reach
     taper = np.clip((reach - along) / (0.2 * reach), 0, 1)
-    near = np.abs(offsets).max(axis=1) <= MOST_RADIUS
+    near = np.abs(offsets).max(axis=1) <= options.most_radius
     weight = taper * (across < margin) * near * inside
     most = max(int(np.count_nonzero(weight, axis=1).max()), 1)
     order = np.argsort(weight == 0, axis=1, kind="stable")[:, :most]
@@ -567,10 +609,10 @@ class _Fit(NamedTuple):
         """Normal matrix (k, 7, 7)."""
         return (self.by * self.weight[:, None]) @ self.by.mT
 
-    def stepped(self) -> tuple[_Fit, Array]:
-        """After a damped step, where it is better, and that step (k, 7)."""
+    def stepped(self, longest: Array) -> tuple[_Fit, Array]:
+        """After a damped step, where it is better, and that step (k, 7); longest : (7,)."""
         right = (self.by @ (self.weight * self.residual)[..., None])[..., 0]
-        step = np.clip(self.damping.step(self.normal, right), -LONGEST_STEP, LONGEST_STEP)
+        step = np.clip(self.damping.step(self.normal, right), -longest, longest)
         value, by = _model(self.p + step, self.shape)
         residual = self.grey - value
         cost = np.sum(self.weight * residual**2, axis=1)
@@ -594,16 +636,18 @@ class _Fit(NamedTuple):
         )
 
 
-def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fitted:
+def _fit(
+    grey: Array, weight: Array, shape: _Shape, p: Array, options: BoardDetectionOptions
+) -> _Fitted:
     """Weighted Levenberg-Marquardt of all corners at once.
 
     Corners that have settled are not looked at again: a few bad ones never do.
     """
     fit = _Fit.begun(grey, weight, shape, p)
     out = _Fitted(np.empty_like(p), np.empty_like(grey), np.empty((len(p), 7, 7)))
-    for more in reversed(range(CORNER_FIT_STEPS)):
-        fit, step = fit.stepped()
-        on = (np.abs(step[:, :2]).max(axis=1) >= CORNER_FIT_SETTLED) & (more > 0)
+    for more in reversed(range(options.steps)):
+        fit, step = fit.stepped(np.array(options.longest_step))
+        on = (np.abs(step[:, :2]).max(axis=1) >= options.settled) & (more > 0)
         settled = fit.select(~on)
         for all_of_them, these in zip(
             out, (settled.p, settled.residual, settled.normal), strict=True
@@ -655,7 +699,14 @@ def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
     return level + amplitude * by[:, 6], by
 
 
-def _judged(start: Array, fitted: _Fitted, grey: Array, weight: Array, scale: Array) -> Corners:
+def _judged(
+    start: Array,
+    fitted: _Fitted,
+    grey: Array,
+    weight: Array,
+    scale: Array,
+    options: BoardDetectionOptions,
+) -> Corners:
     """Where the fit is a corner, and how sure its place is by what it leaves unexplained."""
     p = fitted.unknowns
     total = np.maximum(weight.sum(axis=1), 1e-9)
@@ -664,10 +715,10 @@ def _judged(start: Array, fitted: _Fitted, grey: Array, weight: Array, scale: Ar
     remainder = np.sum(weight * fitted.residual**2, axis=1) / total
     blur, shifted = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
     good = (
-        (remainder < (1 - LEAST_SHARE) * variance)
-        & (blur > CORNER_BLUR_RANGE[0] / 2)
-        & (blur < np.maximum(CORNER_BLUR_RANGE[1], 0.2 * scale))
-        & (shifted < np.maximum(1.5, FARTHEST_CORNER_MOVE * scale))
+        (remainder < (1 - options.least_explained) * variance)
+        & (blur > options.blur_range[0] / 2)
+        & (blur < np.maximum(options.blur_range[1], 0.2 * scale))
+        & (shifted < np.maximum(1.5, options.farthest * scale))
         & (weight.sum(axis=1) > 12)
         & np.isfinite(p).all(axis=1)
     )

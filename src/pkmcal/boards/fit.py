@@ -27,17 +27,36 @@ from pkmcal.solver.kernels import final_weights
 from pkmcal.solver.ranks import NORMAL_RANK_TOLERANCE, normal_root
 from pkmcal.solver.search import Stop, Values, minimise
 
+MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
+"""Median length of a vector of two normal numbers, in their standard deviation."""
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""
-LEAST_VIEWS_ELSEWHERE = 2
-"""Views in which a corner has to lie at another one's place, before its number is wrong."""
-CORNERS_OF_A_MARKER = 4
-"""Corners that one wrong marker, such as another thing's, puts elsewhere in all views."""
-CAMERA_FIT_ROUNDS = 12
-CAMERA_FIT_STEPS = 20
-"""Most steps of a round; a long valley, such as that of xi and f, is followed over several."""
-CAMERA_FIT_SETTLED = 1e-3
-"""Change of the corners' weights and relative change of tau that end the rounds."""
+
+
+@dataclass(frozen=True)
+class CameraFitOptions:
+    """Constants of the fit of a camera and of a board's poses."""
+
+    # views in which a corner has to lie at another one's place before its number is wrong
+    least_views: int = 2
+    # corners that one wrong marker, such as another thing's, puts elsewhere in all views
+    marker_corners: int = 4
+    # most rounds of reweighting
+    rounds: int = 12
+    # most steps of a round; a long valley, such as that of xi and f, is followed over several
+    steps: int = 20
+    # change of the corners' weights and relative change of tau that end the rounds (numerical)
+    settled: float = 1e-3
+    # factor on the robust scale of the first round, halved down to 1: the start's outliers are
+    # unknown
+    first_cut: float = 4.0
+    # rms of the corners' residuals, as a share of the image's width, from which on the board file
+    # or the camera file is wrong, or no camera model explains the images; correct files leave a
+    # hundredth of this limit on known cameras, and a tenth on held-out views (measured)
+    residual_limit: float = 0.004
+
+
+CAMERA_FIT_OPTIONS = CameraFitOptions()
 
 
 class Views(NamedTuple):
@@ -189,16 +208,17 @@ def fit_camera(
     free: Integers,
     views: Views,
     T_camera_board: Array,
-    rounds: int = CAMERA_FIT_ROUNDS,
+    rounds: int | None = None,
+    options: CameraFitOptions = CAMERA_FIT_OPTIONS,
 ) -> CameraFit:
     """Fit intrinsics and poses from a start; weights and noise alternate with the search."""
     in_view = views.visible
     weight = in_view.astype(float)
     state = CameraState(camera.parameters[None, free], T_camera_board[None])
-    tau, cut, converged, off = 1.0, 4.0, True, views.pixels
-    for _ in range(rounds):
+    tau, cut, converged, off = 1.0, options.first_cut, True, views.pixels
+    for _ in range(options.rounds if rounds is None else rounds):
         problem = _problem(camera, free, views, weight, tau)
-        solution = minimise(problem, state, max_steps=CAMERA_FIT_STEPS)
+        solution = minimise(problem, state, max_steps=options.steps)
         state, converged = solution.state, solution.stop[0] is Stop.CONVERGED
         off = _off(with_free(camera, free, state), state, views)
         dof = max(2 * weight.sum() - 6 * len(in_view) - len(free), 1.0)
@@ -209,8 +229,8 @@ def fit_camera(
         change = np.abs(new_weight - weight).max(initial=0.0)
         done = (
             cut == 1.0
-            and change < CAMERA_FIT_SETTLED
-            and abs(new_tau - tau) <= CAMERA_FIT_SETTLED * max(tau, new_tau)
+            and change < options.settled
+            and abs(new_tau - tau) <= options.settled * max(tau, new_tau)
         )
         weight, tau, cut = new_weight, new_tau, max(cut / 2, 1.0)
         if done:
@@ -269,7 +289,13 @@ def inverted(normal: Array) -> Array:
     return half @ half.mT
 
 
-def check_numbering(residuals: Array, pixels: Array, board: Board, where: str) -> None:
+def check_numbering(
+    residuals: Array,
+    pixels: Array,
+    board: Board,
+    where: str,
+    options: CameraFitOptions = CAMERA_FIT_OPTIONS,
+) -> None:
     """Raise `InputError` where corners lie at other ones' places in most of the views that show
     them, by residuals and pixels (V, N, 2), NaN where not seen.
 
@@ -283,8 +309,8 @@ def check_numbering(residuals: Array, pixels: Array, board: Board, where: str) -
     off = np.linalg.norm(residuals, axis=-1)
     finite = np.isfinite(off) & np.isfinite(nearest)
     elsewhere = np.sum(finite & (np.nan_to_num(off) > nearest / 2), axis=0)
-    wrong = (elsewhere >= LEAST_VIEWS_ELSEWHERE) & (2 * elsewhere > finite.sum(axis=0))
-    if wrong.sum() <= CORNERS_OF_A_MARKER or 2 * wrong.sum() > len(wrong):
+    wrong = (elsewhere >= options.least_views) & (2 * elsewhere > finite.sum(axis=0))
+    if wrong.sum() <= options.marker_corners or 2 * wrong.sum() > len(wrong):
         return  # where most lie elsewhere there is no board to be numbered
     raise InputError(
         "the board's corners do not lie as its file numbers them",
@@ -326,10 +352,8 @@ def _off(camera: Camera, state: CameraState, views: Views) -> Array:
 
 
 def _robust_scale(off: Array, sigma: Array, visible: Booleans) -> float:
-    """Tau from the median of the residuals' lengths, px: half of a 2-D normal's lie within
-    sqrt(2 ln 2) standard deviations.
-    """
-    middle = float(np.median(np.sum(off[visible] ** 2, axis=-1))) / (2 * np.log(2))
+    """Tau from the median of the residuals' lengths, px."""
+    middle = float(np.median(np.sum(off[visible] ** 2, axis=-1))) / MEDIAN_LENGTH**2
     return float(np.sqrt(max(middle - float(np.median(sigma[visible] ** 2)), LEAST_NOISE**2)))
 
 
@@ -350,14 +374,16 @@ class BoardPoses(NamedTuple):
     noise: float
 
 
-def board_poses(camera: Camera, views: Views) -> BoardPoses:
+def board_poses(
+    camera: Camera, views: Views, options: CameraFitOptions = CAMERA_FIT_OPTIONS
+) -> BoardPoses:
     """The board's pose in every view, by maximum likelihood with a known camera."""
     n = len(camera.parameters)
     if not len(views.pixels):
         none = np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros((0, 6, n))
         return BoardPoses(*none, views.pixels, views.sigma, 0.0)
     start = settled_poses(camera, views)
-    fit = fit_camera(camera, np.zeros(0, dtype=int), views, start)
+    fit = fit_camera(camera, np.zeros(0, dtype=int), views, start, options=options)
     # The derivative by all intrinsics, though none of them is estimated here.
     as_if_free = replace(fit, free=np.arange(n))
     return BoardPoses(

@@ -18,17 +18,25 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.boards.board import Board
 from pkmcal.boards.find import Markers
 
-LARGEST_LATTICE_MISFIT = 0.25
-"""Largest distance of a neighbour from its lattice point, in pitches."""
-LEAST_MARKER_SIDE = 10.0
-"""Shortest side of a marker, px; corners are located to about half a pixel, a twentieth of it."""
-LEAST_NEIGHBOURS = 4
-"""Fewest pairs of neighbours that determine the step of the ids along rows or columns."""
-LEAST_AGREEMENT = 0.8
-"""Least share of the pairs that agree on a step; misread ids are rare."""
-LEAST_CONTRADICTIONS = 2
-"""Fewest contradictions to a described numbering, pairs of row neighbours in different rows or ids
-out of range, for which it is wrong."""
+
+@dataclass(frozen=True)
+class MarkerLayoutOptions:
+    """Constants of the layout of markers."""
+
+    # largest distance of a neighbour from its lattice point, in pitches
+    misfit: float = 0.25
+    # shortest side of a marker, px; corners are located to about half a pixel, a twentieth of it
+    least_side: float = 10.0
+    # fewest pairs of neighbours that determine the step of the ids along rows or columns
+    least_neighbours: int = 4
+    # least share of the pairs that agree on a step; misread ids are rare
+    agreement: float = 0.8
+    # fewest contradictions to a described numbering, pairs of row neighbours in different rows or
+    # ids out of range, for which it is wrong
+    contradictions: int = 2
+
+
+MARKER_LAYOUT_OPTIONS = MarkerLayoutOptions()
 
 
 @dataclass(frozen=True)
@@ -74,16 +82,18 @@ class _Neighbours(NamedTuple):
     pitch: Array
 
 
-def marker_layout(images: Sequence[Markers]) -> MarkerLayout | None:
+def marker_layout(
+    images: Sequence[Markers], options: MarkerLayoutOptions = MARKER_LAYOUT_OPTIONS
+) -> MarkerLayout | None:
     """Layout of the markers in images; None if there are too few neighbours or they disagree."""
-    neighbours = [part for markers in images if (part := _neighbours(markers)) is not None]
+    neighbours = [part for markers in images if (part := _neighbours(markers, options)) is not None]
     if not neighbours:
         return None
     ids = np.concatenate([part.ids for part in neighbours])
     step = np.concatenate([part.step for part in neighbours])
     difference = ids[:, 1] - ids[:, 0]
-    along = _common_step(difference[step[:, 0] == 1])
-    down = _common_step(difference[step[:, 1] == 1])
+    along = _common_step(difference[step[:, 0] == 1], options)
+    down = _common_step(difference[step[:, 1] == 1], options)
     if along is None or down is None:
         return None
     rows = ids[(step[:, 0] == 1) & (difference == along)].tolist()
@@ -96,7 +106,9 @@ def marker_layout(images: Sequence[Markers]) -> MarkerLayout | None:
     )
 
 
-def another_grid(layout: MarkerLayout, board: Board) -> str | None:
+def another_grid(
+    layout: MarkerLayout, board: Board, options: MarkerLayoutOptions = MARKER_LAYOUT_OPTIONS
+) -> str | None:
     """Description of a detected grid that differs from the one described; None if they agree.
 
     The pitch is not compared.
@@ -113,7 +125,7 @@ def another_grid(layout: MarkerLayout, board: Board) -> str | None:
             " downward"
         )
     beyond = [i for i in sorted(layout.ids) if not first <= i < first + count]
-    if layout.breaks(first) < LEAST_CONTRADICTIONS and len(beyond) < LEAST_CONTRADICTIONS:
+    if layout.breaks(first) < options.contradictions and len(beyond) < options.contradictions:
         return None
     possible = [k for k in layout.first_ids() if max(layout.ids) < k + count]
     if possible:
@@ -121,21 +133,21 @@ def another_grid(layout: MarkerLayout, board: Board) -> str | None:
     return f"markers {', '.join(map(str, beyond[:4]))} beyond its {count}" if beyond else None
 
 
-def _common_step(differences: Array) -> int | None:
-    """Most frequent difference of ids; None if LEAST_AGREEMENT of the pairs do not share it."""
-    if len(differences) < LEAST_NEIGHBOURS:
+def _common_step(differences: Array, options: MarkerLayoutOptions) -> int | None:
+    """Most frequent difference of ids; None if too few of the pairs share it."""
+    if len(differences) < options.least_neighbours:
         return None
     steps, counts = np.unique(differences, return_counts=True)
     best = int(np.argmax(counts))
-    return int(steps[best]) if counts[best] >= LEAST_AGREEMENT * len(differences) else None
+    return int(steps[best]) if counts[best] >= options.agreement * len(differences) else None
 
 
-def _neighbours(markers: Markers) -> _Neighbours | None:
+def _neighbours(markers: Markers, options: MarkerLayoutOptions) -> _Neighbours | None:
     """Neighbours in one image; None if there are none."""
     # Markers that are large enough.
     ids, corners = markers
     wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
-    large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER_SIDE
+    large = wide.min(axis=1, initial=np.inf) > options.least_side
     ids, corners = ids[large], corners[large]
     if len(ids) < 2:
         return None
@@ -155,7 +167,7 @@ def _neighbours(markers: Markers) -> _Neighbours | None:
     nearest = distance.min(axis=1)
     step = off / np.median(nearest)
     whole = np.rint(step)
-    close: Booleans = (np.abs(step - whole) < LARGEST_LATTICE_MISFIT).all(axis=-1)
+    close: Booleans = (np.abs(step - whole) < options.misfit).all(axis=-1)
     one, other = np.nonzero(close & (np.abs(whole).sum(axis=-1) == 1))
     if not len(one):
         return None

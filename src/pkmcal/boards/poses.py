@@ -25,8 +25,9 @@ import numpy as np
 
 from pkmcal.arrays import THREADS, Array, Booleans, Integers, evenly
 from pkmcal.boards.board import Board, Detection
-from pkmcal.boards.find import detect_board
+from pkmcal.boards.find import BOARD_DETECTION_OPTIONS, detect_board
 from pkmcal.boards.fit import (
+    CAMERA_FIT_OPTIONS,
     BoardPoses,
     Views,
     board_poses,
@@ -40,35 +41,43 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
 from pkmcal.measurements import Column, PoseSet, Rejection
 from pkmcal.measurements.effects import by_board_size
-from pkmcal.observe.repeats import groups_of
+from pkmcal.observe.repeats import REPEAT_OPTIONS, groups_of
 from pkmcal.wording import count, listed
 
-BOARD_RESIDUAL_LIMIT = 0.004
-"""Rms of the corners' residuals, as a share of the image's width, above which the board file or the
-camera file is wrong; correct files leave a hundredth of this limit."""
-LEAST_CORNERS_WEIGHED = 6
-"""Least sum of the corners' weights of a usable pose; with fewer, no corner is redundant."""
-TWO_TILTS = 25.0
-"""Least difference of chi square between a pose and the board's other tilt, which from afar looks
-the same."""
+
+@dataclass(frozen=True)
+class BoardPoseOptions:
+    """Constants of a board's poses in the images of a station."""
+
+    # least sum of the corners' weights of a usable pose: as many corners as a detection needs
+    least_weight: float = BOARD_DETECTION_OPTIONS.least_corners
+    # least difference of chi square between a pose and the board's other tilt, which from afar
+    # looks the same: five standard deviations (statistical)
+    tilt_chi2: float = 25.0
+    # difference between two images of a still board allowed beyond noise, px rms over the board. A
+    # camera on a tripod keeps a tenth of a pixel; smaller movements hardly matter for edges of
+    # legs, which are as uncertain
+    still: float = 0.2
+    # standard deviations of the images' own noise allowed in addition (statistical: 6 in 10^5 by
+    # chance)
+    moved: float = 4.0
+    # largest share of single images that disagree; with more, the board never stood still
+    most_outlying: float = 1 / 3
+    # largest share of a pose's covariance that repeats have in common (numerical: keeps the rest
+    # invertible)
+    most_common: float = 0.99
+    # distance of a repeat from the median repeat, in standard deviations (root mean square of six
+    # numbers), above which it is rejected, as a repeat of an edge
+    outlying: float = REPEAT_OPTIONS.far
+
+
+BOARD_POSE_OPTIONS = BoardPoseOptions()
+
 UNSURE_BOARD_REASON = "the board: too few corners agree on one pose, or its tilt is not sure"
 """Reason for the rejection of a pose."""
-STILL_BOARD_DIFFERENCE = 0.2
-"""Difference between two images of a still board allowed beyond noise, px rms over the board. A
-camera on a tripod keeps a tenth of a pixel; smaller movements hardly matter for edges of legs,
-which are as uncertain."""
-MOVED_BOARD_DEVIATIONS = 4.0
-"""Standard deviations of the images' own noise allowed in addition."""
-MOST_ODD = 1 / 3
-"""Largest share of single images that disagree; with more, the board never stood still."""
 _EXPECTED = "a board fixed to the base, and a camera that stands still: all images of a " \
     "station show the board in one place"  # fmt: skip
-MOST_COMMON = 0.99
-"""Largest share of a pose's covariance that repeats have in common."""
 ODD_BOARD_REASON = "the board lies {:.1f} standard deviations from where the repeats show it"
-ODD_BOARD_DEVIATIONS = 5.0
-"""Distance of a repeat from the median repeat, in standard deviations (root mean square of six
-numbers), above which it is rejected."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +158,7 @@ def board_views(
     configuration: Integers,
     board: Board,
     detections: Sequence[Detection],
+    options: BoardPoseOptions = BOARD_POSE_OPTIONS,
 ) -> BoardViews:
     """Poses of the board in a station's images.
 
@@ -162,7 +172,7 @@ def board_views(
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
-    usable = (used >= LEAST_CORNERS_WEIGHED) & _tilt_is_unique(camera, views, poses)
+    usable = (used >= options.least_weight) & _tilt_is_unique(camera, views, poses, options)
     station_views = BoardViews(
         station,
         camera,
@@ -193,7 +203,9 @@ def pose_set(
     )
 
 
-def _tilt_is_unique(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
+def _tilt_is_unique(
+    camera: Camera, views: Views, poses: BoardPoses, options: BoardPoseOptions
+) -> Booleans:
     """Whether the corners exclude the second local minimum of the pose, the board tilted the other
     way, (V,).
     """
@@ -204,7 +216,7 @@ def _tilt_is_unique(camera: Camera, views: Views, poses: BoardPoses) -> Booleans
     second, other = fit_board_poses(camera, views, tilted_back(first, views.points), scale)
     # If both searches converge to one pose there is no second minimum.
     same = np.linalg.norm((second - first)[:, :3, :3], axis=(1, 2)) < 1e-3
-    return same | (other > cost + TWO_TILTS)
+    return same | (other > cost + options.tilt_chi2)
 
 
 def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
@@ -239,7 +251,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
 def _check_explained(views: BoardViews) -> None:
     """Raise `InputError` if the corners contradict board and camera files."""
     check_numbering(views.poses.residuals, views.views.pixels, views.board, "board.yaml")
-    limit = BOARD_RESIDUAL_LIMIT * views.camera.image_size[0]
+    limit = CAMERA_FIT_OPTIONS.residual_limit * views.camera.image_size[0]
     if not len(views.rms) or np.median(views.rms) <= limit:
         return
     worst = int(np.argmax(views.rms))
@@ -284,7 +296,9 @@ class Standing:
         return replace(poses, by_intrinsics=by)
 
 
-def standing_board(views: BoardViews) -> Standing | None:
+def standing_board(
+    views: BoardViews, options: BoardPoseOptions = BOARD_POSE_OPTIONS
+) -> Standing | None:
     """Pose of a still board in a station's images; None if no image has a usable pose.
 
     Raises `InputError` if the board or the camera moved between images.
@@ -292,9 +306,9 @@ def standing_board(views: BoardViews) -> Standing | None:
     if not views.usable.any():
         return None
     there, noise = _projected_corners(views)
-    agreed = _consistent_images(there, noise, views.usable)
+    agreed = _consistent_images(there, noise, views.usable, options)
     odd = views.usable & ~agreed
-    _check_still(views, there, agreed)
+    _check_still(views, there, agreed, options)
     T_camera_board, covariance, rest = _mean_pose(views, agreed)
     off = there[agreed] - there[agreed].mean(axis=0)
     scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
@@ -327,11 +341,11 @@ def _projected_corners(views: BoardViews) -> tuple[Array, Array]:
     return views.camera.project(there), np.sqrt(np.nanmean(variance, axis=(1, 2)))
 
 
-def _consistent_images(there: Array, noise: Array, usable: Booleans) -> Booleans:
+def _consistent_images(
+    there: Array, noise: Array, usable: Booleans, options: BoardPoseOptions
+) -> Booleans:
     """Largest set of images (F,) that agree with one of them."""
-    limit = np.sqrt(
-        STILL_BOARD_DIFFERENCE**2 + MOVED_BOARD_DEVIATIONS**2 * (noise[:, None] ** 2 + noise**2)
-    )
+    limit = np.sqrt(options.still**2 + options.moved**2 * (noise[:, None] ** 2 + noise**2))
     agree = (_rms_distance(there[:, None], there) <= limit) & usable & usable[:, None]
     return agree[int(np.argmax(agree.sum(axis=1)))]
 
@@ -341,7 +355,9 @@ def _rms_distance(there: Array, other: Array) -> Array:
     return np.sqrt(np.nanmean(np.sum((there - other) ** 2, axis=-1), axis=-1))
 
 
-def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
+def _check_still(
+    views: BoardViews, there: Array, agreed: Booleans, options: BoardPoseOptions
+) -> None:
     """Raise `InputError` if consecutive images disagree with the rest, or too many others."""
     used = np.flatnonzero(views.usable)
     runs = [
@@ -355,7 +371,7 @@ def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
         )  # fmt: skip
         raise _movement_error(views, there, before, after)
     odd = int((views.usable & ~agreed).sum())
-    if odd > MOST_ODD * len(used) and odd > 1:
+    if odd > options.most_outlying * len(used) and odd > 1:
         raise InputError(
             "the board, or the camera, did not stand still",
             where=views.names[0].rpartition("/")[0] or views.names[0],
@@ -449,7 +465,13 @@ class MeanPoses(NamedTuple):
     off: Array
 
 
-def mean_poses(configuration: Integers, T: Array, covariance: Array, common: float) -> MeanPoses:
+def mean_poses(
+    configuration: Integers,
+    T: Array,
+    covariance: Array,
+    common: float,
+    options: BoardPoseOptions = BOARD_POSE_OPTIONS,
+) -> MeanPoses:
     """Mean pose over the repeats of each configuration, with outliers rejected.
 
     configuration : (N,).
@@ -464,7 +486,7 @@ def mean_poses(configuration: Integers, T: Array, covariance: Array, common: flo
     # With two repeats the outlier is unknown: both stay, and their scatter increases sigma.
     repeated = groups.count[groups.member] > 2
     usual = float(np.median(off[repeated])) if repeated.any() else 1.0
-    used = (off < ODD_BOARD_DEVIATIONS * max(1.0, usual)) | ~repeated
+    used = (off < options.outlying * max(1.0, usual)) | ~repeated
     # Mean of the rest.
     groups_used = groups_of(configuration[used])
     delta, covariance_used = delta[used], covariance[used]
@@ -489,7 +511,9 @@ def _deviation(delta: Array, covariance: Array) -> Array:
     return np.sqrt(np.mean(white**2, axis=-1))
 
 
-def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[Rejection, ...]]:
+def one_a_configuration(
+    views: BoardViews, mount: int, options: BoardPoseOptions = BOARD_POSE_OPTIONS
+) -> tuple[PoseSet, tuple[Rejection, ...]]:
     """Measurements of a board on the platform, one for each configuration, and rejections of
     outlying repeats.
     """
@@ -499,12 +523,13 @@ def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[R
         return PoseSet.empty(), ()
     sigma2 = float(np.median(views.views.sigma[views.views.visible]) ** 2)
     noise2 = views.poses.noise**2
-    common = min(noise2 / (noise2 + sigma2), MOST_COMMON)
+    common = min(noise2 / (noise2 + sigma2), options.most_common)
     means = mean_poses(
         rows,
         views.poses.T_camera_board[usable],
         views.poses.covariance[usable],
         common,
+        options=options,
     )
     odd = tuple(
         views.rejection(int(views.numbers[usable[k]]), ODD_BOARD_REASON.format(means.off[k]))

@@ -20,13 +20,13 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.refinement import FEW_MEASURED, RefinementResult
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import placed_at
-from pkmcal.observe.repeats import combined
-from pkmcal.observe.station_localization import BY_CHANCE
+from pkmcal.observe.repeats import combine_repeats
+from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.session.load import Session
 from pkmcal.wording import how_often
 
-IMAGE_OFFSET = 2 * legs.LEG_SEARCH_REACH
+IMAGE_OFFSET = 2 * legs.LEG_SEARCH_OPTIONS.reach
 """Shift of the images, px: further than legs are searched."""
 OFFSET_DIRECTIONS = 8
 """Number of directions of the shift, evenly spaced; the p-value is that of one more draw."""
@@ -94,7 +94,7 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     mine = np.isin(in_view.edges.station, stations)
     measured = int(np.sum(mine & ~in_view.edges.coarse))
     missed = sum(
-        r.side >= 0 and r.reason != legs.OUT_OF_SIGHT_REASON and r.station in stations
+        r.side >= 0 and r.code != "edges.out_of_sight" and r.station in stations
         for r in in_view.rejected
     )
     given_up = int(np.sum(mine & (turns.estimate.edge_weights < 0.5)))  # which are among both
@@ -110,7 +110,8 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     own = _count(turns, stations, np.zeros(2))
     apart = (own - mean) / (spread * np.sqrt(1 + 1 / len(counts)))
     chance = float(stdtr(len(counts) - 1, -apart))
-    return _Offered(in_sight, measured, mean, chance) if chance >= BY_CHANCE else None
+    surely = chance < LOCALIZATION_OPTIONS.by_chance
+    return None if surely else _Offered(in_sight, measured, mean, chance)
 
 
 def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> int:
@@ -126,5 +127,5 @@ def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> i
     placed = placed_at(shifted, state.T_camera_base, state.T_base_platform)
     passes = legs.measure_stations(placed, turns.estimate.machine, turns.blur)
     return sum(
-        len(combined(station_edges).edges) for station_edges in passes
+        len(combine_repeats(station_edges).edges) for station_edges in passes
     )  # as those that were measured

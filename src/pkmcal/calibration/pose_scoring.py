@@ -60,7 +60,7 @@ machine."""
 PASSES_FROM_NOMINAL, PASSES_FROM_PRIOR = 4, 2
 """Numbers of measurement passes of silhouettes, each from the estimate before: the nominal model
 is off by pixels, a machine that images have determined is not."""
-SILHOUETTE_SCATTER = legs.SEARCH_SIGMA
+SILHOUETTE_SCATTER = legs.LEG_SEARCH_OPTIONS.sigma
 """Largest scatter of silhouettes about image edges, pixels of the finest tables: a whole leg is
 measured no less accurately, and the nominal model's errors are explained by then. By chance legs
 lie near image edges; they do not lie on them."""

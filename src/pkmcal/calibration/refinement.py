@@ -48,9 +48,9 @@ from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages, placed_at
 from pkmcal.observe.image_localization import finest_view
 from pkmcal.observe.images import CACHED_IMAGE_BYTES
-from pkmcal.observe.profiles import EDGE_SHIFTS, BlurByStation
+from pkmcal.observe.profiles import PROFILE_OPTIONS, BlurByStation
 from pkmcal.observe.quality import quality
-from pkmcal.observe.repeats import combined
+from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.outcome.finding import Finding, note, wrong
 from pkmcal.session.load import Session
@@ -75,7 +75,7 @@ SETTLED_EDGE_DISTANCE = 0.15
 """Median distance (px) of edges from their prediction below which another look changes nothing:
 the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
 far."""
-ASTRAY_EDGE_DISTANCE = float(EDGE_SHIFTS[-1]) / 3
+ASTRAY_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 3
 """The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
 over the profiles' reach, so that the median of hundreds of places is half of it."""
 IMPUTATION_PASSES = 6
@@ -512,8 +512,8 @@ def _first_estimate(
         return bundle(session.machine, measurements, begin(measurements))
     start: State | None = None
     for text, reach, share in (
-        ("Finding the legs", legs.LEG_SEARCH_REACH, 0.35),
-        ("Finding the legs again", legs.REPEATED_SEARCH_REACH, 0.4),
+        ("Finding the legs", legs.LEG_SEARCH_OPTIONS.reach, 0.35),
+        ("Finding the legs again", legs.LEG_SEARCH_OPTIONS.repeated_reach, 0.4),
     ):
         done = _counted(progress, text, total, share)
         search = partial(_whole_legs, scene=reference_values, reach=reach, done=done)
@@ -616,9 +616,9 @@ def _search_pass(
     """
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in images)
     if pixels <= CACHED_IMAGE_BYTES:
-        return [combined(one) for one in measure(images)]
+        return [combine_repeats(one) for one in measure(images)]
     with ThreadPoolExecutor(THREADS) as pool:
-        return [combined(one) for (one,) in pool.map(measure, ([p] for p in images))]
+        return [combine_repeats(one) for (one,) in pool.map(measure, ([p] for p in images))]
 
 
 def _edges(passes: list[legs.StationEdges]) -> EdgeSet:

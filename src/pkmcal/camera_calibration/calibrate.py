@@ -13,6 +13,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.fit import (
+    CAMERA_FIT_OPTIONS,
     CameraFit,
     Views,
     check_numbering,
@@ -38,32 +39,38 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.wording import listed
 
-LEAST_VIEWS = 3
-"""Fewest images that show the board."""
-GOOD_VIEWS = 6
-"""Number of images below which a warning is given."""
-UNFIT_MODEL_RATIO = 3.0
-"""Ratio of held-out errors above which a model named by the user is refused; a smaller significant
-ratio gives a warning."""
-LEAST_SURE = 0.02
-"""Largest standard deviation of the focal length, as a share of it; a machine of 1 m would be off
-by 2 cm."""
-HELD_OUT_ERROR_LIMIT = 0.004
-"""Held-out error, as a share of the image's width, above which no model explains the images."""
-MOST_CORNERS_LOST = 0.25
-"""Largest share of rejected corners. Their noise is estimated from the better half of all corners,
-which does not represent the rest if its errors are of another kind."""
-ODD_VIEW_RMS_FACTOR = 2.5
-"""Ratio of a view's held-out error to the median of all views above which the view is reported."""
-FACING_CAMERA_TILT = 15.0
-"""Tilt of a board in degrees below which views all have the same information on the focal length,
-which is little."""
-COVERAGE_CELLS = (8, 6)
-"""Columns and rows of cells by which the coverage of the image is counted."""
-LEAST_COVERED_SHARE = 0.5
-"""Share of cells with corners below which a warning is given."""
-STRONG_INTRINSICS_CORRELATION = 0.95
-"""Correlation above which two intrinsics are reported as hardly separable."""
+
+@dataclass(frozen=True)
+class CalibrationCheckOptions:
+    """Thresholds of the checks of a camera calibration."""
+
+    # fewest images that show the board
+    least_views: int = 3
+    # number of images below which a warning is given
+    good_views: int = 6
+    # ratio of held-out errors above which a model named by the user is refused; a smaller
+    # significant ratio gives a warning
+    unfit_ratio: float = 3.0
+    # largest standard deviation of the focal length, as a share of it; a machine of 1 m would be
+    # off by 2 cm
+    least_sure: float = 0.02
+    # largest share of rejected corners. Their noise is estimated from the better half of all
+    # corners, which does not represent the rest if its errors are of another kind
+    most_lost: float = 0.25
+    # ratio of a view's held-out error to the median of all views above which the view is reported
+    outlying_view: float = 2.5
+    # tilt of a board in degrees below which views all have the same information on the focal
+    # length, which is little
+    facing_tilt: float = 15.0
+    # columns and rows of cells by which the coverage of the image is counted
+    cells: tuple[int, int] = (8, 6)
+    # share of cells with corners below which a warning is given
+    least_covered: float = 0.5
+    # correlation above which two intrinsics are reported as hardly separable
+    strong_correlation: float = 0.95
+
+
+CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
 
 
 @dataclass(frozen=True)
@@ -128,7 +135,7 @@ class CameraCalibration:
             (names[i], names[j], float(rho[i, j]))
             for i in range(len(names))
             for j in range(i + 1, len(names))
-            if abs(rho[i, j]) >= STRONG_INTRINSICS_CORRELATION
+            if abs(rho[i, j]) >= CALIBRATION_CHECK_OPTIONS.strong_correlation
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
@@ -171,15 +178,21 @@ class CameraCalibration:
 
 
 def calibrate_images(
-    paths: Sequence[Path | str], board: Board, model: str = "auto"
+    paths: Sequence[Path | str],
+    board: Board,
+    model: str = "auto",
+    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
     _check_model_name(model)
-    return calibrate_camera(detect_boards(paths, board), board, model)
+    return calibrate_camera(detect_boards(paths, board), board, model, options=options)
 
 
 def calibrate_camera(
-    detections: Sequence[Detection], board: Board, model: str = "auto"
+    detections: Sequence[Detection],
+    board: Board,
+    model: str = "auto",
+    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
 ) -> CameraCalibration:
     """Calibrate a camera from detected corners.
 
@@ -189,7 +202,7 @@ def calibrate_camera(
     """
     _check_model_name(model)
     used = [detection for detection in detections if detection.success]
-    check_enough(used, len(detections))
+    check_enough(used, len(detections), options=options)
     image_size = used[0].image_size
     views = views_of(used, board)
     # Choose the model and its coefficients on a subset of the corners.
@@ -198,14 +211,14 @@ def calibrate_camera(
     if not mine:
         raise no_fit(model, pool)
     chosen = best_of(mine)
-    model_warnings = check_model(model, chosen, best_of(pool))
+    model_warnings = check_model(model, chosen, best_of(pool), options=options)
     # Fit all corners, with the covariance scaled by the disagreement of the views.
     fit = fitted_to_all(chosen, views)
-    check_corners(fit, views, board)
+    check_corners(fit, views, board, options=options)
     by_noise, poses_by_noise, _ = covariance_of(fit, views)
     spread = spread_of_views(fit, views)
     covariance = by_noise * spread**2
-    check_determined(fit, covariance, views)
+    check_determined(fit, covariance, views, options=options)
     # Test on held-out views.
     tested = held_out(fit, views, board.lines)
     check_explained(tested.rms, fit.camera)
@@ -230,7 +243,9 @@ def calibrate_camera(
         detections=tuple(detections),
         findings=(),
     )
-    return replace(calibration, findings=(*model_warnings, *calibration_findings(calibration)))
+    return replace(
+        calibration, findings=(*model_warnings, *calibration_findings(calibration, options=options))
+    )
 
 
 def _check_model_name(model: str) -> None:
@@ -244,13 +259,16 @@ def _check_model_name(model: str) -> None:
         )
 
 
-def check_enough(used: Sequence[Any], taken: int) -> None:
-    """Raise `InputError` if fewer than LEAST_VIEWS images show the board."""
-    if len(used) < LEAST_VIEWS:
+def check_enough(
+    used: Sequence[Any], taken: int, options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS
+) -> None:
+    """Raise `InputError` if too few images show the board."""
+    if len(used) < options.least_views:
         raise InputError(
             "too few images show the board",
             found=f"{len(used)} of {taken}",
-            expected=f"{LEAST_VIEWS} at least, better ten, with the board tilted differently",
+            expected=f"{options.least_views} at least, better ten,"
+            " with the board tilted differently",
         )
 
 
@@ -265,14 +283,19 @@ def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
     )
 
 
-def check_model(model: str, chosen: Candidate, best: Candidate) -> list[Finding]:
+def check_model(
+    model: str,
+    chosen: Candidate,
+    best: Candidate,
+    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
+) -> list[Finding]:
     """Warnings about a model chosen by the user that is worse than another; raises `InputError` if
     it does not fit.
     """
     if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
         return []
     ratio = chosen.left_out / best.left_out
-    if ratio > UNFIT_MODEL_RATIO:
+    if ratio > options.unfit_ratio:
         raise InputError(
             f"the model {model} does not fit the images",
             found=f"an error of {chosen.left_out:.2g} px on views left out",
@@ -289,7 +312,12 @@ def check_model(model: str, chosen: Candidate, best: Candidate) -> list[Finding]
     ]
 
 
-def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
+def check_determined(
+    fit: CameraFit,
+    covariance: Array,
+    views: Views,
+    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
+) -> None:
     """Raise `ResultError` if the views do not determine the focal length."""
     names = fit.camera.parameter_names
     mine = [names.index("focal.x"), names.index("focal.y")]
@@ -303,7 +331,7 @@ def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
     else:
         sigma = np.sqrt(np.diag(covariance))[mine]
     share = float(np.max(sigma / fit.camera.parameters[mine]))
-    if share <= LEAST_SURE and np.isfinite(share):
+    if share <= options.least_sure and np.isfinite(share):
         return
     tilt = tilts(fit.T_camera_board, views.points)
     raise ResultError(
@@ -316,19 +344,24 @@ def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
     )
 
 
-def check_corners(fit: CameraFit, views: Views, board: Board) -> None:
+def check_corners(
+    fit: CameraFit,
+    views: Views,
+    board: Board,
+    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
+) -> None:
     """Raise `InputError` if the corners contradict the board file, and `ResultError` if too many
     corners are rejected.
     """
     check_numbering(fit.residuals, views.pixels, board, "the board file")
     visible = views.visible
     rejected = 1 - float((visible & (fit.weight >= 0.5)).sum()) / max(int(visible.sum()), 1)
-    if rejected <= MOST_CORNERS_LOST:
+    if rejected <= options.most_lost:
         return
     raise ResultError(
         "too many of the board's corners do not fit the rest",
         found=f"{rejected:.0%} of them ({fit.camera.model} fits best)",
-        expected=f"{MOST_CORNERS_LOST:.0%} at most",
+        expected=f"{options.most_lost:.0%} at most",
         next_step="Look for a bent board, a wrong board file, motion blur, or a zoom or focus that"
         " moved",
     )
@@ -336,7 +369,7 @@ def check_corners(fit: CameraFit, views: Views, board: Board) -> None:
 
 def check_explained(rms: float, camera: Camera) -> None:
     """Raise `ResultError` if the best model does not explain the images."""
-    limit = HELD_OUT_ERROR_LIMIT * camera.image_size[0]
+    limit = CAMERA_FIT_OPTIONS.residual_limit * camera.image_size[0]
     if rms <= limit:
         return
     raise ResultError(
@@ -356,25 +389,29 @@ def tilts(T_camera_board: Array, points: Array) -> Array:
     return np.rad2deg(np.arctan2(across, np.abs(dot(normal, middle))))
 
 
-def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
-    """Number of corners in each cell of the image, (rows, columns) for COVERAGE_CELLS columns and
-    rows.
-    """
+def coverage(
+    pixels: Array,
+    image_size: tuple[int, int],
+    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
+) -> Array:
+    """Number of corners in each cell of the image, (rows, columns)."""
     flat = pixels[np.isfinite(pixels).all(axis=-1)]
     edges = [
         np.linspace(-0.5, size - 0.5, n + 1)
-        for size, n in zip(image_size, COVERAGE_CELLS, strict=True)
+        for size, n in zip(image_size, options.cells, strict=True)
     ]
     return np.histogram2d(flat[:, 1], flat[:, 0], bins=(edges[1], edges[0]))[0]
 
 
-def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
+def calibration_findings(
+    calibration: CameraCalibration, options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS
+) -> Iterator[Finding]:
     """Warnings about a usable camera calibration."""
     c = calibration
     missed = [f"{d.name} ({d.reason})" for d in c.detections if not d.success]
     if missed:
         yield doubtful("lens.unused", number=len(missed), of=len(c.detections), names=missed)
-    if len(c.views) < GOOD_VIEWS:
+    if len(c.views) < options.good_views:
         yield doubtful("lens.few_views", number=len(c.views))
     mirrored = [d.name for d in c.detections if d.mirrored]
     if mirrored and len(mirrored) < sum(d.success for d in c.detections):
@@ -384,10 +421,10 @@ def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
     if c.spread > 1:
         yield doubtful("lens.views_disagree", scale=c.spread)
     most = float(tilts(c.T_camera_board, c.board.points).max())
-    if most < FACING_CAMERA_TILT:
+    if most < options.facing_tilt:
         yield doubtful("lens.little_tilt", degrees=most)
-    covered = float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
-    if covered < LEAST_COVERED_SHARE:
+    covered = float(np.mean(coverage(c.pixels, c.camera.image_size, options=options) > 0))
+    if covered < options.least_covered:
         yield doubtful("lens.little_covered", percent=100 * covered)
     finite = np.isfinite(c.residuals).all(axis=-1)
     rejected = int((finite & ~c.inliers).sum())
@@ -395,7 +432,7 @@ def calibration_findings(calibration: CameraCalibration) -> Iterator[Finding]:
         yield doubtful("lens.rejected_corners", number=rejected, of=int(finite.sum()))
     middle = float(np.median(c.held_out.by_view))
     for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True):
-        if rms > ODD_VIEW_RMS_FACTOR * middle:
+        if rms > options.outlying_view * middle:
             yield doubtful("lens.odd_view", name, scale=rms / middle)
     # intrinsics that are determined only together with xi
     others = [

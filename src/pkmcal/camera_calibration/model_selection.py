@@ -14,6 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, rms
 from pkmcal.boards.fit import (
+    MEDIAN_LENGTH,
     CameraFit,
     Views,
     fit_board_poses,
@@ -31,19 +32,41 @@ from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE
 FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of starting values for the pixels per radian at the image's centre, as a share of its
 width."""
-FOCALS_TRIED = 16
-"""Focal lengths of the grid, in geometric steps over the range."""
-XIS_TRIED = (0.0, 0.5, 1.0, 1.5, 2.2)
-"""Values of xi of the grid."""
-CAMERA_STARTS_REFINED = 3
-"""Number of best starting values that are refined."""
-CAMERA_START_ROUNDS = 3
-"""IRLS rounds of this refinement."""
-HELD_OUT_PARTS = 10
-"""Number of parts into which the views are dealt; each is predicted by a camera fitted to the
-others."""
-CHANCE_DISAGREEMENT_RATIO = 1.5
-"""Ratio of variances between views and corners that chance explains for about ten views."""
+
+
+@dataclass(frozen=True)
+class ModelSelectionOptions:
+    """Constants of the selection of a camera model and its coefficients."""
+
+    # focal lengths of the grid, in geometric steps over the range
+    focals: int = 16
+    # values of xi of the grid
+    xis: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.2)
+    # number of best starting values that are refined
+    starts: int = 3
+    # IRLS rounds of this refinement
+    start_rounds: int = 3
+    # number of parts into which the views are dealt; each is predicted by a camera fitted to the
+    # others
+    parts: int = 10
+    # ratio of variances between views and corners that chance explains for about ten views
+    # (statistical)
+    chance_ratio: float = 1.5
+    # least relative decrease of the held-out error that justifies a coefficient
+    least_gain: float = 0.01
+    # number of corners used for the selection; the final fit uses all
+    most_corners: int = 1500
+    # fewest corners that determine a board's pose (derived)
+    least_rays: int = 4
+    # fewest corners kept of each view, if it has as many
+    least_of_view: int = 12
+    # ratio of residuals to another model's, with two radial terms, above which no more terms are
+    # tried
+    hopeless_ratio: float = 5.0
+
+
+MODEL_SELECTION_OPTIONS = ModelSelectionOptions()
+
 DISTORTION_CANDIDATES: dict[str, tuple[tuple[str, ...], ...]] = {
     "pinhole": (
         (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
@@ -52,19 +75,6 @@ DISTORTION_CANDIDATES: dict[str, tuple[tuple[str, ...], ...]] = {
     "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
 }  # fmt: skip
 """Sets of distortion coefficients by model, from few to many; the first of equal ones wins."""
-LEAST_GAIN = 0.01
-"""Least relative decrease of the held-out error that justifies a coefficient."""
-MEDIAN_LENGTH = float(np.sqrt(2 * np.log(2)))
-"""Median length of a vector of two normal numbers, in their standard deviation."""
-MOST_CORNERS = 1500
-"""Number of corners used for the selection; the final fit uses all."""
-LEAST_RAYS = 4
-"""Fewest corners that determine a board's pose."""
-LEAST_OF_VIEW = 12
-"""Fewest corners kept of each view, if it has as many."""
-HOPELESS_MODEL_RATIO = 5.0
-"""Ratio of residuals to another model's, with two radial terms, above which no more terms are
-tried."""
 
 
 def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers:
@@ -74,12 +84,17 @@ def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers
     return np.array([k for k, name in enumerate(names) if name in base or name in terms])
 
 
-def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFit | None:
+def first_fit(
+    model: str,
+    views: Views,
+    image_size: tuple[int, int],
+    options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS,
+) -> CameraFit | None:
     """Best fit without distortion; None if no starting value gives finite pixels."""
     scored: list[tuple[float, Camera, Array]] = []
-    for camera in starting_cameras(model, image_size):
+    for camera in starting_cameras(model, image_size, options=options):
         rays = camera.ray(views.pixels)
-        if np.isfinite(rays).all(axis=-1).sum(axis=-1).min() < LEAST_RAYS:
+        if np.isfinite(rays).all(axis=-1).sum(axis=-1).min() < options.least_rays:
             continue  # this camera has no rays for the corners, and so no initial poses
         poses = linear_poses(rays, views.points)
         off = camera.project(apply(poses[:, None], views.points)) - views.pixels
@@ -91,9 +106,9 @@ def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFi
     scored.sort(key=lambda item: item[0])
     # Refine the best few.
     best: CameraFit | None = None
-    for _, camera, poses in scored[:CAMERA_STARTS_REFINED]:
+    for _, camera, poses in scored[: options.starts]:
         settled = settled_poses(camera, views, poses)
-        fit = fit_camera(camera, positions(camera, ()), views, settled, CAMERA_START_ROUNDS)
+        fit = fit_camera(camera, positions(camera, ()), views, settled, options.start_rounds)
         if best is None or _median_residual(fit) < _median_residual(best):
             best = fit
     return best
@@ -104,13 +119,17 @@ def extended(fit: CameraFit, views: Views, terms: tuple[str, ...]) -> CameraFit:
     return fit_camera(fit.camera, positions(fit.camera, terms), views, fit.T_camera_board)
 
 
-def starting_cameras(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
+def starting_cameras(
+    model: str,
+    image_size: tuple[int, int],
+    options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS,
+) -> Iterator[Camera]:
     """Starting values of a model without distortion: a grid of focal lengths, and of xi."""
     width, height = image_size
     kind = camera_models()[model]
     names = kind.parameter_names
-    for scale in np.geomspace(*FOCAL_RANGES[model], FOCALS_TRIED):
-        for xi in XIS_TRIED if "xi" in names else (0.0,):
+    for scale in np.geomspace(*FOCAL_RANGES[model], options.focals):
+        for xi in options.xis if "xi" in names else (0.0,):
             parameters = dict.fromkeys(names, 0.0)
             parameters["focal.x"] = parameters["focal.y"] = float(scale) * width * (1 + xi)
             parameters["center.x"], parameters["center.y"] = (width - 1) / 2, (height - 1) / 2
@@ -137,13 +156,18 @@ class HeldOut:
     straightness: float
 
 
-def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -> HeldOut:
+def held_out(
+    fit: CameraFit,
+    views: Views,
+    lines: tuple[tuple[int, ...], ...],
+    options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS,
+) -> HeldOut:
     """Errors of each part of the views under a camera refitted to the other parts."""
     count = len(fit.T_camera_board)
     inliers = (fit.weight >= 0.5) & views.visible
     residuals = np.full(views.pixels.shape, np.nan)
     bends: list[Array] = []
-    part_of = np.arange(count) % min(HELD_OUT_PARTS, count)
+    part_of = np.arange(count) % min(options.parts, count)
     for part in range(part_of.max() + 1):
         out = np.flatnonzero(part_of == part)
         # Camera from the other views; poses of this part fitted to it.
@@ -202,7 +226,9 @@ def leave_one_out_residuals(fit: CameraFit, views: Views) -> Array:
     return fit.residuals + np.where(scale > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
 
 
-def spread_of_views(fit: CameraFit, views: Views) -> float:
+def spread_of_views(
+    fit: CameraFit, views: Views, options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS
+) -> float:
     """Ratio of the intrinsics' standard deviation by the jackknife over views to that by the
     corners' noise.
 
@@ -214,7 +240,7 @@ def spread_of_views(fit: CameraFit, views: Views) -> float:
     count = len(changes)
     jackknife = (count - 1) / count * deviation.T @ deviation
     ratio = float(np.trace(normal @ jackknife)) / max(len(fit.free), 1)
-    return float(np.sqrt(ratio)) if ratio > CHANCE_DISAGREEMENT_RATIO else 1.0
+    return float(np.sqrt(ratio)) if ratio > options.chance_ratio else 1.0
 
 
 def _jackknife_changes(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
@@ -256,7 +282,10 @@ class Candidate:
 
 
 def camera_candidates(
-    views: Views, image_size: tuple[int, int], models: tuple[str, ...]
+    views: Views,
+    image_size: tuple[int, int],
+    models: tuple[str, ...],
+    options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS,
 ) -> tuple[Candidate, ...]:
     """All models with each of their sets of coefficients, fitted; models without a starting value
     are missing.
@@ -264,13 +293,13 @@ def camera_candidates(
     fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
     # The unified model first: it fits almost any lens, and shows which other models are hopeless.
     for model in sorted(models, key=list(DISTORTION_CANDIDATES).index, reverse=True):
-        start = first_fit(model, views, image_size)
+        start = first_fit(model, views, image_size, options=options)
         if start is None:
             continue
         for terms in DISTORTION_CANDIDATES[model]:
             fit = extended(start, views, terms)
             fits.append((model, terms, fit))
-            if "k2" in terms and _median_residual(fit) > HOPELESS_MODEL_RATIO * min(
+            if "k2" in terms and _median_residual(fit) > options.hopeless_ratio * min(
                 _median_residual(f) for _, _, f in fits
             ):
                 break
@@ -306,17 +335,23 @@ def camera_candidates(
     return tuple(sorted(pool, key=lambda c: list(DISTORTION_CANDIDATES).index(c.model)))
 
 
-def best_of(pool: tuple[Candidate, ...]) -> Candidate:
+def best_of(
+    pool: tuple[Candidate, ...], options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS
+) -> Candidate:
     """Candidate with the fewest parameters among those not significantly worse than the best."""
     best = min(pool, key=lambda c: c.robust)
-    return min((c for c in pool if not is_worse(c, best)), key=lambda c: c.parameters)
+    return min(
+        (c for c in pool if not is_worse(c, best, options=options)), key=lambda c: c.parameters
+    )
 
 
-def is_worse(candidate: Candidate, best: Candidate) -> bool:
-    """Whether held-out views favour ``best`` significantly: by LEAST_GAIN of the error, and by more
+def is_worse(
+    candidate: Candidate, best: Candidate, options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS
+) -> bool:
+    """Whether held-out views favour ``best`` significantly: by the least gain, and by more
     than the standard error of the difference over the views.
     """
-    if candidate.robust <= best.robust * (1 + LEAST_GAIN):
+    if candidate.robust <= best.robust * (1 + options.least_gain):
         return False
     gain = candidate.by_view - best.by_view
     error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
@@ -329,17 +364,17 @@ def fitted_to_all(chosen: Candidate, views: Views) -> CameraFit:
     return fit_camera(fit.camera, fit.free, views, fit.T_camera_board)
 
 
-def thinned(views: Views) -> Views:
-    """Views with at most about MOST_CORNERS corners in all, spread over the board."""
+def thinned(views: Views, options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS) -> Views:
+    """Views with about the most corners in all, spread over the board."""
     total = int(views.visible.sum())
-    if total <= MOST_CORNERS:
+    if total <= options.most_corners:
         return views
     # One random set of corners for all views keeps arrays small and has no pattern of rows.
     order = np.random.default_rng(0).permutation(len(views.points))
-    used = order[: max(len(order) * MOST_CORNERS // total, LEAST_OF_VIEW)]
+    used = order[: max(len(order) * options.most_corners // total, options.least_of_view)]
     for visible in views.visible:
         mine = order[visible[order]]
-        used = np.union1d(used, mine[:LEAST_OF_VIEW])
+        used = np.union1d(used, mine[: options.least_of_view])
     return Views(views.points[used], views.pixels[:, used], views.sigma[:, used])
 
 

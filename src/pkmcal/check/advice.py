@@ -15,8 +15,8 @@ from pkmcal.check.forecast import Forecast, LegForecast
 from pkmcal.check.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.profiles import PROFILE_REACH_INSIDE, SATURATED_GREY_LEVEL
-from pkmcal.observe.quality import BLACK_GREY_LEVEL
+from pkmcal.observe.profiles import PROFILE_OPTIONS
+from pkmcal.observe.quality import QUALITY_OPTIONS
 from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.planning.first import EdgesOf
@@ -123,7 +123,7 @@ def _hidden_legs(inspection: Inspection) -> list[Finding]:
 
 def _slim_tubes(inspection: Inspection) -> list[Finding]:
     """Advice on tubes so narrow in a station's images that the profiles of both edges overlap."""
-    tubes, least = tubes_of(inspection.session.machine), 2 * PROFILE_REACH_INSIDE
+    tubes, least = tubes_of(inspection.session.machine), 2 * PROFILE_OPTIONS.reach_inside
     out: list[Finding] = []
     for station in inspection.stations:
         if station.quality is None:
@@ -155,7 +155,10 @@ def _lost_edges(
     usual = float(np.median(usual)) if usual.size else math.nan
     finite = lost & np.isfinite(contrast)
     brighter = np.fmax(level, behind)
-    kinds = {"white": brighter >= SATURATED_GREY_LEVEL, "black": brighter <= BLACK_GREY_LEVEL}
+    kinds = {
+        "white": brighter >= QUALITY_OPTIONS.saturated,
+        "black": brighter <= QUALITY_OPTIONS.black,
+    }
     kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < usual / 2)
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
     number = {name: int(np.sum(finite & of)) for name, of in kinds.items()}

@@ -24,7 +24,6 @@ from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.legs import (
-    OUT_OF_SIGHT_REASON,
     StationEdges,
     measure,
     search,
@@ -328,9 +327,9 @@ def first_track_state(view: MachineView, start: Array | None = None) -> TrackSta
 
 def warm_up(blur: float) -> None:
     """Fill the tables of edge profiles for a blur (px), so that no image waits for them."""
-    samples = len(profiles.profile_offsets())
-    width = np.repeat(profiles.HALF_WIDTHS, samples)
-    cut = np.tile(np.arange(samples), len(profiles.HALF_WIDTHS))
+    samples = len(profiles.PROFILE_OPTIONS.profile_offsets)
+    width = np.repeat(profiles.PROFILE_OPTIONS.half_widths, samples)
+    cut = np.tile(np.arange(samples), len(profiles.PROFILE_OPTIONS.half_widths))
     grey = np.zeros((len(width), samples))
     none = np.zeros(len(width), dtype=int)
     some = profiles.Profiles(grey, np.ones(len(width)), width, cut, none, none, none > 0)
@@ -431,9 +430,9 @@ def _reasons(sight: Sight, at: _EdgePass) -> tuple[str, ...]:
         return ("its edges are not where they were predicted",) * len(sight.view.legs)
     out: list[str] = []
     for leg, results, agrees in zip(sight.view.legs, at.lines.valid, at.lines.agrees, strict=True):
-        mine = [r.reason for r in at.station_edges.rejected if r.leg == leg]
-        display = [reason for reason in mine if reason != OUT_OF_SIGHT_REASON]
-        why = (display or mine or ["only one of its sides is seen"])[0]
+        mine = [r for r in at.station_edges.rejected if r.leg == leg]
+        in_sight = [r for r in mine if r.code != "edges.out_of_sight"]
+        why = ([r.reason for r in in_sight or mine] or ["only one of its sides is seen"])[0]
         out.append("" if results else why if agrees else "its edges do not belong to one leg")
     return tuple(out)
 

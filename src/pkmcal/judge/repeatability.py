@@ -28,7 +28,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
     Groups,
     groups_of,
-    odd_ones,
+    outlying_repeats,
     pixel_units,
     same_edges,
     turns_from_first,
@@ -247,7 +247,7 @@ class _StationEdges:
         photo = edges.configuration
         edges = replace(edges, configuration=rows[photo])
         # reject outlying repeats
-        odd = odd_ones(edges, same_edges(edges))
+        odd = outlying_repeats(edges, same_edges(edges))
         keep = ~odd.any
         edges, photo = edges.select(keep), photo[keep]
         same = same_edges(edges)

@@ -132,8 +132,8 @@ class EdgeSet:
         """The edges with standard deviations larger by a factor."""
         return replace(self, covariance=self.covariance * factor**2)
 
-    def rejection(self, k: int, reason: str) -> Rejection:
-        """Rejection of the edge at position k, with a reason."""
+    def rejection(self, k: int, reason: str, code: str = "") -> Rejection:
+        """Rejection of the edge at position k, with a reason and its code."""
         return Rejection(
             station=int(self.station[k]),
             configuration=int(self.configuration[k]),
@@ -141,6 +141,7 @@ class EdgeSet:
             tube=int(self.tube[k]),
             side=int(self.side[k]),
             reason=reason,
+            code=code,
         )
 
 
@@ -148,7 +149,8 @@ class EdgeSet:
 class Rejection:
     """A measurement that was rejected, or not found, and the reason.
 
-    tube and side are -1 for a whole leg, leg is -1 for a whole image.
+    tube and side are -1 for a whole leg, leg is -1 for a whole image. code : of the finding whose
+    sentence the reason is, empty for other reasons.
     """
 
     station: int
@@ -157,6 +159,7 @@ class Rejection:
     tube: int
     side: int
     reason: str
+    code: str = ""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ with itself from both sides. Features are Lowe's SIFT (International Journal of 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 from itertools import combinations
 from typing import NamedTuple
 
@@ -26,49 +27,67 @@ from pkmcal.observe.image_localization import PoseHypotheses
 from pkmcal.observe.pose_candidates import same_pose
 from pkmcal.observe.predict import LegsInCamera
 
-LARGEST_TEXTURE_SIDE = 1600
-"""Longer side, in pixels, to which images are reduced for feature detection; finer detail is
-mostly noise."""
-MOST_TEXTURE_POINTS = 3000
-"""Largest number of features of an image; those of most contrast are used."""
-PARTNER_DISTANCE_RATIO = 0.8
-"""Largest ratio of the descriptor distances to the nearest and the second nearest feature at
-which two features are matched (Lowe, section 7.1)."""
-TEXTURE_POINTS_APART = 8.0
-"""Distance in pixels below which two matches count as one: a corner has several descriptors, but
-is one observation."""
-FEWEST_POINT_PAIRS = 16
-"""Fewest matches of two images from which a likelihood is computed; the distribution of chance
-matches cannot be estimated from fewer."""
-MACHINE_OUTLINE_FACTOR = 1.5
-"""Size of the image region that may belong to the machine, relative to the outline of its
-joints: plates, motors and cables extend beyond the joints, to an extent that the nominal model
-does not contain."""
-EPIPOLAR_SPREADS = np.radians([0.1, 0.25, 0.6])
-"""Standard deviations (rad) of points about their epipolar planes, of which the likeliest is
-used: from the localization error of a feature to the camera rotation that a nominal model wrong
-by millimetres causes."""
-RIGHT_PAIR_SHARES = np.linspace(0.02, 0.98, 49)
-"""Shares of correct matches, of which the likeliest is used."""
-PARTNER_EXCHANGES, EPIPOLAR_WINDOW = 20, np.radians(2.0)
-"""Number of random permutations of the partners from which the density of chance matches is
-estimated, and the angle (rad) from the epipolar planes within which these are counted."""
 
-LEAST_LANDMARK_PARALLAX = np.radians(3.0)
-"""Smallest angle (rad) between two rays at which their intersection is used as a landmark: five
-times the largest spread."""
-LANDMARK_TRIPLES_TRIED, LEAST_COSINE_AHEAD = 3000, 0.2
-"""Number of landmark triples tried by RANSAC for the pose of an image: a share of one correct
-landmark in ten suffices to draw three correct ones. Rays whose cosine to the optical axis is
-smaller than the second number are left out."""
+@dataclass(frozen=True)
+class BackgroundOptions:
+    """Constants of the background's features, of their matches, and of landmarks."""
 
-CANDIDATES_TESTED_BY_BACKGROUND = 4
-"""Number of candidate poses of an image around which the background is evaluated."""
-TURN_GRID = np.radians(
-    np.stack(np.meshgrid(*[np.arange(-6.0, 7.0, 2.0)] * 2), axis=-1).reshape(-1, 2)
-)
-"""Rotations (49, 2) about the machine, rad, that are tried there; with larger ones the
-silhouettes would match other legs."""
+    # longer side, px, to which images are reduced for feature detection; finer detail is mostly
+    # noise
+    largest_side: int = 1600
+    # largest number of features of an image; those of most contrast are used
+    most_features: int = 3000
+    # largest ratio of the descriptor distances to the nearest and the second nearest feature at
+    # which two features are matched (Lowe, section 7.1)
+    distance_ratio: float = 0.8
+    # distance in px below which two matches count as one: a corner has several descriptors, but is
+    # one observation
+    apart: float = 8.0
+    # fewest matches of two images from which a likelihood is computed; the distribution of chance
+    # matches cannot be estimated from fewer
+    fewest_pairs: int = 16
+    # size of the image region that may belong to the machine, relative to the outline of its
+    # joints: plates, motors and cables extend beyond the joints, to an extent that the nominal
+    # model does not contain
+    outline_factor: float = 1.5
+    # standard deviations of points about their epipolar planes, rad, of which the likeliest is
+    # used: from the localization error of a feature to the camera rotation that a nominal model
+    # wrong by millimetres causes
+    spreads: tuple[float, ...] = (np.radians(0.1), np.radians(0.25), np.radians(0.6))
+    # number of shares of correct matches, from 2 to 98 %, of which the likeliest is used
+    # (numerical: steps of 2 %)
+    shares: int = 49
+    # number of random permutations of the partners from which the density of chance matches is
+    # estimated
+    exchanges: int = 20
+    # angle from the epipolar planes within which these are counted, rad: three times the largest
+    # spread
+    window: float = np.radians(2.0)
+    # smallest angle between two rays at which their intersection is used as a landmark, rad: five
+    # times the largest spread (derived)
+    least_parallax: float = np.radians(3.0)
+    # number of landmark triples tried by RANSAC for the pose of an image: a share of one correct
+    # landmark in ten suffices to draw three correct ones (derived)
+    triples: int = 3000
+    # cosine of rays to the optical axis below which they are left out of it: normalized
+    # coordinates grow beyond bounds
+    least_cosine: float = 0.2
+    # number of candidate poses of an image around which the background is evaluated
+    candidates: int = 4
+    # largest rotation about the machine that is tried there, degrees; with larger ones the
+    # silhouettes would match other legs
+    turn_reach: float = 6.0
+    # spacing of these rotations, degrees
+    turn_step: float = 2.0
+
+    @cached_property
+    def turns(self) -> Array:
+        """Rotations (n, 2) about the machine, rad, that are tried."""
+        steps = np.arange(-self.turn_reach, self.turn_reach + self.turn_step / 2, self.turn_step)
+        return np.radians(np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2))
+
+
+BACKGROUND_OPTIONS = BackgroundOptions()
 
 
 class Texture(NamedTuple):
@@ -84,13 +103,15 @@ class Texture(NamedTuple):
     descriptor: Array
 
 
-def texture_of(image: Integers, camera: Camera) -> Texture:
+def texture_of(
+    image: Integers, camera: Camera, options: BackgroundOptions = BACKGROUND_OPTIONS
+) -> Texture:
     """Feature points of an image of grey levels (height, width)."""
     import cv2
 
-    scale = min(LARGEST_TEXTURE_SIDE / max(image.shape), 1.0)
+    scale = min(options.largest_side / max(image.shape), 1.0)
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    points, value = cv2.SIFT.create(MOST_TEXTURE_POINTS).detectAndCompute(small, None)
+    points, value = cv2.SIFT.create(options.most_features).detectAndCompute(small, None)
     if not points:
         return Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
     pixel = (np.array([p.pt for p in points]) + 0.5) / scale - 0.5
@@ -100,7 +121,9 @@ def texture_of(image: Integers, camera: Camera) -> Texture:
     return Texture(ray[ok], pixel[ok], np.sqrt(share)[ok].astype(np.float32))
 
 
-def partners(one: Texture, other: Texture) -> Integers:
+def partners(
+    one: Texture, other: Texture, options: BackgroundOptions = BACKGROUND_OPTIONS
+) -> Integers:
     """Indices (n, 2) of mutually nearest features that pass the ratio test, no image point used
     twice.
     """
@@ -123,13 +146,18 @@ def partners(one: Texture, other: Texture) -> Integers:
     for worth, j, k in sorted(mutual):
         at = np.stack([one.pixel[j], other.pixel[k]])
         away = np.abs(taken - at).max(axis=-1)
-        if worth < PARTNER_DISTANCE_RATIO and (away >= TEXTURE_POINTS_APART).all():
+        if worth < options.distance_ratio and (away >= options.apart).all():
             retained_rows.append((j, k))
             taken = np.concatenate([taken, at[None]])
     return np.array(retained_rows, dtype=int).reshape(-1, 2)
 
 
-def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans:
+def beside_machine(
+    pixel: Array,
+    camera: Camera,
+    legs: LegsInCamera,
+    options: BackgroundOptions = BACKGROUND_OPTIONS,
+) -> Booleans:
     """Mask (n,) of the pixels (n, 2) that lie outside the machine's outline.
 
     legs : (L, 3) in the frame of this camera, for this image alone.
@@ -141,7 +169,7 @@ def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans
     if len(joints) < 3:
         return np.ones(len(pixel), dtype=bool)
     middle = (joints.min(axis=0) + joints.max(axis=0)) / 2
-    outline = (middle + MACHINE_OUTLINE_FACTOR * (joints - middle)).astype(np.float32)
+    outline = (middle + options.outline_factor * (joints - middle)).astype(np.float32)
     corner = cv2.convexHull(outline).reshape(-1, 2).astype(float)
     # a point is outside a convex polygon if it is outside one of its sides
     side, away = np.roll(corner, -1, axis=0) - corner, pixel[:, None] - corner
@@ -150,17 +178,19 @@ def beside_machine(pixel: Array, camera: Camera, legs: LegsInCamera) -> Booleans
     return (np.sign(turn.sum()) * inward < 0).any(axis=1)
 
 
-def agreement(one: Array, other: Array, T_other_one: Array) -> float:
+def agreement(
+    one: Array, other: Array, T_other_one: Array, options: BackgroundOptions = BACKGROUND_OPTIONS
+) -> float:
     """Log-likelihood ratio that matched unit rays (n, 3) observe the same points, against chance.
 
     A match is either correct, with a share common to all matches, or distributed as matches with
     permuted partners. The share and the spread of the correct matches are maximized over, and each
     costs half the logarithm of n (Schwarz, Annals of Statistics 6, 1978). Zero for fewer than
-    FEWEST_POINT_PAIRS matches.
+    the options' fewest matches.
 
     T_other_one : (4, 4), from the frame of the first camera to that of the other.
     """
-    if len(one) < FEWEST_POINT_PAIRS:
+    if len(one) < options.fewest_pairs:
         return 0.0
     # normals of the epipolar planes
     ray = one @ T_other_one[:3, :3].T
@@ -168,15 +198,16 @@ def agreement(one: Array, other: Array, T_other_one: Array) -> float:
     normal /= np.maximum(np.sqrt(dot(normal, normal)), 1e-12)[:, None]
     # angles from the planes, and their density by chance
     rng = np.random.default_rng(0)
-    exchanged = other[np.stack([rng.permutation(len(other)) for _ in range(PARTNER_EXCHANGES)])]
+    exchanged = other[np.stack([rng.permutation(len(other)) for _ in range(options.exchanges)])]
     off, by_chance = (np.arcsin(np.clip(dot(normal, v), -1, 1)) for v in (other, exchanged))
-    chance = max(float(np.mean(np.abs(by_chance) < EPIPOLAR_WINDOW)), 1 / by_chance.size) / (
-        2 * EPIPOLAR_WINDOW
+    chance = max(float(np.mean(np.abs(by_chance) < options.window)), 1 / by_chance.size) / (
+        2 * options.window
     )
     # maximum over share and spread, less the penalty of both
-    spread = EPIPOLAR_SPREADS[:, None]
+    spread = np.array(options.spreads)[:, None]
     density = np.exp(-0.5 * (off / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
-    gain = np.log1p(RIGHT_PAIR_SHARES[:, None, None] * (density / chance - 1)).sum(axis=-1)
+    shares = np.linspace(0.02, 0.98, options.shares)[:, None, None]
+    gain = np.log1p(shares * (density / chance - 1)).sum(axis=-1)
     return max(float(gain.max()) - np.log(len(one)), 0.0)
 
 
@@ -210,10 +241,15 @@ class Surroundings:
     returns the grey levels and the camera of the image with a given number.
     """
 
-    def __init__(self, image: Callable[[int], tuple[Integers, Camera]]) -> None:
-        self.texture: Callable[[int], Texture] = cache(lambda k: texture_of(*image(k)))
+    def __init__(
+        self,
+        image: Callable[[int], tuple[Integers, Camera]],
+        options: BackgroundOptions = BACKGROUND_OPTIONS,
+    ) -> None:
+        self.options = options
+        self.texture: Callable[[int], Texture] = cache(lambda k: texture_of(*image(k), options))
         self._pairs: Callable[[int, int], Integers] = cache(
-            lambda j, k: partners(self.texture(j), self.texture(k))
+            lambda j, k: partners(self.texture(j), self.texture(k), options)
         )
 
     def shared(self, one: int, other: int) -> tuple[Integers, Integers]:
@@ -239,7 +275,7 @@ class Surroundings:
                 self.texture(n).ray[m] @ T[:3, :3].T
                 for n, m, T in zip((one, other), (j, k), out, strict=True)
             ]
-            point, ok = _crossing(eyes[0], rays[0], eyes[1], rays[1])
+            point, ok = _crossing(eyes[0], rays[0], eyes[1], rays[1], self.options)
             results[one].append((point[ok], j[ok]))
             results[other].append((point[ok], k[ok]))
         empty = np.zeros((0, 3)), np.zeros(0, dtype=int)
@@ -250,12 +286,14 @@ class Surroundings:
 
     def _beside(self, k: int, numbers: Integers, neighbour: Neighbour) -> Booleans:
         """Mask (n,) of the features of image ``k`` that lie outside the machine's outline."""
-        return beside_machine(self.texture(k).pixel[numbers], neighbour.camera, neighbour.legs)
+        return beside_machine(
+            self.texture(k).pixel[numbers], neighbour.camera, neighbour.legs, options=self.options
+        )
 
     def place(self, one: int, landmarks: Mapping[int, Landmarks]) -> Array:
         """Camera pose T_camera_base (0 or 1, 4, 4) of an image from its matches with landmarks.
 
-        P3P in RANSAC, refined on the inliers; empty with fewer than FEWEST_POINT_PAIRS of them.
+        P3P in RANSAC, refined on the inliers; empty with fewer than the options' fewest of them.
         """
         import cv2
 
@@ -268,19 +306,19 @@ class Surroundings:
             rays.append(self.texture(one).ray[j[at]])
             points.append(reference_values.point[where])
         ray, point = np.concatenate(rays), np.concatenate(points)
-        ahead = ray[:, 2] > LEAST_COSINE_AHEAD
+        ahead = ray[:, 2] > self.options.least_cosine
         ray, point = ray[ahead], point[ahead]
-        if len(ray) < FEWEST_POINT_PAIRS:
+        if len(ray) < self.options.fewest_pairs:
             return np.zeros((0, 4, 4))
         # P3P with RANSAC on normalized image coordinates, then refinement on the inliers
         plane = np.ascontiguousarray(ray[:, :2] / ray[:, 2:])
-        off = float(np.tan(EPIPOLAR_SPREADS[-1]))
+        off = float(np.tan(self.options.spreads[-1]))
         ok, turn, shift, inside = cv2.solvePnPRansac(
             point, plane, np.eye(3), np.zeros(0),
-            iterationsCount=LANDMARK_TRIPLES_TRIED, reprojectionError=off, flags=cv2.SOLVEPNP_AP3P,
+            iterationsCount=self.options.triples, reprojectionError=off, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
         which = np.asarray(inside, dtype=int).ravel() if ok else np.zeros(0, dtype=int)
-        if len(which) < FEWEST_POINT_PAIRS:
+        if len(which) < self.options.fewest_pairs:
             return np.zeros((0, 4, 4))
         turn, shift = cv2.solvePnPRefineLM(
             point[which], plane[which], np.eye(3), np.zeros(0), turn, shift
@@ -304,12 +342,12 @@ class Surroundings:
         legs : (H, L, 3) for each of the hypotheses.
         """
         out = [np.zeros((0, 4, 4))]
-        for h, T in enumerate(hypotheses.T_camera_base[:CANDIDATES_TESTED_BY_BACKGROUND]):
+        for h, T in enumerate(hypotheses.T_camera_base[: self.options.candidates]):
             to_base = inverse(T)
             middle = to_base[:3, :3] @ np.concatenate([legs.a[h], legs.b[h]]).mean(axis=0)
             middle = middle + to_base[:3, 3]
             # rotations about the camera's axes x and y, through the middle of the machine
-            turn = rotation(TURN_GRID @ to_base[:3, :2].T)
+            turn = rotation(self.options.turns @ to_base[:3, :2].T)
             near = T @ pose(turn, middle - turn @ middle)
             gain = self._gain(near, one, camera, [legs[h]] * len(near), placed)
             best = int(np.argmax(gain))
@@ -328,7 +366,7 @@ class Surroundings:
         """Pose hypotheses of an image, with the log-likelihood ratio of the background added.
 
         The background determines from which side the image was taken; the legs determine the exact
-        pose. Hypotheses within SAME_POSE_TURN of each other share the largest gain of the group.
+        pose. Hypotheses that are the same pose share the largest gain of the group.
 
         hypotheses : log-likelihood ratios in unit 1.
         camera : of this image.
@@ -363,20 +401,26 @@ class Surroundings:
             j, k = self.shared(one, other)
             beside = self._beside(other, k, in_view)
             for h, T in enumerate(T_camera_base):
-                ok = beside & beside_machine(texture.pixel[j], camera, legs[h])
+                ok = beside & beside_machine(
+                    texture.pixel[j], camera, legs[h], options=self.options
+                )
                 rays = texture.ray[j[ok]], self.texture(other).ray[k[ok]]
-                gain[h, n] = agreement(*rays, in_view.T_camera_base @ inverse(T))
+                gain[h, n] = agreement(
+                    *rays, in_view.T_camera_base @ inverse(T), options=self.options
+                )
         # the best of several rotations and neighbours is chosen: the number of trials is paid for
-        tries = len(placed) * len(TURN_GRID)
+        tries = len(placed) * len(self.options.turns)
         return np.maximum(np.logaddexp.reduce(gain, axis=1) - np.log(tries), 0.0)
 
 
-def _crossing(eye: Array, ray: Array, eye_b: Array, ray_b: Array) -> tuple[Array, Booleans]:
+def _crossing(
+    eye: Array, ray: Array, eye_b: Array, ray_b: Array, options: BackgroundOptions
+) -> tuple[Array, Booleans]:
     """Midpoints (n, 3) of the common perpendiculars of rays (n, 3), and which of them are
     landmarks.
 
     A landmark lies in front of both centres ``eye`` (3,), within the largest spread of both rays,
-    and the rays differ by LEAST_LANDMARK_PARALLAX at least.
+    and the rays differ by the least parallax.
     """
     base = eye_b - eye
     cosine = dot(ray, ray_b)
@@ -392,7 +436,7 @@ def _crossing(eye: Array, ray: Array, eye_b: Array, ray_b: Array) -> tuple[Array
     good = (
         (depth > 0)
         & (depth_b > 0)
-        & (off < EPIPOLAR_SPREADS[-1])
-        & (cosine < np.cos(LEAST_LANDMARK_PARALLAX))
+        & (off < options.spreads[-1])
+        & (cosine < np.cos(options.least_parallax))
     )
     return point, good

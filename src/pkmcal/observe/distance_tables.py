@@ -19,25 +19,35 @@ import numpy as np
 from pkmcal.arrays import THREADS, Array, Booleans, Integers
 from pkmcal.observe.grey_levels import MOST_ROWS_INTERPOLATED, interpolated
 
-EDGE_DIRECTIONS = 8
-"""Number of edge directions; each table includes the neighbouring directions."""
-WORKING_WIDTH = 256
-"""Width in pixels to which images are reduced: fine enough to separate the two edges of a leg,
-coarse enough for a fast search."""
-STILL_LEVEL_DIFFERENCE = 5.0
-"""Largest difference in grey levels from the station's median image at which a pixel counts as
-static."""
-ENOUGH_TO_COMPARE = 4
-"""Fewest images whose median is taken as the background."""
-CANNY_SLOPES = (20, 40)
-"""Canny thresholds on the Sobel slope, lower and upper: five times the slope caused by a noise
-of one level, the most in a reduced image. Half or twice these values change little."""
-FURTHEST_EDGE_DISTANCE = 32.0
-"""Reduced pixels beyond which distances share one bin of the chance histogram."""
+
+@dataclass(frozen=True)
+class DistanceTableOptions:
+    """Constants of the distance tables; lengths in reduced pixels."""
+
+    # width to which images are reduced: fine enough to separate the two edges of a leg, coarse
+    # enough for a fast search
+    width: int = 256
+    # number of edge directions; each table includes the neighbouring directions
+    directions: int = 8
+    # largest difference in grey levels from the station's median image at which a pixel counts as
+    # static: five times the noise of one level, the most in a reduced image
+    still: float = 5.0
+    # fewest images whose median is taken as the background
+    enough: int = 4
+    # Canny thresholds on the Sobel slope, lower and upper: five times the slope caused by a noise
+    # of one level, the most in a reduced image. Half or twice these values change little
+    # (measured)
+    canny: tuple[int, int] = (20, 40)
+    # distance beyond which distances share one bin of the chance histogram
+    furthest: float = 32.0
+    # width of a bin of the histogram of chance distances
+    bin_width: float = 0.5
+
+
+DISTANCE_TABLE_OPTIONS = DistanceTableOptions()
+
 NO_EDGE_DISTANCE = 1e3
-"""Distance, in reduced pixels, where an image has no edge of a direction."""
-CHANCE_DISTANCE_BIN = 0.5
-"""Width, in reduced pixels, of a bin of the histogram of chance distances."""
+"""Distance, in reduced pixels, where an image has no edge of a direction: stands for infinity."""
 
 
 class PictureEdges(NamedTuple):
@@ -55,11 +65,11 @@ class DirectionTables:
 
     place, number : for each image the flat pixel indices (n,) of its edge points, row by row, and
         their direction numbers (n,).
-    picture : (rows, h, columns, EDGE_DIRECTIONS, w). The tables of image n are at row n % rows and
+    picture : (rows, h, columns, directions, w). The tables of image n are at row n % rows and
         column n // rows.
-    chance : (EDGE_DIRECTIONS, bins) density of the distances of arbitrary pixels, in bins of
-        CHANCE_DISTANCE_BIN.
-    ready : (EDGE_DIRECTIONS,) whether table and density of a direction are computed.
+    chance : (directions, bins) density of the distances of arbitrary pixels, in bins of
+        the options' width.
+    ready : (directions,) whether table and density of a direction are computed.
     """
 
     place: tuple[Integers, ...]
@@ -67,20 +77,25 @@ class DirectionTables:
     picture: Array
     chance: Array
     ready: Booleans
+    options: DistanceTableOptions
 
     @classmethod
     def of_edges(
-        cls, place: Sequence[Integers], number: Sequence[Integers], shape: tuple[int, int, int]
+        cls,
+        place: Sequence[Integers],
+        number: Sequence[Integers],
+        size: tuple[int, int],
+        options: DistanceTableOptions,
     ) -> DirectionTables:
-        """Tables of given edge points, none computed yet; shape : EDGE_DIRECTIONS, h, w."""
-        directions, height, width = shape
+        """Tables of given edge points, none computed yet; size : height, width."""
+        (height, width), directions = size, options.directions
         rows = min(len(place), MOST_ROWS_INTERPOLATED // height)
         columns = -(-len(place) // rows)
         picture = np.zeros((rows, height, columns, directions, width), dtype=np.float32)
-        chance = np.zeros(
-            (directions, round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)), dtype=np.float32
-        )
-        return cls(tuple(place), tuple(number), picture, chance, np.zeros(directions, dtype=bool))
+        bins = round(options.furthest / options.bin_width)
+        chance = np.zeros((directions, bins), dtype=np.float32)
+        ready = np.zeros(directions, dtype=bool)
+        return cls(tuple(place), tuple(number), picture, chance, ready, options)
 
     def get_ready(self, direction: Integers) -> None:
         """Compute the tables of directions (...) that are still missing."""
@@ -100,8 +115,12 @@ class DirectionTables:
         # many images in one operation, for threads wait for each other in Python
         for first in range(0, len(self.place), rows):
             tables = self.picture[: len(self.place) - first, :, first // rows, direction]
-            counted += _counted(tables)
-        self.chance[direction] = counted / counted.sum() / CHANCE_DISTANCE_BIN
+            # every second pixel of every second row: with fewer, the chance densities would differ
+            # between hypotheses about one image
+            bin_number = tables[:, ::2, ::2] * np.float32(1 / self.options.bin_width)
+            bin_number = np.minimum(bin_number, len(counted) - 1).astype(np.intp)
+            counted += np.bincount(bin_number.ravel(), minlength=len(counted))
+        self.chance[direction] = counted / counted.sum() / self.options.bin_width
         self.ready[direction] = True  # last, because other threads read it
 
     def mirrored(self) -> DirectionTables:
@@ -110,7 +129,7 @@ class DirectionTables:
         place = [p + width - 1 - 2 * (p % width) for p in self.place]
         # direction a becomes pi - a
         number = [directions - 1 - n for n in self.number]
-        return self.of_edges(place, number, (directions, height, width))
+        return self.of_edges(place, number, (height, width), self.options)
 
 
 @dataclass(frozen=True)
@@ -209,7 +228,9 @@ class DistanceTables:
         """Probability density, per reduced pixel, of distances (...) at arbitrary pixels."""
         self.tables.get_ready(direction)
         bins = self.tables.chance.shape[1]
-        number = np.minimum(values / np.float32(CHANCE_DISTANCE_BIN), bins - 1).astype(np.int32)
+        number = np.minimum(values / np.float32(self.tables.options.bin_width), bins - 1).astype(
+            np.int32
+        )
         return self.tables.chance.take(direction * bins + number)
 
     def select(self, images: Integers) -> DistanceTables:
@@ -235,7 +256,7 @@ class DistanceTables:
         )
 
 
-def direction_of(normal: Array, count: int = EDGE_DIRECTIONS) -> Integers:
+def direction_of(normal: Array, count: int) -> Integers:
     """Direction numbers, of ``count``, of edges with image normals (..., 2), regardless of their
     sign.
     """
@@ -270,8 +291,7 @@ def write_distances(place: Integers, out: Array) -> None:
 
 def distance_tables(
     images: Sequence[Integers],
-    width: int = WORKING_WIDTH,
-    directions: int = EDGE_DIRECTIONS,
+    options: DistanceTableOptions = DISTANCE_TABLE_OPTIONS,
 ) -> DistanceTables:
     """Distance tables of one station's images, K arrays (height, width) uint8 of equal size.
 
@@ -281,9 +301,12 @@ def distance_tables(
 
     def reduced(number: int) -> tuple[Integers, float]:
         image = images[number]  # decoded once; only the reduced image stays in memory
-        scale = max(image.shape[1] / width, 1.0)
+        scale = max(image.shape[1] / options.width, 1.0)
         size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
-        return _levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)), scale
+        light = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        # the square root has even noise: a sensor's noise grows with the root of the light. A dark
+        # machine in front of a dark wall is then as distinct as a bright one in the sun
+        return np.rint(np.sqrt(255.0 * light)).astype(np.uint8), scale
 
     with ThreadPoolExecutor(THREADS) as pool:
         pairs = list(pool.map(reduced, range(len(images))))
@@ -291,19 +314,26 @@ def distance_tables(
         height, across = small[0].shape
         against = np.zeros((len(small), height, across), dtype=np.int8)
         differs = None
-        if len(small) >= ENOUGH_TO_COMPARE:
-            against = _against_median(np.stack(small))
+        if len(small) >= options.enough:
+            against = _against_median(np.stack(small), options)
             differs = against != 0
         each = [None] * len(small) if differs is None else differs
-        edges = tuple(pool.map(_edges_of, small, each))
-    moving = _moving(np.stack(small), edges[0]) if differs is None else differs.mean(axis=0)
+        edges = tuple(pool.map(lambda i, m: _edges_of(i, m, options), small, each))
+    if differs is not None:
+        moving = differs.mean(axis=0)
+    elif len(small) > 1:  # too few for a median: whatever changes
+        moving = (np.ptp(np.stack(small).astype(float), axis=0) > options.still).astype(float)
+    else:  # a single image: its edges
+        moving = np.zeros(small[0].shape)
+        x, y = edges[0].pixel.astype(int).T
+        moving[y, x] = 1.0
     place = [e.pixel.astype(int) @ (1, across) for e in edges]
-    number = [direction_of(e.normal, directions) for e in edges]
-    tables = DirectionTables.of_edges(place, number, (directions, height, across))
+    number = [direction_of(e.normal, options.directions) for e in edges]
+    tables = DirectionTables.of_edges(place, number, (height, across), options)
     return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, against)
 
 
-def _against_median(small: Integers) -> Integers:
+def _against_median(small: Integers, options: DistanceTableOptions) -> Integers:
     """Signs (K, h, w) of the difference of images (K, h, w) from their median."""
     # odd-even transposition sort on whole images: thirty times as fast as sorting pixel by pixel
     order = small.copy()
@@ -316,47 +346,16 @@ def _against_median(small: Integers) -> Integers:
     # twice the median, an integer
     twice = order[(n - 1) // 2].astype(np.int16) + order[n // 2]
     off = 2 * small.astype(np.int16) - twice
-    return (off > 2 * STILL_LEVEL_DIFFERENCE).astype(np.int8) - (off < -2 * STILL_LEVEL_DIFFERENCE)
+    return (off > 2 * options.still).astype(np.int8) - (off < -2 * options.still)
 
 
-def _moving(small: Integers, edges: PictureEdges) -> Array:
-    """Share (h, w) of changing pixels for images too few for a median; for one image, its edges."""
-    if len(small) > 1:
-        return (np.ptp(small.astype(float), axis=0) > STILL_LEVEL_DIFFERENCE).astype(float)
-    out = np.zeros(small.shape[1:])
-    x, y = edges.pixel.astype(int).T
-    out[y, x] = 1.0
-    return out
-
-
-def _counted(tables: Array) -> Integers:
-    """Histogram (bins,) of distances in tables (n, h, w), at every second pixel of every second
-    row.
-
-    With fewer samples the chance densities would differ between hypotheses about one image.
-    """
-    bins = round(FURTHEST_EDGE_DISTANCE / CHANCE_DISTANCE_BIN)
-    number = tables[:, ::2, ::2] * np.float32(1 / CHANCE_DISTANCE_BIN)
-    number = np.minimum(number, bins - 1).astype(np.intp)
-    return np.bincount(number.ravel(), minlength=bins)
-
-
-def _levels(image: Any) -> Integers:
-    """Grey levels (h, w) with even noise, the square root of the light.
-
-    A sensor's noise grows with the root of the light; after this, a dark machine in front of a dark
-    wall is as distinct as a bright one in the sun.
-    """
-    return np.rint(np.sqrt(255.0 * image.astype(np.float32))).astype(np.uint8)
-
-
-def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
+def _edges_of(image: Any, moving: Booleans | None, options: DistanceTableOptions) -> PictureEdges:
     """Canny edge points of one reduced image, where it differs from the other images (h, w)."""
     import cv2
 
     dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(image, cv2.CV_16S, 0, 1)
-    edges = cv2.Canny(dx, dy, *CANNY_SLOPES) > 0
+    edges = cv2.Canny(dx, dy, *options.canny) > 0
     if moving is not None:
         edges &= cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     y, x = np.divmod(np.flatnonzero(edges), edges.shape[1])  # faster than np.nonzero

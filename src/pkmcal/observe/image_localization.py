@@ -16,7 +16,7 @@ one measurement.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,11 +24,15 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.distance_tables import WORKING_WIDTH, distance_tables
+from pkmcal.observe.distance_tables import (
+    DISTANCE_TABLE_OPTIONS,
+    DistanceTableOptions,
+    distance_tables,
+)
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.pose_candidates import (
-    CAMERA_DIRECTIONS,
-    SIGHT_LINE_TURNS,
+    CANDIDATE_OPTIONS,
+    CandidateOptions,
     frame_of,
     same_pose,
     sphere,
@@ -41,48 +45,78 @@ from pkmcal.observe.pose_likelihood import (
     refine_ml,
 )
 from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
-from pkmcal.observe.tubes import MAP_CELL_SIZE, PAIR_DIRECTIONS, TubeChart, tube_chart
+from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, TubeChart, TubeChartOptions, tube_chart
 
-PICTURE_SHARES_FILLED = (0.3, 1.5)
-"""Smallest and largest share of the image that the machine fills: from a third, to ends outside
-the image."""
-WIDEST_HALF_ANGLE = 1.2
-"""Largest half angle (rad) subtended by the machine."""
-NEXT_DISTANCE_FACTOR = 1.18
-"""Ratio of successive distances: half a step moves the end of a leg by half its width."""
-CHART_SHARE_OFF_MIDDLE = 0.2
-"""Largest offset of the machine from the middle of the chart, to each side, as a share of the
-chart's size."""
-CHART_STRIDE_CELLS = 2
-"""Chart cells between successive positions in the image."""
-PICTURE_PLACES_A_TURN = 2
-"""Number of image positions retained for each camera position and rotation."""
-HYPOTHESES_THAT_DESCEND = 2000
-"""Number of hypotheses that are refined; in a cluttered laboratory the correct one is among the
-first thousand."""
-HYPOTHESES_ON_COARSE, HYPOTHESES_ON_FINER = 400, 120
-"""Numbers of hypotheses retained after the first descent and for the tables of double
-resolution."""
-MANY_DIRECTIONS = 24
-"""Number of edge directions of the tables: with the neighbours included, edges within 11 degrees
-count."""
-FINEST_TABLES = 4 * WORKING_WIDTH, MANY_DIRECTIONS
-"""Width (px) and number of directions of the tables on which the final hypotheses are compared."""
-HYPOTHESES_ON_FINEST = 40
-"""Number of hypotheses on the finest tables, besides the symmetric poses of the first two."""
-MACHINE_FOLDS = (2, 3, 4, 6)
-"""Orders of rotational symmetry that are tried."""
-JOINT_ON_JOINT_DISTANCE = 0.2
-"""Largest distance between a rotated joint and its counterpart in a symmetric pose, relative to
-the radius of the base. No real parts are exactly interchangeable, but in an image they look so."""
-NEAR_ROUNDS, NEAR_STARTS, NEAR_THAT_GO_ON = 3, 32, 8
-"""For the search near a pose: number of rounds, of starts in each, and of starts that are
-refined to the end."""
-NEAR_TURN, NEAR_SHIFT = np.radians(5.0), np.array([0.005, 0.005, 0.03])
-"""Standard deviations of these starts: rotation about the machine (rad), and shift relative to
-the camera's distance. Legs then move by their own width, the possible error of the first search."""
-PLACES_IN_A_BATCH = 214
-"""Number of camera positions scored together; they take some ten megabytes."""
+
+@dataclass(frozen=True)
+class ImageLocalizationOptions:
+    """Constants of the localization of a single image."""
+
+    # smallest and largest share of the image that the machine fills: from a third, to ends outside
+    # the image
+    filled: tuple[float, float] = (0.3, 1.5)
+    # largest half angle subtended by the machine, rad
+    widest: float = 1.2
+    # ratio of successive distances: half a step moves the end of a leg by half its width
+    distance_ratio: float = 1.18
+    # largest offset of the machine from the middle of the chart, to each side, as a share of the
+    # chart's size
+    off_middle: float = 0.2
+    # chart cells between successive positions in the image
+    stride: int = 2
+    # number of image positions retained for each camera position and rotation
+    positions: int = 2
+    # number of hypotheses that are refined; in a cluttered laboratory the correct one is among the
+    # first thousand (measured)
+    refined: int = 2000
+    # number of hypotheses retained after the first descent
+    on_coarse: int = 400
+    # number of hypotheses for the tables of double resolution
+    on_finer: int = 120
+    # number of hypotheses on the finest tables, besides the symmetric poses of the first two
+    on_finest: int = 40
+    # reaches of the steps of the first descent, reduced pixels, falling from the distance at which
+    # an edge is attracted
+    first_reaches: tuple[float, ...] = (16, 14, 12, 10)
+    # reaches of the second descent
+    next_reaches: tuple[float, ...] = (8, 7, 6, 5, 5)
+    # number of edge directions of the tables: with the neighbours included, edges within 11
+    # degrees count
+    directions: int = 24
+    # orders of rotational symmetry that are tried
+    folds: tuple[int, ...] = (2, 3, 4, 6)
+    # largest distance between a rotated joint and its counterpart in a symmetric pose, relative to
+    # the radius of the base. No real parts are exactly interchangeable, but in an image they look
+    # so
+    joint_distance: float = 0.2
+    # rounds of the search near a pose
+    near_rounds: int = 3
+    # starts in each round
+    near_starts: int = 32
+    # starts that are refined to the end
+    near_refined: int = 8
+    # standard deviation of the starts' rotation about the machine, rad. Legs then move by their
+    # own width, the possible error of the first search
+    near_turn: float = np.radians(5.0)
+    # standard deviations of the starts' shift in the camera's axes, relative to its distance
+    near_shift: tuple[float, float, float] = (0.005, 0.005, 0.03)
+    # number of camera positions scored together; they take some ten megabytes (numerical: no
+    # effect on results)
+    batch: int = 214
+    # distance tables, of which width and number of directions are changed
+    tables: DistanceTableOptions = DISTANCE_TABLE_OPTIONS
+    # chart of possible tubes
+    chart: TubeChartOptions = TUBE_CHART_OPTIONS
+    # grid of camera directions and of rotations about the line of sight
+    candidates: CandidateOptions = CANDIDATE_OPTIONS
+
+    def tables_at(self, resolution: int) -> DistanceTableOptions:
+        """Options of distance tables with a multiple of the usual resolution."""
+        width = resolution * self.tables.width
+        return replace(self.tables, width=width, directions=self.directions)
+
+
+IMAGE_LOCALIZATION_OPTIONS = ImageLocalizationOptions()
 
 
 class PoseHypotheses(NamedTuple):
@@ -110,47 +144,68 @@ class PoseHypotheses(NamedTuple):
         )
 
 
-def localize_image(view: StationView, image: Integers) -> PoseHypotheses:
+def localize_image(
+    view: StationView,
+    image: Integers,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> PoseHypotheses:
     """Pose hypotheses of the camera of one image, best first.
 
     view : of this image alone.
     """
     one = np.zeros(1, dtype=int)
-    coarse = replace(view, tables=distance_tables([image], WORKING_WIDTH, MANY_DIRECTIONS))
-    fine = replace(view, tables=distance_tables([image], 2 * WORKING_WIDTH, MANY_DIRECTIONS))
+    coarse = replace(view, tables=distance_tables([image], options.tables_at(1)))
+    fine = replace(view, tables=distance_tables([image], options.tables_at(2)))
     # chart of tubes, then robust descents on tables of the usual resolution
-    hypotheses = _hypotheses(view, tube_chart(image, view.camera))
-    hypotheses = refine_lm(coarse, hypotheses, one, 2, (16, 14, 12, 10))
-    hypotheses = _most(coarse, hypotheses, 4, HYPOTHESES_ON_COARSE)
-    hypotheses = refine_lm(coarse, hypotheses, one, 4, (8, 7, 6, 5, 5))
-    hypotheses = _most(coarse, hypotheses, 5, HYPOTHESES_ON_FINER)
+    hypotheses = _hypotheses(view, tube_chart(image, view.camera, options.chart), options)
+    hypotheses = refine_lm(coarse, hypotheses, one, 2, options.first_reaches)
+    hypotheses = _most(coarse, hypotheses, 4, options.on_coarse)
+    hypotheses = refine_lm(coarse, hypotheses, one, 4, options.next_reaches)
+    hypotheses = _most(coarse, hypotheses, 5, options.on_finer)
     # maximum likelihood at twice the resolution
     hypotheses, log_likelihood_ratio = refine_ml(fine, hypotheses, one, 8, 6)
     hypotheses = hypotheses[np.argsort(-log_likelihood_ratio)]
-    hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][:HYPOTHESES_ON_FINEST]
+    hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][: options.on_finest]
     # and, with the symmetric poses of the best two, at four times
     return weighed_places(
-        view, image, np.concatenate([hypotheses, symmetric_poses(view, hypotheses[:2])])
+        view,
+        image,
+        np.concatenate([hypotheses, symmetric_poses(view, hypotheses[:2], options)]),
+        options=options,
     )
 
 
-def weighed_places(view: StationView, image: Integers, values: Array) -> PoseHypotheses:
+def weighed_places(
+    view: StationView,
+    image: Integers,
+    values: Array,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> PoseHypotheses:
     """Hypotheses from poses (H, 4, 4) refined on the finest tables, duplicates removed.
 
     Poses no likelier than chance are removed too, unless none remains; then the best one is
     returned.
     """
     one = np.zeros(1, dtype=int)
-    view = replace(view, tables=distance_tables([image], *FINEST_TABLES))
+    view = replace(view, tables=distance_tables([image], options.tables_at(4)))
     values, log_likelihood_ratio = refine_ml(view, values, one, 16, 6)
     order = np.argsort(-log_likelihood_ratio)
     order = order[log_likelihood_ratio[order] > 0]
     if not len(order):
         order = np.array([int(np.argmax(log_likelihood_ratio))])
     order = order[distinct(view, values[order])]
-    return PoseHypotheses(
-        values[order], log_likelihood_ratio[order], _unit(view, values[order[:1]])
+    # unit of log likelihood: the mean length of half a leg's silhouette
+    edges = edge_points(
+        view.machine,
+        view.camera,
+        legs_in_camera(view.machine, values[order[0]], view.poses, view.joints),
+        view.tubes,
+        2,
     )
+    chord = edges.pixel[0, :, 1] - edges.pixel[0, :, 0]
+    length = np.nan_to_num(2 * np.hypot(chord[:, 0], chord[:, 1]) / view.tables.scale)
+    unit = float(length.sum()) / (2 * len(np.unique(view.tubes.leg)))
+    return PoseHypotheses(values[order], log_likelihood_ratio[order], unit)
 
 
 def distinct(view: StationView, values: Array) -> Integers:
@@ -160,16 +215,27 @@ def distinct(view: StationView, values: Array) -> Integers:
     return retained_rows[~same_pose(values[retained_rows], values[0]) | (retained_rows == 0)]
 
 
-def finest_view(machine: Machine, image: StationImages, joints: Array, poses: Array) -> StationView:
+def finest_view(
+    machine: Machine,
+    image: StationImages,
+    joints: Array,
+    poses: Array,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> StationView:
     """View of one image with the finest tables.
 
     joints, poses : of all configurations of the session; the latter are T_base_platform.
     """
-    tables = distance_tables([image.images[0]], *FINEST_TABLES)
+    tables = distance_tables([image.images[0]], options.tables_at(4))
     return StationView(machine, image.camera, image.configuration, joints, poses, tables)
 
 
-def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tuple[Array, float]:
+def refine_local(
+    view: StationView,
+    T_camera_base: Array,
+    scatter: float,
+    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
+) -> tuple[Array, float]:
     """Likeliest pose near another (4, 4), and its log-likelihood ratio.
 
     After a localization with the nominal model, some legs may be matched to the wrong side of a
@@ -181,33 +247,22 @@ def refine_local(view: StationView, T_camera_base: Array, scatter: float) -> tup
     ends = view.machine.ends_at(view.joints, view.poses)
     middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
     best, most = T_camera_base, -np.inf
-    for _ in range(NEAR_ROUNDS):
+    for _ in range(options.near_rounds):
         # rotations about the middle of the machine, and shifts; the first start is the best so far
-        turn = rotation(rng.normal(size=(NEAR_STARTS, 3)) * NEAR_TURN)
+        turn = rotation(rng.normal(size=(options.near_starts, 3)) * options.near_turn)
         turn[0] = np.eye(3)
         starts = best @ pose(turn, middle - turn @ middle)
         away = np.sqrt(dot(starts[0, :3, 3], starts[0, :3, 3]))
-        starts[1:, :3, 3] += away * rng.normal(size=(NEAR_STARTS - 1, 3)) * NEAR_SHIFT
+        starts[1:, :3, 3] += (
+            away * rng.normal(size=(options.near_starts - 1, 3)) * options.near_shift
+        )
         starts, log_likelihood_ratio = refine_ml(view, starts, one, 8, 6)
-        starts = starts[np.argsort(-log_likelihood_ratio)[:NEAR_THAT_GO_ON]]
+        starts = starts[np.argsort(-log_likelihood_ratio)[: options.near_refined]]
         starts, log_likelihood_ratio = refine_ml(view, starts, one, 16, 10, scatter)
         k = int(np.argmax(log_likelihood_ratio))
         if log_likelihood_ratio[k] > most:
             best, most = starts[k], float(log_likelihood_ratio[k])
     return best, most
-
-
-def _unit(view: StationView, values: Array) -> float:
-    """Log-likelihood unit of a hypothesis: the mean length of half a leg's silhouette, reduced
-    pixels.
-    """
-    edges = edge_points(
-        view.machine, view.camera, legs_in_camera(view.machine, values[0], view.poses, view.joints),
-        view.tubes, 2,
-    )  # fmt: skip
-    chord = edges.pixel[0, :, 1] - edges.pixel[0, :, 0]
-    length = np.nan_to_num(2 * np.hypot(chord[:, 0], chord[:, 1]) / view.tables.scale)
-    return float(length.sum()) / (2 * len(np.unique(view.tubes.leg)))
 
 
 def _most(view: StationView, values: Array, samples: int, count: int) -> Array:
@@ -233,54 +288,61 @@ class _Tubes(NamedTuple):
     size: float
 
 
-def _hypotheses(view: StationView, chart: TubeChart) -> Array:
-    """Camera poses T_camera_base (HYPOTHESES_THAT_DESCEND, 4, 4), best first."""
+def _hypotheses(view: StationView, chart: TubeChart, options: ImageLocalizationOptions) -> Array:
+    """Camera poses T_camera_base (H, 4, 4), best first."""
     tubes = _tubes(view)
     width, height = chart.size
     half = min(width, height) / 2 / chart.scale
     # distances at which the machine fills the given shares of the image
     near, far = (
-        tubes.size / np.sin(min(half * fill, WIDEST_HALF_ANGLE))
-        for fill in reversed(PICTURE_SHARES_FILLED)
+        tubes.size / np.sin(min(half * fill, options.widest)) for fill in reversed(options.filled)
     )
-    count = int(np.ceil(np.log(far / near) / np.log(NEXT_DISTANCE_FACTOR))) + 1
+    count = int(np.ceil(np.log(far / near) / np.log(options.distance_ratio))) + 1
     distance = np.geomspace(near, far, count)
-    direction = sphere(CAMERA_DIRECTIONS)
+    direction = sphere(options.candidates.directions)
     rotation_to = frame_of(-direction)
     # a position in the image is a shift of the maps
-    reach = [int(CHART_SHARE_OFF_MIDDLE * n / MAP_CELL_SIZE) for n in chart.size]
-    steps = [np.arange(-cells, cells + 1, CHART_STRIDE_CELLS) for cells in reach]
-    windows = _windows(chart.surprisal, steps)
+    reach = [int(options.off_middle * n / chart.options.map_cell) for n in chart.size]
+    steps = [np.arange(-cells, cells + 1, options.stride) for cells in reach]
+    windows = _windows(chart.surprisal, steps, options)
     # for each distance and rotation, the best positions in the image for all directions
     values: list[Array] = []
     shifts: list[Integers] = []
     for away in distance:
         point = tubes.ends - (tubes.centre + direction * away)[:, None, None]
         in_view = np.einsum("pij,ptnj->ptni", rotation_to, point)
-        for turn in range(SIGHT_LINE_TURNS):
+        for turn in range(options.candidates.turns):
             score = _scores(
-                in_view, tubes.radius, 2 * np.pi * turn / SIGHT_LINE_TURNS, chart, windows
+                in_view,
+                tubes.radius,
+                2 * np.pi * turn / options.candidates.turns,
+                chart,
+                windows,
+                options,
             )
-            for _ in range(PICTURE_PLACES_A_TURN):
+            for _ in range(options.positions):
                 best = score.argmax(axis=-1)[:, None]
                 shifts += [best]
                 values += [np.take_along_axis(score, best, axis=-1)]
                 np.put_along_axis(score, best, -np.inf, axis=-1)
-    # now (direction, distance x rotation x PICTURE_PLACES_A_TURN)
+    # now (direction, distance x rotation x positions)
     value, best = (np.concatenate(part, axis=-1).T for part in (values, shifts))
-    order = np.argsort(-value.ravel())[:HYPOTHESES_THAT_DESCEND]
+    order = np.argsort(-value.ravel())[: options.refined]
     row, place = np.unravel_index(order, value.shape)
-    step, shift = row // PICTURE_PLACES_A_TURN, best[row, place]
+    step, shift = row // options.positions, best[row, place]
     # poses from the indices: direction, roll about the optical axis, tilt to the image position
     dx, dy = steps[0][shift % len(steps[0])], steps[1][shift // len(steps[0])]
-    x, y = (d * MAP_CELL_SIZE / chart.scale for d in (dx, dy))
+    x, y = (d * chart.options.map_cell / chart.scale for d in (dx, dy))
     zero = np.zeros(len(order))
     tilt = rotation(np.stack([-y, x, zero], axis=-1))
     roll = rotation(
-        np.stack([zero, zero, 2 * np.pi / SIGHT_LINE_TURNS * (step % SIGHT_LINE_TURNS)], axis=-1)
+        np.stack(
+            [zero, zero, 2 * np.pi / options.candidates.turns * (step % options.candidates.turns)],
+            axis=-1,
+        )
     )
     rot = tilt @ roll @ rotation_to[place]
-    stand = tubes.centre + direction[place] * distance[step // SIGHT_LINE_TURNS][:, None]
+    stand = tubes.centre + direction[place] * distance[step // options.candidates.turns][:, None]
     return pose(rot, -(rot @ stand[..., None])[..., 0])
 
 
@@ -299,7 +361,9 @@ def _tubes(view: StationView) -> _Tubes:
     return _Tubes(ends, view.machine.values[tubes.radius[one]], centre, size)
 
 
-def _windows(surprisal: Integers, steps: Sequence[Integers]) -> Integers:
+def _windows(
+    surprisal: Integers, steps: Sequence[Integers], options: ImageLocalizationOptions
+) -> Integers:
     """View of the maps in which [width, direction, y, x] is the window of all shifts, (Sy, Sx).
 
     y and x count from the corner of the padded maps, see :func:`_border`.
@@ -309,14 +373,14 @@ def _windows(surprisal: Integers, steps: Sequence[Integers]) -> Integers:
     nx, ny = (len(s) for s in steps)
     shape = (
         *surprisal.shape[:2],
-        padded.shape[2] - CHART_STRIDE_CELLS * ny,
-        padded.shape[3] - CHART_STRIDE_CELLS * nx,
+        padded.shape[2] - options.stride * ny,
+        padded.shape[3] - options.stride * nx,
     )
     stride = padded.strides
     return np.lib.stride_tricks.as_strided(
         padded,
         (*shape, ny, nx),
-        (*stride, CHART_STRIDE_CELLS * stride[2], CHART_STRIDE_CELLS * stride[3]),
+        (*stride, options.stride * stride[2], options.stride * stride[3]),
         writeable=False,
     )
 
@@ -327,7 +391,12 @@ def _border(surprisal: Integers) -> int:
 
 
 def _scores(
-    visibility: Array, radius: Array, turn: float, chart: TubeChart, windows: Integers
+    visibility: Array,
+    radius: Array,
+    turn: float,
+    chart: TubeChart,
+    windows: Integers,
+    options: ImageLocalizationOptions,
 ) -> Array:
     """Mean map value (P, shifts) at the middles of the tubes, weighted by their length in the
     image.
@@ -346,40 +415,45 @@ def _scores(
     # direction, apparent width and weight of each tube
     chord = cell[:, :, 2] - cell[:, :, 0]
     normal = np.arctan2(chord[..., 0], -chord[..., 1])
-    number = np.rint(normal % np.pi * (PAIR_DIRECTIONS / np.pi)).astype(np.intp) % PAIR_DIRECTIONS
+    number = (
+        np.rint(normal % np.pi * (chart.options.directions / np.pi)).astype(np.intp)
+        % chart.options.directions
+    )
     width = 2 * radius * chart.scale / np.sqrt(dot(visibility[:, :, 1], visibility[:, :, 1]))
     weight = np.hypot(chord[..., 0], chord[..., 1])
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
     # first cell of each tube's window of shifts
-    at = np.floor((cell[:, :, 1] + chart.middle) / MAP_CELL_SIZE).astype(np.intp)
+    at = np.floor((cell[:, :, 1] + chart.middle) / chart.options.map_cell).astype(np.intp)
     shifts = windows.shape[-2:]
-    first = _border(chart.surprisal) - CHART_STRIDE_CELLS * (np.array(shifts[::-1]) // 2)
+    first = _border(chart.surprisal) - options.stride * (np.array(shifts[::-1]) // 2)
     at = np.clip(at + first, 0, np.array(windows.shape[3:1:-1]) - 1)
     which = chart.width_number(width)
     out = np.empty((len(visibility), shifts[0] * shifts[1]), dtype=np.float32)
-    for k in range(0, len(visibility), PLACES_IN_A_BATCH):
-        part = slice(k, k + PLACES_IN_A_BATCH)
+    for k in range(0, len(visibility), options.batch):
+        part = slice(k, k + options.batch)
         worth = windows[which[part], number[part], at[part, :, 1], at[part, :, 0]]
         worth = worth.reshape(*worth.shape[:2], -1).astype(np.float32)
         out[part] = np.matmul(weight[part, None], worth)[:, 0]
     return out
 
 
-def symmetric_poses(view: StationView, values: Array) -> Array:
+def symmetric_poses(
+    view: StationView, values: Array, options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS
+) -> Array:
     """Poses (H n, 4, 4) of the machine rotated onto itself, from poses (H, 4, 4) and all n
     rotations.
 
-    The rotations are about the normal of the plane of the base joints, by the angles of
-    MACHINE_FOLDS that map every base joint close to another; a machine of equal parts looks nearly
-    the same from there.
+    The rotations are about the normal of the plane of the base joints, by the
+    angles of the folds that map every base joint close to another; a machine of equal parts looks
+    nearly the same from there.
     """
     machine = view.machine
     base = machine.base_centers()
     middle = base.mean(axis=0)
     axis = np.linalg.svd(base - middle)[2][2]  # normal of their approximate plane
-    near = JOINT_ON_JOINT_DISTANCE * np.sqrt(dot(base - middle, base - middle).max())
+    near = options.joint_distance * np.sqrt(dot(base - middle, base - middle).max())
     turns: list[Array] = []
-    for angle in 2 * np.pi * np.unique([k / n for n in MACHINE_FOLDS for k in range(1, n)]):
+    for angle in 2 * np.pi * np.unique([k / n for n in options.folds for k in range(1, n)]):
         turn = rotation(angle * axis)
         shifted = (base - middle) @ turn.T + middle
         apart = np.sqrt(dot(shifted[:, None] - base, shifted[:, None] - base))

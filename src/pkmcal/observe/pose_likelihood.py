@@ -20,7 +20,7 @@ from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import cross, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.distance_tables import CHANCE_DISTANCE_BIN, DistanceTables
+from pkmcal.observe.distance_tables import DISTANCE_TABLE_OPTIONS, DistanceTables
 from pkmcal.observe.predict import (
     EdgePoints,
     LegsInCamera,
@@ -35,23 +35,43 @@ from pkmcal.observe.predict import (
 from pkmcal.solver.marquardt import Damping
 
 DISTANCE_OUTSIDE_IMAGE = 1e4
-"""Distance, in reduced pixels, of points outside the image."""
-LEAST_LOG_LIKELIHOOD_GAIN = 0.1
-"""Gain in log-likelihood ratio below which the maximization stops; one measurement contributes
-tens of it."""
-SILHOUETTE_PLACES_AT_ONCE = 30_000
-"""Number of silhouette points processed together, so that intermediate results stay in the
-processor's cache."""
-LAST_REACH = 4.0
-"""Truncation distance of the final score, in reduced pixels."""
-FEWEST_RIVALS, MOST_RIVALS = 8, 24
-"""Fewest and most sets of other readings for each image, from which the distribution of the
-likelihood by chance is estimated."""
-ELSEWHERE_TURN_AND_SHIFT = np.repeat([0.2, 0.1], 3)
-"""Standard deviations of the rotation (rad) and of the shift (relative to the distance between
-base and platform) of a randomly displaced platform."""
-SILHOUETTES_APART = 8.0
-"""Smallest median distance, in reduced pixels, between the silhouettes of two different poses."""
+"""Distance, in reduced pixels, of points outside the image: stands for infinity."""
+
+
+@dataclass(frozen=True)
+class LikelihoodOptions:
+    """Constants of the likelihood of a pose and of its maximization; lengths in reduced pixels."""
+
+    # gain in log-likelihood ratio below which the maximization stops; one measurement contributes
+    # tens of it
+    least_gain: float = 0.1
+    # number of silhouette points processed together, so that intermediate results stay in the
+    # processor's cache (numerical: no effect on results)
+    places_at_once: int = 30_000
+    # smallest scatter of silhouettes: a bin of the chance distances
+    least_sigma: float = DISTANCE_TABLE_OPTIONS.bin_width
+    # truncation distance of the final score, and largest scatter of silhouettes about image edges
+    last_reach: float = 4.0
+    # fewest sets of other readings for each image, from which the distribution of the likelihood
+    # by chance is estimated
+    fewest_rivals: int = 8
+    # most such sets: the standard deviation of so many is known to 15 %
+    most_rivals: int = 24
+    # standard deviation of the rotation of a randomly displaced platform, rad
+    elsewhere_turn: float = 0.2
+    # standard deviation of its shift, relative to the distance between base and platform
+    elsewhere_shift: float = 0.1
+    # smallest median distance between the silhouettes of two different poses: twice the largest
+    # scatter
+    apart: float = 8.0
+    # steps of expectation maximization of a mixture that is used afterwards; within a descent
+    # three suffice, for the poses change too
+    mixture_rounds: int = 10
+    # longest step of a pose, rad and m: the tables' slopes are valid nearby only
+    longest_step: float = 0.1
+
+
+LIKELIHOOD_OPTIONS = LikelihoodOptions()
 
 
 @dataclass(frozen=True)
@@ -64,6 +84,7 @@ class StationView:
     tables : distance tables of the K images.
     guessed : (H, K, L) hypothetical legs in the images, base frame, one for each candidate pose (or
         H = 1); None where the legs follow the readings.
+    options : of the likelihood.
     """
 
     machine: Machine
@@ -73,6 +94,7 @@ class StationView:
     all_poses: Array
     tables: DistanceTables
     guessed: LegsInCamera | None = None
+    options: LikelihoodOptions = LIKELIHOOD_OPTIONS
 
     @cached_property
     def tubes(self) -> TubeList:
@@ -137,13 +159,15 @@ class StationView:
         the session has few, randomly displaced platforms are added.
         """
         count, own = len(self.all_joints), self.configuration
-        steps = np.unique(np.linspace(1, max(count - 1, 1), MOST_RIVALS).astype(int))
+        steps = np.unique(np.linspace(1, max(count - 1, 1), self.options.most_rivals).astype(int))
         steps = steps[steps < count]
         others = self.all_legs[(own + steps[:, None]) % count]
-        rest = max(FEWEST_RIVALS - len(steps), 0)
+        rest = max(self.options.fewest_rivals - len(steps), 0)
         if not rest:
             return others
-        away = rng.normal(size=(rest, len(own), 6)) * ELSEWHERE_TURN_AND_SHIFT
+        away = rng.normal(size=(rest, len(own), 6)) * np.repeat(
+            [self.options.elsewhere_turn, self.options.elsewhere_shift], 3
+        )
         away[..., 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
         return others.joined(self.legs_at(perturb(self.poses, away), self.joints))
 
@@ -151,7 +175,7 @@ class StationView:
 def distinct_silhouettes(view: StationView, candidates: Array, images: Integers) -> list[int]:
     """Indices of the candidates (H, 4, 4), best first, that are not the same as a better one.
 
-    Two poses are the same if the median distance of their silhouettes is SILHOUETTES_APART at most.
+    Two poses are the same if the median distance of their silhouettes is small.
     """
     if len(candidates) < 2:
         return list(range(len(candidates)))
@@ -161,7 +185,7 @@ def distinct_silhouettes(view: StationView, candidates: Array, images: Integers)
     for h in range(len(candidates)):
         away = pixel[retained] - pixel[h]
         off = np.nan_to_num(np.hypot(away[..., 0], away[..., 1])) / view.tables.scale
-        if all(np.median(other) > SILHOUETTES_APART for other in off):
+        if all(np.median(other) > view.options.apart for other in off):
             retained.append(h)
     return retained
 
@@ -237,17 +261,24 @@ class Distances(NamedTuple):
     rare: Array
     length: Array
 
-    def mixture(self, mixture: _Mixture, rounds: int = 3, widest: float = LAST_REACH) -> _Mixture:
+    def mixture(
+        self,
+        mixture: _Mixture,
+        rounds: int = 3,
+        widest: float | None = None,
+        options: LikelihoodOptions = LIKELIHOOD_OPTIONS,
+    ) -> _Mixture:
         """Maximum-likelihood mixture, by expectation maximization from an initial one.
 
-        widest : upper bound of sigma.
+        widest : upper bound of sigma; None for that of the options.
         """
+        widest = options.last_reach if widest is None else widest
         total = np.maximum(_summed(self.length), 1e-9)
         for _ in range(rounds):
             own = self.length * self.own(mixture)
             mine = _summed(own)
             square = _summed(own * self.distance**2) / np.maximum(mine, 1e-9)
-            sigma = np.clip(np.sqrt(square), CHANCE_DISTANCE_BIN, widest)
+            sigma = np.clip(np.sqrt(square), options.least_sigma, widest)
             mixture = _Mixture(np.clip(1 - mine / total, 0.01, 0.99), sigma)
         return mixture
 
@@ -324,7 +355,13 @@ def refine_lm(
     linearization = linearize_distances(view, candidates, images, samples)
     damping = Damping.first(len(candidates))
     for reach in reaches:
-        trial = _step(candidates, linearization, linearization.weight(reach), damping)
+        trial = _step(
+            candidates,
+            linearization,
+            linearization.weight(reach),
+            damping,
+            view.options.longest_step,
+        )
         in_view = linearize_distances(view, trial, images, samples)
         better = in_view.cost(reach) < linearization.cost(reach)
         candidates = np.where(better[:, None, None], trial, candidates)
@@ -339,25 +376,26 @@ def refine_ml(
     images: Integers,
     samples: int,
     steps: int,
-    widest: float = LAST_REACH,
+    widest: float | None = None,
 ) -> tuple[Array, Array]:
     """Maximum-likelihood poses near candidates (H, 4, 4), and their log-likelihood ratios (H,).
 
-    Levenberg-Marquardt steps; the scatter of the edges, up to ``widest`` reduced pixels, is
-    estimated in alternation.
+    Levenberg-Marquardt steps; the scatter of the edges, up to ``widest`` reduced pixels (None for
+    the options' limit), is estimated in alternation.
     """
     linearization = linearize_distances(view, candidates, images, samples)
     damping = Damping.first(len(candidates))
-    mixture = first_mixture(len(candidates))
+    mixture = first_mixture(len(candidates), view.options)
     last = float("inf")
     for _ in range(steps):
         # mixture at the current poses, then one step of each
-        mixture = linearization.distances.mixture(mixture, widest=widest)
+        mixture = linearization.distances.mixture(mixture, widest=widest, options=view.options)
         trial = _step(
             candidates,
             linearization,
             linearization.distances.length * linearization.distances.own(mixture),
             damping,
+            view.options.longest_step,
         )
         in_view = linearize_distances(view, trial, images, samples)
         gain = _summed(in_view.distances.log_likelihood(mixture)) - _summed(
@@ -368,25 +406,33 @@ def refine_ml(
         linearization = in_view.where(better, linearization)
         damping = damping.after(better)
         most = float(gain.max())
-        if max(last, most) < LEAST_LOG_LIKELIHOOD_GAIN:
+        if max(last, most) < view.options.least_gain:
             break  # a single step may have been too long
         last = most
-    mixture = linearization.distances.mixture(first_mixture(len(candidates)), 10, widest)
+    start = first_mixture(len(candidates), view.options)
+    rounds = view.options.mixture_rounds
+    mixture = linearization.distances.mixture(start, rounds, widest, view.options)
     return candidates, _summed(linearization.distances.log_likelihood(mixture))
 
 
-def first_mixture(count: int) -> _Mixture:
+def first_mixture(count: int, options: LikelihoodOptions = LIKELIHOOD_OPTIONS) -> _Mixture:
     """Initial mixture of ``count`` hypotheses: half of the distances by chance."""
-    return _Mixture(np.full(count, 0.5), np.full(count, LAST_REACH / 2))
+    return _Mixture(np.full(count, 0.5), np.full(count, options.last_reach / 2))
+
+
+def mixture_of(distances: Distances, options: LikelihoodOptions = LIKELIHOOD_OPTIONS) -> _Mixture:
+    """Maximum-likelihood mixture of the distances of each hypothesis."""
+    start = first_mixture(len(distances.distance), options)
+    return distances.mixture(start, options.mixture_rounds, options=options)
 
 
 def log_likelihood_of(
     view: StationView, candidates: Array, images: Integers, samples: int
 ) -> Array:
     """Log-likelihood ratio (H, K) of candidates (H, 4, 4) in each image."""
-    count = distances_under(view, candidates, images, samples)
-    mixture = count.mixture(first_mixture(len(candidates)), rounds=10)
-    return by_image(count.log_likelihood(mixture), len(images))
+    distances = distances_under(view, candidates, images, samples)
+    mixture = mixture_of(distances, view.options)
+    return by_image(distances.log_likelihood(mixture), len(images))
 
 
 def by_image(log_likelihood_ratio: Array, count: int) -> Array:
@@ -405,7 +451,7 @@ def log_likelihood_by_name(view: StationView, T_camera_base: Array, names: Integ
     """
     every = view.few(len(view.configuration))
     own = distances_under(view, T_camera_base[None], every, 8)
-    mixture = own.mixture(first_mixture(1), rounds=10)
+    mixture = mixture_of(own, view.options)
     # the legs of a configuration are the same for every image
     legs = view.all_legs[names].under(T_camera_base[None])
     points = edge_points(view.machine, view.camera, legs, view.tubes, 8)
@@ -452,7 +498,7 @@ def _parts(view: StationView, count: int, places: int) -> list[slice]:
     points on each edge.
     """
     each = max(places * len(view.tubes), 1)
-    parts = max(min(round(count * each / SILHOUETTE_PLACES_AT_ONCE), count), 1)
+    parts = max(min(round(count * each / view.options.places_at_once), count), 1)
     ends = [count * k // parts for k in range(parts + 1)]
     return [slice(*pair) for pair in pairwise(ends)]
 
@@ -539,7 +585,11 @@ def _stacked(vectors: tuple[Array, ...], visible: Booleans) -> Array:
 
 
 def _step(
-    candidates: Array, station_edges: _Linearization, weight: Array, damping: Damping
+    candidates: Array,
+    linearization: _Linearization,
+    weight: Array,
+    damping: Damping,
+    longest: float,
 ) -> Array:
     """One Levenberg-Marquardt step of every candidate's pose, (H, 4, 4).
 
@@ -550,14 +600,15 @@ def _step(
     so the normal equations need only the sums over t^0, t and t^2 of the weighted squares.
 
     weight : (H, E, n) of the points.
+    longest : limit of each component of the step, rad and m.
     """
     # points are evenly spaced from the first to the last of an edge
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
     powers = np.stack([at**0, at, at**2], axis=-1)
-    weighted = weight * station_edges.slope
-    one, both, two = ((weighted * station_edges.slope) @ powers).transpose(2, 0, 1)[:, :, None]
-    here, there = ((weighted * station_edges.distances.distance) @ powers[:, :2]).transpose(2, 0, 1)
-    begins, grows = station_edges.begins, station_edges.grows
+    weighted = weight * linearization.slope
+    one, both, two = ((weighted * linearization.slope) @ powers).transpose(2, 0, 1)[:, :, None]
+    here, there = ((weighted * linearization.distances.distance) @ powers[:, :2]).transpose(2, 0, 1)
+    begins, grows = linearization.begins, linearization.grows
     # normal equations, of which omega's block has the terms in t
     normal = (begins * one) @ begins.mT
     mixed = (grows * both) @ begins.mT
@@ -567,6 +618,6 @@ def _step(
     right = begins @ here[..., None]
     right[:, :3] += grows @ there[..., None]
     step = -damping.step(normal.astype(float), right[..., 0].astype(float))
-    step = np.clip(step, -0.1, 0.1)  # the tables' slopes are valid nearby only
+    step = np.clip(step, -longest, longest)
     # rotation about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
     return pose(rotation(step[:, :3]), step[:, 3:]) @ candidates

@@ -27,78 +27,115 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import EdgePoints, TubeList
 from pkmcal.solver.kernels import cauchy_weights
 
-PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE = 3.0, 3.0
-"""Pixels of a profile, inside and outside, that the model explains: with fewer the fit is
-ill-conditioned, with more it meets other features of the leg and its neighbours."""
-SAMPLED_INSIDE = 6.0
-"""Pixels inside to which profiles are sampled: highlights end beyond the modelled part."""
-MODELLED_LIMB_SHARE = 0.45
-"""Share of a leg's half width, inwards from its limb, that the model explains: highlights of
-bare metal begin further inside. On slim legs this is less than PROFILE_REACH_INSIDE."""
-LEAST_INSIDE = 1.25
-"""Smallest depth in pixels that is used: less would not contain the brightness of the limb
-itself."""
-CLEAR_OUTSIDE = 1.0
-"""Distance in pixels outward of the predicted edge from which samples belong to the background."""
-HIGHLIGHT_DEVIATIONS = 3.0
-"""Standard deviations by which the brightness must return towards the background further inside
-for a strip to be detected."""
-PROFILE_STEP = 0.5
-"""Spacing of the samples of a profile, px."""
-EDGE_SHIFTS = np.arange(-1.5, 1.55, 0.1)
-"""Trial positions of the edge about the predicted one, px."""
-PROFILE_MODEL_PITCH = 0.05
-"""Spacing in pixels at which the model is tabulated; it divides PROFILE_STEP and the steps of
-EDGE_SHIFTS, so all samples of all trial positions are on the grid."""
+
+@dataclass(frozen=True)
+class ProfileOptions:
+    """Constants of the profile model; lengths in pixels of the image that is measured."""
+
+    # extent inside the edge that the model explains: with less the fit of five brightnesses is
+    # ill-conditioned, with more it meets other features of the leg
+    reach_inside: float = 3.0
+    # extent outside the edge, likewise; with more it meets neighbours
+    reach_outside: float = 3.0
+    # extent inside to which profiles are sampled: highlights end beyond the modelled part
+    sampled_inside: float = 6.0
+    # share of a leg's half width, inwards from its limb, that the model explains: highlights of
+    # bare metal begin further inside; on slim legs this is less than the reach
+    limb_share: float = 0.45
+    # smallest depth that is used: a shallower part would not contain the brightness of the limb
+    # itself, behind a blur of 0.7 px
+    least_inside: float = 1.25
+    # distance outward of the predicted edge from which samples belong to the background: more than
+    # its blur
+    clear_outside: float = 1.0
+    # standard deviations by which the brightness returns towards the background behind a strip
+    # (statistical: 3 in 1000 samples by chance)
+    highlight_deviations: float = 3.0
+    # spacing of the samples: half of the pixel that limits the image's resolution
+    step: float = 0.5
+    # largest trial shift of the edge from its prediction, which is correct to a pixel
+    shift_reach: float = 1.5
+    # spacing of the trial shifts; a parabola interpolates between them
+    shift_step: float = 0.1
+    # spacing at which the model is tabulated; it divides both steps, so that all samples of all
+    # trial shifts are on the grid
+    model_pitch: float = 0.05
+    # smallest and largest half width of legs for which the model is tabulated
+    half_width_range: tuple[float, float] = (3.0, 60.0)
+    # number of half widths, in geometric progression (ratio 1.22); the nearest one is used
+    half_width_count: int = 16
+    # smallest and largest trial blur, standard deviation of lens, pixel and interpolation
+    # together: below, pixels alias; above, images are binned
+    blur_range: tuple[float, float] = (0.45, 1.45)
+    # spacing of the trial blurs; a parabola interpolates between them
+    blur_step: float = 0.1
+    # blur that is tried first, and the default where no profile determines it: lens 0.6, pixel 0.3
+    usual_blur: float = 0.7
+    # trial blurs on both sides of the best one: further values move the estimate by less than its
+    # uncertainty; with the nearest neighbours alone, a local minimum of a hundred poor profiles
+    # may be mistaken for the best (measured)
+    blurs_beside: int = 2
+    # number of profiles that determine the blur to a hundredth of a pixel; more only take time
+    enough_for_blur: int = 500
+    # fewest profiles for an estimate of the blur: if fewer are uncut, as those of a single wide
+    # leg among slim ones, the profiles with the next larger cuts are added
+    fewest_for_blur: int = 100
+    # lower bound of the standard deviation of a sample, grey levels: 8-bit rounding (0.3) and
+    # model errors. It limits the weight of a fit that is perfect by chance
+    grey_noise: float = 0.6
+    # share of the contrast by which real profiles differ from the model; the scale of
+    # the two shading priors
+    model_error: float = 0.01
+    # prior sigma of the shading's linear part, contrasts per pixel. Complete profiles are hardly
+    # affected; where a leg is overexposed and only the flank of the limb is left, the two priors
+    # bound the hidden shading, so that the position's sigma grows realistically
+    shading_slope: float = 0.3
+    # prior sigma of the shading's root part at a depth of a pixel, contrasts
+    shading_root: float = 1.0
+    # smallest grey level of a clipped sample: interpolation and compression blur 255 by a few
+    # levels
+    saturated: int = 250
+    # position up to which a profile may be clipped: the edge itself, half a sample inside
+    most_cut: float = -0.25
+    # largest distance of a profile's edge from that of its leg as a whole: further away are
+    # highlights, which all points of an edge may show consistently
+    own_edge: float = 0.5
+    # standard deviation of a position from which on a profile has no edge: that of the window
+    # itself
+    faint_sigma: float = 0.5
+
+    @cached_property
+    def shifts(self) -> Array:
+        """Trial shifts of the edge from its prediction, px."""
+        return np.arange(-self.shift_reach, self.shift_reach + self.shift_step / 2, self.shift_step)
+
+    @cached_property
+    def blurs(self) -> Array:
+        """Trial values of the blur, px."""
+        first, last = self.blur_range
+        return np.arange(first, last + self.blur_step / 2, self.blur_step)
+
+    @cached_property
+    def half_widths(self) -> Array:
+        """Tabulated half widths, px."""
+        return np.geomspace(*self.half_width_range, self.half_width_count)
+
+    @cached_property
+    def sampled_offsets(self) -> Array:
+        """Sample positions of a profile, px outward from the predicted edge."""
+        return np.arange(-self.sampled_inside, self.reach_outside + self.step / 2, self.step)
+
+    @cached_property
+    def profile_offsets(self) -> Array:
+        """Sample positions that the model explains, the outermost of :attr:`sampled_offsets`."""
+        return np.arange(-self.reach_inside, self.reach_outside + self.step / 2, self.step)
+
+
+PROFILE_OPTIONS = ProfileOptions()
+
+
 BRIGHTNESS_UNKNOWNS = 5
 """Number of linear unknowns of the model: three inside the limb, two outside."""
-HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
-"""Half widths w (px) of legs for which the model is tabulated; the nearest one is used."""
-_BETWEEN_HALF_WIDTHS = np.sqrt(HALF_WIDTHS[1:] * HALF_WIDTHS[:-1])
-"""Boundaries (px) between successive half widths, their geometric means."""
-BLURS_TRIED = np.arange(0.45, 1.5, 0.1)
-"""Trial values of the blur (px, standard deviation; lens, pixel and interpolation together)."""
-USUAL_BLUR = 0.7
-"""Blur (px) that is tried first, and the default where no profile determines it: lens 0.6, pixel
-0.3."""
-BLURS_BESIDE = 2
-"""Trial values on both sides of the best one: the neighbours determine its position between
-them, and the smallest residual of each profile. Further values move the estimate by less than
-its uncertainty; with the nearest neighbours alone, a local minimum of a hundred poor profiles
-may be mistaken for the best."""
-ENOUGH_FOR_BLUR = 500
-"""Number of profiles that determine the blur to a hundredth of a pixel; more only take time."""
-FEWEST_FOR_BLUR = 100
-"""Fewest profiles for an estimate of the blur: if fewer are uncut, as those of a single wide leg
-among slim ones, the profiles with the next larger cuts are added."""
-GREY_NOISE = 0.6
-"""Lower bound of the standard deviation (grey levels) of a profile's samples: 8-bit rounding and
-model errors. It limits the weight of a fit that is perfect by chance."""
-PROFILE_MODEL_ERROR = 0.01
-"""Share of the contrast by which real profiles differ from the model; the scale of the two
-shading priors."""
-SHADING_SLOPE, SHADING_ROOT = 0.3, 1.0
-"""Prior sigma (in contrasts) of the shading's linear part per pixel, and of its root part at a
-depth of a pixel. Complete profiles are hardly affected; where the leg is overexposed and only
-the flank of the limb is left, the priors bound the hidden shading, so that the position's sigma
-grows realistically."""
-SATURATED_GREY_LEVEL = 250
-"""Smallest grey level of a clipped sample."""
-MOST_CUT = -0.25
-"""Position (px) beyond which a profile must be free of saturation: the edge itself."""
-OWN_EDGE_WINDOW = 0.5
-"""Largest distance in pixels of a profile's edge from that of its leg as a whole: further away
-are highlights, which all points of an edge may show consistently."""
-FAINT_EDGE_SIGMA = 0.5
-"""Standard deviation (px) of a position above which a profile has no edge: half the window."""
-EDGE_SIGMA_FLOOR = 0.02
-"""Lower bound in pixels of a position's standard deviation, however sharp the profile."""
-MEASUREMENTS_AN_EDGE = 2.0
-"""Effective sample size of an edge, whatever its length. Shading and paint shift all positions
-along an edge together, so they do not average out: an edge is one line measured once at each of
-two halves, not three hundred points."""
-FEWEST_PLACES_FOR_TILT = 3
-"""Fewest positions along an edge from which its tilt is estimated."""
 
 
 BlurByStation = Mapping[int, float]
@@ -119,36 +156,26 @@ class ProfileEdges:
     valid: Booleans
 
 
-def sampled_offsets() -> Array:
-    """Sample positions of a profile, px outward from the predicted edge."""
-    return np.arange(-SAMPLED_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
-
-
-def profile_offsets() -> Array:
-    """Sample positions that the model explains, the outermost of :func:`sampled_offsets`."""
-    return np.arange(-PROFILE_REACH_INSIDE, PROFILE_REACH_OUTSIDE + PROFILE_STEP / 2, PROFILE_STEP)
-
-
 @lru_cache(maxsize=512)
-def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
+def _blurred_model(blur: float, half_width: float, options: ProfileOptions) -> tuple[Array, Array]:
     """Positions x (px outward of the edge), (n,), and the five blurred basis functions there, (n,
     5).
     """
-    place = np.arange(-PROFILE_REACH_INSIDE - 8, PROFILE_REACH_OUTSIDE + 8, PROFILE_MODEL_PITCH)
+    place = np.arange(-options.reach_inside - 8, options.reach_outside + 8, options.model_pitch)
     inside = (place < 0).astype(float)
-    inside[np.abs(place) < PROFILE_MODEL_PITCH / 2] = 0.5
+    inside[np.abs(place) < options.model_pitch / 2] = 0.5
     depth = np.clip(-place, 0.0, 2 * half_width)
     root = np.sqrt(depth * (2 * half_width - depth))
     columns = [inside, depth, root, 1 - inside, np.maximum(place, 0.0)]
     # odd length: np.convolve shifts an even kernel, and the edge with it, by half a pitch
-    half = int(np.ceil(5 * blur / PROFILE_MODEL_PITCH))
-    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * PROFILE_MODEL_PITCH / blur) ** 2)
+    half = int(np.ceil(5 * blur / options.model_pitch))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * options.model_pitch / blur) ** 2)
     smooth = [np.convolve(c, kernel / kernel.sum(), mode="same") for c in columns]
     return place, np.stack(smooth, axis=1)
 
 
 @lru_cache(maxsize=2048)
-def _projections(blur: float, half_width: float, cut: int) -> Array:
+def _projections(blur: float, half_width: float, cut: int, options: ProfileOptions) -> Array:
     """Orthonormal bases of the model at each trial position, (samples, 5 x shifts).
 
     The first basis vectors of all positions come first, then the second ones. The priors of the
@@ -161,13 +188,13 @@ def _projections(blur: float, half_width: float, cut: int) -> Array:
 
     cut : samples at the inner end that are not used; their rows are zero.
     """
-    place, model = _blurred_model(blur, half_width)
-    at = profile_offsets() - EDGE_SHIFTS[:, None]
-    values = model[np.rint((at - place[0]) / PROFILE_MODEL_PITCH).astype(int)]
+    place, model = _blurred_model(blur, half_width, options)
+    at = options.profile_offsets - options.shifts[:, None]
+    values = model[np.rint((at - place[0]) / options.model_pitch).astype(int)]
     values[:, :cut] = 0.0
-    beliefs = np.zeros((len(EDGE_SHIFTS), 2, BRIGHTNESS_UNKNOWNS))
-    beliefs[:, 0, 1] = PROFILE_MODEL_ERROR / SHADING_SLOPE
-    beliefs[:, 1, 2] = PROFILE_MODEL_ERROR / SHADING_ROOT * np.sqrt(2 * half_width)
+    beliefs = np.zeros((len(options.shifts), 2, BRIGHTNESS_UNKNOWNS))
+    beliefs[:, 0, 1] = options.model_error / options.shading_slope
+    beliefs[:, 1, 2] = options.model_error / options.shading_root * np.sqrt(2 * half_width)
     bases = np.linalg.qr(np.concatenate([values, beliefs], axis=1))[0][:, : at.shape[1]]
     return bases.transpose(1, 2, 0).reshape(at.shape[1], -1)
 
@@ -192,13 +219,14 @@ class _Kinds(NamedTuple):
 class Profiles:
     """N averaged profiles across edges.
 
-    grey : (N, samples) at :func:`profile_offsets`.
+    grey : (N, samples) at :attr:`ProfileOptions.profile_offsets`.
     count : (N,) number of image profiles in each average.
     half_width : (N,) of the leg there, px.
     cut : (N,) samples at the inner end that are not used: clipped at the camera's brightest level,
         or too deep inside a slim leg.
     station : (N,) station, which determines the blur.
     strip, bright : (N,), see :func:`strips`.
+    options : of the model, which fix the sample positions.
     """
 
     grey: Array
@@ -208,23 +236,31 @@ class Profiles:
     station: Integers
     strip: Integers
     bright: Booleans
+    options: ProfileOptions = PROFILE_OPTIONS
 
     @classmethod
     def of(
-        cls, grey: Array, clipped: Booleans, count: Array, half_width: Array, station: Integers
+        cls,
+        grey: Array,
+        clipped: Booleans,
+        count: Array,
+        half_width: Array,
+        station: Integers,
+        options: ProfileOptions = PROFILE_OPTIONS,
     ) -> Profiles:
         """Profiles from grey levels and clipping.
 
-        grey : (N, samples) at :func:`sampled_offsets`.
-        clipped : (N, samples) at :func:`profile_offsets`.
+        grey : (N, samples) at :attr:`ProfileOptions.sampled_offsets`.
+        clipped : (N, samples) at :attr:`ProfileOptions.profile_offsets`.
         """
-        explained, cut = grey[:, -clipped.shape[1] :], cut_of(clipped, half_width)
-        strip = strips(grey, count, half_width)
-        return cls(explained, count, half_width, cut, station, *strip)
+        explained, cut = grey[:, -clipped.shape[1] :], cut_of(clipped, half_width, options=options)
+        strip = strips(grey, count, half_width, options=options)
+        return cls(explained, count, half_width, cut, station, *strip, options)
 
     def select(self, keep: Booleans | Integers) -> Profiles:
         """The profiles at a mask or at indices."""
-        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        arrays = (f.name for f in fields(self) if f.name != "options")
+        return replace(self, **{name: getattr(self, name)[keep] for name in arrays})
 
     @cached_property
     def contrast(self) -> Array:
@@ -239,22 +275,27 @@ class Profiles:
         scaled /= self.contrast[:, None]
         samples = scaled.shape[1]
         scaled[np.arange(samples) < self.cut[:, None]] = 0.0
-        width = np.searchsorted(_BETWEEN_HALF_WIDTHS, self.half_width)
+        half_widths = self.options.half_widths
+        # the nearest tabulated width: their geometric means are the boundaries
+        boundaries = np.sqrt(half_widths[1:] * half_widths[:-1])
+        width = np.searchsorted(boundaries, self.half_width)
         kind = np.minimum(self.cut, samples - 1) + samples * (
-            width + len(HALF_WIDTHS) * self.station
+            width + len(half_widths) * self.station
         )
         order = np.argsort(kind, kind="stable")
         kind = kind[order]
         first = np.flatnonzero(np.diff(kind, prepend=-1))
         widths, cuts = divmod(kind[first], samples)
-        stations, widths = divmod(widths, len(HALF_WIDTHS))
-        columns = (v.tolist() for v in (stations, HALF_WIDTHS[widths], cuts))
+        stations, widths = divmod(widths, len(half_widths))
+        columns = (v.tolist() for v in (stations, half_widths[widths], cuts))
         parts = zip(pairwise([*first.tolist(), len(kind)]), *columns, strict=True)
         scaled = scaled[order]
         return _Kinds(scaled, np.einsum("ni,ni->n", scaled, scaled), order, list(parts))
 
 
-def cut_of(saturated: Booleans, half_width: Array) -> Integers:
+def cut_of(
+    saturated: Booleans, half_width: Array, options: ProfileOptions = PROFILE_OPTIONS
+) -> Integers:
     """Number (N,) of samples that are not used at the inner end of profiles.
 
     These are the samples up to the outermost saturated one, and those deeper than the modelled
@@ -265,42 +306,44 @@ def cut_of(saturated: Booleans, half_width: Array) -> Integers:
     """
     count = saturated.shape[-1]
     last = count - np.argmax(saturated[..., ::-1], axis=-1)
-    depth = np.maximum(MODELLED_LIMB_SHARE * half_width, LEAST_INSIDE)
-    beyond = np.searchsorted(profile_offsets(), -depth - 1e-9)
+    depth = np.maximum(options.limb_share * half_width, options.least_inside)
+    beyond = np.searchsorted(options.profile_offsets, -depth - 1e-9)
     return np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
 
 
-def strips(grey: Array, count: Array, half_width: Array) -> tuple[Integers, Booleans]:
+def strips(
+    grey: Array, count: Array, half_width: Array, options: ProfileOptions = PROFILE_OPTIONS
+) -> tuple[Integers, Booleans]:
     """Bright or dark strips within the limb of profiles.
 
-    Returns the number of samples (N,) of :func:`profile_offsets` inward of the middle of a strip, 0
-    without one, and whether the strip is brighter than the background (N,).
+    Returns the number of samples (N,) of :attr:`ProfileOptions.profile_offsets` inward of the
+    middle of a strip, 0 without one, and whether the strip is brighter than the background (N,).
 
     A strip is detected where, further inside, the deviation from the background decreases by more
-    than diffuse light usually allows, whose cosine changes by MODELLED_LIMB_SHARE down to that
+    than diffuse light usually allows, whose cosine changes by ``options.limb_share`` down to that
     depth, and by more than noise.
 
-    grey : (N, samples) at :func:`sampled_offsets`.
+    grey : (N, samples) at :attr:`ProfileOptions.sampled_offsets`.
     count, half_width : (N,), as in `Profiles`.
     """
-    offsets = sampled_offsets()
-    background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
-    inside = np.flatnonzero(offsets <= -PROFILE_STEP)[::-1]  # from the limb inwards
+    offsets = options.sampled_offsets
+    background = np.median(grey[:, offsets >= options.clear_outside], axis=1, keepdims=True)
+    inside = np.flatnonzero(offsets <= -options.step)[::-1]  # from the limb inwards
     violation = grey[:, inside] - background
     away = np.abs(violation)
     # decrease of the deviation from its running maximum
     most = np.maximum.accumulate(away, axis=1)
-    contrast = _contrast(grey[:, offsets >= -PROFILE_REACH_INSIDE])
-    noise = (np.hypot(_noise(contrast, count), PROFILE_MODEL_ERROR) * contrast)[:, None]
-    less = most - away > np.maximum(HIGHLIGHT_DEVIATIONS * noise, MODELLED_LIMB_SHARE * most)
-    depth = np.maximum(MODELLED_LIMB_SHARE * half_width, PROFILE_REACH_INSIDE)
+    contrast = _contrast(grey[:, offsets >= -options.reach_inside])
+    noise = (np.hypot(_noise(contrast, count, options), options.model_error) * contrast)[:, None]
+    less = most - away > np.maximum(options.highlight_deviations * noise, options.limb_share * most)
+    depth = np.maximum(options.limb_share * half_width, options.reach_inside)
     less &= -offsets[inside] <= depth[:, None]
     # last running maximum before the decrease
     before = np.arange(len(inside)) < np.argmax(less, axis=1)[:, None]
     largest = len(inside) - 1 - np.argmax(((away == most) & before)[:, ::-1], axis=1)
     there, which = less.any(axis=1), np.arange(len(grey))
-    middle = np.minimum(offsets[inside[largest]], -LEAST_INSIDE)
-    cut = np.searchsorted(profile_offsets(), middle - 1e-9)
+    middle = np.minimum(offsets[inside[largest]], -options.least_inside)
+    cut = np.searchsorted(options.profile_offsets, middle - 1e-9)
     return np.where(there, cut, 0), there & (violation[which, largest] > 0)
 
 
@@ -313,22 +356,24 @@ def without_highlights(profiles: Profiles, blur: BlurByStation) -> tuple[Profile
     behind has a bright strip as well, but one that the model explains to its usual error; a
     highlight it does not.
     """
+    options = profiles.options
     bright, odd = np.flatnonzero(profiles.bright), np.zeros(len(profiles.cut), dtype=bool)
     if bright.size:
         whole = profiles.select(bright)
-        residual = residual_curves(whole, blur).min(axis=-1) * PROFILE_STEP
-        expected = _noise(whole.contrast, whole.count) ** 2 + PROFILE_MODEL_ERROR**2
+        residual = residual_curves(whole, blur).min(axis=-1) * options.step
+        expected = _noise(whole.contrast, whole.count, options) ** 2 + options.model_error**2
         odd[bright] = residual > expected * _freedom(whole)
     return replace(profiles, cut=np.maximum(profiles.cut, profiles.strip)), odd
 
 
 def residual_curves(profiles: Profiles, blur: BlurByStation) -> Array:
     """Sum of squared residuals (N, shifts) at every trial position, in squared contrasts."""
-    kinds, shifts = profiles.by_kind, len(EDGE_SHIFTS)
+    options = profiles.options
+    kinds, shifts = profiles.by_kind, len(options.shifts)
     explained = np.empty((len(kinds.scaled), shifts))
     for (first, end), station, half_width, cut in kinds.parts:
         # explained = sum of squares of the projections on the five basis vectors
-        bases = _projections(round(float(blur[station]), 3), half_width, cut)
+        bases = _projections(round(float(blur[station]), 3), half_width, cut, options)
         along = (kinds.scaled[first:end] @ bases).reshape(-1, BRIGHTNESS_UNKNOWNS, shifts)
         np.einsum("nbs,nbs->ns", along, along, out=explained[first:end])
     out = np.empty_like(explained)
@@ -343,24 +388,28 @@ def shift_log_likelihoods(profiles: Profiles, curves: Array) -> Array:
 
     curves : (N, shifts), :func:`residual_curves`.
     """
+    options = profiles.options
     samples = np.maximum(profiles.grey.shape[-1] - profiles.cut, 1)
-    floor = samples * (_noise(profiles.contrast, profiles.count) ** 2 + PROFILE_MODEL_ERROR**2)
+    floor = samples * (
+        _noise(profiles.contrast, profiles.count, options) ** 2 + options.model_error**2
+    )
     out = -_freedom(profiles)[:, None] / 2 * np.log(curves + floor[:, None])
     out -= out.max(axis=-1, keepdims=True)
     return np.where(_shows_its_edge(profiles)[:, None], out, 0.0)
 
 
 def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
-    """Edge positions of profiles, each within OWN_EDGE_WINDOW of its leg's edge.
+    """Edge positions of profiles, each within the window about its leg's edge.
 
     curves : (N, shifts), :func:`residual_curves`.
     about : (N,) position of the leg's edge, px outward.
     """
     # lowest trial position within the window
-    step = EDGE_SHIFTS[1] - EDGE_SHIFTS[0]
-    half = round(OWN_EDGE_WINDOW / step)
-    middle = np.rint((about - EDGE_SHIFTS[0]) / step).astype(int)
-    middle = np.clip(middle, half, len(EDGE_SHIFTS) - 1 - half)
+    options = profiles.options
+    step = options.shifts[1] - options.shifts[0]
+    half = round(options.own_edge / step)
+    middle = np.rint((about - options.shifts[0]) / step).astype(int)
+    middle = np.clip(middle, half, len(options.shifts) - 1 - half)
     near = middle[:, None] + np.arange(-half, half + 1)
     lowest = np.argmin(np.take_along_axis(curves, near, axis=-1), axis=-1)
     best = middle - half + np.clip(lowest, 1, 2 * half - 1)
@@ -369,14 +418,14 @@ def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
         np.take_along_axis(curves, (best + d)[..., None], -1)[..., 0] for d in (-1, 0, 1)
     )
     bend = np.maximum(left - 2 * here + right, 1e-12)
-    position = EDGE_SHIFTS[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
-    noise = _noise(profiles.contrast, profiles.count)
-    variance = here * PROFILE_STEP / _freedom(profiles) + noise**2
-    # cost(x) = residual / (variance / PROFILE_STEP): its second derivative is 2 / sigma^2
-    sigma = np.sqrt(2 * (variance / PROFILE_STEP) / (bend / step**2))
+    position = options.shifts[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
+    noise = _noise(profiles.contrast, profiles.count, options)
+    variance = here * options.step / _freedom(profiles) + noise**2
+    # cost(x) = residual / (variance / options.step): its second derivative is 2 / sigma^2
+    sigma = np.sqrt(2 * (variance / options.step) / (bend / step**2))
     inside = (lowest > 0) & (lowest < 2 * half)
     return ProfileEdges(
-        position, sigma, inside & _shows_its_edge(profiles) & (sigma < FAINT_EDGE_SIGMA)
+        position, sigma, inside & _shows_its_edge(profiles) & (sigma < options.faint_sigma)
     )
 
 
@@ -385,9 +434,9 @@ def _contrast(grey: Array) -> Array:
     return np.maximum(np.ptp(grey, axis=-1), 1e-3)
 
 
-def _noise(contrast: Array, count: Array) -> Array:
+def _noise(contrast: Array, count: Array, options: ProfileOptions) -> Array:
     """Lower bound (N,) of a sample's noise, in contrasts."""
-    return GREY_NOISE / contrast / np.sqrt(np.maximum(count, 1))
+    return options.grey_noise / contrast / np.sqrt(np.maximum(count, 1))
 
 
 def _freedom(profiles: Profiles) -> Array:
@@ -395,13 +444,15 @@ def _freedom(profiles: Profiles) -> Array:
 
     Neighbouring samples at half a pixel have correlated noise: two count as one.
     """
+    options = profiles.options
     samples = profiles.grey.shape[-1] - profiles.cut
-    return np.maximum(samples * PROFILE_STEP - BRIGHTNESS_UNKNOWNS, 1.0)
+    return np.maximum(samples * options.step - BRIGHTNESS_UNKNOWNS, 1.0)
 
 
 def _shows_its_edge(profiles: Profiles) -> Booleans:
     """Mask (N,) of the profiles that are not clipped up to their edge."""
-    return profiles.cut < np.searchsorted(profile_offsets(), MOST_CUT)
+    options = profiles.options
+    return profiles.cut < np.searchsorted(options.profile_offsets, options.most_cut)
 
 
 def estimate_blur(profiles: Profiles) -> float:
@@ -411,18 +462,21 @@ def estimate_blur(profiles: Profiles) -> float:
     median over profiles is minimized, so up to half of them may be outliers. The profiles with the
     smallest cuts are used. The search starts at the usual blur and moves towards the minimum.
     """
-    few = min(FEWEST_FOR_BLUR, len(profiles.cut))
+    options = profiles.options
+    few = min(options.fewest_for_blur, len(profiles.cut))
     whole = np.flatnonzero(profiles.cut <= np.sort(profiles.cut)[few - 1]) if few else np.array([])
     if whole.size:
-        profiles = profiles.select(whole[evenly(whole.size, ENOUGH_FOR_BLUR)])
+        profiles = profiles.select(whole[evenly(whole.size, options.enough_for_blur)])
     # walk to the minimum, evaluating its neighbours only
-    floor = (GREY_NOISE / profiles.contrast) ** 2
-    costs = np.full((len(profiles.cut), len(BLURS_TRIED)), np.inf)  # inf: not evaluated
-    k = int(np.argmin(np.abs(BLURS_TRIED - USUAL_BLUR)))
+    floor = (options.grey_noise / profiles.contrast) ** 2
+    costs = np.full((len(profiles.cut), len(options.blurs)), np.inf)  # inf: not evaluated
+    k = int(np.argmin(np.abs(options.blurs - options.usual_blur)))
     while True:
-        for near in range(max(k - BLURS_BESIDE, 0), min(k + BLURS_BESIDE + 1, len(BLURS_TRIED))):
+        for near in range(
+            max(k - options.blurs_beside, 0), min(k + options.blurs_beside + 1, len(options.blurs))
+        ):
             if np.isinf(costs[0, near]):
-                tried = dict.fromkeys(profiles.station.tolist(), BLURS_TRIED[near])
+                tried = dict.fromkeys(profiles.station.tolist(), options.blurs[near])
                 costs[:, near] = residual_curves(profiles, tried).min(axis=-1)
         total = np.median(costs / (costs.min(axis=-1) + floor)[:, None], axis=0)
         best = int(np.argmin(total))
@@ -430,13 +484,37 @@ def estimate_blur(profiles: Profiles) -> float:
             break
         k = best
     # parabola through the minimum and its neighbours
-    k = int(np.clip(k, 1, len(BLURS_TRIED) - 2))
+    k = int(np.clip(k, 1, len(options.blurs) - 2))
     left, here, right = total[k - 1 : k + 2]
     bend = max(left - 2 * here + right, 1e-12)
     return float(
-        BLURS_TRIED[k]
-        + (BLURS_TRIED[1] - BLURS_TRIED[0]) * np.clip((left - right) / (2 * bend), -1, 1)
+        options.blurs[k]
+        + (options.blurs[1] - options.blurs[0]) * np.clip((left - right) / (2 * bend), -1, 1)
     )
+
+
+@dataclass(frozen=True)
+class EdgeFitOptions:
+    """Constants of the fit of an edge's plane to positions along the edge."""
+
+    # lower bound of a position's standard deviation, px, however sharp the profile
+    sigma_floor: float = 0.02
+    # effective sample size of an edge, whatever its length. Shading and paint shift all positions
+    # along an edge together, so they do not average out: an edge is one line measured once at each
+    # of two halves, not three hundred points
+    effective: float = 2.0
+    # fewest positions along an edge: two determine shift and tilt, a third tests them
+    fewest: int = 3
+    # reweighting steps
+    rounds: int = 8
+    # squared distance from the fit, in variances, below which a position is an inlier: three
+    # sigmas (statistical: 3 in 1000 rejected by chance)
+    inlier_square: float = 9.0
+    # smallest share of an edge's positions that are inliers: a minority may lie on another line
+    majority: float = 0.5
+
+
+EDGE_FIT_OPTIONS = EdgeFitOptions()
 
 
 @dataclass(frozen=True)
@@ -461,7 +539,11 @@ class EdgeFits:
 
 
 def fit_edges(
-    points: EdgePoints, position: Array, sigma: Array, valid: Booleans, rounds: int = 8
+    points: EdgePoints,
+    position: Array,
+    sigma: Array,
+    valid: Booleans,
+    options: EdgeFitOptions = EDGE_FIT_OPTIONS,
 ) -> EdgeFits:
     """Robust weighted fit of edge planes, two rotations each, to positions along the edges.
 
@@ -470,13 +552,12 @@ def fit_edges(
 
     position, sigma : (K, E, n) px outward, and standard deviations.
     valid : (K, E, n).
-    rounds : number of reweighting steps.
     """
     middle = _middle_ray(points)
     basis = tangent_basis(points.normal, middle)
     rows = np.where(valid[..., None], np.nan_to_num(points.by_normal() @ basis), 0.0)
     value = np.where(valid, position, 0.0)
-    base = np.where(valid, 1 / (sigma**2 + EDGE_SIGMA_FLOOR**2), 0.0)
+    base = np.where(valid, 1 / (sigma**2 + options.sigma_floor**2), 0.0)
     # sample by sample for all edges, so that sums run over contiguous memory
     one, two, at, sure = (
         np.ascontiguousarray(v.reshape(-1, v.shape[-1]).T)
@@ -485,24 +566,29 @@ def fit_edges(
     squares = np.stack([one * one, one * two, two * two, one * at, two * at])
 
     def fitted(weight: Array) -> tuple[Array, Array, Array]:
-        inverse, turn = _solved(squares, weight)
+        # N least-squares problems in two unknowns: inverses (2, 2, N) of the normal matrices
+        a, b, c, p, q = np.einsum("pnx,nx->px", squares, weight)
+        ridge = 1e-12 * (a + c) + 1e-30
+        a, c = a + ridge, c + ridge
+        inverse = np.stack([c, -b, -b, a]).reshape(2, 2, -1) / (a * c - b * b)
+        turn = inverse[0] * p + inverse[1] * q
         return inverse, turn, (at - one * turn[0] - two * turn[1]) ** 2 * sure
 
     weight = sure
     inverse, turn, off2 = fitted(weight)
-    for _ in range(rounds):
+    for _ in range(options.rounds):
         weight = sure * cauchy_weights(off2)
         inverse, turn, off2 = fitted(weight)
     shape = valid.shape[:-1]
     off2, weight = (v.T.reshape(valid.shape) for v in (off2, weight))
-    # inliers within three sigmas; scatter and correlation enlarge the covariance
-    used = valid & (off2 < 9.0)
+    # inliers; scatter and correlation enlarge the covariance
+    used = valid & (off2 < options.inlier_square)
     count = used.sum(axis=-1)
     scatter = np.sum(used * off2, axis=-1) / np.maximum(count - 2, 1)
-    factor = np.maximum(scatter, 1.0) * np.maximum(count / MEASUREMENTS_AN_EDGE, 1.0)
+    factor = np.maximum(scatter, 1.0) * np.maximum(count / options.effective, 1.0)
     inverse = np.moveaxis(inverse.reshape(2, 2, *shape), (0, 1), (-2, -1))
     operator = inverse @ (rows * weight[..., None]).mT
-    good = (count >= FEWEST_PLACES_FOR_TILT) & (count >= 0.5 * valid.sum(axis=-1))
+    good = (count >= options.fewest) & (count >= options.majority * valid.sum(axis=-1))
     covariance = inverse * factor[..., None, None]
     good &= np.isfinite(covariance).all(axis=(-1, -2))
     return EdgeFits(turn.T.reshape(*shape, 2), basis, covariance, operator, used, good)
@@ -512,20 +598,6 @@ def _middle_ray(points: EdgePoints) -> Array:
     """Unit ray (..., E, 3) to the middle sample of each edge."""
     ray = points.point[..., points.point.shape[-2] // 2, :]
     return ray / np.sqrt(dot(ray, ray))[..., None]
-
-
-def _solved(squares: Array, weight: Array) -> tuple[Array, Array]:
-    """N weighted least-squares problems of n equations in two unknowns: inverses (2, 2, N) of the
-    normal matrices, and unknowns (2, N).
-
-    squares : (5, n, N) products of the rows' entries with each other, then with the values.
-    weight : (n, N).
-    """
-    a, b, c, p, q = np.einsum("pnx,nx->px", squares, weight)
-    ridge = 1e-12 * (a + c) + 1e-30
-    a, c = a + ridge, c + ridge
-    inverse = np.stack([c, -b, -b, a]).reshape(2, 2, -1) / (a * c - b * b)
-    return inverse, inverse[0] * p + inverse[1] * q
 
 
 def edge_set(
@@ -550,6 +622,12 @@ def edge_set(
     normal /= np.sqrt(dot(normal, normal))[:, None]
     middle = _middle_ray(points)[k, e]
     along = np.where(fits.used[k, e], points.along[k, e], np.nan)
+    # derivative (K, E, 2, p) of the planes' rotation by the camera's parameters, pixels fixed
+    by_intrinsics = np.zeros((*fits.turn.shape, 0))
+    if by_parameters is not None:
+        outward = (points.outward[..., None, :] @ by_parameters)[..., 0, :]
+        used = fits.used[..., None] & np.isfinite(outward)
+        by_intrinsics = -fits.operator @ np.where(used, outward, 0.0)
     return EdgeSet(
         station=station[k],
         configuration=configuration[k],
@@ -562,16 +640,5 @@ def edge_set(
         covariance=fits.covariance[k, e],
         shift=fits.operator[k, e].sum(axis=-1),
         span=np.stack([np.nanmin(along, axis=1), np.nanmax(along, axis=1)], axis=1),
-        by_intrinsics=_by_intrinsics(points, fits, by_parameters)[k, e],
+        by_intrinsics=by_intrinsics[k, e],
     )
-
-
-def _by_intrinsics(points: EdgePoints, fits: EdgeFits, by_parameters: Array | None) -> Array:
-    """Derivative (K, E, 2, p) of the fitted planes' rotation by the camera's parameters, pixels
-    fixed.
-    """
-    if by_parameters is None:
-        return np.zeros((*fits.turn.shape, 0))
-    outward = (points.outward[..., None, :] @ by_parameters)[..., 0, :]
-    used = fits.used[..., None] & np.isfinite(outward)
-    return -fits.operator @ np.where(used, outward, 0.0)

@@ -11,27 +11,42 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.grey_levels import levels_at
 from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages, windows
-from pkmcal.observe.legs import SEARCH_SAMPLES, predicted, search_legs
-from pkmcal.observe.profiles import SATURATED_GREY_LEVEL
+from pkmcal.observe.legs import LEG_SEARCH_OPTIONS, LegSearchOptions, predicted, search_legs
+from pkmcal.observe.profiles import PROFILE_OPTIONS
 
-BLACK_GREY_LEVEL = 8
-"""Largest grey level of a black sample: shading and edges are lost in noise."""
-DEPTHS_INSIDE_EDGE = np.array([0.25, 0.6, 1.0])
-"""Depths inside an edge at which exposure is sampled, in half widths of the leg."""
-BLUR_PROFILE_REACH, BLUR_PROFILE_PITCH = 8.0, 0.5
-"""Extent to each side of an edge, and spacing, of the profiles from which the blur is estimated,
-px."""
-EDGE_FLANK_WIDTH = 6.0
-"""Pixels from the steepest point within which a blurred edge attains its full contrast."""
-LEAST_BLUR_CONTRAST = 30.0
-"""Smallest contrast, in grey levels, of an edge from which the blur is estimated in spite of
-noise."""
-LENS_WIDTH_PERCENTILE = 25.0
-"""Percentile of the edges' widths that is taken as the lens's blur; shading widens the other
-edges."""
-BESIDE_EDGE_RANGE = (1.5, 4.0)
-"""Range of distances from an edge, px, over which its two grey levels are averaged: beyond the
-blur, and before the next feature."""
+
+@dataclass(frozen=True)
+class QualityOptions:
+    """Constants of the quality of images."""
+
+    # largest grey level of a black sample: shading and edges are lost in noise
+    black: int = 8
+    # smallest grey level of a clipped sample
+    saturated: int = PROFILE_OPTIONS.saturated
+    # depths inside an edge at which exposure is sampled, in half widths of the leg
+    depths: tuple[float, ...] = (0.25, 0.6, 1.0)
+    # extent to each side of an edge of the profiles from which the blur is estimated, px: more
+    # than a flank
+    reach: float = 8.0
+    # spacing of these profiles, px
+    pitch: float = 0.5
+    # pixels from the steepest point within which a blurred edge attains its full contrast: three
+    # times a blur of two
+    flank: float = 6.0
+    # smallest contrast, in grey levels, of an edge from which the blur is estimated in spite of
+    # noise
+    least_contrast: float = 30.0
+    # percentile of the edges' widths that is taken as the lens's blur; shading widens the other
+    # edges
+    percentile: float = 25.0
+    # range of distances from an edge, px, over which its two grey levels are averaged: beyond the
+    # blur, and before the next feature
+    beside: tuple[float, float] = (1.5, 4.0)
+    # search of the legs
+    search: LegSearchOptions = LEG_SEARCH_OPTIONS
+
+
+QUALITY_OPTIONS = QualityOptions()
 
 
 @dataclass(frozen=True)
@@ -63,14 +78,20 @@ class Quality:
         return np.abs(self.level - self.behind)
 
 
-def quality(images: StationImages, machine: Machine, T_camera_base: Array, poses: Array) -> Quality:
+def quality(
+    images: StationImages,
+    machine: Machine,
+    T_camera_base: Array,
+    poses: Array,
+    options: QualityOptions = QUALITY_OPTIONS,
+) -> Quality:
     """Quality on the legs of one station's images.
 
     T_camera_base : (4, 4).
     poses : T_base_platform (K, 4, 4), one for each image.
     """
     placed = Placed(images, T_camera_base, poses)
-    parts = [_quality(window, machine) for window in windows([placed])]
+    parts = [_quality(window, machine, options) for window in windows([placed])]
     each = (f.name for f in fields(Quality))
     return Quality(
         *(
@@ -80,11 +101,13 @@ def quality(images: StationImages, machine: Machine, T_camera_base: Array, poses
     )
 
 
-def _quality(window: ImageWindow, machine: Machine) -> Quality:
+def _quality(window: ImageWindow, machine: Machine, options: QualityOptions) -> Quality:
     """Quality on the legs in one window of images."""
     # edges found by the search, and the widths of their legs
-    tubes, points, clear = predicted(window, machine, SEARCH_SAMPLES)
-    places = search_legs(window.images, tubes, points, clear)
+    tubes, points, clear = predicted(
+        window, machine, options.search.samples, options.search.clearance
+    )
+    places = search_legs(window.images, tubes, points, clear, options=options.search)
     edge = places.outward(points, clear, tubes)[..., None]
     half_width = (points.gain * machine.values[tubes.radius][:, None])[..., None]
 
@@ -94,21 +117,19 @@ def _quality(window: ImageWindow, machine: Machine) -> Quality:
         return np.stack([levels_at(im, p[..., 0], p[..., 1]) for im, p in pairs])
 
     # exposure inside the legs, and profiles across the edges
-    inside = measure(edge - DEPTHS_INSIDE_EDGE * half_width)
-    offsets = np.arange(
-        -BLUR_PROFILE_REACH, BLUR_PROFILE_REACH + BLUR_PROFILE_PITCH / 2, BLUR_PROFILE_PITCH
-    )
+    inside = measure(edge - np.array(options.depths) * half_width)
+    offsets = np.arange(-options.reach, options.reach + options.pitch / 2, options.pitch)
     across = measure(edge + offsets).astype(float)
     valid = clear & places.clear[:, tubes.leg][..., None]
-    near = (np.abs(offsets) >= BESIDE_EDGE_RANGE[0]) & (np.abs(offsets) <= BESIDE_EDGE_RANGE[1])
+    near = (np.abs(offsets) >= options.beside[0]) & (np.abs(offsets) <= options.beside[1])
     hidden = np.full((len(clear), machine.n_legs), np.nan)
     for leg in np.unique(tubes.leg):
         hidden[:, leg] = 1 - clear[:, tubes.leg == leg].mean(axis=(1, 2))
     return Quality(
         legs=places.clear,
-        saturated=_share(inside >= SATURATED_GREY_LEVEL, clear),
-        black=_share(inside <= BLACK_GREY_LEVEL, clear),
-        blur=np.array([_blur(a[f]) for a, f in zip(across, valid, strict=True)]),
+        saturated=_share(inside >= options.saturated, clear),
+        black=_share(inside <= options.black, clear),
+        blur=np.array([_blur(a[f], options) for a, f in zip(across, valid, strict=True)]),
         hidden=hidden,
         level=_middle(across[..., near & (offsets < 0)].mean(axis=-1), clear),
         behind=_middle(across[..., near & (offsets > 0)].mean(axis=-1), clear),
@@ -116,12 +137,14 @@ def _quality(window: ImageWindow, machine: Machine) -> Quality:
     )
 
 
-def unrecognised_quality(images: Sequence[Integers], n_legs: int) -> Quality:
+def unrecognised_quality(
+    images: Sequence[Integers], n_legs: int, options: QualityOptions = QUALITY_OPTIONS
+) -> Quality:
     """Quality of images in which the machine was not localized: exposure of all pixels."""
     count = len(images)
     shares = np.array(
         [
-            (np.mean(image >= SATURATED_GREY_LEVEL), np.mean(image <= BLACK_GREY_LEVEL))
+            (np.mean(image >= options.saturated), np.mean(image <= options.black))
             for image in images
         ],
         dtype=float,
@@ -148,13 +171,13 @@ def _share(is_so: Booleans, clear: Booleans) -> Array:
     return np.sum(is_so & clear[..., None], axis=(1, 2, 3)) / count
 
 
-def _blur(profiles: Array) -> float:
+def _blur(profiles: Array, options: QualityOptions) -> float:
     """Blur s (px) from profiles (N, n): a step of contrast C has the slope C / (s sqrt(2 pi)).
 
     NaN where no profile has enough contrast.
     """
-    flank = round(EDGE_FLANK_WIDTH / BLUR_PROFILE_PITCH)
-    slope = np.abs(profiles[:, 2:] - profiles[:, :-2]) / (2 * BLUR_PROFILE_PITCH)
+    flank = round(options.flank / options.pitch)
+    slope = np.abs(profiles[:, 2:] - profiles[:, :-2]) / (2 * options.pitch)
     # near the middle, so that the profile contains most of the contrast around
     near = slope[:, flank // 2 : -(flank // 2)]
     steepest = near.argmax(axis=1) + flank // 2
@@ -162,8 +185,8 @@ def _blur(profiles: Array) -> float:
     around = np.clip(around, 0, profiles.shape[1] - 1)
     contrast = np.ptp(np.take_along_axis(profiles, around, axis=1), axis=1)
     steep = near.max(axis=1)
-    use = (contrast > LEAST_BLUR_CONTRAST) & (steep > 0)
+    use = (contrast > options.least_contrast) & (steep > 0)
     if not use.any():
         return float("nan")
     width = contrast[use] / steep[use] / np.sqrt(2 * np.pi)
-    return float(np.percentile(width, LENS_WIDTH_PERCENTILE))
+    return float(np.percentile(width, options.percentile))

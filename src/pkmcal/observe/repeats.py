@@ -19,22 +19,29 @@ from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe.legs import StationEdges
+from pkmcal.outcome.finding import note
 
-SCATTER_PRIOR_FREEDOM = 10.0
-"""Degrees of freedom with which the scatter of a wider group enters that of a narrower one: an
-edge with few repeats has the scatter of its leg, a leg with few configurations that of its
-station."""
-FAR_REPEAT_DEVIATIONS = 5.0
-"""Distance of a repeat from the others, in standard deviations, beyond which it is rejected."""
-HARMLESS_REPEAT_DEVIATIONS = 1.0
-"""Distance, in stated standard deviations, within which a repeat is an inlier however well the
-others agree."""
-MAJORITY_OF_REPEATS = 0.5
-"""Share of a configuration's repeats that must be exceeded by those with an edge: edges that are
-measured now and then are faint, and may well be a pixel off."""
-_RARE = "seen in only {} of {} repeats"
-_OUT = "a repeat lies {:.1f} standard deviations from the others, which are used without it"
-_DISPUTED = "its repeats lie up to {:.1f} standard deviations off, and no majority agrees"
+
+@dataclass(frozen=True)
+class RepeatOptions:
+    """Constants of the combination of repeats."""
+
+    # degrees of freedom with which the scatter of a wider group enters that of a narrower one: an
+    # edge with few repeats has the scatter of its leg, a leg with few configurations that of its
+    # station
+    prior_freedom: float = 10.0
+    # distance of a repeat from the others, in standard deviations, beyond which it is rejected
+    # (statistical: 6 in 10^7 of normal errors)
+    far: float = 5.0
+    # distance, in stated standard deviations, within which a repeat is an inlier however well the
+    # others agree
+    harmless: float = 1.0
+    # share of a configuration's repeats that must be exceeded by those with an edge: edges that
+    # are measured now and then are faint, and may well be a pixel off
+    majority: float = 0.5
+
+
+REPEAT_OPTIONS = RepeatOptions()
 
 
 @dataclass(frozen=True)
@@ -89,8 +96,10 @@ def same_edges(edges: EdgeSet) -> Groups:
     return groups_of(edges.station, edges.configuration, edges.leg, edges.tube, edges.side)
 
 
-def combined(station_edges: StationEdges) -> StationEdges:
-    """Edges of a measurement pass with the repeats of each edge replaced by their mean.
+def combine_repeats(
+    station_edges: StationEdges, options: RepeatOptions = REPEAT_OPTIONS
+) -> StationEdges:
+    """Replace the repeats of each edge of a measurement pass by their mean.
 
     Outlying repeats are rejected first, with a reason. A pass without repeats is returned
     unchanged.
@@ -98,7 +107,7 @@ def combined(station_edges: StationEdges) -> StationEdges:
     groups = same_edges(station_edges.edges)
     if len(groups.first) == len(station_edges.edges):
         return station_edges
-    odd = odd_ones(station_edges.edges, groups)
+    odd = outlying_repeats(station_edges.edges, groups, options=options)
     # reject outliers and renumber the points' edges
     keep = ~odd.any
     edges = station_edges.edges.select(keep)
@@ -109,14 +118,14 @@ def combined(station_edges: StationEdges) -> StationEdges:
     text = (*station_edges.rejected, *_rejections(station_edges.edges, odd))
     return replace(
         station_edges,
-        edges=mean_edges(edges, groups),
+        edges=mean_edges(edges, groups, options=options),
         rejected=tuple(dict.fromkeys(text)),  # a hidden edge is hidden in every repeat
         points=station_edges.points[point_edge >= 0],
         point_edge=point_edge[point_edge >= 0],
     )
 
 
-def mean_edges(edges: EdgeSet, groups: Groups) -> EdgeSet:
+def mean_edges(edges: EdgeSet, groups: Groups, options: RepeatOptions = REPEAT_OPTIONS) -> EdgeSet:
     """Mean edge (G,) of each group of repeats, with a covariance from their scatter."""
     normal = groups.mean(edges.normal)
     normal /= np.sqrt(dot(normal, normal))[:, None]
@@ -126,7 +135,9 @@ def mean_edges(edges: EdgeSet, groups: Groups) -> EdgeSet:
         normal=normal,
         # repeats differ by milliradians: the tangent basis of one serves for all
         basis=tangent_basis(normal, edges.basis[groups.first, :, 0]),
-        covariance=mean_covariance(stated, repeat_scatter(edges, groups), groups.count),
+        covariance=mean_covariance(
+            stated, repeat_scatter(edges, groups, options=options), groups.count
+        ),
         shift=groups.mean(edges.shift),
         span=groups.mean(edges.span),
         by_intrinsics=groups.mean(edges.by_intrinsics),
@@ -175,7 +186,9 @@ def pixel_units(edges: EdgeSet) -> Array:
     return np.stack([pixel, pixel / length], axis=1)
 
 
-def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
+def repeat_scatter(
+    edges: EdgeSet, groups: Groups, options: RepeatOptions = REPEAT_OPTIONS
+) -> Array:
     """Covariance (G, 2, 2), rad^2, of a single repeat of each edge, estimated from the repeats
     alone.
 
@@ -199,12 +212,12 @@ def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
         total, number = level.total(squares), level.total(np.asarray(freedom))
         weight = np.maximum(number + prior, 1.0)[level.member]
         scatter = (total[level.member] + prior * scatter) / weight[:, None, None]
-        prior = SCATTER_PRIOR_FREEDOM
+        prior = options.prior_freedom
     return scatter * unit[:, :, None] * unit[:, None, :]
 
 
 @dataclass(frozen=True)
-class OddOnes:
+class OutlyingRepeats:
     """Rejected repeats, all arrays (N,).
 
     off : distance from the median of the repeats, in stated standard deviations.
@@ -226,54 +239,58 @@ class OddOnes:
         return self.out | self.disputed | self.rare
 
 
-def odd_ones(edges: EdgeSet, groups: Groups) -> OddOnes:
+def outlying_repeats(
+    edges: EdgeSet, groups: Groups, options: RepeatOptions = REPEAT_OPTIONS
+) -> OutlyingRepeats:
     """Repeats of one station that are further from their group's median than noise explains."""
     turn, unit = turns_from_first(edges, groups), pixel_units(edges)
     away = np.abs(turn - groups.median(turn)[groups.member])
     stated = np.sqrt(edges.covariance[:, [0, 1], [0, 1]])
-    far = (away > FAR_REPEAT_DEVIATIONS * _typical_spread(turn / unit, groups) * unit) & (
-        away > HARMLESS_REPEAT_DEVIATIONS * stated
-    )
+    # spread (2,) of a repeat of a typical edge, robust against a few bad ones: the median of the
+    # edges' variances, corrected by the ratio of median and mean (Wilson-Hilferty)
+    several, spread = groups.count > 1, np.full(2, np.inf)
+    if several.any():
+        freedom = np.maximum(groups.count - 1.0, 1.0)[:, None]
+        scaled = turn / unit
+        scaled = scaled - groups.mean(scaled)[groups.member]
+        variance = groups.total(scaled * scaled) / freedom / (1 - 2 / (9 * freedom)) ** 3
+        spread = np.sqrt(np.median(variance[several], axis=0))
+    far = (away > options.far * spread * unit) & (away > options.harmless * stated)
     far = far.any(axis=1)
     count = groups.count[groups.member]
     photos = groups_of(edges.station, edges.configuration)
     most = np.zeros(len(photos.first), dtype=int)
     np.maximum.at(most, photos.member, count)
     most = most[photos.member]
-    rare = count <= MAJORITY_OF_REPEATS * most
+    rare = count <= options.majority * most
     disputed = (
-        groups.total((~far).astype(float))[groups.member] <= MAJORITY_OF_REPEATS * count
+        groups.total((~far).astype(float))[groups.member] <= options.majority * count
     ) & ~rare
     # a single image is its own majority
     rare &= most > 1
-    return OddOnes((away / stated).max(axis=1), far & ~disputed & ~rare, disputed, rare, most)
+    return OutlyingRepeats(
+        (away / stated).max(axis=1), far & ~disputed & ~rare, disputed, rare, most
+    )
 
 
-def _typical_spread(turn: Array, groups: Groups) -> Array:
-    """Standard deviation (2,) of a repeat of a typical edge, robust against a few bad ones.
-
-    The median of the edges' variances, corrected by the ratio of median and mean (Wilson-Hilferty).
-    """
-    several = groups.count > 1
-    freedom = np.maximum(groups.count - 1.0, 1.0)[:, None]
-    away = turn - groups.mean(turn)[groups.member]
-    square = groups.total(away * away) / freedom
-    if not several.any():
-        return np.full(2, np.inf)
-    return np.sqrt(np.median((square / (1 - 2 / (9 * freedom)) ** 3)[several], axis=0))
-
-
-def _rejections(edges: EdgeSet, odd: OddOnes) -> list[Rejection]:
+def _rejections(edges: EdgeSet, odd: OutlyingRepeats) -> list[Rejection]:
     """Rejections with their reasons: one for each repeat that is out, one for each other edge."""
-    out = [edges.rejection(k, _OUT.format(odd.off[k])) for k in np.flatnonzero(odd.out).tolist()]
+    out: list[Rejection] = []
+    for k in np.flatnonzero(odd.out).tolist():
+        reason = note("repeats.outlier", distance=odd.off[k])
+        out.append(edges.rejection(k, reason.text, reason.code))
     for kind in (odd.disputed, odd.rare):
         rows = np.flatnonzero(kind)
-        groups = same_edges(edges.select(rows)) if rows.size else None
-        if groups is None:
+        if not rows.size:
             continue
+        groups = same_edges(edges.select(rows))
         apart = np.zeros(len(groups.first))
         np.maximum.at(apart, groups.member, odd.off[rows])
         for k, count, far in zip(rows[groups.first].tolist(), groups.count, apart, strict=True):
-            text = _RARE.format(count, odd.most[k]) if kind is odd.rare else _DISPUTED.format(far)
-            out.append(edges.rejection(k, text))
+            reason = (
+                note("repeats.rare", number=int(count), of=int(odd.most[k]))
+                if kind is odd.rare
+                else note("repeats.disputed", distance=far)
+            )
+            out.append(edges.rejection(k, reason.text, reason.code))
     return out

@@ -10,6 +10,8 @@ darker than their background.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
@@ -18,14 +20,28 @@ from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.pose_candidates import same_pose
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
 
-PLACES_ALONG_TUBE = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-"""Sampled positions along the axis of a tube, as shares of its visible part."""
-MOSTLY_CHANGED_SHARE = 0.5
-"""Share of these, over all images, above which a pose lies on pixels that became darker, or
-brighter."""
+
+@dataclass(frozen=True)
+class ShadowOptions:
+    """Constants of the detection of shadows."""
+
+    # sampled positions along the axis of a tube, as shares of its visible part
+    along: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9)
+    # share of the samples, over all images, above which a pose lies on pixels that became darker,
+    # or brighter: the majority
+    changed: float = 0.5
 
 
-def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: DistanceTables) -> Array:
+SHADOW_OPTIONS = ShadowOptions()
+
+
+def lightness(
+    camera: Camera,
+    tubes: TubeList,
+    legs: LegsInCamera,
+    tables: DistanceTables,
+    options: ShadowOptions = SHADOW_OPTIONS,
+) -> Array:
     """Mean sign (H,) of the brightness change on the legs' axes against the median image, -1 to 1.
 
     legs : (H, K, L) camera frame, in the K images of ``tables``.
@@ -33,18 +49,20 @@ def lightness(camera: Camera, tubes: TubeList, legs: LegsInCamera, tables: Dista
     a, b, u = of_edges(legs, tubes)
     first, last = visible_stretch(a, b, tubes)
     length = np.maximum(last - first, 0.0)
-    at = (first + length * PLACES_ALONG_TUBE[:, None, None, None])[..., None]
+    at = (first + length * np.array(options.along)[:, None, None, None])[..., None]
     number = np.arange(len(tables.row))[:, None]
     sign, inside = tables.brighter(camera.project(a + at * u), number)
     count = np.maximum(inside.sum(axis=(0, 2, 3)), 1)
     return sign.sum(axis=(0, 2, 3)) / count
 
 
-def without_shadows(places: Array, light: Array) -> Integers:
+def without_shadows(
+    places: Array, light: Array, options: ShadowOptions = SHADOW_OPTIONS
+) -> Integers:
     """Indices of the pose candidates (H, 4, 4) that are not another one's shadow.
 
     light : (H,) as `lightness` returns. A shadow's candidate is turned little against the
     machine's, for the two planes are nearly parallel.
     """
-    casts = (light > MOSTLY_CHANGED_SHARE) & same_pose(places[:, None], places)
-    return np.flatnonzero((light > -MOSTLY_CHANGED_SHARE) | ~casts.any(axis=1))
+    casts = (light > options.changed) & same_pose(places[:, None], places)
+    return np.flatnonzero((light > -options.changed) | ~casts.any(axis=1))

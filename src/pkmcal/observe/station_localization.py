@@ -22,36 +22,47 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import angle_between, inverse, pose, rotation
-from pkmcal.observe.pose_candidates import global_candidates
+from pkmcal.observe.pose_candidates import CANDIDATE_OPTIONS, CandidateOptions, global_candidates
 from pkmcal.observe.pose_likelihood import (
-    LAST_REACH,
     StationView,
     by_image,
     correlation_length,
     distances_under,
     distinct_silhouettes,
-    first_mixture,
+    mixture_of,
     refine_lm,
     refine_ml,
     score,
 )
-from pkmcal.observe.shadows import lightness, without_shadows
+from pkmcal.observe.shadows import (
+    SHADOW_OPTIONS,
+    ShadowOptions,
+    lightness,
+    without_shadows,
+)
 
 
-class _SearchRadius(NamedTuple):
+@dataclass(frozen=True)
+class SearchRadius:
     """Extent of the search around a rough pose.
 
-    spread : (6,) standard deviations, rad and m, of the poses that are drawn.
+    turn, shift : standard deviations of the poses that are drawn, rad and m.
     tried : number of poses drawn.
     descending : number of poses that are refined.
     enough : probability by chance, from some of the images, below which the others are not
         searched.
     """
 
-    spread: Array
+    turn: float
+    shift: float
     tried: int
     descending: int
     enough: float
+
+    @property
+    def spread(self) -> Array:
+        """Standard deviations (6,), rad and m."""
+        return np.repeat([self.turn, self.shift], 3)
 
     def reaches(self, T_camera_base: Array, other: Array) -> bool:
         """Whether two poses (4, 4) differ by less than the drawn poses do on average, rotation and
@@ -62,53 +73,100 @@ class _SearchRadius(NamedTuple):
         return bool(square < len(self.spread))
 
 
-FAR = _SearchRadius(np.repeat([np.radians(15.0), 0.15], 3), 3200, 48, 1e-6)
-"""Wide search. The norm of the spread over three axes is 26 degrees and 26 cm; of poses that are
-30 degrees and 30 cm off, 97 of 100 lead to the correct one. A rough pose that is off by more
-than the search covers cannot be distinguished from a correct one: in clutter, images confirm the
-pose that fits near it with a probability by chance down to one in ten thousand."""
-NEAR = _SearchRadius(FAR.spread / 3, 160, 8, 1e-3)
-"""Narrow search, done first, and for each of some thirty hypotheses. If the rough pose is off by
-more, a search rarely ends this close to it by chance."""
+@dataclass(frozen=True)
+class LocalizationOptions:
+    """Constants of the localization of a station; reaches in reduced pixels."""
+
+    # wide search. The norm of the spread over three axes is 26 degrees and 26 cm; of poses that
+    # are 30 degrees and 30 cm off, 97 of 100 lead to the correct one (measured). A rough pose that
+    # is off by more than the search covers cannot be distinguished from a correct one: in clutter,
+    # images confirm the pose that fits near it with a probability by chance down to one in ten
+    # thousand
+    far: SearchRadius = SearchRadius(np.radians(15.0), 0.15, 3200, 48, 1e-6)
+    # narrow search, a third as wide, done first, and for each of some thirty hypotheses. If the
+    # rough pose is off by more, a search rarely ends this close to it by chance
+    near: SearchRadius = SearchRadius(np.radians(15.0) / 3, 0.15 / 3, 160, 8, 1e-3)
+    # spread of the second draw of poses, about the best of the first, relative to the first
+    narrowing: float = 0.45
+    # reaches of the scores of the two draws
+    draw_reaches: tuple[float, float] = (12, 10)
+    # ratio of the poses drawn to those that are scored on four images instead of two, which
+    # discriminate nearly as well (measured)
+    rescored: int = 8
+    # number of candidates without a prior that are refined: before the refinement the images
+    # hardly distinguish poses that are near the correct one, least of all with three equal legs
+    global_refined: int = 1200
+    # number of these that are retained afterwards
+    global_retained: int = 300
+    # reaches of the steps of this refinement, falling from the distance at which an edge is
+    # attracted
+    global_reaches: tuple[float, ...] = (14, 12, 10, 10, 8, 8)
+    # reaches of the next refinement
+    reaches: tuple[float, ...] = (8, 8, 6, 6, 5, 5)
+    # reaches of the refinement before perturbed poses are drawn
+    candidate_reaches: tuple[float, ...] = (5, 4, 4, 3)
+    # reaches of the robust refinement of the likeliest pose
+    final_reaches: tuple[float, ...] = (5, 3, 2, 1.5)
+    # number of candidates that are compared on eight images
+    retained: int = 24
+    # number of distinct candidates around which perturbed poses are drawn
+    perturbed_about: int = 4
+    # standard deviation of the perturbed poses' rotation, rad
+    shaken_turn: float = np.radians(2.0)
+    # standard deviation of their shift, m
+    shaken_shift: float = 0.02
+    # number of perturbed poses before the last refinement
+    perturbed: int = 48
+    # number of these that are retained after two steps
+    perturbed_retained: int = 16
+    # number of likeliest poses, if they are all the same, that are refined without perturbed ones
+    likeliest: int = 4
+    # number of distinct poses that one search returns
+    returned: int = 3
+    # number of candidates scored without a prior, for each of some thirty hypotheses
+    few_global: int = 160
+    # number of these that are retained
+    few_retained: int = 16
+    # number of poses refined for each of some thirty hypotheses
+    nearby_refined: int = 8
+    # number of hypotheses refined besides the first; three are searched completely
+    hypotheses_refined: int = 8
+    # fewest images from which a half is held out for the test: three images remain for a search
+    # without a prior
+    fewest_for_halves: int = 7
+    # fewest images from which a third is held out; with fewer, each image is held out in turn
+    fewest_for_thirds: int = 5
+    # the same as for halves, with a prior: around a rough pose two images suffice for a search
+    fewest_for_halves_with_prior: int = 4
+    # probability by chance, from some of the images, below which the others are not searched
+    # without a prior (statistical)
+    early: float = 1e-4
+    # probability of so large a likelihood by chance below which the machine is localized without a
+    # prior (statistical)
+    by_chance: float = 1e-3
+    # the same near a hand-placed pose, which is evidence itself (statistical)
+    by_chance_with_prior: float = 1e-2
+    # probability of a second pose above which neither is accepted (statistical)
+    rival: float = 0.05
+    # grid of candidates without a prior
+    candidates: CandidateOptions = CANDIDATE_OPTIONS
+    # detection of shadows among the poses
+    shadows: ShadowOptions = SHADOW_OPTIONS
+
+    @property
+    def shaken_spread(self) -> Array:
+        """Standard deviations (6,), rad and m, of perturbed poses around the best ones."""
+        return np.repeat([self.shaken_turn, self.shaken_shift], 3)
+
+
+LOCALIZATION_OPTIONS = LocalizationOptions()
 
 
 class _PosePrior(NamedTuple):
     """A rough pose (4, 4), and the extent of the search around it."""
 
     T_camera_base: Array
-    nearness: _SearchRadius
-
-
-POSES_FOR_RESCORING = 8
-"""Ratio of the poses drawn to those that are scored on four images instead of two, which
-discriminate nearly as well."""
-GLOBAL_CANDIDATES_REFINED, GLOBAL_CANDIDATES_RETAINED = 1200, 300
-"""Numbers of candidates without a prior that are refined, and that are retained afterwards:
-before the refinement the images hardly distinguish poses that are near the correct one, least of
-all with three equal legs."""
-SHAKEN_SPREAD = np.repeat([np.radians(2.0), 0.02], 3)
-"""Standard deviations, rad and m, of perturbed poses around the best ones."""
-PERTURBED_POSES_TRIED, PERTURBED_POSES_RETAINED = 48, 16
-"""Number of perturbed poses tried before the last refinement, and how many are retained after
-two steps."""
-LIKELIEST_PLACES_SETTLED = 4
-"""Number of likeliest poses, if they are all the same, that are refined without perturbed ones."""
-FEW_GLOBAL_CANDIDATES, FEW_CANDIDATES_RETAINED = 160, 16
-"""Numbers of candidates scored and retained without a prior, for each of some thirty hypotheses."""
-NEARBY_PLACES_SETTLED, HYPOTHESES_SETTLED = 8, 8
-"""Number of poses refined for each of some thirty hypotheses, and of hypotheses refined besides
-the first; three are searched completely."""
-FEWEST_FOR_HALVES, FEWEST_FOR_THIRDS, FEWEST_FOR_HALVES_WITH_PRIOR = 7, 5, 4
-"""Fewest images from which a half, a third or, with a prior, a half are held out for the test;
-with fewer, each image is held out in turn. Around a rough pose two images suffice for a search."""
-EARLY_DECISION = 1e-4
-"""Probability by chance, from some of the images, below which the others are not searched
-without a prior."""
-BY_CHANCE, BY_CHANCE_WITH_PRIOR = 1e-3, 1e-2
-"""Probability of so large a likelihood by chance below which the machine is localized: without a
-prior, and near a hand-placed pose, which is evidence itself."""
-RIVAL_POSE_PROBABILITY = 0.05
-"""Probability of a second pose above which neither is accepted."""
+    nearness: SearchRadius
 
 
 @dataclass(frozen=True)
@@ -122,6 +180,7 @@ class LocalizedPose:
     second : probability that another pose is the correct one.
     has_prior : whether the search was around a rough pose.
     correlation_length : reduced pixels of silhouette that count as one measurement.
+    options : of the localization.
     """
 
     T_camera_base: Array
@@ -131,6 +190,7 @@ class LocalizedPose:
     second: float = 0.0
     has_prior: bool = False
     correlation_length: float = 1.0
+    options: LocalizationOptions = LOCALIZATION_OPTIONS
 
     def likelier(self, other: LocalizedPose) -> float:
         """Log odds of this explanation of the images against another one of the same images."""
@@ -139,17 +199,17 @@ class LocalizedPose:
     @property
     def limit(self) -> float:
         """Upper bound of ``by_chance`` for acceptance."""
-        return BY_CHANCE_WITH_PRIOR if self.has_prior else BY_CHANCE
+        return self.options.by_chance_with_prior if self.has_prior else self.options.by_chance
 
     @property
     def good(self) -> bool:
         """Whether the machine is localized, at one pose only."""
-        return self.by_chance < self.limit and self.second < RIVAL_POSE_PROBABILITY
+        return self.by_chance < self.limit and self.second < self.options.rival
 
     @property
     def sure(self) -> bool:
         """Whether the machine would be localized without the prior."""
-        return self.by_chance < BY_CHANCE and self.second < RIVAL_POSE_PROBABILITY
+        return self.by_chance < self.options.by_chance and self.second < self.options.rival
 
 
 def find_station(
@@ -157,6 +217,7 @@ def find_station(
     T_camera_base: Array | None,
     rng: np.random.Generator,
     near_prior: bool = False,
+    options: LocalizationOptions = LOCALIZATION_OPTIONS,
 ) -> LocalizedPose:
     """Camera pose of a station near a rough pose, or anywhere.
 
@@ -169,23 +230,27 @@ def find_station(
         be compared.
     """
     if T_camera_base is None:
-        return _localize(view, None, rng, near_prior)
+        return _localize(view, None, rng, near_prior, options)
     if len(view.configuration) > 1:  # a single image has no held-out test
-        near = _localize(view, _PosePrior(T_camera_base, NEAR), rng, near_prior)
-        if near.sure and NEAR.reaches(T_camera_base, near.T_camera_base):
+        near = _localize(view, _PosePrior(T_camera_base, options.near), rng, near_prior, options)
+        if near.sure and options.near.reaches(T_camera_base, near.T_camera_base):
             return near
-    return _localize(view, _PosePrior(T_camera_base, FAR), rng, near_prior)
+    return _localize(view, _PosePrior(T_camera_base, options.far), rng, near_prior, options)
 
 
 def _localize(
-    view: StationView, prior: _PosePrior | None, rng: np.random.Generator, near_prior: bool
+    view: StationView,
+    prior: _PosePrior | None,
+    rng: np.random.Generator,
+    near_prior: bool,
+    options: LocalizationOptions,
 ) -> LocalizedPose:
     """Result of one search, around a rough pose or anywhere."""
     count = len(view.configuration)
     number = np.arange(count)
-    halves = FEWEST_FOR_HALVES_WITH_PRIOR if prior else FEWEST_FOR_HALVES
-    enough = (FAR if near_prior else prior.nearness).enough if prior else EARLY_DECISION
-    folds = 2 if count >= halves else 3 if count >= FEWEST_FOR_THIRDS else count
+    halves = options.fewest_for_halves_with_prior if prior else options.fewest_for_halves
+    enough = (options.far if near_prior else prior.nearness).enough if prior else options.early
+    folds = 2 if count >= halves else 3 if count >= options.fewest_for_thirds else count
     retained: list[Array] = []
     surely: list[Array] = []
     held_out = [number % folds == fold for fold in range(folds if count > 1 else 0)]
@@ -193,33 +258,38 @@ def _localize(
         (np.flatnonzero(~part), np.flatnonzero(part)) for part in held_out
     ]  # a single image has no folds
     for searched, other in parts:
-        value = _search(view.select(searched), prior, rng, near_prior)
+        value = _search(view.select(searched), prior, rng, near_prior, options)
         retained.append(value)
         surely.append(_z_scores(view, value[0], searched, other, rng))
         if _by_chance(surely) < enough:
             break
     # refine the results of all folds on all images, and drop shadows
-    candidates = np.concatenate(retained) if retained else _search(view, prior, rng, near_prior)
+    candidates = (
+        np.concatenate(retained) if retained else _search(view, prior, rng, near_prior, options)
+    )
     every = view.few(count)
     candidates, log_likelihood_ratio = refine_ml(view, candidates, every, 8, 8)
     order = np.argsort(-log_likelihood_ratio)
     legs = view.legs(every).under(candidates[order])
-    light = lightness(view.camera, view.tubes, legs, view.tables)
-    order = order[without_shadows(candidates[order], light)]
+    light = lightness(view.camera, view.tubes, legs, view.tables, options.shadows)
+    order = order[without_shadows(candidates[order], light, options.shadows)]
     # probability by chance, from the folds that ended at the best pose
     first = np.cumsum([0, *(len(value) for value in retained)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
-    if parts and not prior and confirmed >= BY_CHANCE:
-        confirmed = min(confirmed, _second_search(view, candidates[order], parts, rng))
+    if parts and not prior and confirmed >= options.by_chance:
+        confirmed = min(confirmed, _second_search(view, candidates[order], parts, rng, options))
     # distinct poses, and a robust refinement of the best
     order = order[distinct_silhouettes(view, candidates[order], every)]
     candidates, log_likelihood_ratio = candidates[order], log_likelihood_ratio[order]
     # the likeliest pose uses all edges; where hidden ones were matched by chance, the nearby edges
     # alone determine the pose better
     best = candidates[:1]
-    nearer = refine_lm(view, best, every, 8, (5, 3, 2, 1.5))
+    nearer = refine_lm(view, best, every, 8, options.final_reaches)
     ends = np.concatenate([nearer, best])
-    scores, each = score(view, ends, every, LAST_REACH), correlation_length(view, candidates[0])
+    scores, each = (
+        score(view, ends, every, view.options.last_reach),
+        correlation_length(view, candidates[0]),
+    )
     return LocalizedPose(
         T_camera_base=ends[scores.argmin()],
         score=float(scores.min()),
@@ -232,69 +302,84 @@ def _localize(
 
 
 def _search(
-    view: StationView, prior: _PosePrior | None, rng: np.random.Generator, near_prior: bool
+    view: StationView,
+    prior: _PosePrior | None,
+    rng: np.random.Generator,
+    near_prior: bool,
+    options: LocalizationOptions,
 ) -> Array:
     """Up to three poses (H, 4, 4) from one search, the likeliest first."""
     few, more = view.few(4), view.few(8)
     if prior is None:
         # more candidates for fewer images, which discriminate less and cost less
         each = 4 // len(few)
-        candidates = _anywhere(view, few, each * GLOBAL_CANDIDATES_REFINED)
-        candidates = refine_lm(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
-        candidates = _best(view, candidates, few, reach=8, keep=each * GLOBAL_CANDIDATES_RETAINED)
+        candidates = _anywhere(view, few, each * options.global_refined, options)
+        candidates = refine_lm(view, candidates, few, 3, options.global_reaches)
+        candidates = _best(view, candidates, few, reach=8, keep=each * options.global_retained)
     else:
-        candidates = _random_search(view, prior, rng)
+        candidates = _random_search(view, prior, rng, options)
     # robust refinement, then the best on more images
-    candidates = refine_lm(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
-    candidates = _best(view, candidates, more, reach=5, keep=24)
+    candidates = refine_lm(view, candidates, few, 5, options.reaches)
+    candidates = _best(view, candidates, more, reach=5, keep=options.retained)
     likelier = candidates[: len(candidates) // 2]
     # if all images took part in the refinement, none is left to disagree, unless the prior is
     # narrow
-    near = prior is not None and prior.nearness is NEAR
+    near = prior is not None and prior.nearness == options.near
     near_prior = near_prior or prior is None or (not near and len(more) == len(few))
     if not near_prior and len(distinct_silhouettes(view, likelier, more)) == 1:
         others = distinct_silhouettes(view, candidates, more)[1:3]
-        candidates = candidates[[*range(LIKELIEST_PLACES_SETTLED), *others]]
+        candidates = candidates[[*range(options.likeliest), *others]]
     else:
-        candidates = _best_about(view, candidates, more, rng)
+        candidates = _best_about(view, candidates, more, rng, options)
     # maximum likelihood
     candidates, log_likelihood_ratio = refine_ml(view, candidates, more, 5, 5)
     candidates = candidates[np.argsort(-log_likelihood_ratio)]
-    return candidates[distinct_silhouettes(view, candidates, more)[:3]]
+    return candidates[distinct_silhouettes(view, candidates, more)[: options.returned]]
 
 
 def _best_about(
-    view: StationView, candidates: Array, images: Integers, rng: np.random.Generator
+    view: StationView,
+    candidates: Array,
+    images: Integers,
+    rng: np.random.Generator,
+    options: LocalizationOptions,
 ) -> Array:
-    """Likeliest poses (PERTURBED_POSES_RETAINED, 4, 4) among refined candidates and perturbations
+    """Likeliest poses (H, 4, 4) among refined candidates and perturbations
     of them.
     """
-    candidates = refine_lm(view, candidates, images, 5, (5, 4, 4, 3))
-    candidates = _best(view, candidates, images, reach=3, keep=24)
-    candidates = candidates[distinct_silhouettes(view, candidates, images)[:4]]
+    candidates = refine_lm(view, candidates, images, 5, options.candidate_reaches)
+    candidates = _best(view, candidates, images, reach=3, keep=options.retained)
+    candidates = candidates[
+        distinct_silhouettes(view, candidates, images)[: options.perturbed_about]
+    ]
     # the likelihood has many local maxima: a pose beside a good one may be better
-    beside = candidates[rng.integers(0, len(candidates), PERTURBED_POSES_TRIED)]
-    steps = rng.normal(size=(PERTURBED_POSES_TRIED, 6)) * SHAKEN_SPREAD
+    beside = candidates[rng.integers(0, len(candidates), options.perturbed)]
+    steps = rng.normal(size=(options.perturbed, 6)) * options.shaken_spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
     candidates, log_likelihood_ratio = refine_ml(
         view, np.concatenate([candidates, turned]), images, 3, 2
     )
-    return candidates[np.argsort(-log_likelihood_ratio)[:PERTURBED_POSES_RETAINED]]
+    return candidates[np.argsort(-log_likelihood_ratio)[: options.perturbed_retained]]
 
 
-def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
+def _anywhere(view: StationView, few: Integers, keep: int, options: LocalizationOptions) -> Array:
     """Candidates (keep, 4, 4) without a prior, all round the machine."""
     legs = view.legs(np.arange(len(view.configuration)))
     legs = legs if view.guessed is None else legs[0]
     radius = view.machine.values[view.tubes.radius]
-    return global_candidates(view.camera, view.tubes, radius, legs, view.tables, few, keep)
+    return global_candidates(
+        view.camera, view.tubes, radius, legs, view.tables, few, keep, options.candidates
+    )
 
 
-def _random_search(view: StationView, prior: _PosePrior, rng: np.random.Generator) -> Array:
+def _random_search(
+    view: StationView, prior: _PosePrior, rng: np.random.Generator, options: LocalizationOptions
+) -> Array:
     """Candidates (``descending``, 4, 4) around a rough pose: a wide random draw, then a narrower
     one around the best of it.
     """
-    T_base_camera, (spread, tried, descending, _) = inverse(prior.T_camera_base), prior.nearness
+    T_base_camera, nearness = inverse(prior.T_camera_base), prior.nearness
+    spread, tried, descending = nearness.spread, nearness.tried, nearness.descending
 
     def shifted(steps: Array) -> Array:
         return inverse(T_base_camera @ pose(rotation(steps[:, :3]), steps[:, 3:]))
@@ -304,15 +389,16 @@ def _random_search(view: StationView, prior: _PosePrior, rng: np.random.Generato
     def likely(steps: Array, reach: float, keep: int) -> Array:
         # two images and few samples suffice to discard most poses
         first = np.argsort(score(view, shifted(steps), few[::2], reach, 3))
-        steps = steps[first[: max(len(steps) // POSES_FOR_RESCORING, keep)]]
+        steps = steps[first[: max(len(steps) // options.rescored, keep)]]
         return steps[np.argsort(score(view, shifted(steps), few, reach))[:keep]]
 
     steps = rng.normal(size=(tried, 6)) * spread
     steps[0] = 0.0
-    best = likely(steps, 12, 4 * descending)
+    first_reach, second_reach = options.draw_reaches
+    best = likely(steps, first_reach, 4 * descending)
     again = best[rng.integers(0, len(best), tried // 2)]
-    again = again + rng.normal(size=again.shape) * (0.45 * spread)
-    return shifted(likely(np.concatenate([best, again]), 10, descending))
+    again = again + rng.normal(size=again.shape) * (options.narrowing * spread)
+    return shifted(likely(np.concatenate([best, again]), second_reach, descending))
 
 
 def _best(view: StationView, candidates: Array, images: Integers, reach: float, keep: int) -> Array:
@@ -328,6 +414,7 @@ def likelihood_nearby(
     wide: bool,
     few: Integers,
     rng: np.random.Generator,
+    options: LocalizationOptions = LOCALIZATION_OPTIONS,
 ) -> Array:
     """Log-likelihood ratios (N,) that a short search reaches for each of several sets of readings.
 
@@ -347,7 +434,7 @@ def likelihood_nearby(
         view, few = view.select(few), np.arange(len(few))
     each = np.broadcast_to(starts, (len(legs), *starts.shape))
     if wide or not len(starts):
-        near = [_about(replace(view, guessed=legs[k : k + 1]), few, starts, rng)
+        near = [_about(replace(view, guessed=legs[k : k + 1]), few, starts, rng, options)
                 for k in range(len(legs))]  # fmt: skip
         each = np.stack(near)
     # all hypotheses side by side: robust refinement, then maximum likelihood for the best
@@ -355,9 +442,9 @@ def likelihood_nearby(
     view = replace(view, guessed=legs[np.repeat(np.arange(len(legs)), count)])
     ends = refine_lm(view, each.reshape(-1, 4, 4), few, 4, (12, 8, 5))
     scores = score(view, ends, few, 5).reshape(-1, count)
-    best = np.argsort(scores.min(axis=1)[1:])[:HYPOTHESES_SETTLED] + 1
+    best = np.argsort(scores.min(axis=1)[1:])[: options.hypotheses_refined] + 1
     best = np.concatenate([[0], best])
-    order = np.argsort(scores[best], axis=1)[:, :NEARBY_PLACES_SETTLED]
+    order = np.argsort(scores[best], axis=1)[:, : options.nearby_refined]
     retained = (order + count * best[:, None]).ravel()
     settled = refine_ml(view.guess(retained), ends[retained], few, 5, 3)[1]
     log_likelihood_ratio = np.full(len(legs), -np.inf)
@@ -365,12 +452,20 @@ def likelihood_nearby(
     return log_likelihood_ratio
 
 
-def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Generator) -> Array:
+def _about(
+    view: StationView,
+    few: Integers,
+    starts: Array,
+    rng: np.random.Generator,
+    options: LocalizationOptions,
+) -> Array:
     """Poses (H, 4, 4) worth refining around poses (S, 4, 4), or anywhere, for one set of legs."""
     if not len(starts):
-        places = _anywhere(view, few, FEW_GLOBAL_CANDIDATES)
-        return _best(view, places, few, reach=12, keep=FEW_CANDIDATES_RETAINED)
-    return np.concatenate([_random_search(view, _PosePrior(T, NEAR), rng) for T in starts])
+        places = _anywhere(view, few, options.few_global, options)
+        return _best(view, places, few, reach=12, keep=options.few_retained)
+    return np.concatenate(
+        [_random_search(view, _PosePrior(T, options.near), rng, options) for T in starts]
+    )
 
 
 def _z_scores(
@@ -393,7 +488,7 @@ def _z_scores(
 
     # scatter of the machine's edges, from the images that were searched
     mine = distances_under(view, T_camera_base[None], searched, 8)
-    mixture = mine.mixture(first_mixture(1), rounds=10)
+    mixture = mixture_of(mine, view.options)
     every = np.arange(len(view.configuration))
     guessed = view.legs(every)[None].joined(view.rivals(rng))
     places = np.broadcast_to(T_camera_base, (len(guessed), 4, 4))
@@ -448,6 +543,7 @@ def _second_search(
     candidates: Array,
     parts: Sequence[tuple[Integers, Integers]],
     rng: np.random.Generator,
+    options: LocalizationOptions,
 ) -> float:
     """Probability by chance of the first of some poses (H, 4, 4), by a second search that starts at
     it.
@@ -461,7 +557,7 @@ def _second_search(
         part = view.select(searched)
         few = part.few(8)
         near, log_likelihood_ratio = refine_ml(
-            part, _best_about(part, candidates[:1], few, rng), few, 5, 5
+            part, _best_about(part, candidates[:1], few, rng, options), few, 5, 5
         )
         surely.append(_z_scores(view, near[log_likelihood_ratio.argmax()], searched, other, rng))
     choices = len(distinct_silhouettes(view, candidates, view.few(len(view.configuration))))

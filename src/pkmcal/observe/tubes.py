@@ -14,7 +14,8 @@ the camera is nearly a shift.
 
 from __future__ import annotations
 
-from functools import reduce
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -22,47 +23,64 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
 
-FINE_CHART_CELLS = 384
-"""Cells of the fine chart along the image's longer side: the edges of a leg whose width is a
-fiftieth of the image, as where a machine fills it, are eight cells apart."""
-MAP_CELL_SIZE = 6
-"""Fine cells per cell of the maps, which are evaluated at steps of 15 degrees and 8 degrees."""
-SUPPORT_SPACING = 2
-"""Fine cells between the points at which support is computed."""
-PAIR_DIRECTIONS = 24
-"""Number of directions of a pair: 7.5 degrees apart."""
-PAIR_WIDTHS = 3.2 * np.sqrt(2.0) ** np.arange(6)
-"""Widths (fine cells) of a pair; the edges of narrower ones merge."""
-SUPPORT_LENGTH_WIDTHS = 4.0
-"""Length, in widths, along which a pair's support is averaged; tubes are longer."""
-SHORTEST_SUPPORT_LENGTH = 12.0
-"""Smallest averaging length in fine cells."""
-HALF_STRENGTH_SLOPE = 2.5
-"""Slope, in levels per fine cell, at which an edge has half the strength of a strong one. Levels
-are square roots of grey levels (255 is unchanged), whose noise is even and half a level at most;
-this is five times that."""
-SLOPE_ALONG_WEIGHT = 2.0
-"""Weight of a slope along a pair against one across it: directions within 27 degrees pass."""
-LEAST_PAIR_SUPPORT = 0.24
-"""Support below which a point has no value: one in four points of its length."""
-GREATEST_SURPRISAL = 4.0
-"""Largest negative logarithm of rarity; one leg must not outweigh six."""
-SURPRISAL_STEPS = 60
-"""Integer steps of the maps per unit of the negative logarithm."""
+
+@dataclass(frozen=True)
+class TubeChartOptions:
+    """Constants of the chart of possible tubes; lengths in fine cells."""
+
+    # cells of the fine chart along the image's longer side: the edges of a leg whose width is a
+    # fiftieth of the image, as where a machine fills it, are eight cells apart
+    cells: int = 384
+    # fine cells per cell of the maps, which are evaluated at steps of 15 degrees and 8 degrees
+    map_cell: int = 6
+    # spacing of the points at which support is computed
+    support_spacing: int = 2
+    # number of directions of a pair: 7.5 degrees apart
+    directions: int = 24
+    # narrowest width of a pair; the edges of narrower ones merge
+    narrowest: float = 3.2
+    # number of widths, each wider than the one before by the root of two
+    width_count: int = 6
+    # length, in widths, along which a pair's support is averaged; tubes are longer
+    support_widths: float = 4.0
+    # smallest averaging length
+    least_length: float = 12.0
+    # slope, in levels per cell, at which an edge has half the strength of a strong one. Levels are
+    # square roots of grey levels (255 is unchanged), whose noise is even and half a level at most;
+    # this is five times that (derived)
+    half_slope: float = 2.5
+    # weight of a slope along a pair against one across it: directions within 27 degrees pass
+    along_weight: float = 2.0
+    # support below which a point has no value: one in four points of its length
+    least_support: float = 0.24
+    # largest negative logarithm of rarity; one leg must not outweigh six
+    most_surprisal: float = 4.0
+    # integer steps of the maps per unit of the negative logarithm: 4 times 60 fits into 8 bits
+    steps: int = 60
+
+    @cached_property
+    def widths(self) -> Array:
+        """Widths of a pair, fine cells."""
+        return self.narrowest * np.sqrt(2.0) ** np.arange(self.width_count)
+
+
+TUBE_CHART_OPTIONS = TubeChartOptions()
 
 
 class TubeChart(NamedTuple):
     """Maps of possible tubes.
 
     surprisal : (W, D, h, w) uint8, negative logarithm of the share of points with such clear a
-        pair, in steps of 1 / SURPRISAL_STEPS.
+        pair, in steps of 1 / ``options.steps``.
     scale : fine cells per radian.
     size : (w, h) of the fine chart.
+    options : of the chart.
     """
 
     surprisal: Integers
     scale: float
     size: tuple[int, int]
+    options: TubeChartOptions
 
     @property
     def middle(self) -> Array:
@@ -71,17 +89,20 @@ class TubeChart(NamedTuple):
 
     def width_number(self, width: Array) -> Integers:
         """Indices (...) of the tabulated widths nearest to widths (...) in fine cells, by ratio."""
-        apart = np.abs(np.log(np.maximum(width, 1e-9))[..., None] - np.log(PAIR_WIDTHS))
+        apart = np.abs(np.log(np.maximum(width, 1e-9))[..., None] - np.log(self.options.widths))
         return apart.argmin(axis=-1)
 
 
-def tube_chart(image: Integers, camera: Camera) -> TubeChart:
+def tube_chart(
+    image: Integers, camera: Camera, options: TubeChartOptions = TUBE_CHART_OPTIONS
+) -> TubeChart:
     """Chart of one image (height, width)."""
-    grey, scale = _on_chart(image, camera)
-    return TubeChart(_rarity(_support(grey)), scale, (grey.shape[1], grey.shape[0]))
+    grey, scale = _on_chart(image, camera, options)
+    surprisal = _rarity(_support(grey, options), options)
+    return TubeChart(surprisal, scale, (grey.shape[1], grey.shape[0]), options)
 
 
-def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
+def _on_chart(image: Integers, camera: Camera, options: TubeChartOptions) -> tuple[Array, float]:
     """Levels (h, w) on the fine chart, equidistant angles from the optical axis, and cells per
     radian.
     """
@@ -90,9 +111,12 @@ def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
     height, width = image.shape
     across = np.stack([np.linspace(0, width - 1, 65), np.full(65, (height - 1) / 2)], axis=-1)
     along = np.stack([np.full(65, (width - 1) / 2), np.linspace(0, height - 1, 65)], axis=-1)
-    half = [float(np.nanmax(np.abs(_angle(camera.ray(line))))) for line in (across, along)]
+    half = [
+        float(np.nanmax(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])))
+        for rays in (camera.ray(across), camera.ray(along))
+    ]
     # angular extent along the image's two middle lines gives scale and size
-    scale = FINE_CHART_CELLS / (2 * max(half))
+    scale = options.cells / (2 * max(half))
     w, h = (int(2 * angle * scale) for angle in half)
     x, y = np.meshgrid((np.arange(w) - (w - 1) / 2) / scale, (np.arange(h) - (h - 1) / 2) / scale)
     away = np.hypot(x, y)
@@ -110,15 +134,10 @@ def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
     return np.sqrt(255.0 * np.asarray(grey)), scale
 
 
-def _angle(rays: Array) -> Array:
-    """Angles (...) of rays (..., 3) from the optical axis, rad."""
-    return np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+def _support(grey: Array, options: TubeChartOptions) -> Array:
+    """Clarity of a pair at each point, (widths, directions, h, w), 0 to 1.
 
-
-def _support(grey: Array) -> Array:
-    """Clarity of a pair at each point, (PAIR_WIDTHS, PAIR_DIRECTIONS, h, w), 0 to 1.
-
-    Points are SUPPORT_SPACING fine cells apart.
+    Points are the options' spacing apart.
     """
     import cv2
 
@@ -126,35 +145,44 @@ def _support(grey: Array) -> Array:
         cv2.Sobel(grey.astype(np.float32), cv2.CV_32F, *direction) / 8
         for direction in ((1, 0), (0, 1))
     )
-    height, width = (n // SUPPORT_SPACING for n in grey.shape)
-    out = np.empty((len(PAIR_WIDTHS), PAIR_DIRECTIONS, height, width), dtype=np.float32)
-    for k in range(PAIR_DIRECTIONS):
-        angle = np.pi * k / PAIR_DIRECTIONS
+    spacing = options.support_spacing
+    height, width = (n // spacing for n in grey.shape)
+    out = np.empty((len(options.widths), options.directions, height, width), dtype=np.float32)
+    for k in range(options.directions):
+        angle = np.pi * k / options.directions
         n = np.array([np.cos(angle), np.sin(angle)])
         # strength of rising and falling edges with normal n
         slope, other = dx * n[0] + dy * n[1], np.abs(dy * n[0] - dx * n[1])
-        rising, falling = (_strength(sign * slope - SLOPE_ALONG_WEIGHT * other) for sign in (1, -1))
-        for w, wide in enumerate(PAIR_WIDTHS):
+        rising, falling = (
+            _strength(sign * slope - options.along_weight * other, options) for sign in (1, -1)
+        )
+        for w, wide in enumerate(options.widths):
             # edges at x + n wide/2 and x - n wide/2: those of a bright tube rise inwards, of a dark
             # one fall
             step = np.rint(n * wide / 2).astype(int)
             bright = np.minimum(_shifted(falling, step), _shifted(rising, -step))
             dark = np.minimum(_shifted(rising, step), _shifted(falling, -step))
-            pair = np.maximum(bright, dark)[: height * SUPPORT_SPACING, : width * SUPPORT_SPACING]
-            # largest value of each block of SUPPORT_SPACING cells, averaged along the pair
-            rows = reduce(np.maximum, (pair[n::SUPPORT_SPACING] for n in range(SUPPORT_SPACING)))
-            pair = reduce(np.maximum, (rows[:, n::SUPPORT_SPACING] for n in range(SUPPORT_SPACING)))
-            length = max(SUPPORT_LENGTH_WIDTHS * wide, SHORTEST_SUPPORT_LENGTH) / SUPPORT_SPACING
+            pair = np.maximum(bright, dark)[: height * spacing, : width * spacing]
+            # largest value of each block of cells, averaged along the pair
+            rows = reduce(
+                np.maximum,
+                (pair[n::spacing] for n in range(spacing)),
+            )
+            pair = reduce(
+                np.maximum,
+                (rows[:, n::spacing] for n in range(spacing)),
+            )
+            length = max(options.support_widths * wide, options.least_length) / spacing
             out[w, k] = cv2.filter2D(pair, -1, _line(np.array([-n[1], n[0]]), length))
     return out
 
 
-def _strength(slope: Array) -> Array:
+def _strength(slope: Array, options: TubeChartOptions) -> Array:
     """Strength of edges, 0 to 1, from slopes (h, w); dilated by one cell."""
     import cv2
 
     up = np.square(np.maximum(slope, 0.0))
-    wide = cv2.dilate(up / (up + HALF_STRENGTH_SLOPE**2), np.ones((3, 3), np.uint8))
+    wide = cv2.dilate(up / (up + options.half_slope**2), np.ones((3, 3), np.uint8))
     return np.asarray(wide, dtype=np.float32)
 
 
@@ -179,15 +207,15 @@ def _line(along: Array, length: float) -> Array:
     return kernel / kernel.sum()
 
 
-def _rarity(support: Array) -> Integers:
-    """Maps of :class:`TubeChart` from supports (W, PAIR_DIRECTIONS, h, w).
+def _rarity(support: Array, options: TubeChartOptions) -> Integers:
+    """Maps of :class:`TubeChart` from supports (W, D, h, w).
 
     A map cell takes the maximum over its surroundings and the neighbouring directions, the spacing
     of the hypotheses.
     """
     import cv2
 
-    cell = MAP_CELL_SIZE // SUPPORT_SPACING
+    cell = options.map_cell // options.support_spacing
     height, width = (n // cell for n in support.shape[-2:])
     around = np.ones((cell + 2, cell + 2), np.uint8)
     rows, columns = (slice(cell // 2, n * cell, cell) for n in (height, width))
@@ -201,7 +229,7 @@ def _rarity(support: Array) -> Integers:
         # share of the points with at least this support
         count = np.bincount(level[place].ravel(), minlength=256)
         share = count[::-1].cumsum()[::-1] / count.sum()
-        worth = np.minimum(-np.log(np.maximum(share, 1e-9)), GREATEST_SURPRISAL)
-        worth[: round(255 * LEAST_PAIR_SUPPORT)] = 0.0
-        out[place] = np.rint(SURPRISAL_STEPS * worth)[level[place]]
+        worth = np.minimum(-np.log(np.maximum(share, 1e-9)), options.most_surprisal)
+        worth[: round(255 * options.least_support)] = 0.0
+        out[place] = np.rint(options.steps * worth)[level[place]]
     return out

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.boards.poses import LEAST_CORNERS_WEIGHED, pose_set
+from pkmcal.boards.poses import BOARD_POSE_OPTIONS, pose_set
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, skew
 from pkmcal.identify.assembly import Assembled, assemble, batch_of
@@ -113,7 +113,7 @@ class BoardFrom:
         by_pose = np.concatenate([-by_point @ skew(there - T[:, None, :3, 3]), by_point], axis=-1)
         by_pose = np.where(visible[..., None, None], by_pose, 0.0) / self.sigma
         normal = np.einsum("knip,kniq->kpq", by_pose, by_pose)
-        enough = visible.sum(axis=1) >= LEAST_CORNERS_WEIGHED
+        enough = visible.sum(axis=1) >= BOARD_POSE_OPTIONS.least_weight
         covariance = np.linalg.inv(normal[enough])
         return pose_set(self.station, rows[enough], self.mount, T[enough], covariance)
 

@@ -11,7 +11,12 @@ import numpy as np
 from markupsafe import Markup
 
 from pkmcal.arrays import THREADS
-from pkmcal.camera_calibration.calibrate import COVERAGE_CELLS, CameraCalibration, coverage, tilts
+from pkmcal.camera_calibration.calibrate import (
+    CALIBRATION_CHECK_OPTIONS,
+    CameraCalibration,
+    coverage,
+    tilts,
+)
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.pages import charts, page
@@ -196,8 +201,9 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "How much of the image was tested?",
             ((f"{covered:.0f}", "%"),),
-            f"of {COVERAGE_CELLS[0]}×{COVERAGE_CELLS[1]} cells hold corners;"
-            " elsewhere the lens is extrapolated",
+            "of {}×{} cells hold corners; elsewhere the lens is extrapolated".format(
+                *CALIBRATION_CHECK_OPTIONS.cells
+            ),
         ),
     )
 

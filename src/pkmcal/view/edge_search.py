@@ -208,13 +208,14 @@ def _agreement_text(
     gain = _contours(pane, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
     # expected offset: prior sigma of a centre, projected, and resolution of the search
-    near = median < MIDDLE_EDGE_SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
+    near = median < MIDDLE_EDGE_SIGMAS * np.hypot(allowed, legs.LEG_SEARCH_OPTIONS.sigma)
     # some background edges lie near by chance, but not most of the machine's
     verdict = (
         "It fits" if near and measured > missed else "It may fit" if near else "It does not fit"
     )
     # the search has a resolution of whole pixels
-    off = f"{number(median, 1)} px" if median > legs.SEARCH_SIGMA / 2 else "less than half a pixel"
+    half = legs.LEG_SEARCH_OPTIONS.sigma / 2
+    off = f"{number(median, 1)} px" if median > half else "less than half a pixel"
     return [
         f"{verdict}: {text}, and the middle one lies {off} from the nominal model. The"
         " nominal model's"

@@ -12,7 +12,7 @@ from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_localization import localize_image
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.station_localization import RIVAL_POSE_PROBABILITY, find_station
+from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_station
 from pkmcal.view.content import Viewed
 from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
 from pkmcal.view.requests import ViewRequest
@@ -72,7 +72,7 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
             else f"less than {LEAST_CHANCE_DISPLAYED:.0e}"
         )
         text = f"Recognised in {shots}: as good a fit by chance has probability {chance}."
-    elif pose.second >= RIVAL_POSE_PROBABILITY:
+    elif pose.second >= LOCALIZATION_OPTIONS.rival:
         text = (
             f"Not sure: from another place the machine fits {shots} nearly as well. Bring it to"
             " where it is, joint by joint."
@@ -90,7 +90,7 @@ def _from_one_image(view: StationView, image: Integers) -> tuple[Array, bool, st
     """Localization from one image, with a global search: pose, success, and a sentence."""
     localized = localize_image(view, image)
     best = localized.T_camera_base[0]
-    if localized.rival_probability < RIVAL_POSE_PROBABILITY:
+    if localized.rival_probability < LOCALIZATION_OPTIONS.rival:
         return best, True, "Placed: from no other place does the machine fit as well."
     why = f"with probability {brief(localized.rival_probability)} another place is the right one"
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
