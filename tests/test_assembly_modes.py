@@ -35,17 +35,16 @@ def random_hexapod(seed):
     return machine, poses[best], readings[best]
 
 
-def search(machine, readings, home, seed, most=100_000):
+def search(machine, readings, home, seed, most=100_000, finds=10):
+    options = assembly_modes.AssemblyModeOptions(finds=finds)
     return assembly_modes.assembly_modes(
-        machine.layout, machine.values, readings, home, np.random.default_rng(seed), most
+        machine.layout, machine.values, readings, home, np.random.default_rng(seed), most, options
     )
 
 
-def exhaustive(machine, readings, home, seed, starts, monkeypatch):
+def exhaustive(machine, readings, home, seed, starts):
     """The same search without a stopping rule, until its last start."""
-    with monkeypatch.context() as patch:
-        patch.setattr(assembly_modes, "RAREST_MODE_FINDS", 10**9)
-        return search(machine, readings, home, seed, starts)
+    return search(machine, readings, home, seed, starts, 10**9)
 
 
 def assert_same(value, long):
@@ -55,12 +54,12 @@ def assert_same(value, long):
 
 
 @pytest.mark.parametrize("seed", [0, 6, 12, 19])
-def test_modes_of_random_hexapods_are_those_of_a_long_search(seed, monkeypatch):
+def test_modes_of_random_hexapods_are_those_of_a_long_search(seed):
     machine, T, readings = random_hexapod(seed)
     value = search(machine, readings, T, seed)
     assert value.complete
     assert np.abs(value.poses - T).max(axis=(-1, -2)).min() < APART  # the pose it came from
-    long = exhaustive(machine, readings, T, 1000 + seed, 5000, monkeypatch)
+    long = exhaustive(machine, readings, T, 1000 + seed, 5000)
     assert not long.complete
     assert long.starts == 5000
     assert_same(value, long)
@@ -68,11 +67,11 @@ def test_modes_of_random_hexapods_are_those_of_a_long_search(seed, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
-def test_modes_of_twenty_random_hexapods_against_200000_starts(seed, monkeypatch):
+def test_modes_of_twenty_random_hexapods_against_200000_starts(seed):
     machine, T, readings = random_hexapod(seed)
     value = search(machine, readings, T, seed)
     assert value.complete
-    assert_same(value, exhaustive(machine, readings, T, 1000 + seed, 200_000, monkeypatch))
+    assert_same(value, exhaustive(machine, readings, T, 1000 + seed, 200_000))
 
 
 @pytest.mark.parametrize("name", sorted(catalogue()))
@@ -90,7 +89,7 @@ def test_every_mode_closes_the_machine_once(name):
         assert values.sign[0] == 1
         assert set(values.sign) <= {-1, 1}
     assert values.mode_numbers.sum() == values.closed <= values.starts
-    assert values.mode_numbers.min() >= assembly_modes.RAREST_MODE_FINDS
+    assert values.mode_numbers.min() >= assembly_modes.ASSEMBLY_MODE_OPTIONS.finds
     numbers = np.concatenate(
         [
             values.poses[:, :3].reshape(len(values), -1),
@@ -119,11 +118,11 @@ def test_a_sign_is_that_of_same_assembly():
     np.testing.assert_array_equal(machine.same_assembly(values.poses), values.sign > 0)
 
 
-def test_what_may_be_missing_shrinks_with_the_starts(monkeypatch):
+def test_what_may_be_missing_shrinks_with_the_starts():
     """n starts miss a share p with probability (1 - p)^n: a thousandth at the stated share."""
     machine, T, readings = random_hexapod(3)
     short = search(machine, readings, T, 0)
-    long = exhaustive(machine, readings, T, 0, 10_000, monkeypatch)
+    long = exhaustive(machine, readings, T, 0, 10_000)
     for item in (short, long):
         assert (1 - item.missing) ** item.closed == pytest.approx(1e-3)
     assert long.missing < short.missing / 5

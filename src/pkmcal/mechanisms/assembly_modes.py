@@ -23,16 +23,24 @@ from pkmcal.mechanisms.kinematics import (
 from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.mechanisms.velocities import assembly_sign, sign_of
 
-STARTS_A_BATCH = 1000
-"""Starts in one batch."""
-RAREST_MODE_FINDS = 10
-"""Number of times that each mode must be found before the search ends. A mode half as likely as the
-rarest one would have been missed with probability exp(-5), 0.7 percent."""
-MISSED_MODE_CHANCE = 1e-3
-"""Probability that a mode with the share :attr:`AssemblyModes.missing` was missed."""
-SAME_MODE_DISTANCE = 1e-6
-"""Largest difference of coordinates (1 and m) of one mode. Where two modes merge, a closure error
-of 1e-14 m leaves an uncertainty of 1e-7."""
+
+@dataclass(frozen=True)
+class AssemblyModeOptions:
+    """Constants of the search for assembly modes."""
+
+    # random starts in one batch
+    batch: int = 1000
+    # number of times that each mode must be found before the search ends: a mode half as likely as
+    # the rarest one would have been missed with probability exp(-5), 0.7 percent (statistical)
+    finds: int = 10
+    # probability that a mode with the share ``missing`` was missed (statistical)
+    missed: float = 0.001
+    # largest difference of coordinates (1 and m) of one mode. Where two modes merge, a closure
+    # error of 1e-14 m leaves an uncertainty of 1e-7 (numerical)
+    same: float = 1e-6
+
+
+ASSEMBLY_MODE_OPTIONS = AssemblyModeOptions()
 
 
 @dataclass(frozen=True)
@@ -47,7 +55,7 @@ class AssemblyModes:
     starts, closed : number of starts, and of those that led to any pose.
     missing : upper bound, with 99.9 percent probability, of the share of closed starts that lead to
         a mode not listed; 1 if no start closed.
-    complete : whether each mode was found RAREST_MODE_FINDS times; False if the number of starts
+    complete : whether each mode was found often enough; False if the number of starts
         ended the search.
     """
 
@@ -71,6 +79,7 @@ def assembly_modes(
     home: Array,
     rng: np.random.Generator,
     most: int = 100_000,
+    options: AssemblyModeOptions = ASSEMBLY_MODE_OPTIONS,
 ) -> AssemblyModes:
     """Distinct poses that close the machine at readings (m,).
 
@@ -78,19 +87,19 @@ def assembly_modes(
     home : (4, 4) pose of the assembly that defines the sign.
     most : largest number of starts.
 
-    Modes that nearly merge, nearer than SAME_MODE_DISTANCE, count as one.
+    Modes that nearly merge, nearer than the options allow, count as one.
     """
     modes, count = np.zeros((0, 12 + 2 * layout.n_internal)), np.zeros(0, dtype=int)
     starts = closed = 0
     complete = False
     while not complete and starts < most:
-        begin, internal = _random_starts(layout, theta, readings, home, rng)
-        at = np.broadcast_to(readings, (STARTS_A_BATCH, readings.shape[-1]))
+        begin, internal = _random_starts(layout, theta, readings, home, rng, options)
+        at = np.broadcast_to(readings, (options.batch, readings.shape[-1]))
         result = close(layout, theta, at, begin, internal)
         good = _coordinates(result)[result.error < CONVERGED_CLOSURE_ERROR]
-        modes, count = _count_by_mode(modes, count, good)
-        starts, closed = starts + STARTS_A_BATCH, closed + len(good)
-        complete = bool(count.size) and bool(count.min() >= RAREST_MODE_FINDS)
+        modes, count = _count_by_mode(modes, count, good, options)
+        starts, closed = starts + options.batch, closed + len(good)
+        complete = bool(count.size) and bool(count.min() >= options.finds)
         if not closed and starts >= most // 10:
             break
     poses, internal = _poses_of_coordinates(modes)
@@ -98,12 +107,17 @@ def assembly_modes(
     poses, internal, count = poses[near], internal[near], count[near]
     own = sign_of(scaled_rows(closure(layout, theta, readings, poses, internal)))
     sign = (own * assembly_sign(layout, theta, home)).astype(int)
-    missing = 1 - MISSED_MODE_CHANCE ** (1 / closed) if closed else 1.0
+    missing = 1 - options.missed ** (1 / closed) if closed else 1.0
     return AssemblyModes(poses, internal, count, sign, starts, closed, missing, complete)
 
 
 def _random_starts(
-    layout: LimbLayout, theta: Array, readings: Array, home: Array, rng: np.random.Generator
+    layout: LimbLayout,
+    theta: Array,
+    readings: Array,
+    home: Array,
+    rng: np.random.Generator,
+    options: AssemblyModeOptions,
 ) -> tuple[Array, Array]:
     """Random poses (n, 4, 4) in the motion's freedoms, and random hinge angles (n, k).
 
@@ -112,15 +126,15 @@ def _random_starts(
     """
     free = layout.free
     if free[:3].all():
-        turn = from_quaternion(rng.normal(size=(STARTS_A_BATCH, 4)))
+        turn = from_quaternion(rng.normal(size=(options.batch, 4)))
     else:
-        turn = rotation(rng.uniform(-np.pi, np.pi, (STARTS_A_BATCH, 3)) * free[:3])
+        turn = rotation(rng.uniform(-np.pi, np.pi, (options.batch, 3)) * free[:3])
     rot = turn @ home[:3, :3]
     a = base_ends(layout, theta, readings).a.mean(axis=-2)
     b = platform_ends(layout, theta, pose(rot, np.zeros(3))).b.mean(axis=-2)
-    shift = rng.normal(size=(STARTS_A_BATCH, 3)) * typical_reach(layout, theta, readings)
+    shift = rng.normal(size=(options.batch, 3)) * typical_reach(layout, theta, readings)
     position = np.where(free[3:], a - b + shift, home[:3, 3])
-    return pose(rot, position), rng.uniform(-np.pi, np.pi, (STARTS_A_BATCH, layout.n_internal))
+    return pose(rot, position), rng.uniform(-np.pi, np.pi, (options.batch, layout.n_internal))
 
 
 def _coordinates(result: Closed) -> Array:
@@ -138,7 +152,9 @@ def _poses_of_coordinates(modes: Array) -> tuple[Array, Array]:
     return pose(matrix[..., :3], matrix[..., 3]), np.arctan2(sin, cos)
 
 
-def _count_by_mode(modes: Array, count: Integers, closed: Array) -> tuple[Array, Integers]:
+def _count_by_mode(
+    modes: Array, count: Integers, closed: Array, options: AssemblyModeOptions
+) -> tuple[Array, Integers]:
     """Modes (k, c) and their counts (k,), updated with the coordinates (n, c) of further closed
     starts.
     """
@@ -149,7 +165,7 @@ def _count_by_mode(modes: Array, count: Integers, closed: Array) -> tuple[Array,
         if k == len(distinct):
             distinct.append(unassigned[0])
             counts.append(0)
-        same: Booleans = np.abs(unassigned - distinct[k]).max(axis=-1) < SAME_MODE_DISTANCE
+        same: Booleans = np.abs(unassigned - distinct[k]).max(axis=-1) < options.same
         counts[k] += int(np.count_nonzero(same))
         unassigned = unassigned[~same]
         k += 1
