@@ -39,7 +39,7 @@ def test_hypotheses_weigh_as_their_solutions_do(found):
     measurements, estimate = found.measurements, found.estimate
     assert np.flatnonzero(estimate.pose_weights < 0.5).tolist() == [WRONG]
     assembled, info = estimate.linearized
-    drawn = np.array(assembled.priors) == "drawing"
+    drawn = np.array(assembled.priors) == "nominal"
     wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
     problem = replace(
         info.problem,

@@ -338,7 +338,7 @@ def test_a_rejected_image_is_counted_named_and_shown(breathed):
     whole = replace(session, stations=(*session.stations, again))
     outcome = outcome_of(replace(calibration, session=whole.without({3: EDGES_DISAGREE_REASON})))
     (card,) = [card for card in outcome.figures if card.question == "What is it based on?"]
-    assert card.values == (("3 of 4", "photographs"),)
+    assert card.values == (("3 of 4", "images"),)
     file = "images/phone/0001-1.jpg"
     (rows,) = [one.text for one in outcome.findings]
     assert rows == f"{file}: left out, for {EDGES_DISAGREE_REASON}."

@@ -292,7 +292,7 @@ def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
     """
     estimate, session = calibration.estimate, calibration.session
     rng = np.random.default_rng(0)
-    drawn = list(refinement._as_likely(session, calibration.measurements, estimate, rng))
+    drawn = list(refinement._as_likely(session, estimate, rng))
     away = np.stack([one.state.theta - estimate.state.theta for one in drawn])
     assert len(drawn) == refinement.IMPUTATION_PASSES
     np.testing.assert_allclose(away[::2], -away[1::2], atol=1e-4)

@@ -71,19 +71,19 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
     pose from the board.
     """
     boards = set(turns.measurements.poses.station.tolist())
-    wrong: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     for k in (p.station for p in turns.images):
         station = session.stations[k]
         if station.handheld or k in boards:
             continue
         if (offered := _offered(turns, [k])) is not None:
             advice = "" if station.T_camera_base is not None else "; a pose by hand would tell"
-            wrong[k] = (
+            reasons[k] = (
                 f"only {offered.measured} of {offered.in_sight} edges in sight were measured where"
                 f" the machine has them, and chance offers as many {how_often(offered.chance)}: it"
                 f" may stand elsewhere{advice}"
             )
-    return wrong if len(wrong) < len(turns.images) else {}
+    return reasons if len(reasons) < len(turns.images) else {}
 
 
 def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | None:

@@ -194,12 +194,12 @@ def size_notes(
             continue
         # of the estimate's two sources, the prior is the file's: the rest is what all else tells
         other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
-        above_limit = {"tolerance": 100 * tolerance}
+        facts = {"tolerance": 100 * tolerance}
         if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT * tolerance:
-            above_limit |= {"value": value / other, "sigma": sigma / np.sqrt(other)}
-            yield note("board.size_disagrees", file, **above_limit)
+            facts |= {"value": value / other, "sigma": sigma / np.sqrt(other)}
+            yield note("board.size_disagrees", file, **facts)
         else:
-            yield note("board.size_by_file", file, **above_limit)
+            yield note("board.size_by_file", file, **facts)
 
 
 def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) -> Iterator[Finding]:

@@ -198,12 +198,12 @@ def _start(view: MachineView, u: Array, readings: Array) -> Array:
     layout = view.machine.layout
     ends = limb_ends(layout, view.theta, readings, np.eye(4))
     shape = np.broadcast_shapes(ends.a.shape[:-2], u.shape[:-2])
-    above_limit = np.flatnonzero(layout.closing[view.legs])
-    if not view.rigid or len(above_limit) < 3 or layout.motion.shape[1] < 6:
+    closing = np.flatnonzero(layout.closing[view.legs])
+    if not view.rigid or len(closing) < 3 or layout.motion.shape[1] < 6:
         return np.broadcast_to(view.home, (*shape, 4, 4))
-    legs = view.legs[above_limit]
+    legs = view.legs[closing]
     length = rod_lengths(layout, view.theta, readings)[..., legs, None]
-    b = ends.a[..., legs, :] + length * u[..., above_limit, :]
+    b = ends.a[..., legs, :] + length * u[..., closing, :]
     return register(np.broadcast_to(ends.b[..., legs, :], b.shape), b)
 
 

@@ -373,7 +373,7 @@ def prior_rows(
         targets.append(np.zeros(len(part)) if at is None else -inverse_root @ at)
         kinds.extend([kind] * len(part))
 
-    add("drawing", held, tolerance[held])
+    add("nominal", held, tolerance[held])
     first_column = u.effects.start
     roots = [one.prior for one in columns if one.prior is not None]
     for column, root in zip(columns, roots, strict=True):

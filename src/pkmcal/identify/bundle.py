@@ -467,7 +467,7 @@ def bundle(
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
     problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
     if marginal_prior is not None:
-        drawn, u = np.array(assembled.priors) == "drawing", problem.unknowns
+        drawn, u = np.array(assembled.priors) == "nominal", problem.unknowns
         prior, target = problem.prior.copy(), problem.prior_target.copy()
         prior[drawn, u.machine], target[drawn] = (
             marginal_prior.root,

@@ -145,7 +145,7 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
         return Rejections()
     # problem at the solution, with wider priors
     assembled, info = estimate.linearized
-    drawn = np.array(assembled.priors) == "drawing"
+    drawn = np.array(assembled.priors) == "nominal"
     wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
     problem, state = info.problem, info.state
     problem = replace(

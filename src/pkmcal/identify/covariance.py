@@ -50,8 +50,8 @@ from pkmcal.solver.ranks import (
 from pkmcal.solver.search import take
 
 ROWS_RANK_TOLERANCE = 1e-12
-"""Same, for the scaled rows with nominal model and gauge: below it a direction counts as unknown.
-"""
+"""Relative singular value of the scaled rows of data, nominal model and gauge below which a
+direction counts as unknown."""
 
 
 @dataclass(frozen=True)
@@ -222,9 +222,9 @@ def prior_in_gauge(
         spread[index] -= np.outer(axis, axis @ spread[index])
     out = spread @ shared @ spread.T
     # constrained and fixed coordinates are exactly known; the product leaves rounding there
-    above_limit = np.diag(out)[estimated.machine] < 1e-18 * machine.parameters.tolerance**2
-    above_limit = np.flatnonzero(above_limit)
-    out[above_limit, :], out[:, above_limit] = 0.0, 0.0
+    without_variance = np.diag(out)[estimated.machine] < 1e-18 * machine.parameters.tolerance**2
+    without_variance = np.flatnonzero(without_variance)
+    out[without_variance, :], out[:, without_variance] = 0.0, 0.0
     return 0.5 * (out + out.T)
 
 

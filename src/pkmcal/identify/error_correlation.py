@@ -100,11 +100,11 @@ def _beside(info: Information, options: ErrorCorrelationOptions) -> Array:
             out -= (part[cut].reshape(-1, 1) * shift).T @ shift
             np.add.at(sums[0], mine, once[cut].reshape(-1, 1) * shift)
             np.add.at(sums[1], mine, tilt)
-            above_limit = mine >= 0
-            tilts += tilt[above_limit].T @ tilt[above_limit]
+            present = mine >= 0
+            tilts += tilt[present].T @ tilt[present]
             # tilts of some configurations, to estimate c
             number = np.broadcast_to(row[cut] + piece.first, cell[cut].shape).ravel()
-            some = above_limit & (number % every == 0)
+            some = present & (number % every == 0)
             value = piece.value[0, cut, 1::NUMBERS_AN_EDGE].ravel()
             taken = piece.own[0, cut, :, 1::NUMBERS_AN_EDGE].swapaxes(1, 2)
             taken = taken.reshape(len(mine), -1)

@@ -102,7 +102,7 @@ class _Evaluated(NamedTuple):
 class Problem:
     """The joint estimation of B runs; a :class:`~pkmcal.solver.search.Divisible`.
 
-    layout, nominal model (P,) nominal values, free (P, nz) : the machine. unknowns : and their
+    layout, nominal (P,) nominal values, free (P, nz) : the machine. unknowns : and their
     columns.
     blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns and prior_target : (c,). frames : (12 + n, g)
@@ -629,9 +629,9 @@ class Problem:
             return np.ones(after.shape[:2], dtype=bool)
         change = (after - before)[..., :3, :]
         turned = np.linalg.norm(change[..., :3], axis=(-2, -1)) / np.sqrt(2)
-        direction = np.linalg.norm(change[..., 3], axis=-1) + self.structure.reach * turned
+        displacement = np.linalg.norm(change[..., 3], axis=-1) + self.structure.reach * turned
         length = rod_lengths(layout, self.nominal, self.data.joints)
-        bent = direction**2 > 2 * np.nanmin(length, axis=-1) * self.joint_noise[:, None]
+        bent = displacement**2 > 2 * np.nanmin(length, axis=-1) * self.joint_noise[:, None]
         if bent.any():
             bent &= singularity_of(layout, scaled_rows(self.closure(state))) > NEAR_SINGULAR
         return bent

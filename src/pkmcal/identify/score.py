@@ -229,11 +229,11 @@ class ScoreTests:
             return 1.0
         scale = free.scale[own]
         size, ways = np.linalg.eigh(part.T @ free.squared @ part / scale / scale[:, None])
-        display = size > OBSERVABLE_SQUARE_SHARE
-        if not display.any():
+        observable = size > OBSERVABLE_SQUARE_SHARE
+        if not observable.any():
             return 1.0
-        ways = ways[:, display] / scale[:, None]
-        usual = np.mean(np.einsum("ij,ik,kj->j", ways, scatter, ways) / size[display])
+        ways = ways[:, observable] / scale[:, None]
+        usual = np.mean(np.einsum("ij,ik,kj->j", ways, scatter, ways) / size[observable])
         return max(1.0, float(usual) / self._variance * clusters / (clusters - 1))
 
 

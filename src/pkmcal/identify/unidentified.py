@@ -398,5 +398,5 @@ def _moves(part: OpenMotion, space: _Open, effect: Array) -> tuple[float, bool]:
     covariance = mixed @ space.covariance @ mixed.T
     # the posterior's information is the prior's, which is 1 in these units, plus the data's
     data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
-    above_limit = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
-    return float(np.sqrt(np.sum((shifted @ covariance) * shifted))), above_limit >= WEAK_INFORMATION
+    worst = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
+    return float(np.sqrt(np.sum((shifted @ covariance) * shifted))), worst >= WEAK_INFORMATION

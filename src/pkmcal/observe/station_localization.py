@@ -517,23 +517,23 @@ def _second(log_likelihood_ratio: Array, correlation_length: float) -> float:
     )
 
 
-def _confirmed(view: StationView, place: Array, distances: Array, surely: list[Array]) -> float:
+def _confirmed(view: StationView, place: Array, others: Array, surely: list[Array]) -> float:
     """Probability by chance of a pose (4, 4), from the held-out tests of several poses.
 
     A test of another pose carries no information about this one and is left out. But this pose was
     chosen among several different ones, any of which may be confirmed by chance (Bonferroni).
 
     place : the pose, T_camera_base (4, 4).
-    distances : (F, 4, 4) poses that were tested.
+    others : (F, 4, 4) poses that were tested.
     surely : scores (K,) of each test.
     """
     every = view.few(len(view.configuration))
     own = [
-        len(distinct_silhouettes(view, np.stack([place, other]), every)) == 1 for other in distances
+        len(distinct_silhouettes(view, np.stack([place, other]), every)) == 1 for other in others
     ]
     if not any(own):
         return _by_chance(surely)
-    choices = len(distinct_silhouettes(view, distances, every))
+    choices = len(distinct_silhouettes(view, others, every))
     about = [sure for sure, mine in zip(surely, own, strict=True) if mine]
     return min(choices * _by_chance(about), 1.0)
 

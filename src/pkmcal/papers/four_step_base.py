@@ -130,11 +130,11 @@ def gathered_directions(v: Array, valid: Booleans, views: StationViews) -> tuple
     same = views.of_station == views.of_station[:, None]
     first = np.argmax(same[:, :, None] & valid[None], axis=1)
     reference = back[:, first, np.arange(v.shape[2])]
-    mean, above_limit = _mean(
+    mean, observed = _mean(
         back * np.where(dot(back, reference) < 0, -1.0, 1.0)[..., None], valid, views
     )
     size = np.sqrt(dot(mean, mean))[..., None]
-    return mean / np.where(size > 0, size, 1.0), above_limit
+    return mean / np.where(size > 0, size, 1.0), observed
 
 
 def _mean(values: Array, valid: Booleans, views: StationViews) -> tuple[Array, Booleans]:
@@ -268,14 +268,14 @@ def base_by_products(items: Items, gauge: Array) -> Base:
         view.append(np.full(len(p), v))
     by_p, by_q = np.concatenate(to_p), np.concatenate(to_q)
     measured = items.measured[:, np.concatenate(view)]
-    above_limit = dot(*(np.einsum("kn,bknc->bkc", by, measured) for by in (by_p, by_q)))
+    product = dot(*(np.einsum("kn,bknc->bkc", by, measured) for by in (by_p, by_q)))
 
     def products(points: Array, runs: Integers) -> tuple[Array, Array]:
         vp, vq = by_p @ points, by_q @ points
         jac = by_p[..., None] * vq[:, :, None] + by_q[..., None] * vp[:, :, None]
-        return dot(vp, vq) - above_limit[runs], jac
+        return dot(vp, vq) - product[runs], jac
 
-    return _base(items, points_by(products, items.nominal, gauge, len(above_limit)))
+    return _base(items, points_by(products, items.nominal, gauge, len(product)))
 
 
 def _base(items: Items, points: Array) -> Base:

@@ -110,9 +110,9 @@ def platform_by_distances(
     of_station = (station == np.unique(station)[:, None]).astype(float)
     count = of_station @ both
     d = np.linalg.norm(b[:, :, j] - b[:, :, g], axis=-1)
-    above_limit = np.einsum("sc,bcp->bsp", of_station, d * both) / np.maximum(count, 1)
+    measured = np.einsum("sc,bcp->bsp", of_station, d * both) / np.maximum(count, 1)
     k, pair = np.nonzero(count)
-    j, g, above_limit = j[pair], g[pair], above_limit[:, k, pair]
+    j, g, measured = j[pair], g[pair], measured[:, k, pair]
     row = np.arange(len(j))
 
     def distances(points: Array, runs: Integers) -> tuple[Array, Array]:
@@ -121,7 +121,7 @@ def platform_by_distances(
         jac = np.zeros((*distance.shape, *points.shape[1:]))
         jac[:, row, j] = v / distance[..., None]
         jac[:, row, g] = -v / distance[..., None]
-        return distance - above_limit[runs], jac
+        return distance - measured[runs], jac
 
     return points_by(distances, nominal, gauge, len(b))
 

@@ -170,11 +170,11 @@ def joint_problem(
         whitened = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
         basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in whitened)
         basis[:, at.row, at.place], white[:, at.row, at.place] = whitened
-        blocks = replace(blocks, side=np.broadcast_to([0, 1], (*at.shape, 2)))
-        shift = np.zeros((1, *at.shape, 4))
-        # axes have no edge shift: its column keeps its place, with derivatives of zero
-        columns = np.zeros((*shift.shape, edge_data.columns.shape[-1]))
-        edge_data = replace(edge_data, basis=basis, white=white, shift=shift, columns=columns)
+        # both sides of an axis, on which no column acts: axes have no edge shift
+        sides, of_none = np.broadcast_to([0, 1], (*at.shape, 2)), blocks.column[..., :0]
+        blocks = replace(blocks, side=sides, column=of_none)
+        shift, none = np.zeros((1, *at.shape, 4)), np.zeros((1, *at.shape, 4, 0))
+        edge_data = replace(edge_data, basis=basis, white=white, shift=shift, columns=none)
     poses = template.pose_data
     if data.view.T_platform_board is not None:
         poses = replace(poses, T_station_target=data.T_camera_board[:, :n, None])
