@@ -183,7 +183,7 @@ def view(session):
         if url := line.get("url"):
             pose = np.eye(4)
             pose[:3, 3] = 0.0, 0.0, 1.0
-            body = json.dumps({"station": 0, "photograph": 0, "pose": pose.tolist()}).encode()
+            body = json.dumps({"station": 0, "image": 0, "pose": pose.tolist()}).encode()
             for request in (url, urllib.request.Request(f"{url}save", body)):
                 try:
                     urllib.request.urlopen(request, timeout=60).read()

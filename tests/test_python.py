@@ -181,7 +181,7 @@ def test_parameters_are_a_table(result, loaded):
 
 def test_a_table_is_short_as_a_repr_and_whole_when_printed(result):
     lines = repr(result.parameters).splitlines()
-    assert lines[0].split() == ["parameter", "drawing", "calibrated", "sigma", "unit", "decided",
+    assert lines[0].split() == ["parameter", "nominal", "calibrated", "sigma", "unit", "decided",
                                 "by"]  # fmt: skip
     assert lines[-1] == f"… and {len(result.parameters) - 12} more; print() shows all"
     whole = str(result.parameters).splitlines()

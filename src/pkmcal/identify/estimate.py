@@ -89,6 +89,9 @@ class Linearization(NamedTuple):
     assembled: Assembled
     info: Information
 
+    def __repr__(self) -> str:
+        return "Linearization(assembled=Assembled, info=Information)"
+
 
 @dataclass(frozen=True)
 class Estimate:
