@@ -49,9 +49,9 @@ def check_found(value, folder, centre):
     deviations.
     """
     errors = compare_with_truth(value, folder)
-    assert errors.nominal.centre > 1e-3
+    assert errors.drawing.centre > 1e-3
     assert errors.calibrated.centre < centre
-    assert errors.calibrated.orientation < errors.nominal.orientation / 5
+    assert errors.calibrated.orientation < errors.drawing.orientation / 5
     # 30 values, correlated: their rms over sigma scatters by some 0.2, about 0.8 on such sessions
     z = errors_in_sigmas(value, folder)
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6

@@ -291,6 +291,6 @@ def test_images_calibrate(name, tmp_path):
     assert value.verdict.usable
     truth = load_truth(tmp_path / "s", nominal)
     errors = compare_with_truth(value, tmp_path / "s")
-    assert errors.calibrated.position < errors.nominal.position / 5
-    assert errors.calibrated.orientation < errors.nominal.orientation / 5
+    assert errors.calibrated.position < errors.drawing.position / 5
+    assert errors.calibrated.orientation < errors.drawing.orientation / 5
     assert np.sqrt(np.mean(in_sigmas(nominal, value.estimate, truth) ** 2)) < 1.6

@@ -83,7 +83,7 @@ def test_shares_are_parts_of_a_whole(found):
     values = found.forecast
     assert sum(leg.tells for leg in values.legs) == pytest.approx(1)
     legs = sum(leg.variance for leg in values.legs)
-    assert legs + values.readings + values.nominal == pytest.approx(1)
+    assert legs + values.readings + values.drawing == pytest.approx(1)
     assert legs > 0.5
     assert [(leg.station, leg.leg) for leg in values.legs[:2]] == [("station1", 1), ("station1", 2)]
     assert len(values.legs) == 18

@@ -122,7 +122,7 @@ def test_a_hexapod_seen_through_a_mirror(tmp_path):
     rendered(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
     value = pkmcal.calibrate(folder)
     result = compare_with_truth(value, folder)
-    assert result.calibrated.centre < result.nominal.centre / 5
-    assert result.calibrated.position < result.nominal.position / 5
+    assert result.calibrated.centre < result.drawing.centre / 5
+    assert result.calibrated.position < result.drawing.position / 5
     # 44 correlated values: 95 % expected within two deviations
     assert result.within > 0.8 * result.count

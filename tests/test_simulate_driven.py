@@ -278,8 +278,8 @@ def test_forearms_and_board_in_images(mixed):
     assert value.verdict.usable
     assert value.estimate.statistics.n_poses >= 6 * 2
     assert len(value.observation.edges) > 40
-    assert errors.calibrated.position < errors.nominal.position / 10
-    assert errors.calibrated.orientation < errors.nominal.orientation / 10
+    assert errors.calibrated.position < errors.drawing.position / 10
+    assert errors.calibrated.orientation < errors.drawing.orientation / 10
 
 
 @pytest.mark.slow
@@ -287,7 +287,7 @@ def test_forearms_alone_in_images(mixed):
     value = pkmcal.calibrate(observing(mixed, "legs"))
     errors = compare_with_truth(value, mixed)
     assert value.estimate.statistics.n_poses == 0
-    assert errors.calibrated.position < errors.nominal.position / 5
+    assert errors.calibrated.position < errors.drawing.position / 5
 
 
 @pytest.mark.slow
@@ -340,12 +340,12 @@ def test_legs_and_board_know_more_than_each(name, tmp_path):
         z = whitened(nominal, value.estimate, load_truth(folder, nominal))
         assert np.sqrt(np.mean(z**2)) < 1.3
         errors = compare_with_truth(value, folder)
-        assert errors.calibrated.position < errors.nominal.position
+        assert errors.calibrated.position < errors.drawing.position
         sigma.append(np.sqrt(np.diag(value.estimate.covariance)))
     kinematic = np.array(nominal.parameters.kinds) != "radius"
     legs, board, both = (np.median(s[kinematic & (s > 1e-9)]) for s in sigma)
     assert both < min(legs, board)
-    assert errors.calibrated.position < errors.nominal.position / 3
+    assert errors.calibrated.position < errors.drawing.position / 3
 
 
 def test_a_home_that_a_limb_does_not_reach_is_told_with_its_file(tmp_path):

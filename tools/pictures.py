@@ -255,7 +255,7 @@ def accuracy(case: Case) -> None:
         value = pkmcal.calibrate(folder)
         tell(f"{count} configurations a station, {sum(value.timings.values()):.1f} s")
         compared = compare_with_truth(value, folder)
-        for what, e in (("drawing", compared.nominal), ("calibrated", compared.calibrated)):
+        for what, e in (("drawing", compared.drawing), ("calibrated", compared.calibrated)):
             tell(
                 f"  {what}: centres {e.centre * 1e3:.3f} mm, offsets {e.offset * 1e3:.3f} mm,"
                 f" platform {e.position * 1e3:.3f} mm, {np.rad2deg(e.orientation):.4f} degrees"

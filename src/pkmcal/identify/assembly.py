@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.link_rows import LinkBlocks, LinkData
@@ -44,6 +44,7 @@ class Assembled:
     observed: Booleans
     places: Kinds[Places]
     priors: tuple[str, ...]
+    __repr__ = short_repr
 
     def trusting(self, weights: Kinds[Array]) -> Problem:
         """The problem with weights (N,) of its measurements; see

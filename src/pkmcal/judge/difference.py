@@ -47,7 +47,7 @@ class ComparedMachine:
     @property
     def kind(self) -> str:
         """Kind of the machine's source, for people."""
-        return "drawing" if self.saved is None else "calibration"
+        return "nominal model" if self.saved is None else "calibration"
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class MachineDifference:
         sides = [
             {
                 "name": side.name,
-                "kind": side.kind,
+                "kind": "drawing" if side.saved is None else "calibration",
                 "usable": None if side.saved is None else side.saved.verdict.usable,
             }
             for side in (self.a, self.b)
