@@ -65,7 +65,7 @@ def test_a_format_expresses_a_machine_or_says_that_it_does_not(name):
         assert not any(d.beyond for d in made.differences)
         for text in made.files.values():
             assert machine in text
-            assert "Drawing only, not calibrated." in text
+            assert "Nominal model only, not calibrated." in text
 
 
 @pytest.mark.parametrize(

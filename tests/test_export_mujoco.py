@@ -213,7 +213,7 @@ def test_what_is_read_again_closes_from_beside(name):
 def test_the_header_says_what_it_is():
     nominal = machine_of("delta")
     _, text = exported(nominal)
-    assert "Drawing only" in text
+    assert "Nominal model only" in text
     assert "a test" in text
     sigma = np.full(len(nominal.parameters), 1.5e-5)
     _, values = exported(

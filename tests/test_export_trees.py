@@ -341,7 +341,7 @@ def test_what_is_not_known_is_said(to):
     source, files, _ = exported("delta", to)
     text = next(iter(files.values()))
     flat = " ".join(text.split())
-    assert "Drawing only, not calibrated." in flat
+    assert "Nominal model only, not calibrated." in flat
     assert "NOT KNOWN: masses and inertias" in flat
     assert "<inertial" not in text
     values = " ".join(note.text for note in exporters()[to].notes(source))

@@ -85,7 +85,7 @@ def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
     assert value.verdict.usable
     assert value.verdict.of("bed.height_unnoticed")
     assert value.findings.bed.unnoticed is None or (
-        value.findings.bed.unnoticed > 0.5 * value.findings.bed.by_nominal
+        value.findings.bed.unnoticed > 0.5 * value.findings.bed.by_drawing
     )
     ranks = value.findings.identifiability
     assert ranks.rank == 4

@@ -134,7 +134,7 @@ def test_a_summary_has_verdict_and_figures(result, loaded):
     assert first.startswith("Calibration of gough-stewart from session, method bundle")
     assert second == f"✓ {result.verdict.headline}"
     assert [line.split(":")[0].strip() for line in rest[:5]] == [
-        "Tool, σ", "Drawing off", "Parameters", "Stations", "Fit",
+        "Tool, σ", "Nominal model off", "Parameters", "Stations", "Fit",
     ]  # fmt: skip
     tool = result.tool_error(result.estimate.state.T_base_platform[result.estimate.configurations])
     assert f"{tool.position.mean() * 1e3:#.2g} mm" in rest[0]

@@ -55,7 +55,7 @@ class MachineSource:
     T_base_camera: Mapping[str, Array] = field(
         default_factory=lambda: MappingProxyType(dict[str, Array]())
     )
-    headline: str = "Drawing only, not calibrated."
+    headline: str = "Nominal model only, not calibrated."
     usable: bool = True
     origin: str = ""
     covariance: Array | None = None

@@ -141,7 +141,7 @@ class CalibrationSummary(ABC):
         tool = self.tool_error(values.poses)
         for name, place, turn in (
             ("Tool, σ", tool.position, tool.orientation),
-            ("Drawing off", tool.off_position, tool.off_orientation),
+            ("Nominal model off", tool.off_position, tool.off_orientation),
         ):
             finite = np.isfinite(place)
             if finite.any():

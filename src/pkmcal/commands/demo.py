@@ -129,7 +129,7 @@ def _print_comparison(out: Console, value: AgainstTruth) -> None:
     ):
         times = f"{old / new:.0f} times nearer" if new > 0 else ""
         rows.append(Row(what, (f"{old:.2f}{unit}", f"{new:.3f}{unit}", times)))
-    columns = ("Against the truth", "Drawing", "Calibrated", "")
+    columns = ("Against the truth", "Nominal model", "Calibrated", "")
     console.print_table(out, Table("", columns, tuple(rows)))
     out.print()
     text = (

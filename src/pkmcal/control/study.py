@@ -105,7 +105,7 @@ def estimates(
     return (
         Belief("true", "True geometry", repeated),
         Belief("identified", "Identified", identified),
-        Belief("cad", "Drawing, fitted", fitted),
+        Belief("cad", "Nominal model, fitted", fitted),
         Belief("hand", "By hand", by_hand),
     )
 

@@ -7,7 +7,7 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 
 FilledNumbers = TypeVar("FilledNumbers", Array, Integers)
 
@@ -23,6 +23,7 @@ class Places:
     row: Integers
     place: Integers
     shape: tuple[int, int]
+    __repr__ = short_repr
 
     def filled(self, values: FilledNumbers) -> FilledNumbers:
         """Scatter values (N, ...) to their places, (K', G, ...); zero for padding."""

@@ -340,7 +340,9 @@ def _with_verdict(d: MachineDifference) -> MachineDifference:
     elif d.a.saved and d.b.saved:
         headline = f"The calibrations differ by more than chance explains{_tool_clause(d)}."
     elif d.change.dof:
-        headline = f"Drawing and calibration differ by more than chance explains{_tool_clause(d)}."
+        headline = (
+            f"Nominal model and calibration differ by more than chance explains{_tool_clause(d)}."
+        )
     else:
         headline = f"The nominal models differ{_tool_clause(d)}."
     named = (

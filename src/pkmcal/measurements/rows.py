@@ -24,6 +24,9 @@ class Kinds(NamedTuple, Generic[Item]):
     poses: Item
     links: Item
 
+    def __repr__(self) -> str:
+        return "Kinds(edges, poses, links)"
+
 
 @dataclass(frozen=True)
 class RowsOfKind:

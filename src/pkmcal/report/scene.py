@@ -277,7 +277,7 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
     base, platform = scene.of_side("base"), scene.of_side("platform")
     legs = list(zip(base, platform, strict=True))
     data = [
-        line("Drawing", "--drawing", 4, [np.stack([*a.arm[0], b.nominal]) for a, b in legs]),
+        line("Nominal model", "--drawing", 4, [np.stack([*a.arm[0], b.nominal]) for a, b in legs]),
         line(
             f"Calibrated, × {scene.factor:g}",
             "--calibrated",

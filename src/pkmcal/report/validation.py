@@ -108,7 +108,16 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
     test = judged.promise
     residuals = Table(
         "Readings: measured less predicted",
-        ("Joint", "Drawing, mean", "rms", "Calibrated, mean", "rms", "promised", "in common", "σ"),
+        (
+            "Joint",
+            "Nominal model, mean",
+            "rms",
+            "Calibrated, mean",
+            "rms",
+            "promised",
+            "in common",
+            "σ",
+        ),
         tuple(
             Row(
                 name,
@@ -131,7 +140,7 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
         ("Machine", "Position, mm", "Orientation, °"),
         tuple(
             Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))
-            for name, f in (("Drawing", nominal), ("Calibrated", calibrated))
+            for name, f in (("Nominal model", nominal), ("Calibrated", calibrated))
         ),
         "Root mean squares, frames laid over each other for the nominal model. The"
         " images' own noise"
@@ -165,7 +174,7 @@ def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
     return Table(
         "Regions of the workspace, each left out once and predicted by a calibration of the rest",
         (
-            "Platform", "Left out", "Drawing", "Calibrated", "Where used", "Times better",
+            "Platform", "Left out", "Nominal model", "Calibrated", "Where used", "Times better",
             "× promise",
         ),
         tuple(rows),

@@ -382,7 +382,7 @@ def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Tab
         return Row(name, (mm(before, 2), mm(printed, 2), depth, mm(joint)))
 
     return Table(
-        "Drawing errors: “uniform noise with variance equal to 2 mm”",
+        "Nominal errors: “uniform noise with variance equal to 2 mm”",
         ("", "drawing", "as printed", "its mean |z|", "joint"),
         (
             Row(

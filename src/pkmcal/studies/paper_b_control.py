@@ -74,7 +74,7 @@ def controlled_by_estimates(centres: Array, seed: int) -> ControlledHexapod:
     beliefs[E2] = _belief(E2, "Linear", true, theta, T)
     fitted = register(np.broadcast_to(nominal.base_centers(), centres.shape), centres)
     as_drawn = np.broadcast_to(nominal.values, theta.shape)
-    beliefs[E1] = _belief(E1, "Drawing, fitted", true, as_drawn, fitted)
+    beliefs[E1] = _belief(E1, "Nominal model, fitted", true, as_drawn, fitted)
     # The same motion with each of them.
     start, goal = (
         np.broadcast_to(machine.forward(q), (runs, 4, 4))

@@ -1,7 +1,7 @@
 /*
  * Machine gough-stewart, exported by pkmcal 0.1.0 from the built-in machine gough-stewart, values
  * 83784bb4.
- * Drawing only, not calibrated.
+ * Nominal model only, not calibrated.
  * Frames: as in the mechanism file.
  * Units: m and rad.
  * pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.

@@ -1,7 +1,7 @@
 /*
  * Machine gough-stewart, exported by pkmcal 0.1.0 from the built-in machine gough-stewart, values
  * 83784bb4.
- * Drawing only, not calibrated.
+ * Nominal model only, not calibrated.
  * Frames: as in the mechanism file.
  * Self-test: reference pairs of readings and poses, computed by pkmcal. Compile and run:
  * cc -std=c99 -O2 pkmcal_*.c -lm -o pkmcal_selftest && ./pkmcal_selftest
