@@ -24,7 +24,7 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.wording import listed
-from test_observe_drawing import camera_of, draw, images, machine, poses, redrawn, tubes_at
+from test_observe_drawing import camera_of, draw, machine, poses, redrawn, rendered_images, tubes_at
 from test_observe_search import clouds, rough_pose
 
 NAMES = tuple("abcdefghi")
@@ -34,7 +34,7 @@ COLUMNS = [f"leg{k + 1}" for k in range(6)]
 def pictures(count=6):
     more = range(6, count)
     return [
-        *images()[0],
+        *rendered_images()[0],
         *(draw(tubes_at(machine(), poses(count)[k]), seed=k)[0] for k in more),
     ]
 

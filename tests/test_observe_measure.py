@@ -26,18 +26,18 @@ from test_observe_drawing import (
     FRONT,
     camera_of,
     draw,
-    images,
     machine,
     outward_to,
     poses,
     redrawn,
+    rendered_images,
     true_normals,
     tubes_at,
 )
 
 
 def taken(pictures=None) -> StationImages:
-    pictures = pictures or images()[0]
+    pictures = pictures or rendered_images()[0]
     readings = machine().inverse(poses())
     rows = np.arange(len(pictures))
     return StationImages(0, camera_of(), rows, readings[rows], pictures)

@@ -33,7 +33,7 @@ from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.observe.legs import measure
 from pkmcal.session.load import load_session
 from test_calibration import check_found
-from test_observe_drawing import FRONT, images, poses, redrawn
+from test_observe_drawing import FRONT, poses, redrawn, rendered_images
 from test_observe_measure import errors, rms, taken
 
 SRGB = np.rint(levels_of_light(np.arange(256.0), "srgb")).astype(np.uint8)
@@ -97,7 +97,7 @@ def test_linear_images_are_their_own_light():
 
 def test_a_blurred_edge_is_where_it_is_by_the_right_code_alone():
     """Painted legs before a darker room: by the wrong code they are wider by tenths of a pixel."""
-    pictures = [cv2.LUT(image, SRGB) for image in images()[0]]
+    pictures = [cv2.LUT(image, SRGB) for image in rendered_images()[0]]
     there = redrawn(0, 0.0005), FRONT, poses()
     shift = {}
     for response in ("srgb", "linear"):
@@ -113,7 +113,7 @@ def test_light_that_is_cut_off_is_so_by_any_code():
     represent.
     """
     table = np.minimum(1.6 * (255 - np.arange(256)), 255).astype(np.uint8)
-    clipped = [cv2.LUT(image, table) for image in images()[0]]
+    clipped = [cv2.LUT(image, table) for image in rendered_images()[0]]
     there = redrawn(0, 0.0005), FRONT, poses()
     usual = measure(taken(clipped), *there).edges
     coded = taken([cv2.LUT(image, SRGB) for image in clipped])
