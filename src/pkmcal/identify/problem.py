@@ -34,7 +34,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.geometry.rigid import inverse, perturb
 from pkmcal.identify.gauge import (
     mount_generators,
@@ -130,6 +130,7 @@ class Problem:
     reading_columns: ReadingColumns
     slopes: Array | None = None
     structure_cache: Structure | None = None
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Keep the structure of a problem of the same measurements."""
