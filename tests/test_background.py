@@ -152,7 +152,7 @@ def test_landmarks_are_where_the_points_are():
         assert np.abs(pixel - scene.textures[k].pixel[above_limit.number]).max() < 1e-3
 
 
-def test_a_image_of_another_part_of_the_room_is_not_placed():
+def test_an_image_of_another_part_of_the_room_is_not_placed():
     scene = Scene([0, 12, 24, 180], seed=7)
     assert not len(scene.room.place(3, scene.room.landmarks(scene.placed(0, 1, 2))))
 

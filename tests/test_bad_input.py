@@ -186,7 +186,7 @@ def test_a_damaged_image_is_told_by_pkmcal_alone(session, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_image_cut_short(session):
+def test_an_image_cut_short(session):
     path = images(session, "station2")[1]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     text = refused(session)

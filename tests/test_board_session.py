@@ -249,7 +249,7 @@ def test_a_camera_that_moved(folder):
     assert run("calibrate", folder).err == f"Error: {text}\n"
 
 
-def test_a_image_that_disagrees_is_told(folder):
+def test_an_image_that_disagrees_is_told(folder):
     shifted(folder, "station1", 3)
     session = load_session(folder)
     boards = boards_of(session, read_images(session))

@@ -142,7 +142,7 @@ def test_cameras_are_refined_with_the_board(rendered, folder):
 
 
 @pytest.mark.slow
-def test_a_image_of_another_configuration_is_let_go(folder):
+def test_an_image_of_another_configuration_is_let_go(folder):
     images = folder / "images" / "station1"
     names = sorted(path.name for path in images.iterdir())
     shutil.copy(images / names[3], images / names[5])

@@ -396,7 +396,7 @@ def test_corners_of_no_board(wide_views, monkeypatch):
 
 
 @pytest.mark.usefixtures("fitted_once")
-def test_a_image_without_a_board_is_not_dropped_silently(wide_views):
+def test_an_image_without_a_board_is_not_dropped_silently(wide_views):
     nothing = replace(wide_views[0], name="dark.png", ids=np.zeros(0, dtype=int), reason="too dark")
     calibration = calibrate_camera([*wide_views, nothing], BOARD, "unified")
     assert calibration.views == tuple(d.name for d in wide_views)

@@ -206,7 +206,7 @@ def test_a_camera_by_exif(folder):
     assert 0.02 < sigma[0] / station.camera.parameters[0] < 0.05
 
 
-def test_a_image_without_a_focal_length(folder):
+def test_an_image_without_a_focal_length(folder):
     replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0000-2.jpg", Exif(6, None))
     message = fault(load_session, folder)
@@ -589,7 +589,7 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
 
 
 @pytest.mark.slow
-def test_a_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
+def test_an_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
     """However well its silhouettes match something: it determines no machine."""
     rows = []
 
@@ -606,7 +606,7 @@ def test_a_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch
     assert len(rows) < 12  # the scoring ends
 
 
-def test_legs_are_measured_where_a_image_is_and_not_elsewhere(looked):
+def test_legs_are_measured_where_an_image_is_and_not_elsewhere(looked):
     session, images, poses, truth = looked
     p = images[EASIEST]
     there = PriorScene(session.machine, truth.T_camera_base, poses)
@@ -639,7 +639,7 @@ def test_images_of_one_configuration_are_recognised(looked, monkeypatch):
         placed(looked, monkeypatch, [0.3, 1e-4, 0.3])
 
 
-def test_a_image_in_a_wrong_place_is_found_out(breathed):
+def test_an_image_in_a_wrong_place_is_found_out(breathed):
     """An image whose edges the estimate rejects, or whose camera it moves away, is rejected."""
     calibration, _ = breathed
     session, measurements = calibration.session, calibration.measurements

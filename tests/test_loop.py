@@ -295,7 +295,7 @@ def test_images_lead_to_the_goal_and_past_a_painted_leg(view):
     assert np.nanmax(np.abs(step.remaining) / step.sigma) < 5
 
 
-def test_a_image_is_a_goal_and_a_wrong_start_is_said():
+def test_an_image_is_a_goal_and_a_wrong_start_is_said():
     lab = Lab(MACHINE, PERSPECTIVE, BESIDE)
     image = lab.image(HOME, READINGS)
     loop = VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalImage(image, READINGS))

@@ -208,7 +208,7 @@ def test_a_whole_jpeg_with_a_preview_is_read(tmp_path):
     np.testing.assert_array_equal(decoded(tmp_path, with_preview(JPEG)), decoded(tmp_path, JPEG))
 
 
-def test_a_image_of_another_size(tmp_path):
+def test_an_image_of_another_size(tmp_path):
     assert sentence(tmp_path, PNG, (640, 480)) == (
         "images/front/a.png: the image has another size than its camera; found 64x48 pixels, "
         "expected 640x480, the camera file's image_size. Use the image as the camera gave "
@@ -216,7 +216,7 @@ def test_a_image_of_another_size(tmp_path):
     )
 
 
-def test_a_image_that_is_not_there(tmp_path):
+def test_an_image_that_is_not_there(tmp_path):
     with pytest.raises(InputError) as caught:
         decode(tmp_path / "b.png", SIZE, "images/front/b.png")
     assert str(caught.value) == "images/front/b.png: cannot be read (No such file or directory)."

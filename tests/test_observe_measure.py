@@ -157,7 +157,7 @@ def test_the_points_lie_on_the_true_edges():
     assert np.abs(off).max() < 3 * PROFILE_OPTIONS.faint_sigma
 
 
-def test_a_image_that_shows_no_leg_leaves_the_others_as_they_are():
+def test_an_image_that_shows_no_leg_leaves_the_others_as_they_are():
     beside = poses().copy()
     beside[2] = np.nan  # readings outside the nominal model's range have no pose
     usual = measure(taken(), machine(), FRONT, poses(), 0.7).edges

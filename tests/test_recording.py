@@ -57,7 +57,7 @@ def test_every_image_is_there_in_its_place(calibrated, entries):
         assert np.abs(grey.astype(float) - truth).mean() < 2  # grey levels, of JPEG
 
 
-def test_a_station_without_a_image_shows_nothing_of_the_last_one(calibrated, entries):
+def test_a_station_without_an_image_shows_nothing_of_the_last_one(calibrated, entries):
     session = calibrated.session
     absent = [
         (station.name, k + 1)

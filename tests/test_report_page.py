@@ -173,7 +173,7 @@ def test_a_page_without_a_single_edge(case):
     assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
 
 
-def test_a_image_that_is_gone_is_said(tmp_path):
+def test_an_image_that_is_gone_is_said(tmp_path):
     case = make_case(tmp_path, n_poses=4, n_stations=2)
     next(tmp_path.glob("*.png")).unlink()
     page = report_html(case.session, case.observation, case.estimate, Verdict(True, "Fine."))

@@ -450,7 +450,7 @@ def test_only_one_configuration_imaged(folder):
     assert "only one configuration has images; found 0000" in fault(load_session, folder)
 
 
-def test_a_image_without_readings(folder):
+def test_an_image_without_readings(folder):
     image(folder / "images/front/0003.png")
     image(folder / "images/front/0004.png")
     message = fault(load_session, folder)
@@ -459,7 +459,7 @@ def test_a_image_without_readings(folder):
     assert "expected one of the table's 3: 0000, 0001 and 0002" in message
 
 
-def test_a_image_of_another_size(folder):
+def test_an_image_of_another_size(folder):
     image(folder / "images/front/0001.png", 16, 12)
     message = fault(load_session, folder)
     assert "images/front/0001.png: the image has another size than its camera" in message

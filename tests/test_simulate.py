@@ -272,7 +272,7 @@ def test_a_style_changes_the_legs_alone_and_no_silhouette(machine):
     assert 0.02 < np.mean(np.abs(in_view(built) - usual)[on_legs] > 0.05) < 0.5
 
 
-def test_noise_of_a_image_is_as_stated():
+def test_noise_of_an_image_is_as_stated():
     sensor = Sensor(blur=0.0, exposure=200.0, read_noise=1.5, shot_noise=0.02)
     flat = sensor_image(np.full((200, 200), 0.5), sensor, np.random.default_rng(1)).astype(float)
     assert flat.mean() == pytest.approx(100, abs=0.05)
@@ -341,7 +341,7 @@ def test_an_outward_shift_moves_edges_by_pixels(setting):
     assert np.abs(off).max() < 0.02
 
 
-def test_seen_edges_are_those_that_a_image_shows(setting, view):
+def test_seen_edges_are_those_that_an_image_shows(setting, view):
     machine, T_camera_base, poses = setting
     k, station = 1, 1  # leg 2 stands behind leg 5
     edges, joints = simulate_edges(

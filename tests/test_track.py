@@ -90,7 +90,7 @@ def test_large_images_are_binned():
     assert np.nanmedian(apart) < 0.1  # the shift that is taken off is of whole pixels
 
 
-def test_a_image_late_by_a_millimetre_is_followed(view):
+def test_an_image_late_by_a_millimetre_is_followed(view):
     """The readings have changed; the next image uses the correction of this one."""
     _, image, sight = view
     later = READINGS + np.array([1, -1, 1, 1, -1, 1]) * 1.5e-3

@@ -165,7 +165,7 @@ def test_all_images_are_named(page, demo):
     assert all(name in text for name in (*session.configurations, *session.station_names))
 
 
-def test_a_image_is_sent(page):
+def test_an_image_is_sent(page):
     image = cv2.imdecode(np.frombuffer(page.get("image/1/2").content, np.uint8), 0)
     assert image.shape[::-1] == page.subject.station(1).camera.image_size
     assert np.abs(image.astype(int) - page.subject.image(1, 2)).mean() < 3

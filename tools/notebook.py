@@ -24,7 +24,7 @@ CELLS = (
     (
         SAY,
         "# A calibration in Python\n\nA simulated hexapod, built a little off its nominal model, is"
-        " imaged and calibrated. With your own machine, `pkmcal new DIR` makes a session to"
+        " calibrated from images. With your own machine, `pkmcal new DIR` makes a session to"
         " fill in, `pkmcal.load_session(DIR)` loads it, and all the rest is the same.",
     ),
     (

@@ -180,7 +180,7 @@ class SavedCalibration(CalibrationSummary):
                 where=str(self.path),
                 found=name,
                 expected=listed(self.placed, 8) or "a calibration that tells it",
-                next_step="A image by hand is no place that a camera is left in"
+                next_step="An image by hand is no place that a camera is left in"
                 if hand
                 else "Calibrate once more with this pkmcal, or name a station of the calibration",
             )

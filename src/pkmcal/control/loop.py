@@ -216,7 +216,7 @@ class VisualServo:
         Raises InputError for an image of another size or type than the camera's.
         """
         if self._sight is None:
-            raise InputError("a image needs the camera", next_step="give it to VisualServo")
+            raise InputError("an image needs the camera", next_step="give it to VisualServo")
         check_image(image, self._sight.camera)
         q = self._checked(readings)
         at = track(self._sight, self._track, image, q)

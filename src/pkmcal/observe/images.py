@@ -239,7 +239,7 @@ def fitting(image_size: tuple[int, int], room: int) -> int:
 
 
 def binned(image: Integers, count: int) -> Integers:
-    """A image with ``count`` x ``count`` pixels averaged to one; see `Camera.binned`."""
+    """An image with ``count`` x ``count`` pixels averaged to one; see `Camera.binned`."""
     if count == 1:
         return image
     import cv2

@@ -299,7 +299,7 @@ def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) ->
     picture = coded[picture]
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, HANDHELD_JPEG_QUALITY])
     if not ok:
-        raise OSError("a image could not be encoded as JPEG")
+        raise OSError("an image could not be encoded as JPEG")
     # direction of up in the stored image: viewers rotate the image by it
     right, down = T_camera_base[:2, 2]
     upright, lying = 1 if down < 0 else 3, 6 if right < 0 else 8
