@@ -142,9 +142,9 @@ FAULTS = {
     "axes that differ tied": (
         "3-upu",
         [("legs:", 'tied: [["legs[1].base.axis", "legs[2].base.axis"]]\nlegs:')],
-        "m.yaml, line 3, tied[1][1]: "
-        "axes that differ in the nominal model are tied; found legs[1].base.axis, "
-        "legs[2].base.axis, expected whole axes with the same direction in their bodies' frames.",
+        "m.yaml, line 3, tied[1][1]: axes that differ in the nominal model are tied; found"
+        " legs[1].base.axis, legs[2].base.axis, expected whole axes with the same direction in"
+        " their bodies' frames.",
     ),
     "an axis tied to a number": (
         "3-upu",

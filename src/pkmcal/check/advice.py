@@ -261,16 +261,13 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
     """Sentences on the forecast, and on the legs with the least information and their causes."""
     images = sum(len(edges.images) for edges in forecast.edges)
     out = [
-        f"{forecast.photographs} such images a station, over the joints' ranges, would"
-        " tell the"
+        f"{forecast.photographs} such images a station, over the joints' ranges, would tell the"
         f" platform's position to {brief(forecast.position * 1e3)} mm and its orientation to"
-        f" {brief(math.degrees(forecast.orientation))}° (standard deviations at given"
-        " readings, by the"
-        f" edges of {count(images, 'image')}). Of its variance"
+        f" {brief(math.degrees(forecast.orientation))}° (standard deviations at given readings, by"
+        f" the edges of {count(images, 'image')}). Of its variance"
         f" {sum(leg.variance for leg in forecast.legs):.0%} comes from the edges,"
-        f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from what is"
-        " known beforehand,"
-        " of the nominal model and of shading."
+        f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from what is known"
+        " beforehand, of the nominal model and of shading."
     ]
     for j in poor:
         mine = [leg for leg in forecast.legs if leg.leg == j]

@@ -145,9 +145,8 @@ def simulate(
         points.append(
             (
                 console.MARK_SIGNS["note"],
-                f"The nominal model of {machine.name} gives its rods no visible cylinders,"
-                " so they are"
-                " drawn as such; see tubes in the session's mechanism.yaml.",
+                f"The nominal model of {machine.name} gives its rods no visible cylinders, so"
+                " they are drawn as such; see tubes in the session's mechanism.yaml.",
             )
         )
     console.print_points(out, points)

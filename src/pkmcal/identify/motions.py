@@ -655,9 +655,8 @@ def _everything(s: Situation) -> NamedChanges:
         text = "the size of everything {is}: all lengths can grow alike"
         return NamedChanges(s.legs, columns, text)
     text = (
-        "the size of everything is known from the nominal model only, by the tolerance of"
-        " the readings'"
-        " scales: all lengths can grow alike, and the scales with them"
+        "the size of everything is known from the nominal model only, by the tolerance of the"
+        " readings' scales: all lengths can grow alike, and the scales with them"
     )
     return NamedChanges(s.legs, columns, text, advice="size")
 

@@ -130,10 +130,9 @@ def sentence(
     how_far = "This does not move the platform."
     if matters:
         how_far = (
-            "Within the nominal model's tolerances this moves the platform by"
-            f" {shifted * 1e3:.2g} mm"
-            " (rms of its joints over these and nearby poses; what moves all poses alike, as other"
-            " frames do, is not counted)."
+            f"Within the nominal model's tolerances this moves the platform by {shifted * 1e3:.2g}"
+            " mm (rms of its joints over these and nearby poses; what moves all poses alike, as"
+            " other frames do, is not counted)."
         )
     return Sentence(
         f"{capital(text)}. {how_far}",

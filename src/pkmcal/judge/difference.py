@@ -294,15 +294,13 @@ def _assumptions(
     if nominal:
         return (
             *out,
-            f"The nominal model {nominal[0].name} is taken at its word; the standard"
-            " deviations are the"
-            " calibration's.",
+            f"The nominal model {nominal[0].name} is taken at its word; the standard deviations"
+            " are the calibration's.",
             UNMODELLED_CHANGES_TEXT,
         )
     out.append(
-        "Both calibrations lean on the same nominal model: where that alone decides, they"
-        " agree, and its"
-        " error is common to both."
+        "Both calibrations lean on the same nominal model: where that alone decides, they agree,"
+        " and its error is common to both."
         if same_nominal
         else "The calibrations lean on different nominal models, whose errors are taken to be"
         " independent."

@@ -109,9 +109,8 @@ def _validation_headline(
 ) -> str:
     if gain.high < 1:
         core = (
-            f"The nominal model predicts the readings{where} {factor(1 / gain.value)} times"
-            " better than"
-            " the calibrated machine"
+            f"The nominal model predicts the readings{where} {factor(1 / gain.value)} times better"
+            " than the calibrated machine"
         )
     elif gain.better:
         core = (

@@ -195,9 +195,8 @@ def calibration_cards(
     shifted = Figure(
         "How far is the machine from its nominal model?",
         ((brief(float(change.mean())), "mm"),),
-        "mean distance of the joint centres, nominal model and result laid over each"
-        " other; largest "
-        f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
+        "mean distance of the joint centres, nominal model and result laid over each other;"
+        f" largest {brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
     cards = (
         _flatness(flatness, tool) if flatness else None,
@@ -275,10 +274,9 @@ def _flatness(bed: Bed, tool: ToolError) -> Figure:
         ((brief(bed.sigma * 1e3), "mm"),),
         f"1σ of the tool's height over a disc of {brief(bed.radius * 1e3)} mm radius, the bed's"
         " own tilt and height aside; by the nominal model's tolerances"
-        f" {brief(bed.by_drawing * 1e3)}"
-        f" mm. The nominal model bent it by {brief(float(np.sqrt(np.mean(bent**2))) * 1e3)}"
-        " mm where it"
-        f" was probed. Along x and y {brief(bed.sideways * 1e3)} mm, by the nominal model",
+        f" {brief(bed.by_drawing * 1e3)} mm. The nominal model bent it by"
+        f" {brief(float(np.sqrt(np.mean(bent**2))) * 1e3)} mm where it was probed. Along x and y"
+        f" {brief(bed.sideways * 1e3)} mm, by the nominal model",
     )
 
 

@@ -124,9 +124,8 @@ def section(
                 "space",
                 "In space",
                 "Drag to turn, wheel or pinch to come nearer.",
-                "The machine in three dimensions: joint centres by the nominal model and"
-                " as calibrated."
-                " The two plane views show the same.",
+                "The machine in three dimensions: joint centres by the nominal model and as"
+                " calibrated. The two plane views show the same.",
                 figure_of(scene),
                 height=420,
             ),

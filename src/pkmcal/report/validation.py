@@ -17,11 +17,10 @@ from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, decimals, number
 
 VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
-    " platform are estimated from the images; a configuration's own readings have no part in"
-    " its pose, and where images leave open where a camera or a board is, the readings of the"
-    " other configurations decide. The readings are then predictions. The nominal model is"
-    " judged in the"
-    " same way, frames laid over each other, on the poses that suit it best.",
+    " platform are estimated from the images; a configuration's own readings have no part in its"
+    " pose, and where images leave open where a camera or a board is, the readings of the other"
+    " configurations decide. The readings are then predictions. The nominal model is judged in"
+    " the same way, frames laid over each other, on the poses that suit it best.",
     "The uncertainty of “times better” is from nominal model the configurations again at random"
     " (bootstrap). Directions count by how well the images see them: one image"
     " determines depth poorly, and there any two machines look the same.",
@@ -142,9 +141,8 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
             Row(name, (_magnitude(f.position, "m"), _magnitude(f.orientation, "rad")))
             for name, f in (("Nominal model", nominal), ("Calibrated", calibrated))
         ),
-        "Root mean squares, frames laid over each other for the nominal model. The"
-        " images' own noise"
-        " is in both.",
+        "Root mean squares, frames laid over each other for the nominal model. The images' own"
+        " noise is in both.",
     )
     pictures = charts.panels(_by_configuration(judged, session), _by_joint(judged, session))
     return Part("readings", "Readings and tool", html=pictures, tables=(residuals, tool))

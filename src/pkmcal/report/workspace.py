@@ -38,12 +38,11 @@ LEAST_TURN_DRAWN = 1.0
 """Least range of a rotation that is drawn, degrees."""
 SLICES_READING_TEXT = (
     "Slices are at home's orientation, on one scale of colours; crosses are poses that were"
-    " measured, near the slice. By the nominal model: how sure the platform would be by"
-    " the nominal model's"
-    " tolerances. Nominal model's error: how far the nominal model's pose is from the"
-    " calibrated at the same"
-    " readings, frames laid over each other. Calibrated: one standard deviation that is left, of"
-    " the geometry; the noise of single readings and what the model leaves out come on top."
+    " measured, near the slice. By the nominal model: how sure the platform would be by the"
+    " nominal model's tolerances. Nominal model's error: how far the nominal model's pose is from"
+    " the calibrated at the same readings, frames laid over each other. Calibrated: one standard"
+    " deviation that is left, of the geometry; the noise of single readings and what the model"
+    " leaves out come on top."
 )
 NO_UNTURNED_SLICES_TEXT = (
     "The platform does not move aside without turning, so there are no slices of one orientation."
@@ -172,10 +171,9 @@ def _slices(session: Session, estimate: Estimate, tool_map: ToolMap, links: Link
         "slices",
         "Before and after, slice by slice",
         "Point at a cell for its number.",
-        "Heat maps of how sure the platform's place is by the nominal model, how far the"
-        " nominal model was"
-        " off, and how sure it is as calibrated, in slices through the workspace. The table below"
-        " has the figures over all of it.",
+        "Heat maps of how sure the platform's place is by the nominal model, how far the nominal"
+        " model was off, and how sure it is as calibrated, in slices through the workspace. The"
+        " table below has the figures over all of it.",
         {"data": data, "layout": layout, "config": {}},
         height=height,
         width=640 if single else 150 * across + SLICES_MARGIN + SLICES_RIGHT_MARGIN,

@@ -36,26 +36,23 @@ MOST_TICKS = 8
 MANY_FAILED = 0.1
 """Share of failed runs from which a combination is reported."""
 STUDY_METHOD_TEXT = (
-    "Each run draws a machine from the nominal model's tolerances, measures it with the"
-    " noise that is"
-    " stated, and calibrates it as pkmcal calibrate does: from the nominal model, robust,"
-    " with the scale"
-    " of the noise and the tubes' shading found from the data. Some runs share a plan of stations"
-    " and configurations, which is drawn anew for the next; standard errors take that into account."
-    " All combinations have the same machines, noise and choices of configurations, as far as what"
-    " is varied leaves them.",
-    "The tool's error is that of the platform's pose at readings spread over the workspace, between"
-    " the calibrated and the true machine, frames laid over each other. What a camera sees is"
-    " decided by the nominal model. Not simulated are wrong edges, other things in the"
-    " picture, bending,"
-    " play and errors of the lens: these cost accuracy, and no simulation knows how much.",
+    "Each run draws a machine from the nominal model's tolerances, measures it with the noise"
+    " that is stated, and calibrates it as pkmcal calibrate does: from the nominal model,"
+    " robust, with the scale of the noise and the tubes' shading found from the data. Some runs"
+    " share a plan of stations and configurations, which is drawn anew for the next; standard"
+    " errors take that into account. All combinations have the same machines, noise and choices"
+    " of configurations, as far as what is varied leaves them.",
+    "The tool's error is that of the platform's pose at readings spread over the workspace,"
+    " between the calibrated and the true machine, frames laid over each other. What a camera"
+    " sees is decided by the nominal model. Not simulated are wrong edges, other things in the"
+    " picture, bending, play and errors of the lens: these cost accuracy, and no simulation"
+    " knows how much.",
 )
 PAPER_STUDY_METHOD_TEXT = (
     "Each run draws a hexapod, measures the axes of its legs with the noise of [A] Table 1, and"
-    " calibrates it by the joint estimate from the corrected four steps, without the"
-    " nominal model as"
-    " knowledge. The tool's error is that of the platform's pose at ten random readings, in frames"
-    " by three joint centres.",
+    " calibrates it by the joint estimate from the corrected four steps, without the nominal"
+    " model as knowledge. The tool's error is that of the platform's pose at ten random"
+    " readings, in frames by three joint centres.",
 )
 
 

@@ -217,7 +217,6 @@ def _agreement_text(
     half = legs.LEG_SEARCH_OPTIONS.sigma / 2
     off = f"{number(median, 1)} px" if median > half else "less than half a pixel"
     return [
-        f"{verdict}: {text}, and the middle one lies {off} from the nominal model. The"
-        " nominal model's"
-        f" tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
+        f"{verdict}: {text}, and the middle one lies {off} from the nominal model. The nominal"
+        f" model's tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
     ]
