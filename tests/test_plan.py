@@ -338,9 +338,9 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     assert len(table.names) == 12
     assert list(table.columns) == loaded.document["joints"]["columns"]
     assert not set(table.names) & set(loaded.configurations)
-    assert "How good edges are is told by 12 of the images" in (result.out + result.err).replace(
-        "\n  ", " "
-    )
+    assert "The accuracy of edges is measured in 12 of the images" in (
+        result.out + result.err
+    ).replace("\n  ", " ")
     np.testing.assert_allclose(
         table.values, [c["joints"] for c in values["configurations"]], atol=1e-6
     )

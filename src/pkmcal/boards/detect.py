@@ -46,7 +46,7 @@ class OtherBoardOptions:
     # least relative difference between measured and described markers: corners of markers are
     # located to about half a pixel, a twentieth of the smallest markers used (derived)
     size_difference: float = 0.1
-    # fewest markers for a measurement of their size, or for another dictionary
+    # fewest markers for a measurement of their size
     least_markers: int = 4
 
 

@@ -155,7 +155,7 @@ def of_machine(
     noise = f"Readings are taken to be good to {brief(joint_noise * 1e6)} µm (or µrad)"
     if tracker is not None:
         rig = _tracker_rig(machine, tracker, joint_noise)
-        return Subject(rig, None, tuple(columns), (), (noise + ", as told.",))
+        return Subject(rig, None, tuple(columns), (), (noise + ", as stated.",))
     # Stations at default poses, which observe legs or a board.
     cameras = tuple(cameras)
     stations = default_stations(machine, cameras, rng, "platform" if board else None)
@@ -439,7 +439,7 @@ def _edge_noise(
             why = "the images that there are do not tell it; pkmcal check says why"
         else:
             count = sum(len(row) for row in rows)
-            words = f"How good edges are is told by {count} of the images that there are."
+            words = f"The accuracy of edges is measured in {count} of the images that there are."
             pixels = tuple(p.binning for p in images.images)
             return pixels, first.pools, first.estimate.statistics.shading, words
     # without images their sharpness is not known

@@ -26,7 +26,7 @@ def section(findings: Findings, table: ParameterTable) -> Part:
     html = page.filled_template(
         "identifiability.html.j2",
         headline=directions_headline(findings),
-        told=findings,
+        findings=findings,
         fixed=held_text(findings, table),
         tied=tied(table),
         spectrum=spectrum(findings),

@@ -124,7 +124,7 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
             ),
         },
         gauge=estimate.gauge,
-        told="heights" if only_heights(estimate) else "images" if visible else "readings",
+        measured_by="heights" if only_heights(estimate) else "images" if visible else "readings",
     )
     return Part("parameters", "Parameters", html=html)
 
