@@ -115,7 +115,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]
     _check_columns(session, bad)
     raise InputError(
-        "the nominal model's machine cannot take these readings: its legs do not meet the platform",
+        "the nominal model cannot take these readings: its legs do not meet the platform",
         where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
         found=f"a gap of {float(fk.error.max()) * 1e3:.3g} mm",
         expected="readings at which all legs reach the platform",
@@ -480,7 +480,7 @@ def boards_of(session: Session, images: list[StationImages]) -> Boards:
 def board_images(
     session: Session, station_images: list[StationImages]
 ) -> dict[int, Sequence[Integers]]:
-    """All stations' station_images by their number: decoded already, or when they are looked at."""
+    """All stations' images by their number: decoded already, or when they are looked at."""
     images: dict[int, Sequence[Integers]] = {p.station: p.images for p in station_images}
     for number, station in enumerate(session.stations):
         if number not in images:

@@ -37,7 +37,7 @@ class Assembled:
     observed : (K,) configurations with at least one edge, link, or pose of a board on the platform,
     or all without a station; only these are in the problem. places : positions of the measurements
     of each kind among the observed configurations. priors : names of the kinds of the prior rows,
-    (c,): nominal model, the code of an effect, mount, level or gauge.
+    (c,): nominal, the code of an effect, mount, level or gauge.
     """
 
     problem: Problem

@@ -229,7 +229,7 @@ def prior_in_gauge(
 
 
 def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) -> Array:
-    """1 - posterior variance / nominal model variance in the gauge, (P,); 0 where both vanish."""
+    """1 - posterior variance / prior variance in the gauge, (P,); 0 where both vanish."""
     table, free = machine.parameters, machine.parameters.free_matrix()
     change = projector(machine, theta, gauge)
     spread = free - generators(machine.layout, theta) @ (change @ free)
@@ -290,7 +290,7 @@ def identifiability(info: Information, machine: Machine) -> Identifiability:
     problem, state = info.problem, info.state
     table, nz = machine.parameters, problem.unknowns.n_free
     tolerance = table.tolerances_free()
-    # what is known beforehand of cameras and shading is no nominal model: without it, a shift of
+    # what is known beforehand of cameras and shading is not left out: without it, a shift of
     # every line by itself would hide the tubes' radii
     remainder = reduced_rows(info, ("machine",), silent=("machine", "mounts"))[0] * tolerance
     theta, moves = problem.theta(state)[0], conventions(machine)

@@ -106,7 +106,7 @@ class Estimate:
     tube of a leg; edge_trust : (N,) by how much more or less than on average each edge counts for
     its tails, see :mod:`pkmcal.identify.edge_noise`.
     joint_residuals : (K, m) in standard deviations.
-    data_share : (P,) 1 - posterior variance / nominal model variance in the same gauge: near 1, the
+    data_share : (P,) 1 - posterior variance / prior variance in the same gauge: near 1, the
         data decide; near 0, the value is the nominal model's.
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
     link_residuals, link_weights : (N,) of measurements that link two configurations, those of one

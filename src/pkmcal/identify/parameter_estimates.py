@@ -32,7 +32,7 @@ ROUNDING_SIGMA = 1e-9
 
 
 def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> tuple[Decider, ...]:
-    """What decides each parameter: data, nominal model (the nominal model), frame or fixed.
+    """What decides each parameter: data, drawing (the nominal model), frame or fixed.
 
     frame : the value only defines the result's frames. fixed : the mechanism file fixes it.
 
@@ -53,7 +53,7 @@ def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> t
 class ParameterEstimate:
     """One parameter: m, rad, or 1 for components of a direction and for ratios.
 
-    nominal model, value, sigma : nominal and calibrated value, and its standard deviation in the
+    drawing, value, sigma : nominal and calibrated value, and its standard deviation in the
     gauge of the result.
     data_share : share of the information that comes from the data; NaN where that is undefined.
     decided_by : see :func:`decided_by`.

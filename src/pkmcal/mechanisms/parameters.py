@@ -33,7 +33,7 @@ class ParameterTable:
     parts : part of the leg that a parameter changes: its ``base`` or ``platform`` joint, its
         ``rod``, the ``zero`` or the ``lead`` of its reading, or a part named by its carrier; empty
         for a tube's radius, which is no part of the mechanism.
-    nominal model, tolerance : (P,) nominal values and their prior sigmas.
+    nominal, tolerance : (P,) nominal values and their prior sigmas.
     fixed : names that keep their nominal value.
     tied : groups of names that change by the same amount.
     opposed : for each group, the names that change by the opposite amount.

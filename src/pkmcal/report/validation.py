@@ -36,7 +36,7 @@ def outcome_of(v: Validation) -> Outcome:
     again = [n for n, flag in zip(v.session.configurations, v.repeated, strict=True) if flag]
     sentences = (
         ("Left out, for the calibration had seen them", prior),
-        ("At poses that the calibration used, imaged anew", again),
+        ("At poses that the calibration used, taken anew", again),
     )
     notes = tuple(f"{what}: {', '.join(names)}." for what, names in sentences if names)
     parts = (
