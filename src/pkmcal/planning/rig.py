@@ -68,7 +68,7 @@ class LegsFrom:
     binning: int = 1
 
     def measure(self, at: At, rows: Integers, rng: np.random.Generator | None, /) -> EdgeSet:
-        """Edges of the legs. rng : for nominal model the information of each edge; its mean without
+        """Edges of the legs. rng : for drawing the information of each edge; its mean without
         it.
         """
         pairs = np.stack([np.zeros_like(rows), rows], axis=-1)

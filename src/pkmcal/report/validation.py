@@ -21,7 +21,7 @@ VALIDATION_METHOD_TEXT = (
     " pose, and where images leave open where a camera or a board is, the readings of the other"
     " configurations decide. The readings are then predictions. The nominal model is judged in"
     " the same way, frames laid over each other, on the poses that suit it best.",
-    "The uncertainty of “times better” is from nominal model the configurations again at random"
+    "The uncertainty of “times better” is from drawing the configurations again at random"
     " (bootstrap). Directions count by how well the images see them: one image"
     " determines depth poorly, and there any two machines look the same.",
     "The promise holds the calibration's covariance and the noise of these images and"
