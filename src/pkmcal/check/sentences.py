@@ -48,8 +48,7 @@ BOARD_LEGEND = (
     "Wander: of the board on the base between images; a still one stays below 0.1 px.",
 )
 KINEMATICS_SENTENCE = (
-    "The nominal model's machine closes at all readings, {0.singularity:.2f} from a"
-    " singular pose (0 is"
+    "The nominal machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
     " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
 )
 

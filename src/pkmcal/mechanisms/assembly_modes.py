@@ -53,8 +53,8 @@ class AssemblyModes:
         cannot be reached from home without crossing a singular pose, others may be. 0 without a
         determinant.
     starts, closed : number of starts, and of those that led to any pose.
-    missing : upper bound, with 99.9 percent probability, of the share of closed starts that lead to
-        a mode not listed; 1 if no start closed.
+    missing : upper bound of the share of closed starts that lead to a mode not listed, exceeded
+        with the probability ``missed`` of the options; 1 if no start closed.
     complete : whether each mode was found often enough; False if the number of starts
         ended the search.
     """

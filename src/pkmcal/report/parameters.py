@@ -57,11 +57,12 @@ LATEX_SIGNS = {
 }  # fmt: skip
 """Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
-    "data": "the images decide",
-    "drawing": "the nominal model decides more than the images",
-    "frame": "defines the frame",
-    "fixed": "kept at the nominal model's value",
+    "data": ("", "the images decide"),
+    "drawing": ("nominal", "the nominal model decides more than the images"),
+    "frame": ("frame", "defines the frame"),
+    "fixed": ("fixed", "kept at the nominal model's value"),
 }
+"""Mark in the table, empty for the name of what was measured, and sentence."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,12 @@ class ParameterRow:
     @property
     def source_text(self) -> str:
         """Source in words."""
-        return PARAMETER_SOURCES[self.source]
+        return PARAMETER_SOURCES[self.source][1]
+
+    @property
+    def mark_text(self) -> str:
+        """Mark of the source; empty for the data, which the page calls by their kind."""
+        return PARAMETER_SOURCES[self.source][0]
 
     @property
     def share_text(self) -> str:

@@ -184,7 +184,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
                 ("poses", s.chi2_poses, s.n_poses, s.dof_poses),
                 ("readings", s.chi2_joints, s.n_joints, s.dof_joints),
                 (linked, s.chi2_links, s.n_links, s.dof_links),
-                ("drawing", s.chi2_drawing, s.n_drawing, 0.0),
+                ("nominal model", s.chi2_drawing, s.n_drawing, 0.0),
             )
             if n
         ),

@@ -19,6 +19,7 @@ from pkmcal.observe.images import decode
 from pkmcal.pages.jpegs import coded
 from pkmcal.pages.overlays import INLIER_WEIGHT, edge_name, machine_laid_over, residual_words
 from pkmcal.report import poses
+from pkmcal.report.parameters import PARAMETER_SOURCES
 from pkmcal.report.pictures import edge_curves
 from pkmcal.report.residuals import weighted_edge_rms
 from pkmcal.session.image_files import label_of
@@ -81,7 +82,7 @@ def _result(c: Calibration) -> Iterator[Logged]:
     ]
     rows += [
         f"| {p.name} | {p.unit} | {p.drawing:.7g} | {p.value:.7g} | {p.sigma:.2g}"
-        f" | {p.decided_by} |"
+        f" | {PARAMETER_SOURCES[p.decided_by][0] or 'data'} |"
         for p in c.parameters
     ]
     yield Logged(("result", "parameters"), "text", {"text": "\n".join(rows)})

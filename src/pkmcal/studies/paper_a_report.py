@@ -383,7 +383,7 @@ def _readings_table(wide: HexapodByAxesStudy, narrow: HexapodByAxesStudy) -> Tab
 
     return Table(
         "Nominal errors: “uniform noise with variance equal to 2 mm”",
-        ("", "drawing", "as printed", "its mean |z|", "joint"),
+        ("", "nominal", "as printed", "its mean |z|", "joint"),
         (
             Row(
                 "The paper",

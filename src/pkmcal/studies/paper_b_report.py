@@ -195,7 +195,7 @@ def _tables(s: HexapodByLegsStudy) -> list[Table]:
                 rows += accuracy_rows(
                     s, key, name, PAPER_B_COLUMNS, PAPER_B_PROTOTYPE.get(key), errors=False
                 )
-        heads = ("", "mm", "depth, mm", "px", "drawing, mm")
+        heads = ("", "mm", "depth, mm", "px", "nominal, mm")
         note = "Pictures of joints that have collapsed into the camera have no place."
         out.append(Table(VIEW_TABLE_TITLES[view], heads, tuple(rows), note))
     return out
@@ -294,7 +294,9 @@ def _image_axes(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict
 def _geometry_part(words: Words, s: HexapodByLegsStudy) -> Part:
     """Section on [B] Fig. 7."""
     nominal = hexapod_with_cylinder_legs().base_centers()
-    sets: list[tuple[str, Array, str, str, float]] = [("drawing", nominal, "--ink", "square", 8)]
+    sets: list[tuple[str, Array, str, str, float]] = [
+        ("nominal model", nominal, "--ink", "square", 8)
+    ]
     styles = (
         (MIRROR_VIEW, "--calibrated", "circle-open"),
         (PERSPECTIVE_VIEW, "--drawing", "diamond-open"),
