@@ -352,6 +352,15 @@ def test_regions_are_whole_named_and_the_same_again():
     assert len(set(spread(points, 3) // 5)) == 3
 
 
+def test_the_choice_of_held_out_points_does_not_hang_on_rounding():
+    """Clusters of two points, whose middle is equally far from both."""
+    rng = np.random.default_rng(3)
+    points = np.repeat(np.eye(6)[:4], 2, axis=0) + 1e-2 * rng.normal(size=(8, 6))
+    choice = spread(points, 4)
+    for _ in range(20):
+        assert np.array_equal(spread(points + 1e-12 * rng.normal(size=(8, 6)), 4), choice)
+
+
 def test_held_out_regions_know_nothing_of_their_readings(hexapod):
     nominal, _, estimate, data = hexapod
     region = chosen(nominal, estimate, data, 5)

@@ -26,6 +26,8 @@ FEWEST_TO_CALIBRATE = 3
 
 MOST_CLUSTERING_ROUNDS = 100
 """Upper bound of the k-means iterations."""
+TIE = 1e-6
+"""Difference of distances, as a share of the points' extent, that counts as none."""
 NAMED_REGION_OFFSET = 0.7
 """Offset of a region from the middle, in standard deviations of the whole workspace, from which
 a direction is part of its name."""
@@ -103,14 +105,16 @@ def clusters(points: Array, n: int) -> Integers:
 def spread(points: Array, n: int) -> Integers:
     """Indices of n points, in rising order, spread over all: the middle one of each of n clusters.
 
-    Clusters are those of :func:`clusters`.
+    Clusters are those of :func:`clusters`. The two points of a pair are equally far from its
+    middle: of points that are equally far, but for rounding, the first is taken.
     """
     owner = clusters(points, n)
     chosen: list[int] = []
     for k in range(n):
         rows = np.flatnonzero(owner == k)
-        middle = points[rows].mean(axis=0)
-        chosen.append(int(rows[np.argmin(np.sum((points[rows] - middle) ** 2, axis=1))]))
+        far = np.linalg.norm(points[rows] - points[rows].mean(axis=0), axis=1)
+        nearest = np.isclose(far, far.min(), rtol=0, atol=TIE * np.ptp(points))
+        chosen.append(int(rows[np.argmax(nearest)]))
     return np.sort(np.array(chosen))
 
 
