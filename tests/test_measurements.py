@@ -116,6 +116,7 @@ EXAMPLES = {
     "poses": of_targets(whitening("poses")),
     "points": of_targets(whitening("points")),
     "heights": of_targets(whitening("heights"), level=True),
+    "orientations": of_targets(whitening("orientations")),
     "readings": of_readings,
     "distances": of_links(distances),
 }
@@ -158,7 +159,7 @@ def test_a_kind_stands_in_a_file_of_its_own(kind):
 def test_words_of_a_kind(kind):
     assert kind.code.isidentifier()
     assert kind.one != kind.label
-    assert kind.unit in ("px", "m", "m or rad")
+    assert kind.unit in ("px", "m", "rad", "m or rad")
     assert 1 <= kind.numbers <= 6
     assert kind.joins == (2 if issubclass(kind, LinkKind) else 1)
     assert len({other.one for _, other in KINDS}) == len(KINDS)
@@ -178,6 +179,7 @@ def test_a_target_is_whitened_where_it_is_measured(kind):
     sigma = np.where(measured < 3, 1e-3, 2e-4)
     np.testing.assert_allclose(np.diag(whiten)[measured], 1 / sigma)
     assert kind.turns() == bool(np.any(measured < 3))
+    assert kind.shifts() == bool(np.any(measured >= 3))
 
 
 def test_words_and_keys_of_a_session_are_those_of_kinds():

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import yaml
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
@@ -28,6 +29,7 @@ from pkmcal.papers import methods
 from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
+from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.simulation.truth import true_machine
 
@@ -37,6 +39,7 @@ COLUMNS = {
     "poses": ("x", "y", "z", "rx", "ry", "rz"),
     "points": ("x", "y", "z"),
     "heights": ("z",),
+    "orientations": ("rx", "ry", "rz"),
 }
 POSITION, TURN = 2e-5, 1e-4
 
@@ -103,7 +106,8 @@ def write_joints(folder, joints):
 def write_poses(folder, in_view, kind="poses"):
     names = [f"{k:03d}" for k in range(len(in_view))]
     values = np.concatenate([in_view[:, :3, 3], rotation_vector(in_view[:, :3, :3])], axis=1)
-    values = values[:, [2]] if kind == "heights" else values[:, : len(COLUMNS[kind])]
+    at = [("x", "y", "z", "rx", "ry", "rz").index(column) for column in COLUMNS[kind]]
+    values = values[:, at]
     (folder / "poses.csv").write_text(csv_text(COLUMNS[kind], names, values))
 
 
@@ -164,6 +168,58 @@ def test_points_alone(folder):
     result = calibrate_session(folder)
     assert result.estimate.statistics.n_poses == 120
     assert tool_error(result.machine, made) < 0.3 * tool_error(made.nominal, made)
+
+
+def test_orientations_alone(folder):
+    """Only rotations are known: the platform's are corrected, with honest deviations, and no place
+    of tracker or target is printed.
+    """
+    made = make(folder, "3-rps", "orientations", n=40, seed=2)
+    document = yaml.safe_load((folder / "session.yaml").read_text())
+    document["stations"]["tracker"]["tracker"]["noise"] = {"rotation": TURN}
+    (folder / "session.yaml").write_text(yaml_text(document))
+    result = calibrate_session(folder)
+    assert result.verdict.usable
+    assert result.estimate.statistics.n_poses == 3 * 40
+    T, joints = configurations(made.machine, 60, np.random.default_rng(9))
+
+    def orientation_error(machine):
+        """Root mean square of the rotation since the first pose, in the true frame."""
+        value = [
+            rotation_vector(P[:, :3, :3] @ P[0, :3, :3].T) for P in (machine.forward(joints), T)
+        ]
+        u, _, vt = np.linalg.svd(value[0].T @ value[1])
+        aligned = value[1] @ (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T
+        return np.sqrt(np.mean(np.sum((value[0] - aligned) ** 2, axis=1)))
+
+    assert orientation_error(result.machine) < 0.05 * orientation_error(made.nominal)
+    save(result, folder.parent / "out")
+    (target,) = load(folder.parent / "out").document["targets"]
+    assert target["sigma_translation"] == [None, None, None]
+    assert None not in target["sigma_rotation"]
+
+
+def test_what_a_tracker_measures_needs_its_own_noise(folder):
+    made = make(folder, "3-rps", "orientations", n=5)
+    joints = tuple(f"{k:03d}" for k in range(len(made.joints)))
+    with pytest.raises(InputError, match="orientations have no stated noise"):
+        read_poses(folder / "poses.csv", "poses.csv", joints, POSITION, None)
+    write_poses(folder, made.T, "points")
+    with pytest.raises(InputError, match="positions have no stated noise"):
+        read_poses(folder / "poses.csv", "poses.csv", joints, None, TURN)
+
+
+@pytest.mark.parametrize(
+    ("position", "rotation", "kind"),
+    [(POSITION, TURN, "poses"), (POSITION, None, "points"), (None, TURN, "orientations")],
+)
+def test_the_kind_to_come_follows_from_the_stated_noise(position, rotation, kind):
+    assert PoseTable.to_come("tracker", "poses.csv", position, rotation).kind == kind
+
+
+def test_a_tracker_to_come_without_any_noise(folder):
+    with pytest.raises(InputError, match="no stated noise"):
+        PoseTable.to_come("tracker", "poses.csv", None, None)
 
 
 def test_heights_of_a_flat_bed(folder):

@@ -25,7 +25,6 @@ from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
 from pkmcal.measurements.effects import BOARD_SIZE, EDGE_SHIFT, FOCAL_EXCESS
-from pkmcal.measurements.heights import Heights
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, digests, session_digest
@@ -282,13 +281,20 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
 
 def _station_covariance(calibration: Calibration) -> dict[str, Any]:
     """Stations in which a camera may stay, by name, and their rows (6 k, P + 6 k) of the joint
-    covariance of all parameters and these stations, (omega, tau) of T_base_camera. Probes of
-    heights have no position along the bed.
+    covariance of all parameters and these stations, (omega, tau) of T_base_camera. Stations whose
+    pose is determined in part, as of a probe of heights or of orientations, are left out.
     """
     session, estimate = calibration.session, calibration.estimate
     nowhere = {station.name for station in session.stations if station.handheld}
-    nowhere |= {table.name for table in session.trackers if table.kind == Heights.code}
     names = session.station_names
+    covariances = map(
+        base_camera_covariance, estimate.state.T_camera_base, estimate.station_covariance
+    )
+    nowhere |= {
+        name
+        for name, covariance in zip(names, covariances, strict=True)
+        if None in _sigma_where_identified(estimate, covariance)
+    }
     retained_rows = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
     n = len(estimate.machine.parameters)
     rows = rows_of_stations(n, retained_rows)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
@@ -30,6 +31,7 @@ from pydantic import Field
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, PairTable, Schema
+from pkmcal.geometry.rigid import from_quaternion, pose, rotation
 from pkmcal.measurements.links import LinkSet
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import listed
@@ -39,7 +41,10 @@ POINT_COLUMNS, QUATERNION_COLUMNS, TURN_VECTOR_COLUMNS = (
     ("qw", "qx", "qy", "qz"),
     ("rx", "ry", "rz"),
 )
-DISPLAY_UNITS = {"m": ("mm", 1e3), "px": ("px", 1.0)}
+COLUMN_UNITS = dict.fromkeys(POINT_COLUMNS, "m") | dict.fromkeys(TURN_VECTOR_COLUMNS, "rad")
+UNIT_QUATERNION_TOLERANCE = 1e-3
+"""Allowed deviation of a quaternion's length from one: the rounding of three digits."""
+DISPLAY_UNITS = {"m": ("mm", 1e3), "rad": ("°", 180 / np.pi), "px": ("px", 1.0)}
 """Unit in reports, and the factor to it, by a kind's unit."""
 LEAST_NOISE = 1e-12
 """Smallest standard deviation of a measurement, m or rad: no instrument is better."""
@@ -62,7 +67,7 @@ class MeasurementKind(ABC):
     code: ClassVar[str]
     one: ClassVar[str]
     label: ClassVar[str]
-    unit: ClassVar[Literal["px", "m", "m or rad"]]
+    unit: ClassVar[Literal["px", "m", "rad", "m or rad"]]
     numbers: ClassVar[int]
     joins: ClassVar[int] = 1
 
@@ -89,12 +94,14 @@ class TargetKind(MeasurementKind, ABC):
     """Table of a tracker, under ``stations.*.tracker``.
 
     headers : for each form of the table, the columns beside the configuration's, in any order.
+    units : unit of each column that has one, m or rad.
     known : which of the six numbers (omega, tau) of T_tracker_target are measured.
     fewest_rows : smallest number of rows that determine the tracker's pose with redundancy.
     levels : whether ``level: true`` is allowed, which makes the tracker's z axis the base's.
     """
 
     headers: ClassVar[tuple[tuple[str, ...], ...]]
+    units: ClassVar[Mapping[str, str]] = COLUMN_UNITS
     known: ClassVar[tuple[int, ...]]
     fewest_rows: ClassVar[int]
     levels: ClassVar[bool] = False
@@ -105,22 +112,39 @@ class TargetKind(MeasurementKind, ABC):
         return any(k < 3 for k in cls.known)
 
     @classmethod
-    def whiten(cls, position: float, rotation: float | None) -> Array:
+    def shifts(cls) -> bool:
+        """Whether positions are measured, which need a stated noise."""
+        return any(k >= 3 for k in cls.known)
+
+    @classmethod
+    def T_tracker_target(cls, table: CsvTable) -> Array:
+        """Measurements (N, 4, 4) of a table with one of the headers; what is not measured is that
+        of the identity.
+
+        Raises `InputError` for a row that is no pose.
+        """
+        column = {head: table.values[:, k] for k, head in enumerate(table.columns)}
+        zeros = np.zeros(len(table.names))
+        shift = np.stack([column.get(axis, zeros) for axis in POINT_COLUMNS], axis=-1)
+        return pose(_rotations(table, column), shift)
+
+    @classmethod
+    def whiten(cls, position: float | None, rotation: float | None) -> Array:
         """Whitening matrix (6, 6) of one measurement.
 
         position, rotation : standard deviations in m and rad. Rows of numbers that are not measured
         are zero.
         """
-        sigma = np.repeat([rotation or 1.0, position], 3)
+        sigma = np.repeat([rotation or 1.0, position or 1.0], 3)
         return np.diag(np.where(np.isin(np.arange(6), cls.known), 1 / sigma, 0.0))
 
     @classmethod
     @abstractmethod
-    def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
+    def start(cls, T_tracker_target: Array, T_base_platform: Array) -> Array | None:
         """Initial T_tracker_base (4, 4), or None for whole poses, which determine it directly.
 
         T_tracker_target : (N, 4, 4) measurements.
-        platform : (N, 3) positions of the platform by the nominal model, m.
+        T_base_platform : (N, 4, 4) by the nominal model, NaN where it has no solution.
         """
 
     @classmethod
@@ -195,6 +219,36 @@ def _concrete(base: type[MeasurementKind]) -> list[type[MeasurementKind]]:
     for kind in base.__subclasses__():
         out += [kind] if "code" in vars(kind) else _concrete(kind)
     return sorted(out, key=lambda kind: kind.__module__)
+
+
+def _rotations(table: CsvTable, column: Mapping[str, Array]) -> Array:
+    """Rotations (N, 3, 3) of the rows, from a quaternion, a rotation vector or the identity."""
+    if "qw" in column:
+        q = np.stack([column[name] for name in QUATERNION_COLUMNS], axis=-1)
+        length = np.linalg.norm(q, axis=1)
+        bad = np.flatnonzero(np.abs(length - 1) > UNIT_QUATERNION_TOLERANCE)
+        if bad.size:
+            raise InputError(
+                "the quaternion is not of length one",
+                where=f"{table.where(int(bad[0]))}, columns {', '.join(QUATERNION_COLUMNS)}",
+                found=f"{length[bad[0]]:.4g}",
+                expected="1; the scalar part is qw",
+            )
+        return from_quaternion(q)
+    if "rx" in column:
+        vector = np.stack([column[name] for name in TURN_VECTOR_COLUMNS], axis=-1)
+        size = np.linalg.norm(vector, axis=1)
+        bad = np.flatnonzero(size > 2 * np.pi)
+        if bad.size:
+            raise InputError(
+                "the rotation vector is longer than a whole turn",
+                where=f"{table.where(int(bad[0]))}, columns {', '.join(TURN_VECTOR_COLUMNS)}",
+                found=f"{size[bad[0]]:.4g}",
+                expected="radians, at most 3.1416",
+                next_step="If these are degrees, head the columns rx [deg], ry [deg], rz [deg]",
+            )
+        return rotation(vector)
+    return np.broadcast_to(np.eye(3), (len(table.names), 3, 3))
 
 
 def configuration_rows(table: CsvTable, names: tuple[str, ...]) -> Integers:

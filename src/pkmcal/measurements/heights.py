@@ -30,7 +30,7 @@ class Heights(TargetKind):
     levels: ClassVar = True
 
     @classmethod
-    def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
+    def start(cls, T_tracker_target: Array, T_base_platform: Array) -> Array | None:
         """Bed that is parallel to the base's x-y plane, at the mean height."""
-        shift = np.nanmean(T_tracker_target[:, 2, 3] - platform[:, 2])
+        shift = np.nanmean(T_tracker_target[:, 2, 3] - T_base_platform[:, 2, 3])
         return pose(np.eye(3), np.array([0.0, 0.0, shift]))

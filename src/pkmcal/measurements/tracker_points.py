@@ -28,7 +28,7 @@ class TrackerPoints(TargetKind):
     fewest_rows: ClassVar = 4
 
     @classmethod
-    def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
+    def start(cls, T_tracker_target: Array, T_base_platform: Array) -> Array | None:
         """Rigid registration of the platform's positions to the measured points."""
-        good = np.isfinite(platform).all(axis=1)
-        return register(platform[good], T_tracker_target[good, :3, 3])
+        good = np.isfinite(T_base_platform[:, 0, 0])
+        return register(T_base_platform[good, :3, 3], T_tracker_target[good, :3, 3])

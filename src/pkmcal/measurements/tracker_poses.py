@@ -33,7 +33,7 @@ class TrackerPoses(TargetKind):
     fewest_rows: ClassVar = 3
 
     @classmethod
-    def start(cls, T_tracker_target: Array, platform: Array) -> Array | None:
+    def start(cls, T_tracker_target: Array, T_base_platform: Array) -> Array | None:
         """None: one measured pose determines the tracker's pose directly."""
-        del T_tracker_target, platform
+        del T_tracker_target, T_base_platform
         return None

@@ -657,6 +657,7 @@ def _check_noise(document: Document, schema: SessionDocument, machine: Machine) 
     noises: list[tuple[tuple[str, ...], float]] = [
         (("stations", name, "tracker", "noise", "position"), station.tracker.noise.position)
         for name, station in schema.trackers.items()
+        if station.tracker.noise.position is not None
     ]
     for code, node in schema.links().items():
         kind = kinds_of(LinkKind)[code]

@@ -72,8 +72,8 @@ class StationDocument(Schema):
 class NoiseDocument(Schema):
     """Entry ``noise`` of a tracker: standard deviations."""
 
-    position: Annotated[Metres, NOISE_FIELD_RANGE] = Field(
-        description="the standard deviation of a coordinate in metres, such as 2.0e-5"
+    position: Annotated[Metres, NOISE_FIELD_RANGE] | None = Field(
+        default=None, description="the standard deviation of a coordinate in metres, such as 2.0e-5"
     )
     rotation: Annotated[Radians, NOISE_FIELD_RANGE] | None = Field(
         default=None, description="the standard deviation of a turn in radians, such as 1.0e-4"
