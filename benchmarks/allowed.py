@@ -1,14 +1,14 @@
-"""What a session's edges allow: the tool's error had the same edge errors other signs.
+"""Attainable accuracy of a session's edges: the tool's error with random signs of the edge errors.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/allowed.py FOLDER [FOLDER ...] [--draws 16]
 
-FOLDER is a session with its truth.json, as of `benchmarks/scenes.py`. It is calibrated without its
-truth; then every edge that was measured is compared with where the true machine has it. One
-session's tool error is one draw: by chance it is small where its edges are bad. So the errors of
-each line (one side of one tube at one station) get a sign at random, together, so that what an edge
-shares with its neighbours stays, and the joint estimate is made again from these edges; so too with
-the errors halved. The root mean square over draws is what a method of calibration can expect of
-edges as good as these, and what it could of edges twice as good.
+FOLDER is a session with its truth.json, as for `benchmarks/scenes.py`. It is calibrated without its
+truth; then every measured edge is compared with its true place. The tool error of one session is a
+single draw: by chance it may be small although the edges are bad. So the errors of each line (one
+side of one tube at one station) are multiplied by a random sign, all together so that their
+correlation remains, and the joint estimate is repeated; also with half the errors. The root mean
+square over the draws is the accuracy that any method of calibration can expect of edges as good as
+these, and of edges twice as good.
 """
 
 from __future__ import annotations

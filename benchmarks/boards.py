@@ -1,10 +1,10 @@
-"""Images of a board a second, from their files to fitted corners, and the processor's time.
+"""Images of a board per second, from files to fitted corners, and processor time.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/boards.py BOARD.yaml PHOTOGRAPH…
 
-As `pkmcal calibrate` looks at them, on `THREADS` threads; the best of ``ROUNDS``.
-Where other work shares the machine the wall's time says nothing: the processor's, divided by the
-threads, is then what a free machine would reach at most.
+As in `pkmcal calibrate`, on `THREADS` threads; the best of ``ROUNDS``. On a machine with other load
+wall time means nothing: processor time divided by the threads is then the best that a free machine
+could reach.
 """
 
 from __future__ import annotations

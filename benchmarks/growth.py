@@ -1,12 +1,11 @@
-"""How each step of a calibration grows with the configurations.
+"""Growth of each step of a calibration with the number of configurations.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/growth.py [--sizes 100 300 1000 3000 10000]
 
-Two kinds of sessions: legs' edges as three cameras see them of a hexapod, taken up after the
-images, and an H4's table of poses, from its files to the page, the whole of `pkmcal
-calibrate`. Processor seconds, each size in a process of its own, with its greatest memory. The
-exponent is the slope of log time over log size from ``FROM`` configurations on. Exits with 1 where
-one is above ``MOST``.
+Two kinds of sessions: simulated edges of a hexapod's legs from three cameras, without images; and
+an H4's table of poses, from its files to the page, the whole of `pkmcal calibrate`. Processor
+seconds, each size in a process of its own, with its peak memory. The exponent is the slope of log
+time over log size from ``FROM`` configurations on. Exits with 1 if one is above ``MOST``.
 """
 
 from __future__ import annotations

@@ -1,19 +1,19 @@
-"""Delta printers calibrated from heights of their bed: by pkmcal and as Klipper does it.
+"""Delta printers calibrated by heights of their bed: pkmcal beside Klipper's method.
 
-python benchmarks/heights.py [PRINTERS]     a table for 7 to 50 points and probes of 10 and 25 um
+    python benchmarks/heights.py [PRINTERS]     tables for 7 to 50 points, probes of 10 and 25 um
 
-Klipper's DELTA_CALIBRATE, as its source has it (klippy/extras/delta_calibrate.py, mathutil.py and
-kinematics/delta.py; written anew here): coordinate descent on the sum of squared heights over delta
-radius, two towers' angles and three end switches, from what the configuration says; the rods stay.
-Both get the same points; both results are pasted into the simulated printer's firmware, which then
-moves over places that nobody probed.
+Klipper's DELTA_CALIBRATE as in its source (klippy/extras/delta_calibrate.py, mathutil.py and
+kinematics/delta.py; rewritten here): coordinate descent on the sum of squared heights over delta
+radius, two towers' angles and three end switches, from the values of the configuration file; the
+rods stay. Both methods use the same points; both results are set in the simulated printer's
+firmware, which then moves to places that were not probed.
 
-Printers are off what their firmware says, one standard deviation: delta radius and end switches 0.5
-mm, towers 0.2 degrees, rods 0.3 mm together and 0.1 mm each. Those "of a kit" have towers that lean
-by 0.1 degrees and motors that go 0.03 % wrong besides, which no firmware holds; the nominal model
-states these two tolerances as the printers have them. In the last table one touch is 0.3 mm too
-high, as of a crumb on the bed. Deviations stated of a bed are compared with errors over the disc
-that was probed, which is what they are stated for; all else is told of the whole bed.
+The printers differ from their firmware's values by, one standard deviation: delta radius and end
+switches 0.5 mm, towers 0.2 degrees, rods 0.3 mm together and 0.1 mm each. Those "of a kit" also
+have towers that lean by 0.1 degrees and motors with a scale error of 0.03 %, which no firmware
+represents; the nominal model states these two tolerances. In the last table one height is 0.3 mm
+too high, as by a crumb on the bed. Stated deviations of the bed are compared with errors over the
+probed disc, to which they refer; all other figures are of the whole bed.
 """
 
 from __future__ import annotations

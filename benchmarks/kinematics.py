@@ -1,13 +1,13 @@
-"""How fast forward kinematics is, for every built-in machine, on one core.
+"""Speed of forward kinematics for every built-in machine, on one core.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/kinematics.py [gough-stewart …] [--poses 60000]
 
-Readings are drawn evenly from the ranges; those that the machine cannot take are left out. Rate:
-poses a second of one batch, every pose found from home. Latency: one call from a pose a step away,
-as in a control loop (1 mm, or 1 mrad of a crank), and the same by a follower, to and fro. All are
-the best of several repeats and count processor time, so that other programs on the machine disturb
-little; wall-clock time stands beside them. Prints one line a machine; exits with 1 where a batch
-and single calls differ.
+Readings are drawn uniformly from the ranges; those that the machine cannot reach are left out.
+Rate: poses per second in one batch, each solved from home. Latency: one call from a pose one step
+away, as in a control loop (1 mm, or 1 mrad of a crank), and the same with a follower, back and
+forth. All are the best of several repeats, in processor time, which other programs disturb little,
+with wall time beside it. Prints one line per machine; exits with 1 if a batch and single calls
+differ.
 """
 
 from __future__ import annotations

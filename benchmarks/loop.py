@@ -1,10 +1,9 @@
-"""How long one sample of the control loop takes, and what it allocates.
+"""Time and allocations of one sample of the control loop.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/loop.py [CALLS]
 
-One core. Times are of the process, so that other programs on the machine count less; the wall
-clock is printed beside them. The machine is the Gough-Stewart platform, all six legs seen, the
-image 640x480 and rendered.
+One core. Processor time, with wall time beside it. The machine is the Gough-Stewart platform with
+all six legs visible, the image 640x480 and rendered.
 """
 
 from __future__ import annotations

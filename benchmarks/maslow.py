@@ -1,23 +1,24 @@
-"""Ten real calibrations of a four-belt machine from its belts' lengths: spread against sigma.
+"""Ten real calibrations of a four-belt machine by its belts' lengths: scatter against sigma.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/maslow.py FILE [--model NAME] [--noise M]
         [--every-row]
 
-FILE is ``ten-runs.txt`` of ../shared/data/maslow-frames, or the folder that holds it: runs of rows
-``{bl:…, br:…, tr:…, tl:…}``, mm, four rows a waypoint. Each run becomes a session of readings alone
-with the catalogue's four-belt machine, its nominal model held to half a metre, and is calibrated as
-`pkmcal calibrate` does. For each of the anchors' coordinates, with bl = (0, 0) and br.y = 0:
+FILE is ``ten-runs.txt`` of the Maslow frames' measurements, or its folder: runs of rows ``{bl:…,
+br:…, tr:…, tl:…}``, mm, four rows per waypoint. Each run becomes a session of readings alone with
+the catalogue's four-belt machine, with a prior sigma of half a metre, and is calibrated as by
+`pkmcal calibrate`. For each coordinate of the anchors, with bl = (0, 0) and br.y = 0:
 
-- spread: standard deviation over the runs. The waypoints are the same in all runs, and so is what
-  the model leaves out there (belts that stretch, hooks that are no points): it does not spread.
-- sigma: root mean square of what the calibrations state, which covers that as other waypoints would
-  show it.
-- again: sigma times the share of the residuals that is not the same in all runs, which is what
-  should spread.
+- spread: standard deviation over the runs. The waypoints, and with them the errors of the model
+  there (belts that stretch, hooks that are no points), are the same in all runs: these do not
+  scatter.
+- sigma: root mean square of the stated standard deviations, which cover these errors as other
+  waypoints would show them.
+- again: sigma times the share of the residuals that is not the same in all runs, which should equal
+  the spread.
 
-Besides, prediction: the residuals of every fifth waypoint with the machine as the others have it.
+Also the prediction: residuals of every fifth waypoint for the machine by the others.
 
---every-row : take rows for independent measurements, to see what that would promise.
+--every-row : use rows as independent measurements, to see the sigma that would follow.
 """
 
 from __future__ import annotations

@@ -3,15 +3,14 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/memory.py [--photographs 500 2000 6000] [--parts]
         [--size 480x360] [--stations 3] [--keep FOLDER]
 
-Thirty configurations of a hexapod are simulated, seen from each of a few places, and repeated as
-many configurations with other names: hard links to the images, and readings that scatter
-about the true ones as the session states, so the session stays right. (What the renderer's shading
-does to thirty configurations' edges is the same in every repeat; of hundreds it may be told as a
-lens that is another, and the result refused; costs are the same.) ``pkmcal calibrate``, with
-all that it writes, runs on each size in a process of its own: processor seconds, seconds by the
-clock and the greatest memory, beside those of a process that only imports what it needs, and the
-exponents with which they grow. ``--parts`` prints the same by step in place of that: memory when a
-step ends, and the most that it held (Linux only).
+Thirty configurations of a hexapod are simulated, seen from each of a few places, and repeated under
+other names: hard links to the images, and readings with the stated noise about the true ones, so
+the session stays consistent. (The renderer's shading has the same effect on the edges in every
+repeat; of hundreds it may be reported as another lens, and the result refused; costs are the same.)
+``pkmcal calibrate``, with all files that it writes, runs on each size in a process of its own:
+processor seconds, wall seconds and peak memory, beside those of a process that only imports its
+modules, and the exponents of their growth. ``--parts`` prints the same by step instead: memory at
+the end of a step, and its peak (Linux only).
 """
 
 from __future__ import annotations

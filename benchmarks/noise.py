@@ -1,13 +1,14 @@
-"""Readings whose stated noise is wrong: what is found, and how good the machine is all the same.
+"""Sessions with a wrong stated noise of the readings: detection, and accuracy of the machine.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/noise.py [--runs N] [--stations N] [--configurations N]
 
 Hexapods (gough-stewart) with simulated edges of 0.1 px, seen by the demonstration's camera from
-several places; the noise of the readings is one thing, what the session states another. For each:
+several places; the true and the stated noise of the readings differ. For each pair:
 
-- told: share of the sessions whose stated noise is contradicted, and by what factor (median);
-- tool: the platform's joints at given readings, off by (root mean square over sessions), and what
-  is stated; z is the one in units of the other, 1 where standard deviations are honest.
+- told: share of the sessions in which the stated noise is contradicted, and the estimated factor
+  (median);
+- tool: true error of the platform's joints at given readings (root mean square over sessions), and
+  the stated one; z is their ratio, 1 for honest standard deviations.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Observation against what anybody would run first: decoding the images and cv2.Canny.
+"""Observation beside the obvious baseline: decoding the images and cv2.Canny.
 
     python benchmarks/observe.py [SESSION]
 
-Without a session, one is simulated. Each part is run a few times and its best time taken, in one
-process, so the ratio means something on any machine.
+Without a session, one is simulated. Each part runs a few times, and the best time counts, in one
+process, so that the ratio is meaningful on any machine.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""How good plans are: against configurations by chance, and against a long search.
+"""Quality of plans: beside random configurations, and beside a long search.
 
     python benchmarks/plan.py [--long MINUTES]
 
 For each machine: the tool's standard deviation (mean over the workspace) with the plan, with as
-many configurations drawn evenly over the joints' ranges (mean of 200 draws, and the best of them),
-and with the best that a long search finds: exchanges from random choices in ever new pools of
-candidates, each moved about, until the time is over.
+many configurations drawn uniformly over the joints' ranges (mean and best of 200 draws), and with
+the best of a long search: exchanges from random choices in new pools of candidates, each improved
+locally, until the time is over.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
-"""Errors that depend on the pose, which the model does not have: what becomes of them.
+"""Errors that depend on the pose and are not in the model: detection, and accuracy.
 
     python benchmarks/pose_errors.py [--sessions 10] [--only WORDS] [--observer legs|poses] [--list]
 
-Simulated sessions of a hexapod, each of a machine and stations of its own, without rendered images:
-``legs`` by the edges of its legs (three stations, twelve configurations each, edges with noise and
-shading as fitted edges have them), ``poses`` by a tracker (thirty poses). Each error of ERRORS
-moves readings, edges or poses as the physics of it does. Reported for each: how many results are
-refused, how many carry a warning, how many are accepted without one; how many of the accepted ones,
-with a warning or without, are off by more than three stated standard deviations; the error of the
-tool over the session's poses, root mean square, in standard deviations, and the median of those.
-"none" are right sessions.
+Simulated sessions of a hexapod, each with its own machine and stations, without rendered images:
+``legs`` by the edges of its legs (three stations, twelve configurations each, edges with the noise
+and shading of fitted edges), ``poses`` by a tracker (thirty poses). Each error of ERRORS changes
+readings, edges or poses by its physics. Reported for each: results that are refused, that carry a
+warning, and that are accepted without one; accepted ones, with a warning or without, that are off
+by more than three stated standard deviations; the error of the tool over the session's poses in
+standard deviations, root mean square and median. "none" are right sessions.
 """
 
 from __future__ import annotations

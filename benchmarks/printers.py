@@ -1,18 +1,22 @@
-"""Made-up delta printers from heights, with one kind of error or all: right, refused, or wrong.
+"""Simulated delta printers calibrated by heights, with one kind of error or all: right, refused or
+wrong.
 
     python benchmarks/printers.py [--seed 0] [--rounds 1] [--tolerance 2] [--wrong-height 0.5]
 
 A round is 40 printers: 7, 10, 19 and 37 points; errors of the radius (1.5 mm), the rods (0.5 mm
 together, 0.1 mm each), the towers (0.4 degrees), of all of these or of none; end switches that are
-wrong (1 mm) alike, or each for itself (standard deviations, normal). The printer's size and the
-probe's noise (5 to 20 um) are drawn too. A session is what ``pkmcal new --printer`` makes of the
-printer's files. Points are the centre and rings about it: where one ring is all, a wrong radius
-moves the centre alone.
+off (1 mm) equally, or each by itself (standard deviations, normal). The printer's size and the
+probe's noise (5 to 20 um) are drawn too. A session is made of the printer's files by ``pkmcal new
+--printer``. Points are the centre and rings around it: with a single ring, a wrong radius moves the
+centre alone.
 
-right : accepted, and as good as stated: the bed over the disc that was probed is as flat, and the
-radius as near to the true one, as three of their standard deviations let it be. wrong : accepted,
-and not so. refused : with its reason. The radius is that of the circle whose chords are as long as
-the towers are apart on average; its deviation is from the covariance of the towers.
+right : accepted, and as good as stated: the bed over the probed disc is flat, and the radius right,
+    within three of their standard deviations.
+wrong : accepted, and not so.
+refused : with its reason.
+
+The radius is that of the circle whose chords are as long as the towers' mean distance; its
+deviation is from the covariance of the towers.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Recognition: stations of all machines without a pose, and sessions with a usual mistake in them.
+"""Localization: stations of all machines without a pose, and sessions with a usual mistake in them.
 
     python benchmarks/recognition.py [--stations 100]         right, refused, wrong; seconds
     python benchmarks/recognition.py --machines 3-rps ...     of some machines alone
     python benchmarks/recognition.py --mistakes [--no-pose]   named, refused otherwise, not noticed
-    python benchmarks/recognition.py --keep FOLDER ...        draws images once and keeps them
+    python benchmarks/recognition.py --keep FOLDER ...        renders images once and keeps them
 
-Each session is simulated with a machine of its own, and what calibration begins with is asked where
-the cameras stand. Right is a place within a tenth of its distance and six degrees of the true one:
-what follows finds the rest from there. Whether it does from a place further off, which a machine
-of three legs that is not as drawn may look like, is asked of the whole calibration.
+Each session is simulated with its own machine, and its stations are localized as at the start of a
+calibration. A pose is right within a tenth of the camera's distance and six degrees of the true
+one: the calibration converges from there. Poses further off, which a machine of three legs with
+large nominal errors may have, are judged by the whole calibration.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Sessions in which nothing is wrong: what is said of them all the same.
+"""False alarms: findings in sessions without any mistake.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/right_sessions.py [--sessions 10] [--kind KIND ...]
                                                                [--first SEED] [--workers 2]
 
-Of each kind so many sessions, each of a machine of its own that is off its nominal model as its
-nominal model says, with noise as stated. For each kind: sessions that are refused, that have a
-departure, a configuration said to be outvoted, a stated noise said to be wrong, and any of these;
-intervals of the readings' noise at 95 % that hold the truth, of those that have two ends and of
-all; the tool's error over the session's poses in stated standard deviations (root mean square over
-the sessions, and the largest); seconds. Then each of these findings, in its own words.
+Sessions of each kind, each with its own machine whose errors have the nominal model's prior sigmas,
+and with noise as stated. For each kind: sessions that are refused, that have a model violation, a
+rejected configuration, a stated noise that is contradicted, and any of these; 95 % intervals of the
+readings' noise that contain the truth, of those with two ends and of all; the tool's error over the
+session's poses in stated standard deviations (root mean square over the sessions, and the largest);
+seconds. Then each of these findings in its own words.
 
-Legs and images by hand are rendered; boards are corners with noise, trackers tables, and
-printers the heights that their firmware keeps.
+Legs and images by hand are rendered; boards are corners with noise, trackers tables, and printers
+the heights that their firmware stores.
 """
 
 from __future__ import annotations

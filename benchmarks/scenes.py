@@ -1,22 +1,22 @@
-"""Calibrations of imaged scenes whose truth is known: how wrong, and how wrong they say.
+"""Calibrations of imaged scenes with known truth: true and stated errors.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/scenes.py FOLDER [FOLDER ...] [--json]
         [--no-pose | --pose-error M DEG] [--seed N]
 
-FOLDER is a session with its truth.json, or holds such sessions. Each session is copied without its
-truth, calibrated as a user would have it, and scored afterwards. The truth is that of `pkmcal
-simulate`, or A_base, B_platform, joint_offsets, T_camera_base and images[].T_base_platform.
+FOLDER is a session with its truth.json, or contains such sessions. Each session is copied without
+its truth, calibrated as by a user, and scored afterwards. The truth is that of `pkmcal simulate`,
+or A_base, B_platform, joint_offsets, T_camera_base and images[].T_base_platform.
 
-Base and platform frames of a truth are its own, so it is first laid over the estimate, and what
-rigid motions of both bodies change is projected out of the error e and of its covariance C:
+A truth has its own base and platform frames, so it is first aligned with the estimate, and rigid
+motions of both bodies are projected out of the error e and of its covariance C:
 
-- whitened: sqrt(e' C^+ e / dof), 1 where the standard deviations are honest, with the range in
-  which 95 of 100 honest ones lie, and the direction that is furthest off (in sigmas);
-- tool: the platform's origin at the same readings, over 200 poses between those imaged; true
-  and stated root mean squares, and z, the true error in units of the stated covariance.
+- whitened: sqrt(e' C^+ e / dof), 1 for honest standard deviations, with the range of 95 in 100
+  honest ones, and the direction with the largest error (in sigmas);
+- tool: the platform's origin at the same readings, over 200 poses between the measured ones; true
+  and stated root mean squares, and z, the true error relative to the stated covariance.
 
-Times are of the processor, so that other programs on the machine count less. "observe" is decoding,
-recognising and measuring, in times of decoding the images and cv2.Canny.
+Processor times. "observe" is decoding, localization and measurement, relative to decoding the
+images and cv2.Canny.
 """
 
 from __future__ import annotations

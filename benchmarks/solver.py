@@ -1,20 +1,21 @@
-"""How fast the joint solve is: beside SciPy's and Ceres's, by size, in studies, and beside another
+"""Speed of the joint solve: beside SciPy and Ceres, by size, in studies, and beside another
 version.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/solver.py [--configurations 30 300 3000]
         [--against ../other/src]
 
-First our solve against SciPy's trust-region method on the same residuals, from the same start: as
-one dense vector, once with our Jacobian and once with finite differences, columns scaled.
+First beside SciPy's trust-region method on the same residuals, from the same start: as one dense
+vector, once with our Jacobian and once with finite differences, columns scaled.
 
-Then against Ceres in C++ (``benchmarks/ceres``), where that can be built: the same problem, dumped,
-brought to the same cost, one thread each, in turns, the least processor seconds of each.
+Then beside Ceres in C++ (``benchmarks/ceres``), where that can be built: the same problem, written
+to a file, solved to the same cost, one thread each, alternating, the least processor seconds of
+each.
 
 Then, each in a process of its own: the solve and the whole robust estimate of a hexapod seen by
-three cameras, and the joint estimates of [A] 4.3 as a study makes them. Processor seconds, as other
-programs disturb these least, with wall-clock seconds beside them, and the greatest memory. With
-``--against`` the same is done with another version's ``src``, the two in turns, and ratios are
-printed. Times are the best of several repeats. Exits with 1 where answers differ.
+three cameras, and the joint estimates of [A] 4.3 as in a study. Processor seconds, with wall
+seconds beside them, and the peak memory. With ``--against`` the same is done with another version's
+``src``, alternating, and ratios are printed. Times are the best of several repeats. Exits with 1 if
+results differ.
 """
 
 from __future__ import annotations

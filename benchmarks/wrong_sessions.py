@@ -1,13 +1,13 @@
-"""Sessions that are well formed and wrong: what becomes of them.
+"""Detection of mistakes in well-formed sessions.
 
     python benchmarks/wrong_sessions.py [--sessions 10] [--only WORDS] [--keep FOLDER]
 
-Each fact of the table is made wrong in simulated sessions, each of a machine and room of its own:
-hexapods by their legs (three places, twelve images from each), H4s by a board (one place,
-twenty-four). Told for each fact: in how many sessions the wrong fact was named in the result, or as
-the reason of a refusal; how many were refused otherwise, how many warned of something else, and how
-many were accepted without a word; how many of these two are off by more than three stated standard
-deviations; and the error, of the tool's position over the session's poses, root mean square, in
+Each fact of the table is made wrong in simulated sessions, each with its own machine and room:
+hexapods by their legs (three stations, twelve images from each), H4s by a board (one station,
+twenty-four). Reported for each fact: sessions in which the wrong fact is named in the result, or as
+the reason of a refusal; that are refused otherwise, that have another warning, and that are
+accepted without a finding; of the last two, those that are off by more than three stated standard
+deviations; and the error of the tool's position over the session's poses, root mean square, in
 standard deviations. "none" are right sessions.
 """
 
