@@ -24,6 +24,7 @@ from pkmcal.outcome.hypotheses import (
     EvidenceLevel,
     Hypothesis,
     decide,
+    likely,
     log_likelihood,
     parameter_cost,
     posterior,
@@ -123,6 +124,17 @@ def test_a_repair_needs_more_than_a_report():
             assert (decide(posterior([named("a", action=action)], [one])) is not None) == (
                 odds > limit
             )
+
+
+def test_rivals_are_reported_that_are_likely_themselves():
+    """What the first hypothesis does not exclude may still be less likely than no mistake."""
+    first = OPTIONS.report + 1
+    one, _ = level("only", {"a": first, "b": OPTIONS.report + 0.5, "c": OPTIONS.report - 0.5})
+    ranked = posterior([named("c"), named("a"), named("b")], [one])
+    assert [each.hypothesis.code for each in likely(ranked)] == ["a", "b"]
+    assert {each.hypothesis.code for each in rivals_of(ranked)} == {"b", "c"}
+    weak, _ = level("only", {"a": OPTIONS.report - 0.1})
+    assert likely(posterior([named("a")], [weak])) == []
 
 
 def test_nothing_is_decided_of_no_hypotheses():
@@ -282,6 +294,7 @@ def test_two_mistakes_are_named_together(tmp_path):
         check_closure(load_session(made.folder), Boards())
     assert caught.value.code == "readings.reversed"
     assert re.findall(r"motor\d", caught.value.what) == ["motor1", "motor4"]
+    assert caught.value.expected.count("times their noise") == 1
     named = [1e-3 * int(value) for value in re.findall(r"(\d+) mm, or", caught.value.expected)]
     np.testing.assert_allclose(named, constants, atol=6e-3)
 

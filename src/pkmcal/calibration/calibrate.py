@@ -255,16 +255,17 @@ def calibrate_measurements(
 ) -> Calibration:
     """Calibrate the machine of a session from edges that are given, such as simulated ones.
 
-    No image is read. observation : with the edges of ``measurements``. T_camera_base : (S, 4, 4)
-    from where the estimate starts. Raises ResultError where there is no estimate.
+    No image is read. observation : with the edges of ``measurements``, whose readings may be others
+    than the session's. T_camera_base : (S, 4, 4) from where the estimate starts. Raises ResultError
+    where there is no estimate.
     """
     clock = Clock(progress)
-    start = start_state(session.machine, measurements, T_camera_base, session.forward)
+    start = start_state(session.machine, measurements, T_camera_base)
     estimate = bundle(session.machine, measurements, start)
     turns = RefinementResult(
         observation, measurements, estimate, refinement_of(session, False), start=start
     )
-    scene = PriorScene.as_drawn(session, T_camera_base)
+    scene = PriorScene(session.machine, T_camera_base, start.T_base_platform)
     case = Case(session, [], Boards(), scene)
     return _judge(case, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
 
@@ -317,7 +318,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
         try:
             turns = _identify(case, refine_camera, clock)
         except ResultError:
-            refuse(explain_radii(case, None, refine_camera, seed))
+            refuse(partial(explain_radii, case, None, refine_camera, seed))
             raise
         # images that are upside down; all stations begin anew, for one that was rejected before
         # may have been upside down, too
@@ -344,8 +345,8 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
     stated = refit_fixed_noise(case.session.machine, turns.measurements, turns.estimate)
     richer = richer_models(case.session, turns.measurements, stated)
     untested = refuse(
-        explain_poses(case.session, turns.measurements, stated, richer),
-        explain_radii(case, turns, refine_camera, seed),
+        partial(explain_poses, case.session, turns.measurements, stated, richer),
+        partial(explain_radii, case, turns, refine_camera, seed),
     )
     failed = (
         note("poses.model_failed", model.name, why=model.failure.rstrip("."))

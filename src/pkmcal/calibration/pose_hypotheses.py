@@ -47,11 +47,10 @@ from pkmcal.outcome.hypotheses import (
     Explanation,
     Hypothesis,
     Ranked,
-    decide,
+    likely,
     log_likelihood,
     parameter_cost,
     posterior,
-    rivals_of,
 )
 from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
@@ -76,9 +75,9 @@ still while its readings move, or the reverse, is off by 20 to 50 times as much.
 NOMINAL_DRAWS = 4
 """Machines drawn from the prior sigmas to know how large closure residuals are by nominal errors:
 four draws of some thirty parameters each tell it to a tenth."""
-PAIR_CONFIGURATIONS = 48
-"""Configurations, spread over all, in which pairs of mistakes are compared: a thousand pairs in
-seconds."""
+CLOSURE_CONFIGURATIONS = 48
+"""Configurations, spread over all, by which poses and readings are tested for a contradiction, and
+in which pairs of mistakes are compared: a thousand pairs in seconds."""
 NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
 """Errors by which an estimate under a hypothesis fails."""
 
@@ -115,9 +114,9 @@ class PoseEvidence:
     """Levels of evidence for the mistakes of one machine's measured poses.
 
     machine : nominal. null_misfit : of the poses as stated, by an estimate. closure_unit : misfit
-    by closure below which differences are nominal errors, in stated standard deviations. rows :
-    configurations (n,) that closure compares; all, if None. estimates, misfits : by an estimate and
-    by closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
+    by closure below which differences are nominal errors, in stated standard deviations. most :
+    configurations that closure compares; all, if None. estimates, misfits : by an estimate and by
+    closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
     """
 
     def __init__(
@@ -130,7 +129,7 @@ class PoseEvidence:
         self.machine, self.measurements = machine, measurements
         self.null_misfit, self.closure_unit = null_misfit, closure_unit
         self.n_effective = effective_sample_size(machine, measurements)
-        self.rows: Integers | None = None
+        self.most: int | None = None
         self.estimates: dict[int, Estimate] = {}
         self.misfits: dict[int, float] = {}
         self.untested: list[tuple[str, str]] = []
@@ -140,8 +139,8 @@ class PoseEvidence:
         less likely than none, and for all but the best variant of an explanation.
         """
         cases = [one.apply(PoseCase(self.measurements)).measurements for one in hypotheses]
-        misfits = closure_misfits(self.machine, [self.measurements, *cases], self.rows)
-        misfits = misfits / self.closure_unit
+        few = [spread_over(case, self.most) for case in (self.measurements, *cases)]
+        misfits = closure_misfits(self.machine, few) / self.closure_unit
         self.misfits = {id(one): m for one, m in zip(hypotheses, misfits[1:].tolist(), strict=True)}
         null, *values = log_likelihood(misfits, self.n_effective).tolist()
         best: dict[tuple[str, str], int] = {}
@@ -180,16 +179,16 @@ class PoseEvidence:
 
     def diagnosis(self, ranked: Sequence[Ranked[PoseHypothesis]]) -> Diagnosis:
         """What to decide by hypotheses that were estimated."""
-        best, untested = decide(ranked), tuple(self.untested)
-        if best is None:
+        found, untested = likely(ranked), tuple(self.untested)
+        if not found:
             return Diagnosis(untested=untested)
+        best, *others = found
         value = self.estimates[id(best.hypothesis)]
         movement = _movement(self.machine, best.hypothesis, value)
         hypothesis = self._with_constants(best.hypothesis, value)
         # such as a camera that moved beside a board that did
-        rivals = [one.hypothesis for one in rivals_of(ranked) if one.log_odds > OPTIONS.report]
-        misfit = pose_misfit(value)
-        return Diagnosis(hypothesis, best.log_odds, misfit, movement, untested, tuple(rivals))
+        rivals = tuple(one.hypothesis for one in others)
+        return Diagnosis(hypothesis, best.log_odds, pose_misfit(value), movement, untested, rivals)
 
     def _with_constants(self, hypothesis: PoseHypothesis, estimate: Estimate) -> PoseHypothesis:
         """The hypothesis with the constants (m or rad) of its reversed motors as estimated.
@@ -232,13 +231,14 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
     return evidence.diagnosis(posterior(pose_hypotheses(machine, measurements, estimate), levels))
 
 
-def diagnose_by_closure(machine: Machine, measurements: Measurements, limit: float) -> Diagnosis:
+def diagnose_by_closure(
+    machine: Machine, measurements: Measurements, misfit: float, limit: float
+) -> Diagnosis:
     """The mistake in the readings, or the two, that explain why poses contradict them.
 
-    By closure they have to leave nominal errors alone; those that do are estimated. limit : of
-    :func:`closure_limit`.
+    By closure they have to leave nominal errors alone; those that do are estimated. misfit : of the
+    poses as stated, in stated standard deviations. limit : of :func:`closure_limit`.
     """
-    (misfit,) = (closure_misfits(machine, [measurements]) / limit).tolist()
     evidence = PoseEvidence(machine, measurements, misfit, limit)
     closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
     estimate = EvidenceLevel("estimate", evidence.by_estimate)
@@ -249,7 +249,7 @@ def diagnose_by_closure(machine: Machine, measurements: Measurements, limit: flo
         diagnosis = evidence.diagnosis(posterior(tenable, [estimate]))
         if diagnosis.hypothesis is not None:
             return diagnosis
-        evidence.rows = evenly(len(measurements.joints), PAIR_CONFIGURATIONS)
+        evidence.most = CLOSURE_CONFIGURATIONS
     return Diagnosis()
 
 
@@ -281,18 +281,24 @@ def _usual(squares: Array) -> Array:
 # ------------------------------------------------------------------ evidence: closure
 
 
-def closure_misfits(
-    machine: Machine, cases: Sequence[Measurements], rows: Integers | None = None
-) -> Array:
+def spread_over(measurements: Measurements, most: int | None) -> Measurements:
+    """Readings and poses of at most ``most`` configurations, spread evenly; of all, if None."""
+    if most is None or most >= len(measurements.joints):
+        return measurements
+    rows, poses = evenly(len(measurements.joints), most), measurements.poses
+    poses = poses.select(np.isin(poses.configuration, rows))
+    poses = replace(poses, configuration=np.searchsorted(rows, poses.configuration))
+    return replace(measurements, joints=measurements.joints[rows], poses=poses)
+
+
+def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
     """Misfits (N,) of N cases of measurements where platform poses follow from the nominal machine
     and the readings: as :func:`pose_misfit`.
 
     Each pair of a station and a mount on the platform is laid by itself, by the best of the closed
     forms. Cases may differ in their readings and in their poses' stations, mounts and values.
-    rows : configurations (n,) that are compared; all, if None.
     """
-    rows = np.arange(len(cases[0].joints)) if rows is None else rows
-    joints = np.stack([case.joints[rows] for case in cases])
+    joints = np.stack([case.joints for case in cases])
     fk = machine.forward_result(joints.reshape(-1, joints.shape[-1])).T_base_platform
     body = fk.reshape(*joints.shape[:2], 4, 4)
     # where legs do not meet, the nearest pose is off by as much as the readings are wrong
@@ -306,11 +312,10 @@ def closure_misfits(
         poses, on_platform = cases[group[0]].poses, cases[group[0]].on_platform
         observed = np.stack([cases[k].poses.T_station_target for k in group])
         squares: list[Array] = []
-        compared = np.isin(poses.configuration, rows)
-        pairs = np.unique(np.stack([poses.station, poses.mount], axis=1)[compared], axis=0)
+        pairs = np.unique(np.stack([poses.station, poses.mount], axis=1), axis=0)
         for s, m in pairs[on_platform[pairs[:, 1]]]:
-            own = np.flatnonzero((poses.station == s) & (poses.mount == m) & compared)
-            at = np.searchsorted(rows, poses.configuration[own])
+            own = np.flatnonzero((poses.station == s) & (poses.mount == m))
+            at = poses.configuration[own]
             squares.append(_laid(body[group][:, at], observed[:, own], poses.whiten[own]))
         if squares:
             out[group] = _usual(np.concatenate(squares, axis=1))
@@ -333,10 +338,20 @@ def _laid(body: Array, observed: Array, whiten: Array) -> Array:
     return each[best, np.arange(each.shape[1])]
 
 
-def closure_limit(machine: Machine, measurements: Measurements, rng: np.random.Generator) -> float:
+def closure_limit(
+    machine: Machine,
+    measurements: Measurements,
+    rng: np.random.Generator,
+    enough: float = np.inf,
+) -> float:
     """Misfit by closure, as of :func:`closure_misfits`, beyond which poses and readings contradict
     each other: NOMINAL_ERROR_FACTOR times that of machines drawn from the prior sigmas.
+
+    enough : a lower bound of the limit is returned once it is no less, after one draw as a rule.
     """
+    squares, limit = 0.0, NOMINAL_ERROR_FACTOR
+    if limit >= enough:
+        return limit
     poses, exact = measurements.poses, measurements.poses.T_station_target.copy()
     fk = machine.forward_result(measurements.joints).T_base_platform[poses.configuration]
     moving = measurements.on_platform[poses.mount]
@@ -346,16 +361,14 @@ def closure_limit(machine: Machine, measurements: Measurements, rng: np.random.G
     exact[whole, :3, :3] = fk[whole, :3, :3]
     nominal = replace(measurements, poses=replace(poses, T_station_target=exact))
     spread = machine.parameters.tolerance
-    expected = [
-        closure_misfits(
-            machine.with_values(
-                machine.parameters.unit_axes(machine.values + spread * rng.normal(size=len(spread)))
-            ),
-            [nominal],
-        )[0]
-        for _ in range(NOMINAL_DRAWS)
-    ]
-    return NOMINAL_ERROR_FACTOR * max(float(np.sqrt(np.mean(np.square(expected)))), 1.0)
+    for _ in range(NOMINAL_DRAWS):
+        values = machine.values + spread * rng.normal(size=len(spread))
+        drawn = machine.with_values(machine.parameters.unit_axes(values))
+        squares += float(closure_misfits(drawn, [nominal])[0]) ** 2 / NOMINAL_DRAWS
+        limit = NOMINAL_ERROR_FACTOR * max(np.sqrt(squares), 1.0)
+        if limit >= enough:
+            break
+    return limit
 
 
 # ------------------------------------------------------------------ hypotheses
@@ -563,14 +576,15 @@ def check_closure(session: Session, boards: Boards) -> None:
     positions = (poses.rows >= 3) & measurements.on_platform[poses.mount]
     if np.count_nonzero(positions) < 2 * FEWEST_POSES_A_SIDE:
         return  # a frame and mount of their own explain few
-    machine = session.machine
-    limit = closure_limit(machine, measurements, np.random.default_rng(0))
-    (misfit,) = closure_misfits(machine, [measurements]).tolist()
+    machine, few = session.machine, spread_over(measurements, CLOSURE_CONFIGURATIONS)
+    (misfit,) = closure_misfits(machine, [few]).tolist()
+    limit = closure_limit(machine, few, np.random.default_rng(0), enough=misfit)
     if misfit <= limit:
         return
     if error := frozen_in(session):
         raise error
-    if error := _error_of(session, diagnose_by_closure(machine, measurements, limit), misfit):
+    diagnosis = diagnose_by_closure(machine, measurements, misfit, limit)
+    if error := _error_of(session, diagnosis, misfit):
         raise error
 
 
@@ -608,14 +622,7 @@ def _error_of(session: Session, diagnosis: Diagnosis, misfit: float) -> InputErr
     error = _error(session, diagnosis.hypothesis, diagnosis, misfit)
     others = [_error(session, one, diagnosis, misfit).what for one in diagnosis.rivals]
     also = f"; the poses fit as well if {' or '.join(others)}" if others else ""
-    return InputError(
-        error.what,
-        where=error.where,
-        found=f"{error.found}{also}",
-        expected=error.expected,
-        next_step=error.next_step,
-        code=error.code,
-    )
+    return error.with_fields(found=f"{error.found}{also}")
 
 
 def _error(
@@ -623,8 +630,7 @@ def _error(
 ) -> InputError:
     """The error that names the mistake. misfit_before : of the poses with it, in stated sigmas."""
     facts, joints = hypothesis.facts, session.document["joints"]
-    without = f"the poses fit {diagnosis.misfit:.1f} times their noise"
-    residual = f"with that, {without}"
+    residual = f"with that, the poses fit {diagnosis.misfit:.1f} times their noise"
     if hypothesis.code in ("board.moved", "station.moved"):
         what = (
             "the board was moved on the platform"
@@ -651,14 +657,14 @@ def _error(
         )
     times = f"{misfit_before:.{int(misfit_before < 10)}f}"
     parts = [
-        reading_error(one, joints["file"], joints["columns"], session.machine.joint_units, without)
+        reading_error(one, joints["file"], joints["columns"], session.machine.joint_units)
         for one in facts.get("parts", (hypothesis,))
     ]
     return InputError(
         ", and ".join(one.what for one in parts),
         where=parts[0].where,
         found=f"poses that the readings miss by {times} times their noise",
-        expected="; ".join(f"{one.expected}" for one in parts),
+        expected="; ".join([*(f"{one.expected}" for one in parts), residual]),
         next_step=". ".join(f"{one.next_step}" for one in parts),
         code=hypothesis.code,
     )

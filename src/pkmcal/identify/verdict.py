@@ -272,7 +272,12 @@ def _readings_misfit(estimate: Estimate, options: VerdictOptions) -> Iterator[Fi
     if np.mean(bad) > options.contradicted_share:
         joint = int(np.argmax(bad.sum(axis=0))) + 1
         yield wrong(
-            "readings.misfit", f"joint {joint}", joint=joint, number=int(bad.sum()), of=bad.size
+            "readings.misfit",
+            f"joint {joint}",
+            joint=joint,
+            number=int(bad.sum()),
+            of=bad.size,
+            limit=options.reading_residual,
         )
 
 

@@ -137,12 +137,12 @@ def reading_error(
     file: str,
     columns: Sequence[str],
     units: Sequence[str],
-    without: str,
+    without: str = "",
 ) -> InputError:
     """The error that names a mistake in the readings, without what shows it.
 
     file : of the readings, with ``columns``. units : ``m`` or ``rad`` of each. without : what the
-    data do where the readings are right.
+    data do where the readings are right, for the end of what is expected.
     """
     facts, where = hypothesis.facts, f"{file}, line 1"
     names = [columns[motor] for motor in facts.get("motors", ())]
@@ -180,7 +180,7 @@ def reading_error(
     return InputError(
         what,
         where=where,
-        expected=f"{expected}; with that, {without}",
+        expected=f"{expected}; with that, {without}" if without else expected,
         next_step=next_step,
         code=hypothesis.code,
     )

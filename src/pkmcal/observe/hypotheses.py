@@ -37,8 +37,8 @@ from pkmcal.outcome.hypotheses import (
     EvidenceLevel,
     Hypothesis,
     HypothesisOptions,
+    likely,
     posterior,
-    rivals_of,
 )
 from pkmcal.wording import how_often, listed
 
@@ -238,9 +238,9 @@ def _mixed_up(
         # of few images any other explanation may fit better by chance
         levels.append(searched(view.few(len(view.configuration))))
     hypotheses, others = list(_hypotheses(station)), list(_other_images(station))
-    likely = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
+    some = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
     count = len(hypotheses) + len(others)
-    return _likelier(station, [*others, *likely], in_order, rng, count)
+    return _likelier(station, [*others, *some], in_order, rng, count)
 
 
 def _likelier(
@@ -282,28 +282,20 @@ def _likelier(
         return out
 
     level = EvidenceLevel("full search", by_full_search)
-    ranked = [
-        one
-        for one in posterior(hypotheses, [level], SEARCH_OPTIONS)
-        if one.log_odds > OPTIONS.report
+    errors = [
+        one.hypothesis.error for one in likely(posterior(hypotheses, [level], SEARCH_OPTIONS))
     ]
-    if not ranked:
+    if not errors:
         return None
-    error = ranked[0].hypothesis.error
-    also = [one.hypothesis.error.what for one in rivals_of(ranked)]
+    error, also = errors[0], [one.what for one in errors[1:]]
     if station.elsewhere and localization.good:
         also.append("the pose by hand is of another side of the machine")
     distinct = [what for what in dict.fromkeys(also) if what != error.what]  # several numberings
     if not distinct:
         return error
     rivals = f"fit as well if {' or '.join(distinct)}"
-    return InputError(
-        error.what,
-        where=error.where,
-        found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}",
-        expected=error.expected,
-        next_step=error.next_step,
-        code=error.code,
+    return error.with_fields(
+        found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}"
     )
 
 

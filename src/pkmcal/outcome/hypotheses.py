@@ -153,6 +153,17 @@ def decide(
     return ranked[0] if ranked[0].log_odds > limit else None
 
 
+def likely(
+    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
+) -> list[Ranked[Subject]]:
+    """The hypothesis to follow, then the others to be reported that it does not exclude; empty
+    where none is likely enough.
+    """
+    first = decide(ranked, options)
+    rivals = rivals_of(ranked, options) if first else []
+    return [one for one in (first, *rivals) if one and one.log_odds > options.report]
+
+
 def rivals_of(
     ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
 ) -> list[Ranked[Subject]]:
@@ -165,14 +176,23 @@ def rivals_of(
     return list(out.values())
 
 
-def refuse(*explanations: Explanation) -> tuple[Finding, ...]:
+def refuse(
+    *explanations: Callable[[], Explanation], options: HypothesisOptions = OPTIONS
+) -> tuple[Finding, ...]:
     """Raise the error of the likeliest explanation; notes on what could not be tested where none
     has an error.
+
+    explanations : the cheapest first. Later ones are not computed once one has odds of ``act``.
     """
-    likeliest = max(explanations, key=lambda one: one.log_odds)
+    likeliest, untested = Explanation(), list[Finding]()
+    for explain in explanations:
+        likeliest = max(likeliest, one := explain(), key=lambda one: one.log_odds)
+        untested += one.untested
+        if likeliest.log_odds > options.act:
+            break
     if likeliest.error is not None:
         raise likeliest.error
-    return tuple(found for one in explanations for found in one.untested)
+    return tuple(untested)
 
 
 def parameter_cost(count: int, n_effective: float) -> float:
