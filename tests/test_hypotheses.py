@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from math import exp, log
 
 import numpy as np
@@ -18,7 +19,11 @@ from pkmcal.calibration.pose_hypotheses import (
     closure_misfits,
 )
 from pkmcal.errors import InputError
-from pkmcal.mechanisms.reading_hypotheses import reading_hypotheses
+from pkmcal.mechanisms.reading_hypotheses import (
+    range_hypotheses,
+    range_ratios,
+    reading_hypotheses,
+)
 from pkmcal.outcome.hypotheses import (
     OPTIONS,
     EvidenceLevel,
@@ -333,3 +338,60 @@ def test_signs_of_two_motors_are_not_taken_for_degrees(tmp_path):
         load_session(made.folder)
     assert caught.value.code == "readings.sign"
     assert "motor1 and motor3" in caught.value.what
+
+
+# readings against their ranges
+
+
+def table_of(ranges, rng, count=16):
+    """Readings all over most of their ranges."""
+    low, high = ranges.T
+    return low + (high - low) * rng.uniform(0.05, 0.9, (count, len(ranges)))
+
+
+def named_by_ranges(joints, ranges, unit):
+    """Code and columns of the mistake that the ranges show, if any."""
+    hypotheses = range_hypotheses(joints, ranges, [unit] * len(ranges))
+    level = EvidenceLevel("ranges", partial(range_ratios, joints, ranges))
+    best = decide(posterior(hypotheses, [level]))
+    return best and (best.hypothesis.code, best.hypothesis.facts["motors"])
+
+
+RANGES = {
+    "m": np.tile([0.345, 0.485], (6, 1)),
+    "rad": np.array([[-0.4, 1.3], [-0.4, 1.3], [0.2, 1.9], [-1.5, 1.6]]),
+}
+
+
+@pytest.mark.parametrize("unit", RANGES)
+def test_ranges_show_what_is_wrong_with_whole_columns(unit):
+    ranges, rng = RANGES[unit], np.random.default_rng(0)
+    low, high = ranges.T
+    every, stroke = tuple(range(len(ranges))), high - low
+    for _ in range(20):
+        right = table_of(ranges, rng)
+        factor = {"m": 1e3, "rad": 180 / np.pi}[unit]
+        assert named_by_ranges(factor * right, ranges, unit) == ("readings.units", every)
+        away = right - 2 * stroke.max()
+        assert named_by_ranges(away, ranges, unit) == ("readings.zero", every)
+        signs = np.where(np.arange(len(ranges)) % 2, 1.0, -1.0)
+        code, motors = named_by_ranges(signs * right, ranges, unit)
+        assert (code, set(motors) <= {0, 2, 4}) == ("readings.sign", True)
+
+
+@pytest.mark.parametrize("unit", RANGES)
+def test_ranges_show_nothing_of_slips_nor_of_a_range_that_is_too_narrow(unit):
+    """Single readings of any size, and all readings of a stroke that is a fifth longer: some are
+    beyond the margin, and all could be in range by one constant.
+    """
+    ranges, rng = RANGES[unit], np.random.default_rng(0)
+    low, high = ranges.T
+    for _ in range(100):
+        right = table_of(ranges, rng)
+        assert named_by_ranges(right, ranges, unit) is None
+        slip = right.copy()
+        slip[rng.integers(len(slip)), rng.integers(len(ranges))] *= rng.choice([-1, 10, 100, 1000])
+        assert named_by_ranges(slip, ranges, unit) is None
+        longer = ranges + np.outer(high - low, [0.0, 0.2])
+        assert named_by_ranges(table_of(longer, rng), ranges, unit) is None
+    assert named_by_ranges(1e3 * right, np.full((len(ranges), 2), np.nan), unit) is None
