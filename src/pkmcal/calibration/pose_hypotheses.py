@@ -592,14 +592,15 @@ def explain_poses(
     session: Session,
     measurements: Measurements,
     estimate: Estimate,
-    richer: tuple[RicherModel, ...] = (),
+    richer: RicherModel | None = None,
 ) -> Explanation:
     """The mistake that explains why poses disagree with the machine, if any.
 
-    richer : other models of the mechanism file; where one of them fits, the model is at fault.
+    richer : the model of the mechanism file that explains the poses; where they agree with it, no
+    mistake is looked for.
     Raises InputError where poses disagree and a reading never changes.
     """
-    if not poses_disagree(estimate) or any(model.scale < SUSPECT_SCALE for model in richer):
+    if not poses_disagree(estimate) or (richer is not None and richer.scale < SUSPECT_SCALE):
         return Explanation()
     if error := frozen_in(session):
         raise error
