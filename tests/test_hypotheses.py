@@ -19,6 +19,7 @@ from pkmcal.calibration.pose_hypotheses import (
     closure_misfits,
 )
 from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms.reading_hypotheses import (
     range_hypotheses,
     range_ratios,
@@ -36,7 +37,7 @@ from pkmcal.outcome.hypotheses import (
     rivals_of,
 )
 from pkmcal.session.load import load_session
-from test_pose_sessions import make, write_joints
+from test_pose_sessions import make, seen_poses, write_joints, write_poses
 
 
 def named(code, subject="", log_prior=0.0, action="refuse"):
@@ -302,6 +303,20 @@ def test_two_mistakes_are_named_together(tmp_path):
     assert caught.value.expected.count("times their noise") == 1
     named = [1e-3 * int(value) for value in re.findall(r"(\d+) mm, or", caught.value.expected)]
     np.testing.assert_allclose(named, constants, atol=6e-3)
+
+
+@pytest.mark.parametrize("name", ["linear-delta", pytest.param("6-rus", marks=pytest.mark.slow)])
+def test_a_mistake_in_the_readings_hides_none_of_another_kind(tmp_path, name):
+    """Two columns exchanged, and a target that moved on the platform."""
+    made = make(tmp_path / "session", name, n=16)
+    in_view = seen_poses(made)
+    in_view[9:] = in_view[9:] @ perturb(np.eye(4), np.array([0.01, 0, 0.02, 0.002, 0, 0]))
+    write_poses(made.folder, in_view)
+    write_joints(made.folder, made.joints[:, [1, 0, *range(2, made.joints.shape[1])]])
+    with pytest.raises(InputError) as caught:
+        check_closure(load_session(made.folder), Boards())
+    assert caught.value.code == "readings.exchanged"
+    assert "between configuration 008 and 009" in caught.value.what
 
 
 def test_what_no_mistake_explains_is_left_to_the_estimate(tmp_path):

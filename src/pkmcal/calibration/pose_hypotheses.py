@@ -161,13 +161,8 @@ class PoseEvidence:
         null = log_likelihood(np.array(self.null_misfit), self.n_effective)
         out = np.full(len(hypotheses), -np.inf)
         for k, one in enumerate(hypotheses):
-            case = one.apply(PoseCase(self.measurements))
             try:
-                start = case.start or start_from_poses(self.machine, case.measurements)
-                value = bundle(
-                    self.machine, case.measurements, start, hopeless=HOPELESS_POSE_SCALE,
-                    scale_readings=False,
-                )  # fmt: skip
+                value = self.estimate(one, HOPELESS_POSE_SCALE)
             except NO_ESTIMATE as error:
                 self.untested.append((one.code, str(error)))
                 continue
@@ -176,6 +171,32 @@ class PoseEvidence:
             if misfit < VERDICT.too_noisy:
                 out[k] = log_likelihood(np.array(misfit), self.n_effective) - null
         return out
+
+    def estimate(self, hypothesis: PoseHypothesis, hopeless: float = np.inf) -> Estimate:
+        """The estimate from the data as they would be without the mistake.
+
+        hopeless : factor on the poses' noise from which it is given up after a first search. Raises
+        one of NO_ESTIMATE where there is none.
+        """
+        case = hypothesis.apply(PoseCase(self.measurements))
+        start = case.start or start_from_poses(self.machine, case.measurements)
+        return bundle(
+            self.machine, case.measurements, start, hopeless=hopeless, scale_readings=False
+        )
+
+    def beside(self, first: PoseHypothesis) -> Diagnosis:
+        """A second mistake, of any kind, beside a first one in the readings."""
+        try:
+            value = self.estimate(first)
+        except NO_ESTIMATE:
+            return Diagnosis()
+        without = first.apply(PoseCase(self.measurements)).measurements
+        second = diagnose(self.machine, without, value)
+        if second.hypothesis is None:
+            return second
+        named = self._with_constants(first, value)
+        parts = (*named.facts.get("parts", (named,)), second.hypothesis)
+        return second._replace(hypothesis=replace(first, facts={"parts": parts}), rivals=())
 
     def diagnosis(self, ranked: Sequence[Ranked[PoseHypothesis]]) -> Diagnosis:
         """What to decide by hypotheses that were estimated."""
@@ -234,19 +255,23 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
 def diagnose_by_closure(
     machine: Machine, measurements: Measurements, misfit: float, limit: float
 ) -> Diagnosis:
-    """The mistake in the readings, or the two, that explain why poses contradict them.
+    """The mistake in the readings that explains why poses contradict them, with another one of any
+    kind where one alone does not.
 
-    By closure they have to leave nominal errors alone; those that do are estimated. misfit : of the
-    poses as stated, in stated standard deviations. limit : of :func:`closure_limit`.
+    By closure mistakes in the readings have to leave nominal errors alone; those that do are
+    estimated. misfit : of the poses as stated, in stated standard deviations. limit : of
+    :func:`closure_limit`.
     """
     evidence = PoseEvidence(machine, measurements, misfit, limit)
     closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
     estimate = EvidenceLevel("estimate", evidence.by_estimate)
     single = reading_mistakes(machine, measurements)
     for hypotheses in (single, _pairs(single, measurements)):
-        likely = [one.hypothesis for one in posterior([*hypotheses], [closure])]
-        tenable = [one for one in likely if evidence.misfits[id(one)] < 1]
+        closing = [one.hypothesis for one in posterior([*hypotheses], [closure])]
+        tenable = [one for one in closing if evidence.misfits[id(one)] < 1]
         diagnosis = evidence.diagnosis(posterior(tenable, [estimate]))
+        if diagnosis.hypothesis is None and tenable:
+            diagnosis = evidence.beside(tenable[0])
         if diagnosis.hypothesis is not None:
             return diagnosis
         evidence.most = CLOSURE_CONFIGURATIONS
@@ -629,9 +654,30 @@ def _error_of(session: Session, diagnosis: Diagnosis, misfit: float) -> InputErr
 def _error(
     session: Session, hypothesis: PoseHypothesis, diagnosis: Diagnosis, misfit_before: float
 ) -> InputError:
-    """The error that names the mistake. misfit_before : of the poses with it, in stated sigmas."""
-    facts, joints = hypothesis.facts, session.document["joints"]
+    """The error that names the mistake, or two. misfit_before : of the poses with it, in stated
+    sigmas.
+    """
+    parts = [
+        _error_of_part(session, one, diagnosis.movement, misfit_before)
+        for one in hypothesis.facts.get("parts", (hypothesis,))
+    ]
+    found = list(dict.fromkeys(f"{one.found}" for one in parts))
+    expected = [f"{one.expected}" for one in parts]
     residual = f"with that, the poses fit {diagnosis.misfit:.1f} times their noise"
+    (found if parts[-1].code.endswith(".moved") else expected).append(residual)
+    return parts[0].with_fields(
+        what=", and ".join(one.what for one in parts),
+        found="; ".join(found),
+        expected="; ".join(expected),
+        next_step=". ".join(f"{one.next_step}" for one in parts),
+    )
+
+
+def _error_of_part(
+    session: Session, hypothesis: PoseHypothesis, movement: Array, misfit_before: float
+) -> InputError:
+    """The error that names one mistake, without the residual of the poses."""
+    facts, joints = hypothesis.facts, session.document["joints"]
     if hypothesis.code in ("board.moved", "station.moved"):
         what = (
             "the board was moved on the platform"
@@ -642,7 +688,7 @@ def _error(
         return InputError(
             f"{what} between configuration {before} and {after}",
             where=f"session.yaml, stations.{session.station_names[facts['station']]}",
-            found=f"{how_far(diagnosis.movement).removeprefix(', ')}; {residual}",
+            found=how_far(movement).removeprefix(", "),
             expected="a board screwed to the platform, and a camera that stands still",
             next_step=f"Calibrate with the configurations before {after}, or with those from it on",
             code=hypothesis.code,
@@ -652,20 +698,12 @@ def _error(
             "the board has another size than its file says",
             where=session.document["board"]["file"],
             found=f"a board {facts['size']:.4f} times as large, by how far the platform moved",
-            expected=f"the size as measured with a ruler over many squares; {residual}",
+            expected="the size as measured with a ruler over many squares",
             next_step=f"Multiply square and marker by {facts['size']:.4f}, if a ruler agrees",
             code=hypothesis.code,
         )
     times = f"{misfit_before:.{int(misfit_before < 10)}f}"
-    parts = [
-        reading_error(one, joints["file"], joints["columns"], session.machine.joint_units)
-        for one in facts.get("parts", (hypothesis,))
-    ]
-    return InputError(
-        ", and ".join(one.what for one in parts),
-        where=parts[0].where,
-        found=f"poses that the readings miss by {times} times their noise",
-        expected="; ".join([*(f"{one.expected}" for one in parts), residual]),
-        next_step=". ".join(f"{one.next_step}" for one in parts),
-        code=hypothesis.code,
+    error = reading_error(
+        hypothesis, joints["file"], joints["columns"], session.machine.joint_units
     )
+    return error.with_fields(found=f"poses that the readings miss by {times} times their noise")
