@@ -140,8 +140,10 @@ def richer_model(
             cost = parameter_cost(more, count)
             hypotheses.append(Hypothesis("machine.model", name, lambda _, to=other: to, cost))
     best = decide(posterior(hypotheses, [EvidenceLevel("estimate", by_estimate)]))
-    name = best and best.hypothesis.subject
-    return (RicherModel(name, scales[name]) if name else None), tuple(untested)
+    if best is None:
+        return None, tuple(untested)
+    name = best.hypothesis.subject
+    return RicherModel(name, scales[name]), tuple(untested)
 
 
 def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:

@@ -70,7 +70,7 @@ def _expected_ratios(
         return np.full(len(hypotheses), -np.inf)
     ends = limb_ends(layout, machine.values, flat, fk.T_base_platform, fk.internal)
     points = np.concatenate([ends.a, ends.b], axis=1).reshape(*joints.shape[:2], -1, 3)
-    closed = fk.converged.reshape(joints.shape[:2]).all(axis=1)
+    closed = np.all(fk.converged.reshape(joints.shape[:2]), axis=1).tolist()
     centre_sigma = max(float(sigma[table.of_kind("center")].mean()), LAST_DIGIT)
     out = np.full(len(hypotheses), -np.inf)
     for k, one in enumerate(hypotheses):

@@ -54,16 +54,12 @@ from pkmcal.outcome.hypotheses import (
 )
 from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
-from pkmcal.session.station_movement import how_far
+from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
 
 SUSPECT_SCALE = 2.0
 """Factor on the noise of poses, or of edges, from which mistakes are looked for."""
 SUSPECT_REJECTED_SHARE = 0.1
 """Share of rejected poses from which they are."""
-FEWEST_POSES_A_SIDE = 3
-"""Poses on either side of a movement: fewer are outliers."""
-OTHER_SIZE = 2e-3
-"""Relative difference of a board's size below which the print is as good as printers are."""
 EXPLAINED_POSES_SHARE = 0.85
 """Share of the poses that a mistake put right has to explain; the rest may be outliers."""
 HOPELESS_POSE_SCALE = 50.0
@@ -460,7 +456,7 @@ def _movements(measurements: Measurements, estimate: Estimate) -> Iterator[PoseH
         for s in np.unique(poses.station[poses.mount == m]):
             rows = np.flatnonzero((poses.mount == m) & (poses.station == s))
             rows = rows[np.argsort(poses.configuration[rows], kind="stable")]
-            if len(rows) < 2 * FEWEST_POSES_A_SIDE:
+            if len(rows) < 2 * FEWEST_BESIDE_MOVEMENT:
                 continue
             at = _jump(measurements, estimate, rows)
             later = rows[at:]
@@ -530,9 +526,9 @@ def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int
     off = off / np.maximum(scale, 1e-3 * max(scale.max(), 1e-12))
     rest = [
         sum(np.abs(part - np.median(part, axis=0)).sum() for part in (off[:at], off[at:]))
-        for at in range(FEWEST_POSES_A_SIDE, len(rows) - FEWEST_POSES_A_SIDE + 1)
+        for at in range(FEWEST_BESIDE_MOVEMENT, len(rows) - FEWEST_BESIDE_MOVEMENT + 1)
     ]
-    return FEWEST_POSES_A_SIDE + int(np.argmin(rest))
+    return FEWEST_BESIDE_MOVEMENT + int(np.argmin(rest))
 
 
 def _movement(machine: Machine, hypothesis: PoseHypothesis, estimate: Estimate) -> Array:
@@ -559,14 +555,12 @@ def _sizes(
     poses = measurements.poses
     boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == "board"]
     rows = np.flatnonzero(np.isin(poses.mount, boards) & measurements.on_platform[poses.mount])
-    if not boards or len(rows) < 2 * FEWEST_POSES_A_SIDE:
+    if not boards or len(rows) < 2 * FEWEST_BESIDE_MOVEMENT:
         return
     state = start_state(machine, measurements, estimate.state.T_camera_base)
     there = state.T_base_platform[poses.configuration[rows], :3, 3]
     in_view = poses.T_station_target[rows, :3, 3]
     size = float(np.sqrt(np.var(there, axis=0).sum() / np.var(in_view, axis=0).sum()))
-    if abs(size - 1) < OTHER_SIZE:
-        return
 
     def apply(case: PoseCase) -> PoseCase:
         T = case.measurements.poses.T_station_target.copy()
@@ -586,7 +580,7 @@ def poses_disagree(estimate: Estimate) -> bool:
     return bool(rejected.size) and (
         estimate.statistics.pose_scale > SUSPECT_SCALE
         or rejected.mean() > SUSPECT_REJECTED_SHARE
-        or rejected.sum() >= 2 * FEWEST_POSES_A_SIDE
+        or rejected.sum() >= 2 * FEWEST_BESIDE_MOVEMENT
     )
 
 
@@ -599,7 +593,7 @@ def check_closure(session: Session, boards: Boards) -> None:
     measurements = measurements_of(session, boards)
     poses = measurements.poses
     positions = (poses.rows >= 3) & measurements.on_platform[poses.mount]
-    if np.count_nonzero(positions) < 2 * FEWEST_POSES_A_SIDE:
+    if np.count_nonzero(positions) < 2 * FEWEST_BESIDE_MOVEMENT:
         return  # a frame and mount of their own explain few
     machine, few = session.machine, spread_over(measurements, CLOSURE_CONFIGURATIONS)
     (misfit,) = closure_misfits(machine, [few]).tolist()

@@ -223,7 +223,7 @@ def shifted_rows(count: int) -> list[ReadingHypothesis]:
 
 
 def reading_error(
-    hypothesis: ReadingHypothesis,
+    hypothesis: Hypothesis[Any],
     file: str,
     columns: Sequence[str],
     units: Sequence[str],
