@@ -18,7 +18,7 @@ from pkmcal.calibration.pose_hypotheses import (
     closure_limit,
     closure_misfits,
 )
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms.reading_hypotheses import (
     range_hypotheses,
@@ -30,6 +30,7 @@ from pkmcal.outcome.hypotheses import (
     EvidenceLevel,
     Hypothesis,
     decide,
+    estimate_level,
     likely,
     log_likelihood,
     parameter_cost,
@@ -146,6 +147,21 @@ def test_rivals_are_reported_that_are_likely_themselves():
 def test_nothing_is_decided_of_no_hypotheses():
     one, _ = level("only", {})
     assert decide(posterior([], [one])) is None
+
+
+def test_an_estimate_weighs_what_it_explains_and_says_what_it_could_not_test():
+    misfits, failures = {"right": 1.0, "worse": 9.0, "poor": 4.0}, []
+
+    def misfit(one):
+        if one.code not in misfits:
+            raise ResultError("no convergence")
+        return misfits[one.code]
+
+    level = estimate_level(misfit, 8.0, 20, 4.0, lambda one, why: failures.append((one.code, why)))
+    ranked = posterior([named(code) for code in ("none", "poor", "worse", "right")], [level])
+    assert [one.hypothesis.code for one in ranked] == ["right"]
+    assert ranked[0].log_odds == pytest.approx(20 * log(8.0))
+    assert failures == [("none", "no convergence")]
 
 
 @pytest.mark.parametrize("misfit", [0.3, 1.0, 7.0])

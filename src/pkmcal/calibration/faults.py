@@ -6,13 +6,13 @@ Mistakes in a session that explain disagreeing poses are in
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Booleans
 from pkmcal.calibration.camera_refinement import CameraRefinement
-from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE, NO_ESTIMATE
+from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
@@ -23,10 +23,9 @@ from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, doubtful, note, wrong
 from pkmcal.outcome.hypotheses import (
-    EvidenceLevel,
     Hypothesis,
     decide,
-    log_likelihood,
+    estimate_level,
     parameter_cost,
     posterior,
 )
@@ -113,24 +112,15 @@ def richer_model(
     unknowns = machine.parameters.free_matrix().shape[1]
     scales, untested = dict[str, float](), list[Finding]()
 
-    def by_estimate(hypotheses: Sequence[Hypothesis[Machine]]) -> Array:
-        out = np.full(len(hypotheses), -np.inf)
-        for k, one in enumerate(hypotheses):
-            other = one.apply(machine)
-            try:
-                start = start_state(other, measurements, estimate.state.T_camera_base)
-                fit = bundle(
-                    other, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
-                )
-            except NO_ESTIMATE as error:
-                why = str(error).rstrip(".")
-                untested.append(note("poses.model_failed", one.subject, why=why))
-                continue
-            scales[one.subject] = fit.statistics.pose_scale
-            if scales[one.subject] < VERDICT.too_noisy:
-                values = log_likelihood(np.array([null, scales[one.subject]]), count)
-                out[k] = values[1] - values[0]
-        return out
+    def scale(hypothesis: Hypothesis[Machine]) -> float:
+        other = hypothesis.apply(machine)
+        start = start_state(other, measurements, estimate.state.T_camera_base)
+        fit = bundle(other, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False)
+        scales[hypothesis.subject] = fit.statistics.pose_scale
+        return fit.statistics.pose_scale
+
+    def failed(hypothesis: Hypothesis[Machine], why: str) -> None:
+        untested.append(note("poses.model_failed", hypothesis.subject, why=why))
 
     hypotheses = list[Hypothesis[Machine]]()
     for name in (each for each in machine.document.models if each != session.model):
@@ -139,7 +129,8 @@ def richer_model(
         if more > 0 and (other.n_legs == machine.n_legs or not len(measurements.edges)):
             cost = parameter_cost(more, count)
             hypotheses.append(Hypothesis("machine.model", name, lambda _, to=other: to, cost))
-    best = decide(posterior(hypotheses, [EvidenceLevel("estimate", by_estimate)]))
+    level = estimate_level(scale, null, count, VERDICT.too_noisy, failed)
+    best = decide(posterior(hypotheses, [level]))
     if best is None:
         return None, tuple(untested)
     name = best.hypothesis.subject

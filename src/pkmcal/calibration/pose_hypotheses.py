@@ -29,7 +29,7 @@ from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.localization import frozen_in
-from pkmcal.errors import InputError, PkmcalError
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
@@ -42,11 +42,13 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.outcome.hypotheses import (
+    NO_ESTIMATE,
     OPTIONS,
     EvidenceLevel,
     Explanation,
     Hypothesis,
     Ranked,
+    estimate_level,
     likely,
     log_likelihood,
     parameter_cost,
@@ -74,8 +76,6 @@ four draws of some thirty parameters each tell it to a tenth."""
 CLOSURE_CONFIGURATIONS = 48
 """Configurations, spread over all, by which poses and readings are tested for a contradiction, and
 in which pairs of mistakes are compared: a thousand pairs in seconds."""
-NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
-"""Errors by which an estimate under a hypothesis fails."""
 
 
 class PoseCase(NamedTuple):
@@ -152,21 +152,18 @@ class PoseEvidence:
         readings = np.array([one.code.startswith("readings.") for one in hypotheses])
         return np.where(retained & (~readings | (ratios + prior > 0)), ratios, -np.inf)
 
-    def by_estimate(self, hypotheses: Sequence[PoseHypothesis]) -> Array:
-        """Log-likelihood ratios by joint estimates, minus infinity where none is tenable."""
-        null = log_likelihood(np.array(self.null_misfit), self.n_effective)
-        out = np.full(len(hypotheses), -np.inf)
-        for k, one in enumerate(hypotheses):
-            try:
-                value = self.estimate(one, HOPELESS_POSE_SCALE)
-            except NO_ESTIMATE as error:
-                self.untested.append((one.code, str(error)))
-                continue
-            self.estimates[id(one)] = value
-            misfit = pose_misfit(value)
-            if misfit < VERDICT.too_noisy:
-                out[k] = log_likelihood(np.array(misfit), self.n_effective) - null
-        return out
+    @property
+    def by_estimate(self) -> EvidenceLevel[PoseHypothesis]:
+        """Level of evidence by joint estimates."""
+
+        def misfit(hypothesis: PoseHypothesis) -> float:
+            value = self.estimates[id(hypothesis)] = self.estimate(hypothesis, HOPELESS_POSE_SCALE)
+            return pose_misfit(value)
+
+        def failed(hypothesis: PoseHypothesis, why: str) -> None:
+            self.untested.append((hypothesis.code, why))
+
+        return estimate_level(misfit, self.null_misfit, self.n_effective, VERDICT.too_noisy, failed)
 
     def estimate(self, hypothesis: PoseHypothesis, hopeless: float = np.inf) -> Estimate:
         """The estimate from the data as they would be without the mistake.
@@ -184,8 +181,8 @@ class PoseEvidence:
         """A second mistake, of any kind, beside a first one in the readings."""
         try:
             value = self.estimate(first)
-        except NO_ESTIMATE:
-            return Diagnosis()
+        except NO_ESTIMATE as error:
+            return Diagnosis(untested=((first.code, str(error).rstrip(".")),))
         without = first.apply(PoseCase(self.measurements)).measurements
         second = diagnose(self.machine, without, value)
         if second.hypothesis is None:
@@ -243,7 +240,7 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
     levels = (
         # nominal errors are in these residuals, so closure drops hypotheses and confirms none
         EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most),
-        EvidenceLevel("estimate", evidence.by_estimate),
+        evidence.by_estimate,
     )
     return evidence.diagnosis(posterior(pose_hypotheses(machine, measurements, estimate), levels))
 
@@ -260,12 +257,11 @@ def diagnose_by_closure(
     """
     evidence = PoseEvidence(machine, measurements, misfit, limit)
     closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
-    estimate = EvidenceLevel("estimate", evidence.by_estimate)
     single = reading_mistakes(machine, measurements)
     for hypotheses in (single, _pairs(single, measurements)):
         closing = [one.hypothesis for one in posterior([*hypotheses], [closure])]
         tenable = [one for one in closing if evidence.misfits[id(one)] < 1]
-        diagnosis = evidence.diagnosis(posterior(tenable, [estimate]))
+        diagnosis = evidence.diagnosis(posterior(tenable, [evidence.by_estimate]))
         if diagnosis.hypothesis is None and tenable:
             diagnosis = evidence.beside(tenable[0])
         if diagnosis.hypothesis is not None:
@@ -627,7 +623,7 @@ def explain_poses(
     untested: tuple[Finding, ...] = ()
     if diagnosis.untested:
         codes = [code for code, _ in diagnosis.untested]
-        why = diagnosis.untested[0][1].rstrip(".")
+        why = diagnosis.untested[0][1]
         untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
     error = _error_of(session, diagnosis, pose_misfit(estimate))
     return Explanation(error, diagnosis.log_odds, untested)

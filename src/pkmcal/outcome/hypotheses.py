@@ -25,7 +25,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, PkmcalError
 from pkmcal.outcome.finding import Finding
 
 Data = TypeVar("Data")
@@ -52,6 +52,8 @@ class HypothesisOptions:
 
 
 OPTIONS = HypothesisOptions()
+NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
+"""Errors by which an estimate under a hypothesis fails."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,33 @@ class EvidenceLevel(NamedTuple, Generic[Subject]):
     log_likelihood_ratios: Callable[[Sequence[Subject]], Array]
     decides: bool = True
     most: int | None = None
+
+
+def estimate_level(
+    misfit: Callable[[Subject], float],
+    null: float,
+    n_effective: float,
+    tenable: float,
+    failed: Callable[[Subject, str], None],
+) -> EvidenceLevel[Subject]:
+    """Level of evidence by an estimate under each hypothesis.
+
+    misfit : of the residuals without the mistake, as of :func:`log_likelihood`; raises one of
+    NO_ESTIMATE where there is none. null : misfit as stated. tenable : misfit from which a
+    hypothesis explains nothing. failed : called with hypotheses without an estimate, and why.
+    """
+
+    def ratios(hypotheses: Sequence[Subject]) -> Array:
+        values = np.full(len(hypotheses), np.inf)
+        for k, one in enumerate(hypotheses):
+            try:
+                values[k] = misfit(one)
+            except NO_ESTIMATE as error:
+                failed(one, str(error).rstrip("."))
+        values = np.where(values < tenable, values, np.inf)
+        return log_likelihood(values, n_effective) - log_likelihood(np.array(null), n_effective)
+
+    return EvidenceLevel("estimate", ratios)
 
 
 class Ranked(NamedTuple, Generic[Subject]):
