@@ -244,11 +244,12 @@ def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
 
 @pytest.mark.parametrize(
     ("name", "firsts"),
-    [("gough-stewart", [2, 4]), ("3-rps", [1, 2]), ("delta", [1, 2]), ("hexaglide", [])],
-)
+    [("gough-stewart", [2, 4]), ("3-rps", [1, 2]), ("delta", [1, 2]), ("hexaglide", []),
+     ("four-belt", [1, 2, 3])],
+)  # fmt: skip
 def test_numberings_that_nothing_tells_apart(name, firsts):
     """The machines of the two configurations differ by one rotation of everything, except for tubes
-    and unequal joints.
+    and unequal joints. A plane machine's may turn it over: its legs are then counted backwards.
     """
     machine = load_mechanism(name)
     joints = machine.inverse(poses_in(machine.limits(), Region(), 8))

@@ -288,9 +288,11 @@ def test_readings_far_beyond_their_noise_are_no_noise(calibrated):
 
 
 def test_edges_measured_elsewhere_give_the_same_machine(calibrated):
-    state = calibrated.estimate.state
+    """Of a session with other readings, such as other configurations."""
+    state, session = calibrated.estimate.state, calibrated.session
+    session = replace(session, joints=np.roll(session.joints, 3, axis=0))
     other = calibrate_measurements(
-        calibrated.session, calibrated.observation, calibrated.measurements, state.T_camera_base
+        session, calibrated.observation, calibrated.measurements, state.T_camera_base
     )
     off = other.machine.values - calibrated.machine.values
     sigma = np.sqrt(np.diag(calibrated.estimate.covariance))

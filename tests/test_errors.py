@@ -82,6 +82,13 @@ def test_located_adds_the_place_and_keeps_the_rest():
     assert placed.located("left").where == "left: session.yaml, line 9"
 
 
+def test_another_field_keeps_the_rest():
+    error = ResultError(**FULL, code="readings.sign")
+    other = error.with_fields(found="nothing")
+    assert type(other) is ResultError
+    assert other.as_dict() == {**error.as_dict(), "found": "nothing", "message": str(other)}
+
+
 def test_names_that_nothing_can_have_are_shortened():
     error = InputError("no", where=f"a/{'n' * 5000} line 2", found="n" * 5000)
     short = f"{'n' * 40}…{'n' * 20}"

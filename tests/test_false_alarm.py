@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 
 from pkmcal.calibration.discrepancy_basis import discrepancy_components
 from pkmcal.identify.covariance import Information
@@ -76,3 +77,11 @@ def test_tests_of_one_search_share_its_level():
     assert level.of_test(5) == 0.001
     assert level.of_test(0) == 0.005
     np.testing.assert_allclose(level.adjusted(np.array([1e-3, 0.5]), np.array([5, 5])), [0.01, 1.0])
+
+
+@pytest.mark.parametrize("dof", [5, 60])
+def test_noise_exceeds_its_scale_as_often_as_the_level_says(dof):
+    level, runs = FalseAlarm(0.02, ("violations", "poses")), 20000
+    rng = np.random.default_rng(0)
+    rms = np.sqrt(np.mean(rng.normal(size=(runs, dof)) ** 2, axis=1))
+    assert np.mean(rms > level.scale(dof)) == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / runs))

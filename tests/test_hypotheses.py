@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from math import exp, log
 
 import numpy as np
@@ -17,20 +18,27 @@ from pkmcal.calibration.pose_hypotheses import (
     closure_limit,
     closure_misfits,
 )
-from pkmcal.errors import InputError
-from pkmcal.mechanisms.reading_hypotheses import reading_hypotheses
+from pkmcal.errors import InputError, ResultError
+from pkmcal.geometry.rigid import perturb
+from pkmcal.mechanisms.reading_hypotheses import (
+    range_hypotheses,
+    range_ratios,
+    reading_hypotheses,
+)
 from pkmcal.outcome.hypotheses import (
     OPTIONS,
     EvidenceLevel,
     Hypothesis,
     decide,
+    estimate_level,
+    likely,
     log_likelihood,
     parameter_cost,
     posterior,
     rivals_of,
 )
 from pkmcal.session.load import load_session
-from test_pose_sessions import make, write_joints
+from test_pose_sessions import make, seen_poses, write_joints, write_poses
 
 
 def named(code, subject="", log_prior=0.0, action="refuse"):
@@ -125,9 +133,35 @@ def test_a_repair_needs_more_than_a_report():
             )
 
 
+def test_rivals_are_reported_that_are_likely_themselves():
+    """What the first hypothesis does not exclude may still be less likely than no mistake."""
+    first = OPTIONS.report + 1
+    one, _ = level("only", {"a": first, "b": OPTIONS.report + 0.5, "c": OPTIONS.report - 0.5})
+    ranked = posterior([named("c"), named("a"), named("b")], [one])
+    assert [each.hypothesis.code for each in likely(ranked)] == ["a", "b"]
+    assert {each.hypothesis.code for each in rivals_of(ranked)} == {"b", "c"}
+    weak, _ = level("only", {"a": OPTIONS.report - 0.1})
+    assert likely(posterior([named("a")], [weak])) == []
+
+
 def test_nothing_is_decided_of_no_hypotheses():
     one, _ = level("only", {})
     assert decide(posterior([], [one])) is None
+
+
+def test_an_estimate_weighs_what_it_explains_and_says_what_it_could_not_test():
+    misfits, failures = {"right": 1.0, "worse": 9.0, "poor": 4.0}, []
+
+    def misfit(one):
+        if one.code not in misfits:
+            raise ResultError("no convergence")
+        return misfits[one.code]
+
+    level = estimate_level(misfit, 8.0, 20, 4.0, lambda one, why: failures.append((one.code, why)))
+    ranked = posterior([named(code) for code in ("none", "poor", "worse", "right")], [level])
+    assert [one.hypothesis.code for one in ranked] == ["right"]
+    assert ranked[0].log_odds == pytest.approx(20 * log(8.0))
+    assert failures == [("none", "no convergence")]
 
 
 @pytest.mark.parametrize("misfit", [0.3, 1.0, 7.0])
@@ -282,8 +316,23 @@ def test_two_mistakes_are_named_together(tmp_path):
         check_closure(load_session(made.folder), Boards())
     assert caught.value.code == "readings.reversed"
     assert re.findall(r"motor\d", caught.value.what) == ["motor1", "motor4"]
+    assert caught.value.expected.count("times their noise") == 1
     named = [1e-3 * int(value) for value in re.findall(r"(\d+) mm, or", caught.value.expected)]
     np.testing.assert_allclose(named, constants, atol=6e-3)
+
+
+@pytest.mark.parametrize("name", ["linear-delta", pytest.param("6-rus", marks=pytest.mark.slow)])
+def test_a_mistake_in_the_readings_hides_none_of_another_kind(tmp_path, name):
+    """Two columns exchanged, and a target that moved on the platform."""
+    made = make(tmp_path / "session", name, n=16)
+    in_view = seen_poses(made)
+    in_view[9:] = in_view[9:] @ perturb(np.eye(4), np.array([0.01, 0, 0.02, 0.002, 0, 0]))
+    write_poses(made.folder, in_view)
+    write_joints(made.folder, made.joints[:, [1, 0, *range(2, made.joints.shape[1])]])
+    with pytest.raises(InputError) as caught:
+        check_closure(load_session(made.folder), Boards())
+    assert caught.value.code == "readings.exchanged"
+    assert "between configuration 008 and 009" in caught.value.what
 
 
 def test_what_no_mistake_explains_is_left_to_the_estimate(tmp_path):
@@ -320,3 +369,60 @@ def test_signs_of_two_motors_are_not_taken_for_degrees(tmp_path):
         load_session(made.folder)
     assert caught.value.code == "readings.sign"
     assert "motor1 and motor3" in caught.value.what
+
+
+# readings against their ranges
+
+
+def table_of(ranges, rng, count=16):
+    """Readings all over most of their ranges."""
+    low, high = ranges.T
+    return low + (high - low) * rng.uniform(0.05, 0.9, (count, len(ranges)))
+
+
+def named_by_ranges(joints, ranges, unit):
+    """Code and columns of the mistake that the ranges show, if any."""
+    hypotheses = range_hypotheses(joints, ranges, [unit] * len(ranges))
+    level = EvidenceLevel("ranges", partial(range_ratios, joints, ranges))
+    best = decide(posterior(hypotheses, [level]))
+    return best and (best.hypothesis.code, best.hypothesis.facts["motors"])
+
+
+RANGES = {
+    "m": np.tile([0.345, 0.485], (6, 1)),
+    "rad": np.array([[-0.4, 1.3], [-0.4, 1.3], [0.2, 1.9], [-1.5, 1.6]]),
+}
+
+
+@pytest.mark.parametrize("unit", RANGES)
+def test_ranges_show_what_is_wrong_with_whole_columns(unit):
+    ranges, rng = RANGES[unit], np.random.default_rng(0)
+    low, high = ranges.T
+    every, stroke = tuple(range(len(ranges))), high - low
+    for _ in range(20):
+        right = table_of(ranges, rng)
+        factor = {"m": 1e3, "rad": 180 / np.pi}[unit]
+        assert named_by_ranges(factor * right, ranges, unit) == ("readings.units", every)
+        away = right - 2 * stroke.max()
+        assert named_by_ranges(away, ranges, unit) == ("readings.zero", every)
+        signs = np.where(np.arange(len(ranges)) % 2, 1.0, -1.0)
+        code, motors = named_by_ranges(signs * right, ranges, unit)
+        assert (code, set(motors) <= {0, 2, 4}) == ("readings.sign", True)
+
+
+@pytest.mark.parametrize("unit", RANGES)
+def test_ranges_show_nothing_of_slips_nor_of_a_range_that_is_too_narrow(unit):
+    """Single readings of any size, and all readings of a stroke that is a fifth longer: some are
+    beyond the margin, and all could be in range by one constant.
+    """
+    ranges, rng = RANGES[unit], np.random.default_rng(0)
+    low, high = ranges.T
+    for _ in range(100):
+        right = table_of(ranges, rng)
+        assert named_by_ranges(right, ranges, unit) is None
+        slip = right.copy()
+        slip[rng.integers(len(slip)), rng.integers(len(ranges))] *= rng.choice([-1, 10, 100, 1000])
+        assert named_by_ranges(slip, ranges, unit) is None
+        longer = ranges + np.outer(high - low, [0.0, 0.2])
+        assert named_by_ranges(table_of(longer, rng), ranges, unit) is None
+    assert named_by_ranges(1e3 * right, np.full((len(ranges), 2), np.nan), unit) is None

@@ -11,6 +11,8 @@ import yaml
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.calibration.faults import richer_model
 from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.check.check import check_session, pose_findings
@@ -23,10 +25,11 @@ from pkmcal.geometry.rigid import (
     rotation,
     rotation_vector,
 )
+from pkmcal.identify.bundle import bundle
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.outcome import Level
 from pkmcal.papers import methods
-from pkmcal.papers.hand_eye import solve_pairs
+from pkmcal.papers.hand_eye import solve_pairs, start_from_poses
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from pkmcal.session.poses import PoseTable, read_poses
@@ -274,6 +277,22 @@ def test_a_model_too_poor_is_refused_and_the_richer_one_named(folder):
     rich = calibrate_session(load_session(folder, "calibration"))
     assert rich.verdict.usable
     assert tool_error(rich.machine, made) < 0.2 * tool_error(poor.machine, made)
+
+
+@pytest.mark.slow
+def test_poses_noisier_than_stated_need_no_richer_model(folder):
+    """Three times the stated noise: more parameters fit more of it, as of any noise."""
+    made, rng = make(folder, "h4", n=16, model="design"), np.random.default_rng(0)
+    sigma = 3 * np.repeat([TURN, POSITION], 3)
+    write_poses(folder, perturb(seen_poses(made), sigma * rng.normal(size=(16, 6))))
+    document = (folder / "session.yaml").read_text().replace("mechanism.yaml", "h4")
+    (folder / "session.yaml").write_text(document)
+    session = load_session(folder, "design")
+    measurements = measurements_of(session, Boards())
+    start = start_from_poses(session.machine, measurements)
+    fit = bundle(session.machine, measurements, start, scale_readings=False)
+    assert fit.statistics.pose_scale > 2
+    assert richer_model(session, measurements, fit) == (None, ())
 
 
 def test_inverse_kinematic_is_a_method(folder, monkeypatch):

@@ -10,7 +10,7 @@ from pkmcal.calibration.calibrate import Clock, calibrate_session, settle
 from pkmcal.calibration.handheld import localize_case
 from pkmcal.errors import InputError
 from pkmcal.outcome.finding import note
-from pkmcal.outcome.hypotheses import Explanation, refuse
+from pkmcal.outcome.hypotheses import OPTIONS, Explanation, refuse
 from pkmcal.session.load import load_session
 from test_pose_sessions import make, write_joints
 
@@ -24,10 +24,18 @@ def settled(folder):
 def test_the_likeliest_explanation_is_the_reason_of_a_refusal():
     one, other = (InputError(code, code=code) for code in ("one", "other"))
     untested = (note("tube.diameter_untested", "mechanism.yaml", why="of little"),)
+    computed = []
+
+    def explained(*given):
+        return [lambda each=each: computed.append(each) or each for each in given]
+
+    weak, strong = Explanation(one, OPTIONS.act - 1), Explanation(other, OPTIONS.act + 1)
+    open_left = Explanation(untested=untested)
     with pytest.raises(InputError) as caught:
-        refuse(Explanation(one, 4.0), Explanation(other, 9.0), Explanation(untested=untested))
+        refuse(*explained(weak, strong, open_left))
     assert caught.value is other
-    assert refuse(Explanation(), Explanation(untested=untested)) == untested
+    assert computed == [weak, strong]  # the last costs a localization
+    assert refuse(*explained(Explanation(), open_left)) == untested
 
 
 def test_one_mistake_after_another_until_there_is_none(tmp_path):

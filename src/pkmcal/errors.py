@@ -84,8 +84,11 @@ class PkmcalError(Exception):
 
     def located(self, where: str) -> Self:
         """Copy of the error with `where` prepended, for callers that know the file and line."""
-        place = where if self.where is None else f"{where}: {self.where}"
-        return type(self)(**{**self._fields(), "where": place})
+        return self.with_fields(where=where if self.where is None else f"{where}: {self.where}")
+
+    def with_fields(self, **fields: Any) -> Self:
+        """Copy of the error with other arguments of the constructor, by name."""
+        return type(self)(**{**self._fields(), **fields})
 
     def as_input(self, where: str) -> InputError:
         """Copy of the error as an `InputError` at `where`, for example for the geometry of a

@@ -22,11 +22,10 @@ from pkmcal.calibration.chance_matches import by_chance, chance_match_reason
 from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
 from pkmcal.calibration.faults import (
     lens_notes,
-    model_at_fault,
     noise_fault,
     noise_notes,
     refit_fixed_noise,
-    richer_models,
+    richer_model,
     scale_fault,
     scale_notes,
     size_notes,
@@ -59,6 +58,7 @@ from pkmcal.files import closest, quoted, resolved
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
@@ -229,8 +229,7 @@ def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
             return None
         return doubtful("camera.refinement_rejects", kept=retained, of=taken, by_files=more)
     by_refined, by_held = refined.estimate.statistics, held.estimate.statistics
-    # the mean square of n numbers that are noise has the standard deviation sqrt(2 / n)
-    chance = 1 + 4 * np.sqrt(2 / max(by_refined.dof, 1.0))
+    chance = SESSION_FALSE_ALARM.scale(by_refined.dof) ** 2
     if by_refined.chi2_as_stated > chance * by_held.chi2_as_stated:
         return doubtful(
             "camera.refinement_fits_worse",
@@ -255,18 +254,19 @@ def calibrate_measurements(
 ) -> Calibration:
     """Calibrate the machine of a session from edges that are given, such as simulated ones.
 
-    No image is read. observation : with the edges of ``measurements``. T_camera_base : (S, 4, 4)
-    from where the estimate starts. Raises ResultError where there is no estimate.
+    No image is read. observation : with the edges of ``measurements``, whose readings may be others
+    than the session's. T_camera_base : (S, 4, 4) from where the estimate starts. Raises ResultError
+    where there is no estimate.
     """
     clock = Clock(progress)
-    start = start_state(session.machine, measurements, T_camera_base, session.forward)
+    start = start_state(session.machine, measurements, T_camera_base)
     estimate = bundle(session.machine, measurements, start)
     turns = RefinementResult(
         observation, measurements, estimate, refinement_of(session, False), start=start
     )
-    scene = PriorScene.as_drawn(session, T_camera_base)
+    scene = PriorScene(session.machine, T_camera_base, start.T_base_platform)
     case = Case(session, [], Boards(), scene)
-    return _judge(case, _Identified(turns, estimate, (), None), (), (), "bundle", 0, clock)
+    return _judge(case, _Identified(turns, estimate, None, None), (), (), "bundle", 0, clock)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -294,7 +294,7 @@ class Settled(NamedTuple):
     case: Case
     turns: RefinementResult
     stated: Estimate
-    richer: tuple[RicherModel, ...]
+    richer: RicherModel | None
     repairs: tuple[UpsideDown, ...] = ()
     findings: tuple[Finding, ...] = ()
 
@@ -317,7 +317,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
         try:
             turns = _identify(case, refine_camera, clock)
         except ResultError:
-            refuse(explain_radii(case, None, refine_camera, seed))
+            refuse(partial(explain_radii, case, None, refine_camera, seed))
             raise
         # images that are upside down; all stations begin anew, for one that was rejected before
         # may have been upside down, too
@@ -342,15 +342,10 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
     # mistakes that a user has to correct
     clock.progress("Looking for mistakes that explain the data", 0.86)
     stated = refit_fixed_noise(case.session.machine, turns.measurements, turns.estimate)
-    richer = richer_models(case.session, turns.measurements, stated)
+    richer, failed = richer_model(case.session, turns.measurements, stated)
     untested = refuse(
-        explain_poses(case.session, turns.measurements, stated, richer),
-        explain_radii(case, turns, refine_camera, seed),
-    )
-    failed = (
-        note("poses.model_failed", model.name, why=model.failure.rstrip("."))
-        for model in richer
-        if model.failure
+        partial(explain_poses, case.session, turns.measurements, stated, richer),
+        partial(explain_radii, case, turns, refine_camera, seed),
     )
     found = (rotation_finding(one) for one in (*repairs, *rotations))
     findings = (*found, *case.scene.findings, *failed, *untested)
@@ -368,18 +363,18 @@ def _finished(
     clock.lap("identify")
     if turns is not settled.turns:
         stated = refit_fixed_noise(machine, turns.measurements, turns.estimate)
-    if model_at_fault(richer, stated):
+    if richer is not None:
         turns = turns._replace(estimate=stated)
     value = _estimated(machine, turns, richer, method, seed, holdout, clock)
     return _judge(case, value, repairs, found, method, seed, clock)
 
 
 class _Identified(NamedTuple):
-    """The refinement, the estimate by the requested method, fits of richer models, the holdout."""
+    """The refinement, the estimate by the requested method, the richer model, the holdout."""
 
     turns: RefinementResult
     estimate: Estimate
-    richer: tuple[RicherModel, ...]
+    richer: RicherModel | None
     out: Holdout | None
 
 
@@ -426,7 +421,7 @@ def _identify(case: Case, refine_camera: bool, clock: Clock) -> RefinementResult
 def _estimated(
     nominal: Machine,
     turns: RefinementResult,
-    richer: tuple[RicherModel, ...],
+    richer: RicherModel | None,
     method: CalibrationMethod,
     seed: int,
     holdout: int,

@@ -12,21 +12,26 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.calibration.camera_refinement import CameraRefinement
-from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE, NO_ESTIMATE
+from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
-from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, RicherModel
+from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, doubtful, note, wrong
+from pkmcal.outcome.hypotheses import (
+    Hypothesis,
+    decide,
+    estimate_level,
+    parameter_cost,
+    posterior,
+)
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
-RICHER_MODEL_SHARE = 0.5
-"""Factor on the poses' misfit by which a richer model has to fit better to be what is missing."""
 UNTOLD_BOARD_SIZE_SIGMA = 0.7
 """Part of its prior sigma from which a board's size is determined by its file rather than by the
 data."""
@@ -72,12 +77,6 @@ def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Es
     return bundle(machine, measurements, estimate.state, scale_readings=False)
 
 
-def model_at_fault(richer: tuple[RicherModel, ...], estimate: Estimate) -> bool:
-    """Whether a richer model fits where the estimate, with noise as stated, does not."""
-    best = min((model.scale for model in richer), default=np.inf)
-    return best < max(POOR_MODEL_POSE_SCALE, RICHER_MODEL_SHARE * estimate.statistics.pose_scale)
-
-
 def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
     """A reason against the result where readings scatter by more than the nominal model's prior
     sigma, so that they determine nothing, or by too much more than stated to be noise.
@@ -98,32 +97,44 @@ def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
         )
 
 
-def richer_models(
+def richer_model(
     session: Session, measurements: Measurements, estimate: Estimate
-) -> tuple[RicherModel, ...]:
-    """Fits of the mechanism file's richer models, where this one is too poor for the poses."""
-    if estimate.statistics.pose_scale < POOR_MODEL_POSE_SCALE:
-        return ()
-    machine = session.machine
+) -> tuple[RicherModel | None, tuple[Finding, ...]]:
+    """The richer model of the mechanism file that explains poses for which this one is too poor,
+    None where none does; and notes on models without an estimate.
+
+    Each of its parameters costs what noise gains by one (:func:`parameter_cost`).
+    """
+    null, machine = estimate.statistics.pose_scale, session.machine
+    if null < POOR_MODEL_POSE_SCALE:
+        return None, ()
+    count = int(measurements.poses.rows.sum())
     unknowns = machine.parameters.free_matrix().shape[1]
-    out: list[RicherModel] = []
-    for name in machine.document.models:
-        if name == session.model:
-            continue
-        try:
-            other = session.other_model(name)
-            same = other.n_legs == machine.n_legs or not len(measurements.edges)
-            if other.parameters.free_matrix().shape[1] <= unknowns or not same:
-                continue
-            start = start_state(other, measurements, estimate.state.T_camera_base)
-            fit = bundle(
-                other, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False
-            )
-        except NO_ESTIMATE as error:
-            out.append(RicherModel(name, np.inf, str(error)))
-            continue
-        out.append(RicherModel(name, fit.statistics.pose_scale))
-    return tuple(out)
+    scales, untested = dict[str, float](), list[Finding]()
+
+    def scale(hypothesis: Hypothesis[Machine]) -> float:
+        other = hypothesis.apply(machine)
+        start = start_state(other, measurements, estimate.state.T_camera_base)
+        fit = bundle(other, measurements, start, hopeless=HOPELESS_POSE_SCALE, scale_readings=False)
+        scales[hypothesis.subject] = fit.statistics.pose_scale
+        return fit.statistics.pose_scale
+
+    def failed(hypothesis: Hypothesis[Machine], why: str) -> None:
+        untested.append(note("poses.model_failed", hypothesis.subject, why=why))
+
+    hypotheses = list[Hypothesis[Machine]]()
+    for name in (each for each in machine.document.models if each != session.model):
+        other = session.other_model(name)
+        more = other.parameters.free_matrix().shape[1] - unknowns
+        if more > 0 and (other.n_legs == machine.n_legs or not len(measurements.edges)):
+            cost = parameter_cost(more, count)
+            hypotheses.append(Hypothesis("machine.model", name, lambda _, to=other: to, cost))
+    level = estimate_level(scale, null, count, VERDICT.too_noisy, failed)
+    best = decide(posterior(hypotheses, [level]))
+    if best is None:
+        return None, tuple(untested)
+    name = best.hypothesis.subject
+    return RicherModel(name, scales[name]), tuple(untested)
 
 
 def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:

@@ -8,7 +8,8 @@ nominal model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +18,13 @@ from pkmcal.calibration.localization import legs_stations
 from pkmcal.geometry.rigid import register
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.reading_hypotheses import (
+    ReadingHypothesis,
+    exchanged_motors,
+    renumbered_legs,
+)
 from pkmcal.outcome.finding import Finding, note
+from pkmcal.outcome.hypotheses import OPTIONS, EvidenceLevel, posterior
 from pkmcal.session.load import Session
 from pkmcal.wording import in_full
 
@@ -29,10 +36,10 @@ LAST_DIGIT = 1e-6
 
 def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
     """Permutations of the readings' columns, (m,) each, under which the nominal model is the same
-    machine.
+    machine as far as its prior sigmas tell.
 
-    Each starts the count at another leg; the rotated machine agrees within its prior sigmas. Empty
-    for machines with legs without a reading of their own.
+    Each starts the count at another leg, or counts backwards. Empty for machines with legs without
+    a reading of their own.
 
     joints : (K, m) readings at which the machines are compared.
     """
@@ -40,37 +47,49 @@ def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
     if machine.n_legs != m or sorted(layout.actuated.tolist()) != list(range(m)):
         return ()
     readings = joints[evenly(len(joints), NUMBERING_CONFIGURATIONS)]
-    orders = [np.roll(np.arange(m), -first) for first in range(1, m)]
-    return tuple(order for order in orders if _equivalent(machine, readings, order))
+    level = EvidenceLevel("nominal model", partial(_expected_ratios, machine, readings))
+    # of two motors another first leg is an exchange
+    ranked = posterior(renumbered_legs(m) or exchanged_motors(m), [level])
+    orders = [one.hypothesis.facts["order"] for one in ranked if one.log_odds > -OPTIONS.act]
+    return tuple(sorted(orders, key=lambda order: order[0]))
 
 
-def _equivalent(machine: Machine, readings: Array, order: Integers) -> bool:
-    """Whether exchanging the columns of readings (n, m) is equivalent to one rigid motion of the
-    machine.
+def _expected_ratios(
+    machine: Machine, readings: Array, hypotheses: Sequence[ReadingHypothesis]
+) -> Array:
+    """Log-likelihood ratios (N,) of other numberings that measurements are expected to have at
+    readings (n, m) where the stated one is right: by the differences of the nominal model from
+    itself with the legs in another order, after the best rigid motion, in prior sigmas.
     """
     layout, table = machine.layout, machine.parameters
-    column = layout.actuated
-    other = np.argsort(column)[order[column]]  # leg that had each leg's new column
-    for mine, its in zip(layout.radius, (layout.radius[j] for j in other), strict=True):
-        if len(mine) != len(its):
-            return False
-        if np.any(np.abs(machine.values[mine] - machine.values[its]) > table.tolerance[mine]):
-            return False
-    # limb ends at both orders of the readings
-    points: list[Array] = []
-    for joints in (readings, readings[:, order]):
-        fk = machine.forward_result(joints)
-        if not fk.converged.all():
-            return False
-        ends = limb_ends(layout, machine.values, joints, fk.T_base_platform, fk.internal)
-        points.append(np.concatenate([ends.a, ends.b], axis=1))
-    # best rigid motion between corresponding legs, and its residuals
-    legs = np.concatenate([other, other + machine.n_legs])
-    before, after = points[0][:, legs].reshape(-1, 3), points[1].reshape(-1, 3)
-    turn = register(after, before)
-    off = after @ turn[:3, :3].T + turn[:3, 3] - before
-    limit = max(float(table.tolerance[table.of_kind("center")].mean()), LAST_DIGIT)
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) < limit
+    column, sigma = layout.actuated, table.tolerance
+    joints = np.stack([readings, *(one.apply(readings) for one in hypotheses)])
+    flat = joints.reshape(-1, joints.shape[-1])
+    fk = machine.forward_result(flat)
+    if not fk.converged[: len(readings)].all():
+        return np.full(len(hypotheses), -np.inf)
+    ends = limb_ends(layout, machine.values, flat, fk.T_base_platform, fk.internal)
+    points = np.concatenate([ends.a, ends.b], axis=1).reshape(*joints.shape[:2], -1, 3)
+    closed = np.all(fk.converged.reshape(joints.shape[:2]), axis=1).tolist()
+    centre_sigma = max(float(sigma[table.of_kind("center")].mean()), LAST_DIGIT)
+    out = np.full(len(hypotheses), -np.inf)
+    for k, one in enumerate(hypotheses):
+        other = np.argsort(column)[one.facts["order"][column]]  # leg that had each leg's new column
+        radii = [(mine, layout.radius[its]) for mine, its in zip(layout.radius, other, strict=True)]
+        if not closed[k + 1] or any(len(mine) != len(its) for mine, its in radii):
+            continue
+        tubes = [
+            (machine.values[mine] - machine.values[its]) / np.maximum(sigma[mine], LAST_DIGIT)
+            for mine, its in radii
+        ]
+        # best rigid motion between corresponding legs, and its residuals
+        legs = np.concatenate([other, other + machine.n_legs])
+        before, after = points[0][:, legs].reshape(-1, 3), points[k + 1].reshape(-1, 3)
+        turn = register(after, before)
+        off = (after @ turn[:3, :3].T + turn[:3, 3] - before) / centre_sigma
+        # each end counts once, not in each configuration
+        out[k] = -0.5 * (np.sum(off**2) / len(readings) + np.sum(np.concatenate(tubes) ** 2))
+    return out
 
 
 def numbering_note(session: Session) -> Iterator[Finding]:

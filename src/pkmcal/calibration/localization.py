@@ -147,13 +147,8 @@ def _check_columns(session: Session, bad: list[str]) -> None:
     error = reading_error(
         best.hypothesis, document["file"], document["columns"], machine.joint_units, without
     )
-    raise InputError(
-        error.what,
-        where=error.where,
-        found=f"readings that the machine cannot take in configuration {listed(bad)}",
-        expected=error.expected,
-        next_step=error.next_step,
-        code=error.code,
+    raise error.with_fields(
+        found=f"readings that the machine cannot take in configuration {listed(bad)}"
     )
 
 

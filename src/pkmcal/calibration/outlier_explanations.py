@@ -29,11 +29,10 @@ from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.hypotheses import (
     EvidenceLevel,
-    decide,
+    likely,
     log_likelihood,
     parameter_cost,
     posterior,
-    rivals_of,
 )
 from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
@@ -156,16 +155,13 @@ def _explained(
         [replace(one, log_prior=one.log_prior + prior) for one in hypotheses],
         [EvidenceLevel("readings", ratios)],
     )
-    best = decide(ranked)
-    if best is None:
-        return None, k
-    likely = [one.hypothesis for one in (best, *rivals_of(ranked))]
-    exchanged = [one for one in likely if "partner" in one.facts]
+    explanations = [one.hypothesis for one in likely(ranked)]
+    exchanged = [one for one in explanations if "partner" in one.facts]
     if exchanged:
         partner = exchanged[0].facts["partner"]
         return _misnamed(session, name, names[partner], True), partner
-    motors = [one for one in likely if "motor" in one.facts]
-    like = [names[one.facts["like"]] for one in likely if "like" in one.facts]
+    motors = [one for one in explanations if "motor" in one.facts]
+    like = [names[one.facts["like"]] for one in explanations if "like" in one.facts]
     if len(motors) == 1:
         facts = motors[0].facts
         column = wrong_reading(columns[facts["motor"]], units[facts["motor"]], name)
@@ -196,7 +192,7 @@ def _wrong_readings(
             return out
 
         facts = {"motor": motor, "value": value[[motor]], "sigma": information[[motor]] ** -0.5}
-        cost = parameter_cost(1, len(measured.configuration))
+        cost = parameter_cost(1, poses.noise.shape[0] * joints.shape[1])
         yield ReadingHypothesis("readings.outvoted", f"motor {motor}", apply, cost, facts=facts)
 
 

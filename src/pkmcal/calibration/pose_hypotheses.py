@@ -29,7 +29,7 @@ from pkmcal.arrays import Array, Integers, evenly
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.localization import frozen_in
-from pkmcal.errors import InputError, PkmcalError
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
@@ -42,29 +42,26 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.outcome.hypotheses import (
+    NO_ESTIMATE,
     OPTIONS,
     EvidenceLevel,
     Explanation,
     Hypothesis,
     Ranked,
-    decide,
+    estimate_level,
+    likely,
     log_likelihood,
     parameter_cost,
     posterior,
-    rivals_of,
 )
 from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
-from pkmcal.session.station_movement import how_far
+from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
 
 SUSPECT_SCALE = 2.0
 """Factor on the noise of poses, or of edges, from which mistakes are looked for."""
 SUSPECT_REJECTED_SHARE = 0.1
 """Share of rejected poses from which they are."""
-FEWEST_POSES_A_SIDE = 3
-"""Poses on either side of a movement: fewer are outliers."""
-OTHER_SIZE = 2e-3
-"""Relative difference of a board's size below which the print is as good as printers are."""
 EXPLAINED_POSES_SHARE = 0.85
 """Share of the poses that a mistake put right has to explain; the rest may be outliers."""
 HOPELESS_POSE_SCALE = 50.0
@@ -76,11 +73,9 @@ still while its readings move, or the reverse, is off by 20 to 50 times as much.
 NOMINAL_DRAWS = 4
 """Machines drawn from the prior sigmas to know how large closure residuals are by nominal errors:
 four draws of some thirty parameters each tell it to a tenth."""
-PAIR_CONFIGURATIONS = 48
-"""Configurations, spread over all, in which pairs of mistakes are compared: a thousand pairs in
-seconds."""
-NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
-"""Errors by which an estimate under a hypothesis fails."""
+CLOSURE_CONFIGURATIONS = 48
+"""Configurations, spread over all, by which poses and readings are tested for a contradiction, and
+in which pairs of mistakes are compared: a thousand pairs in seconds."""
 
 
 class PoseCase(NamedTuple):
@@ -115,9 +110,9 @@ class PoseEvidence:
     """Levels of evidence for the mistakes of one machine's measured poses.
 
     machine : nominal. null_misfit : of the poses as stated, by an estimate. closure_unit : misfit
-    by closure below which differences are nominal errors, in stated standard deviations. rows :
-    configurations (n,) that closure compares; all, if None. estimates, misfits : by an estimate and
-    by closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
+    by closure below which differences are nominal errors, in stated standard deviations. most :
+    configurations that closure compares; all, if None. estimates, misfits : by an estimate and by
+    closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
     """
 
     def __init__(
@@ -130,7 +125,7 @@ class PoseEvidence:
         self.machine, self.measurements = machine, measurements
         self.null_misfit, self.closure_unit = null_misfit, closure_unit
         self.n_effective = effective_sample_size(machine, measurements)
-        self.rows: Integers | None = None
+        self.most: int | None = None
         self.estimates: dict[int, Estimate] = {}
         self.misfits: dict[int, float] = {}
         self.untested: list[tuple[str, str]] = []
@@ -140,8 +135,8 @@ class PoseEvidence:
         less likely than none, and for all but the best variant of an explanation.
         """
         cases = [one.apply(PoseCase(self.measurements)).measurements for one in hypotheses]
-        misfits = closure_misfits(self.machine, [self.measurements, *cases], self.rows)
-        misfits = misfits / self.closure_unit
+        few = [spread_over(case, self.most) for case in (self.measurements, *cases)]
+        misfits = closure_misfits(self.machine, few) / self.closure_unit
         self.misfits = {id(one): m for one, m in zip(hypotheses, misfits[1:].tolist(), strict=True)}
         null, *values = log_likelihood(misfits, self.n_effective).tolist()
         best: dict[tuple[str, str], int] = {}
@@ -157,39 +152,57 @@ class PoseEvidence:
         readings = np.array([one.code.startswith("readings.") for one in hypotheses])
         return np.where(retained & (~readings | (ratios + prior > 0)), ratios, -np.inf)
 
-    def by_estimate(self, hypotheses: Sequence[PoseHypothesis]) -> Array:
-        """Log-likelihood ratios by joint estimates, minus infinity where none is tenable."""
-        null = log_likelihood(np.array(self.null_misfit), self.n_effective)
-        out = np.full(len(hypotheses), -np.inf)
-        for k, one in enumerate(hypotheses):
-            case = one.apply(PoseCase(self.measurements))
-            try:
-                start = case.start or start_from_poses(self.machine, case.measurements)
-                value = bundle(
-                    self.machine, case.measurements, start, hopeless=HOPELESS_POSE_SCALE,
-                    scale_readings=False,
-                )  # fmt: skip
-            except NO_ESTIMATE as error:
-                self.untested.append((one.code, str(error)))
-                continue
-            self.estimates[id(one)] = value
-            misfit = pose_misfit(value)
-            if misfit < VERDICT.too_noisy:
-                out[k] = log_likelihood(np.array(misfit), self.n_effective) - null
-        return out
+    @property
+    def by_estimate(self) -> EvidenceLevel[PoseHypothesis]:
+        """Level of evidence by joint estimates."""
+
+        def misfit(hypothesis: PoseHypothesis) -> float:
+            value = self.estimates[id(hypothesis)] = self.estimate(hypothesis, HOPELESS_POSE_SCALE)
+            return pose_misfit(value)
+
+        def failed(hypothesis: PoseHypothesis, why: str) -> None:
+            self.untested.append((hypothesis.code, why))
+
+        return estimate_level(misfit, self.null_misfit, self.n_effective, VERDICT.too_noisy, failed)
+
+    def estimate(self, hypothesis: PoseHypothesis, hopeless: float = np.inf) -> Estimate:
+        """The estimate from the data as they would be without the mistake.
+
+        hopeless : factor on the poses' noise from which it is given up after a first search. Raises
+        one of NO_ESTIMATE where there is none.
+        """
+        case = hypothesis.apply(PoseCase(self.measurements))
+        start = case.start or start_from_poses(self.machine, case.measurements)
+        return bundle(
+            self.machine, case.measurements, start, hopeless=hopeless, scale_readings=False
+        )
+
+    def beside(self, first: PoseHypothesis) -> Diagnosis:
+        """A second mistake, of any kind, beside a first one in the readings."""
+        try:
+            value = self.estimate(first)
+        except NO_ESTIMATE as error:
+            return Diagnosis(untested=((first.code, str(error).rstrip(".")),))
+        without = first.apply(PoseCase(self.measurements)).measurements
+        second = diagnose(self.machine, without, value)
+        if second.hypothesis is None:
+            return second
+        named = self._with_constants(first, value)
+        parts = (*named.facts.get("parts", (named,)), second.hypothesis)
+        return second._replace(hypothesis=replace(first, facts={"parts": parts}), rivals=())
 
     def diagnosis(self, ranked: Sequence[Ranked[PoseHypothesis]]) -> Diagnosis:
         """What to decide by hypotheses that were estimated."""
-        best, untested = decide(ranked), tuple(self.untested)
-        if best is None:
+        found, untested = likely(ranked), tuple(self.untested)
+        if not found:
             return Diagnosis(untested=untested)
+        best, *others = found
         value = self.estimates[id(best.hypothesis)]
         movement = _movement(self.machine, best.hypothesis, value)
         hypothesis = self._with_constants(best.hypothesis, value)
         # such as a camera that moved beside a board that did
-        rivals = [one.hypothesis for one in rivals_of(ranked) if one.log_odds > OPTIONS.report]
-        misfit = pose_misfit(value)
-        return Diagnosis(hypothesis, best.log_odds, misfit, movement, untested, tuple(rivals))
+        rivals = tuple(one.hypothesis for one in others)
+        return Diagnosis(hypothesis, best.log_odds, pose_misfit(value), movement, untested, rivals)
 
     def _with_constants(self, hypothesis: PoseHypothesis, estimate: Estimate) -> PoseHypothesis:
         """The hypothesis with the constants (m or rad) of its reversed motors as estimated.
@@ -227,29 +240,33 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
     levels = (
         # nominal errors are in these residuals, so closure drops hypotheses and confirms none
         EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most),
-        EvidenceLevel("estimate", evidence.by_estimate),
+        evidence.by_estimate,
     )
     return evidence.diagnosis(posterior(pose_hypotheses(machine, measurements, estimate), levels))
 
 
-def diagnose_by_closure(machine: Machine, measurements: Measurements, limit: float) -> Diagnosis:
-    """The mistake in the readings, or the two, that explain why poses contradict them.
+def diagnose_by_closure(
+    machine: Machine, measurements: Measurements, misfit: float, limit: float
+) -> Diagnosis:
+    """The mistake in the readings that explains why poses contradict them, with another one of any
+    kind where one alone does not.
 
-    By closure they have to leave nominal errors alone; those that do are estimated. limit : of
+    By closure mistakes in the readings have to leave nominal errors alone; those that do are
+    estimated. misfit : of the poses as stated, in stated standard deviations. limit : of
     :func:`closure_limit`.
     """
-    (misfit,) = (closure_misfits(machine, [measurements]) / limit).tolist()
     evidence = PoseEvidence(machine, measurements, misfit, limit)
     closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
-    estimate = EvidenceLevel("estimate", evidence.by_estimate)
     single = reading_mistakes(machine, measurements)
     for hypotheses in (single, _pairs(single, measurements)):
-        likely = [one.hypothesis for one in posterior([*hypotheses], [closure])]
-        tenable = [one for one in likely if evidence.misfits[id(one)] < 1]
-        diagnosis = evidence.diagnosis(posterior(tenable, [estimate]))
+        closing = [one.hypothesis for one in posterior([*hypotheses], [closure])]
+        tenable = [one for one in closing if evidence.misfits[id(one)] < 1]
+        diagnosis = evidence.diagnosis(posterior(tenable, [evidence.by_estimate]))
+        if diagnosis.hypothesis is None and tenable:
+            diagnosis = evidence.beside(tenable[0])
         if diagnosis.hypothesis is not None:
             return diagnosis
-        evidence.rows = evenly(len(measurements.joints), PAIR_CONFIGURATIONS)
+        evidence.most = CLOSURE_CONFIGURATIONS
     return Diagnosis()
 
 
@@ -281,18 +298,24 @@ def _usual(squares: Array) -> Array:
 # ------------------------------------------------------------------ evidence: closure
 
 
-def closure_misfits(
-    machine: Machine, cases: Sequence[Measurements], rows: Integers | None = None
-) -> Array:
+def spread_over(measurements: Measurements, most: int | None) -> Measurements:
+    """Readings and poses of at most ``most`` configurations, spread evenly; of all, if None."""
+    if most is None or most >= len(measurements.joints):
+        return measurements
+    rows, poses = evenly(len(measurements.joints), most), measurements.poses
+    poses = poses.select(np.isin(poses.configuration, rows))
+    poses = replace(poses, configuration=np.searchsorted(rows, poses.configuration))
+    return replace(measurements, joints=measurements.joints[rows], poses=poses)
+
+
+def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
     """Misfits (N,) of N cases of measurements where platform poses follow from the nominal machine
     and the readings: as :func:`pose_misfit`.
 
     Each pair of a station and a mount on the platform is laid by itself, by the best of the closed
     forms. Cases may differ in their readings and in their poses' stations, mounts and values.
-    rows : configurations (n,) that are compared; all, if None.
     """
-    rows = np.arange(len(cases[0].joints)) if rows is None else rows
-    joints = np.stack([case.joints[rows] for case in cases])
+    joints = np.stack([case.joints for case in cases])
     fk = machine.forward_result(joints.reshape(-1, joints.shape[-1])).T_base_platform
     body = fk.reshape(*joints.shape[:2], 4, 4)
     # where legs do not meet, the nearest pose is off by as much as the readings are wrong
@@ -306,11 +329,10 @@ def closure_misfits(
         poses, on_platform = cases[group[0]].poses, cases[group[0]].on_platform
         observed = np.stack([cases[k].poses.T_station_target for k in group])
         squares: list[Array] = []
-        compared = np.isin(poses.configuration, rows)
-        pairs = np.unique(np.stack([poses.station, poses.mount], axis=1)[compared], axis=0)
+        pairs = np.unique(np.stack([poses.station, poses.mount], axis=1), axis=0)
         for s, m in pairs[on_platform[pairs[:, 1]]]:
-            own = np.flatnonzero((poses.station == s) & (poses.mount == m) & compared)
-            at = np.searchsorted(rows, poses.configuration[own])
+            own = np.flatnonzero((poses.station == s) & (poses.mount == m))
+            at = poses.configuration[own]
             squares.append(_laid(body[group][:, at], observed[:, own], poses.whiten[own]))
         if squares:
             out[group] = _usual(np.concatenate(squares, axis=1))
@@ -333,10 +355,20 @@ def _laid(body: Array, observed: Array, whiten: Array) -> Array:
     return each[best, np.arange(each.shape[1])]
 
 
-def closure_limit(machine: Machine, measurements: Measurements, rng: np.random.Generator) -> float:
+def closure_limit(
+    machine: Machine,
+    measurements: Measurements,
+    rng: np.random.Generator,
+    enough: float = np.inf,
+) -> float:
     """Misfit by closure, as of :func:`closure_misfits`, beyond which poses and readings contradict
     each other: NOMINAL_ERROR_FACTOR times that of machines drawn from the prior sigmas.
+
+    enough : a lower bound of the limit is returned once it is no less, after one draw as a rule.
     """
+    squares, limit = 0.0, NOMINAL_ERROR_FACTOR
+    if limit >= enough:
+        return limit
     poses, exact = measurements.poses, measurements.poses.T_station_target.copy()
     fk = machine.forward_result(measurements.joints).T_base_platform[poses.configuration]
     moving = measurements.on_platform[poses.mount]
@@ -346,16 +378,14 @@ def closure_limit(machine: Machine, measurements: Measurements, rng: np.random.G
     exact[whole, :3, :3] = fk[whole, :3, :3]
     nominal = replace(measurements, poses=replace(poses, T_station_target=exact))
     spread = machine.parameters.tolerance
-    expected = [
-        closure_misfits(
-            machine.with_values(
-                machine.parameters.unit_axes(machine.values + spread * rng.normal(size=len(spread)))
-            ),
-            [nominal],
-        )[0]
-        for _ in range(NOMINAL_DRAWS)
-    ]
-    return NOMINAL_ERROR_FACTOR * max(float(np.sqrt(np.mean(np.square(expected)))), 1.0)
+    for _ in range(NOMINAL_DRAWS):
+        values = machine.values + spread * rng.normal(size=len(spread))
+        drawn = machine.with_values(machine.parameters.unit_axes(values))
+        squares += float(closure_misfits(drawn, [nominal])[0]) ** 2 / NOMINAL_DRAWS
+        limit = NOMINAL_ERROR_FACTOR * max(np.sqrt(squares), 1.0)
+        if limit >= enough:
+            break
+    return limit
 
 
 # ------------------------------------------------------------------ hypotheses
@@ -422,7 +452,7 @@ def _movements(measurements: Measurements, estimate: Estimate) -> Iterator[PoseH
         for s in np.unique(poses.station[poses.mount == m]):
             rows = np.flatnonzero((poses.mount == m) & (poses.station == s))
             rows = rows[np.argsort(poses.configuration[rows], kind="stable")]
-            if len(rows) < 2 * FEWEST_POSES_A_SIDE:
+            if len(rows) < 2 * FEWEST_BESIDE_MOVEMENT:
                 continue
             at = _jump(measurements, estimate, rows)
             later = rows[at:]
@@ -492,9 +522,9 @@ def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int
     off = off / np.maximum(scale, 1e-3 * max(scale.max(), 1e-12))
     rest = [
         sum(np.abs(part - np.median(part, axis=0)).sum() for part in (off[:at], off[at:]))
-        for at in range(FEWEST_POSES_A_SIDE, len(rows) - FEWEST_POSES_A_SIDE + 1)
+        for at in range(FEWEST_BESIDE_MOVEMENT, len(rows) - FEWEST_BESIDE_MOVEMENT + 1)
     ]
-    return FEWEST_POSES_A_SIDE + int(np.argmin(rest))
+    return FEWEST_BESIDE_MOVEMENT + int(np.argmin(rest))
 
 
 def _movement(machine: Machine, hypothesis: PoseHypothesis, estimate: Estimate) -> Array:
@@ -521,14 +551,12 @@ def _sizes(
     poses = measurements.poses
     boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == "board"]
     rows = np.flatnonzero(np.isin(poses.mount, boards) & measurements.on_platform[poses.mount])
-    if not boards or len(rows) < 2 * FEWEST_POSES_A_SIDE:
+    if not boards or len(rows) < 2 * FEWEST_BESIDE_MOVEMENT:
         return
     state = start_state(machine, measurements, estimate.state.T_camera_base)
     there = state.T_base_platform[poses.configuration[rows], :3, 3]
     in_view = poses.T_station_target[rows, :3, 3]
     size = float(np.sqrt(np.var(there, axis=0).sum() / np.var(in_view, axis=0).sum()))
-    if abs(size - 1) < OTHER_SIZE:
-        return
 
     def apply(case: PoseCase) -> PoseCase:
         T = case.measurements.poses.T_station_target.copy()
@@ -548,7 +576,7 @@ def poses_disagree(estimate: Estimate) -> bool:
     return bool(rejected.size) and (
         estimate.statistics.pose_scale > SUSPECT_SCALE
         or rejected.mean() > SUSPECT_REJECTED_SHARE
-        or rejected.sum() >= 2 * FEWEST_POSES_A_SIDE
+        or rejected.sum() >= 2 * FEWEST_BESIDE_MOVEMENT
     )
 
 
@@ -561,16 +589,17 @@ def check_closure(session: Session, boards: Boards) -> None:
     measurements = measurements_of(session, boards)
     poses = measurements.poses
     positions = (poses.rows >= 3) & measurements.on_platform[poses.mount]
-    if np.count_nonzero(positions) < 2 * FEWEST_POSES_A_SIDE:
+    if np.count_nonzero(positions) < 2 * FEWEST_BESIDE_MOVEMENT:
         return  # a frame and mount of their own explain few
-    machine = session.machine
-    limit = closure_limit(machine, measurements, np.random.default_rng(0))
-    (misfit,) = closure_misfits(machine, [measurements]).tolist()
+    machine, few = session.machine, spread_over(measurements, CLOSURE_CONFIGURATIONS)
+    (misfit,) = closure_misfits(machine, [few]).tolist()
+    limit = closure_limit(machine, few, np.random.default_rng(0), enough=misfit)
     if misfit <= limit:
         return
     if error := frozen_in(session):
         raise error
-    if error := _error_of(session, diagnose_by_closure(machine, measurements, limit), misfit):
+    diagnosis = diagnose_by_closure(machine, measurements, misfit, limit)
+    if error := _error_of(session, diagnosis, misfit):
         raise error
 
 
@@ -578,14 +607,15 @@ def explain_poses(
     session: Session,
     measurements: Measurements,
     estimate: Estimate,
-    richer: tuple[RicherModel, ...] = (),
+    richer: RicherModel | None = None,
 ) -> Explanation:
     """The mistake that explains why poses disagree with the machine, if any.
 
-    richer : other models of the mechanism file; where one of them fits, the model is at fault.
+    richer : the model of the mechanism file that explains the poses; where they agree with it, no
+    mistake is looked for.
     Raises InputError where poses disagree and a reading never changes.
     """
-    if not poses_disagree(estimate) or any(model.scale < SUSPECT_SCALE for model in richer):
+    if not poses_disagree(estimate) or (richer is not None and richer.scale < SUSPECT_SCALE):
         return Explanation()
     if error := frozen_in(session):
         raise error
@@ -593,7 +623,7 @@ def explain_poses(
     untested: tuple[Finding, ...] = ()
     if diagnosis.untested:
         codes = [code for code, _ in diagnosis.untested]
-        why = diagnosis.untested[0][1].rstrip(".")
+        why = diagnosis.untested[0][1]
         untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
     error = _error_of(session, diagnosis, pose_misfit(estimate))
     return Explanation(error, diagnosis.log_odds, untested)
@@ -608,23 +638,36 @@ def _error_of(session: Session, diagnosis: Diagnosis, misfit: float) -> InputErr
     error = _error(session, diagnosis.hypothesis, diagnosis, misfit)
     others = [_error(session, one, diagnosis, misfit).what for one in diagnosis.rivals]
     also = f"; the poses fit as well if {' or '.join(others)}" if others else ""
-    return InputError(
-        error.what,
-        where=error.where,
-        found=f"{error.found}{also}",
-        expected=error.expected,
-        next_step=error.next_step,
-        code=error.code,
-    )
+    return error.with_fields(found=f"{error.found}{also}")
 
 
 def _error(
     session: Session, hypothesis: PoseHypothesis, diagnosis: Diagnosis, misfit_before: float
 ) -> InputError:
-    """The error that names the mistake. misfit_before : of the poses with it, in stated sigmas."""
+    """The error that names the mistake, or two. misfit_before : of the poses with it, in stated
+    sigmas.
+    """
+    parts = [
+        _error_of_part(session, one, diagnosis.movement, misfit_before)
+        for one in hypothesis.facts.get("parts", (hypothesis,))
+    ]
+    found = list(dict.fromkeys(f"{one.found}" for one in parts))
+    expected = [f"{one.expected}" for one in parts]
+    residual = f"with that, the poses fit {diagnosis.misfit:.1f} times their noise"
+    (found if parts[-1].code.endswith(".moved") else expected).append(residual)
+    return parts[0].with_fields(
+        what=", and ".join(one.what for one in parts),
+        found="; ".join(found),
+        expected="; ".join(expected),
+        next_step=". ".join(f"{one.next_step}" for one in parts),
+    )
+
+
+def _error_of_part(
+    session: Session, hypothesis: PoseHypothesis, movement: Array, misfit_before: float
+) -> InputError:
+    """The error that names one mistake, without the residual of the poses."""
     facts, joints = hypothesis.facts, session.document["joints"]
-    without = f"the poses fit {diagnosis.misfit:.1f} times their noise"
-    residual = f"with that, {without}"
     if hypothesis.code in ("board.moved", "station.moved"):
         what = (
             "the board was moved on the platform"
@@ -635,7 +678,7 @@ def _error(
         return InputError(
             f"{what} between configuration {before} and {after}",
             where=f"session.yaml, stations.{session.station_names[facts['station']]}",
-            found=f"{how_far(diagnosis.movement).removeprefix(', ')}; {residual}",
+            found=how_far(movement).removeprefix(", "),
             expected="a board screwed to the platform, and a camera that stands still",
             next_step=f"Calibrate with the configurations before {after}, or with those from it on",
             code=hypothesis.code,
@@ -645,20 +688,12 @@ def _error(
             "the board has another size than its file says",
             where=session.document["board"]["file"],
             found=f"a board {facts['size']:.4f} times as large, by how far the platform moved",
-            expected=f"the size as measured with a ruler over many squares; {residual}",
+            expected="the size as measured with a ruler over many squares",
             next_step=f"Multiply square and marker by {facts['size']:.4f}, if a ruler agrees",
             code=hypothesis.code,
         )
     times = f"{misfit_before:.{int(misfit_before < 10)}f}"
-    parts = [
-        reading_error(one, joints["file"], joints["columns"], session.machine.joint_units, without)
-        for one in facts.get("parts", (hypothesis,))
-    ]
-    return InputError(
-        ", and ".join(one.what for one in parts),
-        where=parts[0].where,
-        found=f"poses that the readings miss by {times} times their noise",
-        expected="; ".join(f"{one.expected}" for one in parts),
-        next_step=". ".join(f"{one.next_step}" for one in parts),
-        code=hypothesis.code,
+    error = reading_error(
+        hypothesis, joints["file"], joints["columns"], session.machine.joint_units
     )
+    return error.with_fields(found=f"poses that the readings miss by {times} times their noise")

@@ -10,19 +10,16 @@ and they agree.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from pkmcal.arrays import Array
 from pkmcal.calibration.camera_refinement import refinement_of
 from pkmcal.calibration.case import Case
 from pkmcal.calibration.chance_matches import chance_match_reason
 from pkmcal.calibration.handheld import localize_case
 from pkmcal.calibration.pose_hypotheses import SUSPECT_SCALE
 from pkmcal.calibration.refinement import RefinementResult, refine_alternating
-from pkmcal.errors import PkmcalError
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.document import Leg
@@ -30,11 +27,10 @@ from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.observe.hypotheses import diameters, log_prior_of_each
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.outcome.hypotheses import (
-    EvidenceLevel,
     Explanation,
     Hypothesis,
     decide,
-    log_likelihood,
+    estimate_level,
     posterior,
 )
 from pkmcal.session.load import Session
@@ -59,25 +55,19 @@ def explain_radii(
     n_effective = float(case.session.machine.parameters.free_matrix().shape[1])
     untested: list[Finding] = []
 
-    def by_estimate(hypotheses: Sequence[RadiiHypothesis]) -> Array:
-        out = np.full(len(hypotheses), -np.inf)
-        for k, one in enumerate(hypotheses):
-            try:
-                other = _refined(case, one.apply(case.session), refine_camera, seed)
-            except PkmcalError as error:  # not localized in these images, or undetermined by them
-                why = str(error).rstrip(".")
-                untested.append(note(f"{one.code}_untested", one.subject, why=why))
-                continue
-            misfit = _edge_misfit(other)
-            if misfit <= SUSPECT_SCALE and other.estimate.edge_weights.sum() > inliers:
-                misfits = log_likelihood(np.array([null, misfit]), n_effective)
-                out[k] = misfits[1] - misfits[0]
-        return out
+    def misfit(hypothesis: RadiiHypothesis) -> float:
+        other = _refined(case, hypothesis.apply(case.session), refine_camera, seed)
+        more = other.estimate.edge_weights.sum() > inliers
+        return _edge_misfit(other) if more else np.inf
+
+    def failed(hypothesis: RadiiHypothesis, why: str) -> None:
+        untested.append(note(f"{hypothesis.code}_untested", hypothesis.subject, why=why))
 
     mechanism = case.session.document["mechanism"]
     prior = log_prior_of_each(case.session.machine, case.session.joints)
     half = RadiiHypothesis("tube.diameter", mechanism, _of_half_the_radii, prior)
-    best = decide(posterior([half], [EvidenceLevel("estimate", by_estimate)]))
+    level = estimate_level(misfit, null, n_effective, SUSPECT_SCALE, failed)
+    best = decide(posterior([half], [level]))
     if best is None:
         return Explanation(untested=tuple(untested))
     return Explanation(diameters(mechanism), best.log_odds)

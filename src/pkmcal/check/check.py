@@ -520,7 +520,5 @@ def _pose_scale_findings(settled: Settled) -> list[Finding]:
     scale, richer = settled.turns.estimate.statistics.pose_scale, settled.richer
     if not len(settled.turns.measurements.poses) or scale <= POOR_MODEL_POSE_SCALE:
         return []
-    fits = (model for model in richer if not model.failure)
-    better = min(fits, key=lambda model: model.scale, default=None)
-    model = {"model": better and better.name, "model_scale": better and better.scale}
+    model = {"model": richer and richer.name, "model_scale": richer and richer.scale}
     return [doubtful("poses.explained", scale=scale, **model)]

@@ -33,6 +33,15 @@ class FalseAlarm:
         """Level of each of the tests of one search."""
         return self.level / (len(self.searches) * max(tests, 1))
 
+    def scale(self, dof: float) -> float:
+        """Root mean square of normal errors, in their standard deviations, that one search exceeds
+        by chance at its level.
+        """
+        from scipy.special import chdtri
+
+        dof = max(dof, 1.0)
+        return float(np.sqrt(chdtri(dof, self.of_test(1)) / dof))
+
     def adjusted(self, chance: Array | float, tests: Array | Integers | int) -> Array:
         """P-values among all tests of a session, from the p-values of tests and the number of tests
         that share the level of their search.

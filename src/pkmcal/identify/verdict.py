@@ -13,6 +13,7 @@ from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.confirmation import FAR_FROM_NOMINAL
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.parameter_estimates import decided_by
 from pkmcal.identify.sentences import Sentence
@@ -81,15 +82,13 @@ VERDICT = VerdictOptions()
 
 @dataclass(frozen=True)
 class RicherModel:
-    """Another model of the mechanism file, tried on the same poses.
+    """Another model of the mechanism file, which explains the poses.
 
-    scale : noise scale of the poses with it, infinite where there is no estimate.
-    failure : reason why there is none.
+    scale : noise scale of the poses with it.
     """
 
     name: str
     scale: float
-    failure: str = ""
 
 
 def judge(
@@ -98,7 +97,7 @@ def judge(
     findings: Findings,
     method: str = "bundle",
     *,
-    richer: tuple[RicherModel, ...] = (),
+    richer: RicherModel | None = None,
     explained: bool = False,
     others: Sequence[Finding] = (),
     options: VerdictOptions = VERDICT,
@@ -106,7 +105,7 @@ def judge(
     """Verdict on an estimate of a session.
 
     findings : what the data determine of the machine, and what they leave unidentified.
-    richer : models of the machine that were tried because this one is insufficient for the poses.
+    richer : the model of the machine that explains the poses, where this one is insufficient.
     explained : whether the model discrepancy surely explains the scatter of heights; the standard
     deviations then contain it.
     others : findings of any level about the session.
@@ -272,7 +271,12 @@ def _readings_misfit(estimate: Estimate, options: VerdictOptions) -> Iterator[Fi
     if np.mean(bad) > options.contradicted_share:
         joint = int(np.argmax(bad.sum(axis=0))) + 1
         yield wrong(
-            "readings.misfit", f"joint {joint}", joint=joint, number=int(bad.sum()), of=bad.size
+            "readings.misfit",
+            f"joint {joint}",
+            joint=joint,
+            number=int(bad.sum()),
+            of=bad.size,
+            limit=options.reading_residual,
         )
 
 
@@ -306,23 +310,20 @@ def _base_alone(estimate: Estimate, options: VerdictOptions) -> Finding:
 
 
 def _poses_misfit(
-    estimate: Estimate, richer: tuple[RicherModel, ...], options: VerdictOptions
+    estimate: Estimate, richer: RicherModel | None, options: VerdictOptions
 ) -> Iterator[Finding]:
     """Findings on poses that the model does not explain, of which many are rejected, or that
-    scatter more than stated; with the simplest of the richer models that fit equally well.
+    scatter more than stated; with the richer model that explains them.
     """
     s = estimate.statistics
-    best = min((model.scale for model in richer), default=np.inf)
-    fits = next((model for model in richer if model.scale < 1.1 * best), None)
-    better = {"model": fits and fits.name, "model_scale": fits and fits.scale}
+    better = {"model": richer and richer.name, "model_scale": richer and richer.scale}
     if s.pose_scale > options.too_noisy:
         yield wrong("poses.misfit", scale=s.pose_scale, **better)
     share = float(np.mean(estimate.pose_weights < 0.5)) if estimate.pose_weights.size else 0.0
     if share > options.too_many_rejected:
         yield wrong("poses.rejected_share", share=share, limit=options.too_many_rejected)
-    # the scale of n numbers that are noise has the standard deviation 1 / sqrt(2 n)
-    chance = 1 + 4 / np.sqrt(2 * max(s.dof_poses, 1.0))
-    if max(POOR_MODEL_POSE_SCALE, chance) < s.pose_scale <= options.too_noisy:
+    least = max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(s.dof_poses))
+    if least < s.pose_scale <= options.too_noisy:
         yield doubtful("poses.scatter", scale=s.pose_scale, **better)
 
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from math import log
+from math import log, pi
 from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.outcome.hypotheses import Hypothesis
+from pkmcal.outcome.hypotheses import Hypothesis, parameter_cost
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
 RANGE_MARGIN = 0.05
@@ -26,6 +26,13 @@ tolerance."""
 CONSTANTS_IN_A_STROKE = 16
 """Constants that are tried for a reversed motor in one stroke. One that is half a step off moves
 the platform by a thirtieth of the stroke, a tenth of what the reversed readings do."""
+
+SLIP_SHARE = 0.01
+"""Prior share of single readings that are wrong, such as mistyped ones."""
+SLIP_DECADES = 6
+"""Decades about the width of a range over which a wrong reading may be."""
+OTHER_UNITS = {"m": 1e-3, "rad": pi / 180}
+"""Factor to each SI unit from the one in which readings are often written, mm or degrees."""
 
 ReadingHypothesis = Hypothesis[Array]
 """Data of these hypotheses are readings (K, m), m or rad. Facts: ``motors``, the columns (from 0)
@@ -47,6 +54,89 @@ def reading_hypotheses(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
     ]
     prior = -log(max(len({one.meaning for one in hypotheses}), 1))
     return [replace(one, log_prior=prior) for one in hypotheses]
+
+
+def range_hypotheses(joints: Array, ranges: Array, units: Sequence[str]) -> list[ReadingHypothesis]:
+    """Mistakes in whole columns of readings (K, m) that their ranges (m, 2) can show, with equal
+    prior odds: readings in millimetres or degrees, signs, and another zero point of all joints with
+    a unit, or of those that leave their range.
+
+    units : ``m`` or ``rad`` for each joint. Facts in addition: ``factor`` (m,) of the readings, and
+    ``constants``, the smallest and largest by which all of them are in range.
+    """
+    out, kinds = list[ReadingHypothesis](), np.array(units)
+    low, high = ranges.T
+    slack = RANGE_MARGIN * (high - low)
+    # fmax and fmin ignore NaN: an unknown range allows any constant
+    least = np.fmax(low - slack - joints.min(axis=0), -np.inf)
+    most = np.fmin(high + slack - joints.max(axis=0), np.inf)
+    for unit, factor in OTHER_UNITS.items():
+        if (kinds == unit).any():
+            out.append(_linear("readings.units", kinds == unit, factor))
+    stated, turned = (range_log_likelihood(sign * joints, ranges) for sign in (1, -1))
+    reverse = (-joints.max(axis=0) >= low - slack) & (-joints.min(axis=0) <= high + slack)
+    if (reverse & (turned > stated)).any():
+        out.append(_linear("readings.sign", reverse & (turned > stated), -1.0))
+    for unit in dict.fromkeys(units):
+        same = kinds == unit
+        for which in (same, same & ((least > 0) | (most < 0))):
+            ends = np.max(least[which], initial=-np.inf), np.min(most[which], initial=np.inf)
+            if ends[0] <= ends[1] and np.isfinite(ends).all():
+                cost = parameter_cost(1, joints[:, which].size)
+                middle = float(np.mean(ends))
+                out.append(_linear("readings.zero", which, 1.0, middle, cost, constants=ends))
+    prior = -log(max(len(out), 1))
+    return [replace(one, log_prior=prior + one.log_prior) for one in out]
+
+
+def _linear(
+    code: str,
+    which: Booleans,
+    factor: float,
+    constant: float = 0.0,
+    log_prior: float = 0.0,
+    **facts: Any,
+) -> ReadingHypothesis:
+    """Readings of the motors ``which`` (m,) times a factor, plus a constant."""
+    factors, motors = np.where(which, factor, 1.0), tuple(np.flatnonzero(which).tolist())
+    return ReadingHypothesis(
+        code,
+        f"motors {', '.join(str(motor + 1) for motor in motors)}",
+        lambda joints: factors * joints + np.where(which, constant, 0.0),
+        log_prior,
+        facts={"motors": motors, "factor": factors, **facts},
+    )
+
+
+def range_ratios(joints: Array, ranges: Array, hypotheses: Sequence[ReadingHypothesis]) -> Array:
+    """Log-likelihood ratios (N,) of hypotheses about readings (K, m) by their ranges (m, 2)."""
+    known = np.isfinite(ranges).all(axis=1)
+    null = range_log_likelihood(joints, ranges).sum()
+    values = [range_log_likelihood(one.apply(joints), ranges).sum() for one in hypotheses]
+    # density of the table's readings by that of the right ones
+    scales = [np.log(np.abs(one.facts["factor"]))[known].sum() for one in hypotheses]
+    return np.array(values) - null + len(joints) * np.array(scales)
+
+
+def range_log_likelihood(joints: Array, ranges: Array) -> Array:
+    """Log-likelihood (m,) of each column of readings (K, m) by its range (m, 2), relative to
+    readings that are uniform over the range with its margin; constant for unknown ranges.
+
+    Readings beyond their range are slips, each by any factor, or the range is stated too narrow,
+    by RANGE_MARGIN on average.
+    """
+    low, high = ranges.T
+    width, slack = (1 + 2 * RANGE_MARGIN) * (high - low), RANGE_MARGIN * (high - low)
+    # in widths of the range; fmax ignores NaN, an unknown range
+    below = np.fmax((low - slack - joints) / width, 0.0)
+    above = np.fmax((joints - high - slack) / width, 0.0)
+    ends = below.max(axis=0) + above.max(axis=0)
+    # uniform in the logarithm, so no other unit, or sign, makes slips likelier
+    size = np.maximum(np.abs(joints) / width, 10.0 ** (-SLIP_DECADES / 2))
+    slip = np.log(SLIP_SHARE / (2 * log(10.0) * SLIP_DECADES * size))
+    slips = np.where(below + above > 0, slip, np.log1p(-SLIP_SHARE)).sum(axis=0)
+    wider = -len(joints) * np.log1p(ends) - ends / RANGE_MARGIN
+    return np.maximum(slips, wider)
 
 
 def reversed_motor(motor: int, constant: float) -> ReadingHypothesis:
@@ -133,16 +223,16 @@ def shifted_rows(count: int) -> list[ReadingHypothesis]:
 
 
 def reading_error(
-    hypothesis: ReadingHypothesis,
+    hypothesis: Hypothesis[Any],
     file: str,
     columns: Sequence[str],
     units: Sequence[str],
-    without: str,
+    without: str = "",
 ) -> InputError:
     """The error that names a mistake in the readings, without what shows it.
 
     file : of the readings, with ``columns``. units : ``m`` or ``rad`` of each. without : what the
-    data do where the readings are right.
+    data do where the readings are right, for the end of what is expected.
     """
     facts, where = hypothesis.facts, f"{file}, line 1"
     names = [columns[motor] for motor in facts.get("motors", ())]
@@ -180,7 +270,7 @@ def reading_error(
     return InputError(
         what,
         where=where,
-        expected=f"{expected}; with that, {without}",
+        expected=f"{expected}; with that, {without}" if without else expected,
         next_step=next_step,
         code=hypothesis.code,
     )

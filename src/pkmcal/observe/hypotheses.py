@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations, islice
 from typing import NamedTuple
 
@@ -37,8 +38,9 @@ from pkmcal.outcome.hypotheses import (
     EvidenceLevel,
     Hypothesis,
     HypothesisOptions,
+    decide,
+    likely,
     posterior,
-    rivals_of,
 )
 from pkmcal.wording import how_often, listed
 
@@ -98,6 +100,9 @@ class SuspectStation(NamedTuple):
         if self.by_hand is None:
             return 0.0
         return float(angle_between(self.localization.T_camera_base, self.by_hand))
+
+
+StationPair = tuple[SuspectStation, SuspectStation]
 
 
 @dataclass(frozen=True)
@@ -167,29 +172,48 @@ def _little(station: SuspectStation) -> str:
 def _swapped_stations(
     stations: list[SuspectStation], rng: np.random.Generator
 ) -> InputError | None:
-    """The error about two stations that are each recognised near the other's pose, and better than
-    mirrored at their own: a symmetric machine's mirror image looks much as the machine does from
-    the other side.
+    """The error about two stations whose images are exchanged, rather than mirrored: a symmetric
+    machine's mirror image looks much as the machine does from the other side.
+
+    stations : localized far from where the user says, or not at all.
     """
-    for one, other in islice(combinations(stations, 2), STATION_PAIRS_SEARCHED):
-        if one.by_hand is None or other.by_hand is None:
-            continue
-        swapped = (one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand))
-        swapped = [
-            s._replace(localization=find_station(s.view, s.by_hand, rng, near_prior=True))
-            for s in swapped
+    placed = [station for station in stations if station.by_hand is not None]
+
+    def exchanged(pair: StationPair) -> StationPair:
+        one, other = pair
+        return one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand)
+
+    def mirrored(pair: StationPair) -> StationPair:
+        views = (replace(s.view, tables=s.view.tables.mirrored()) for s in pair)
+        one, other = (s._replace(view=view) for s, view in zip(pair, views, strict=True))
+        return one, other
+
+    def by_near_search(pair: StationPair, hypotheses: Sequence[Hypothesis[StationPair]]) -> Array:
+        out = np.zeros(len(hypotheses))
+        for k, hypothesis in enumerate(hypotheses):
+            for s in hypothesis.apply(pair):
+                at = find_station(s.view, s.by_hand, rng, near_prior=True)
+                if s._replace(localization=at).elsewhere:
+                    out[k:] = -np.inf  # mirrored images matter beside exchanged ones alone
+                    return out
+                out[k] += at.log_likelihood_ratio / at.correlation_length
+        return out
+
+    for one, other in islice(combinations(placed, 2), STATION_PAIRS_SEARCHED):
+        subject = f"{one.name} and {other.name}"
+        hypotheses = [
+            Hypothesis("station.exchanged", subject, exchanged),
+            Hypothesis("image.mirrored", subject, mirrored),
         ]
-        if any(station.elsewhere for station in swapped):
-            continue
-        view = replace(one.view, tables=one.view.tables.mirrored())
-        mirrored = find_station(view, one.by_hand, rng, near_prior=True)
-        if not (mirrored.good and mirrored.likelier(swapped[0].localization) > OPTIONS.act):
+        level = EvidenceLevel("near search", partial(by_near_search, (one, other)))
+        best = decide(posterior(hypotheses, [level], SEARCH_OPTIONS))
+        if best is not None and best.hypothesis.code == "station.exchanged":
             return InputError(
-                f"stations {one.name} and {other.name} are mixed up",
+                f"stations {subject} are mixed up",
                 where="session.yaml, stations",
                 found="the images of each fit the pose of the other",
-                next_step=f"Exchange the poses of {one.name} and {other.name} in session.yaml,"
-                " or their image folders",
+                next_step=f"Exchange the poses of {subject} in session.yaml, or their image"
+                " folders",
                 code="station.exchanged",
             )
     return None
@@ -238,9 +262,9 @@ def _mixed_up(
         # of few images any other explanation may fit better by chance
         levels.append(searched(view.few(len(view.configuration))))
     hypotheses, others = list(_hypotheses(station)), list(_other_images(station))
-    likely = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
+    some = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
     count = len(hypotheses) + len(others)
-    return _likelier(station, [*others, *likely], in_order, rng, count)
+    return _likelier(station, [*others, *some], in_order, rng, count)
 
 
 def _likelier(
@@ -282,28 +306,20 @@ def _likelier(
         return out
 
     level = EvidenceLevel("full search", by_full_search)
-    ranked = [
-        one
-        for one in posterior(hypotheses, [level], SEARCH_OPTIONS)
-        if one.log_odds > OPTIONS.report
+    errors = [
+        one.hypothesis.error for one in likely(posterior(hypotheses, [level], SEARCH_OPTIONS))
     ]
-    if not ranked:
+    if not errors:
         return None
-    error = ranked[0].hypothesis.error
-    also = [one.hypothesis.error.what for one in rivals_of(ranked)]
+    error, also = errors[0], [one.what for one in errors[1:]]
     if station.elsewhere and localization.good:
         also.append("the pose by hand is of another side of the machine")
     distinct = [what for what in dict.fromkeys(also) if what != error.what]  # several numberings
     if not distinct:
         return error
     rivals = f"fit as well if {' or '.join(distinct)}"
-    return InputError(
-        error.what,
-        where=error.where,
-        found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}",
-        expected=error.expected,
-        next_step=error.next_step,
-        code=error.code,
+    return error.with_fields(
+        found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}"
     )
 
 

@@ -25,7 +25,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, PkmcalError
 from pkmcal.outcome.finding import Finding
 
 Data = TypeVar("Data")
@@ -52,6 +52,8 @@ class HypothesisOptions:
 
 
 OPTIONS = HypothesisOptions()
+NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
+"""Errors by which an estimate under a hypothesis fails."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,33 @@ class EvidenceLevel(NamedTuple, Generic[Subject]):
     log_likelihood_ratios: Callable[[Sequence[Subject]], Array]
     decides: bool = True
     most: int | None = None
+
+
+def estimate_level(
+    misfit: Callable[[Subject], float],
+    null: float,
+    n_effective: float,
+    tenable: float,
+    failed: Callable[[Subject, str], None],
+) -> EvidenceLevel[Subject]:
+    """Level of evidence by an estimate under each hypothesis.
+
+    misfit : of the residuals without the mistake, as of :func:`log_likelihood`; raises one of
+    NO_ESTIMATE where there is none. null : misfit as stated. tenable : misfit from which a
+    hypothesis explains nothing. failed : called with hypotheses without an estimate, and why.
+    """
+
+    def ratios(hypotheses: Sequence[Subject]) -> Array:
+        values = np.full(len(hypotheses), np.inf)
+        for k, one in enumerate(hypotheses):
+            try:
+                values[k] = misfit(one)
+            except NO_ESTIMATE as error:
+                failed(one, str(error).rstrip("."))
+        values = np.where(values < tenable, values, np.inf)
+        return log_likelihood(values, n_effective) - log_likelihood(np.array(null), n_effective)
+
+    return EvidenceLevel("estimate", ratios)
 
 
 class Ranked(NamedTuple, Generic[Subject]):
@@ -153,6 +182,17 @@ def decide(
     return ranked[0] if ranked[0].log_odds > limit else None
 
 
+def likely(
+    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
+) -> list[Ranked[Subject]]:
+    """The hypothesis to follow, then the others to be reported that it does not exclude; empty
+    where none is likely enough.
+    """
+    first = decide(ranked, options)
+    rivals = rivals_of(ranked, options) if first else []
+    return [one for one in (first, *rivals) if one and one.log_odds > options.report]
+
+
 def rivals_of(
     ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
 ) -> list[Ranked[Subject]]:
@@ -165,14 +205,23 @@ def rivals_of(
     return list(out.values())
 
 
-def refuse(*explanations: Explanation) -> tuple[Finding, ...]:
+def refuse(
+    *explanations: Callable[[], Explanation], options: HypothesisOptions = OPTIONS
+) -> tuple[Finding, ...]:
     """Raise the error of the likeliest explanation; notes on what could not be tested where none
     has an error.
+
+    explanations : the cheapest first. Later ones are not computed once one has odds of ``act``.
     """
-    likeliest = max(explanations, key=lambda one: one.log_odds)
+    likeliest, untested = Explanation(), list[Finding]()
+    for explain in explanations:
+        likeliest = max(likeliest, one := explain(), key=lambda one: one.log_odds)
+        untested += one.untested
+        if likeliest.log_odds > options.act:
+            break
     if likeliest.error is not None:
         raise likeliest.error
-    return tuple(found for one in explanations for found in one.untested)
+    return tuple(untested)
 
 
 def parameter_cost(count: int, n_effective: float) -> float:

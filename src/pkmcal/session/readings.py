@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from math import pi
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,9 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.measurements import Column
-from pkmcal.mechanisms.reading_hypotheses import RANGE_MARGIN
+from pkmcal.mechanisms.reading_hypotheses import RANGE_MARGIN, range_hypotheses, range_ratios
 from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.outcome.hypotheses import EvidenceLevel, decide, posterior
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
 # Largest range of K repeated readings, in standard deviations: below 6 for any K under a million,
@@ -23,19 +24,17 @@ from pkmcal.wording import DISPLAY_UNITS, listed, number
 _SAME_SIGMAS = 6.0
 _UNITS = {
     "m": (
-        1e-3,
         "millimetres",
         "metres",
         "Divide them by 1000, or head the columns leg1 [mm] and so on",
     ),
     "rad": (
-        pi / 180,
         "degrees",
         "radians",
         "Multiply them by pi/180, or head them motor1 [deg] and so on",
     ),
 }
-"""By SI unit: factor from the likely wrong unit, its name, the right one's name, and the remedy."""
+"""By SI unit: name of the likely wrong unit, that of the right one, and the remedy."""
 
 
 def check_readings(
@@ -57,9 +56,7 @@ def check_readings(
             expected="two at least; one cannot tell a joint's place from its offset",
             next_step="Move the machine and take more images; 15 configurations are usual",
         )
-    _check_units(table, ranges, units)
-    _check_signs(table, ranges)
-    _check_shift(table, ranges, units)
+    _check_mistakes(table, ranges, units)
     return _check_ranges(table, ranges) + _check_movement(table, noise)
 
 
@@ -86,100 +83,52 @@ def _check_columns(table: CsvTable, n_joints: int) -> None:
         )
 
 
-def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Refuse readings in mm or degrees: most are out of range, and in range after conversion.
-
-    Readings that signs alone bring back have the right unit: divided by a thousand, or 57, nearly
-    all are near zero, which most ranges contain.
-    """
-    signs = np.where(_reversed(table, ranges), -1.0, 1.0)
-    if _inside(signs * table.values, ranges).all():
+def _check_mistakes(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
+    """Refuse readings that a mistake in whole columns explains better than their ranges do."""
+    level = EvidenceLevel("ranges", partial(range_ratios, table.values, ranges))
+    best = decide(posterior(range_hypotheses(table.values, ranges, units), [level]))
+    if best is None:
         return
-    for kind, (factor, unit, expected, next_step) in _UNITS.items():
-        finite = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
-        if not finite.any() or _inside(table.values, ranges)[:, finite].mean() > 0.5:
-            continue
-        if _inside(table.values * factor, ranges)[:, finite].mean() > 0.5:
-            column = int(np.flatnonzero(finite)[0])
-            low, high = ranges[column]
-            raise InputError(
-                f"the readings look like {unit}",
-                where=table.where(0, column),
-                found=f"{table.values[0, column]:g}",
-                expected=f"{expected}, between {low:g} and {high:g}",
-                next_step=next_step,
-                code="readings.units",
-            )
-
-
-def _reversed(table: CsvTable, ranges: Array) -> Booleans:
-    """Whether each column (m,) is mostly out of range and all in range with the other sign."""
-    here, there = _inside(table.values, ranges), _inside(-table.values, ranges)
-    return (here.mean(axis=0) < 0.5) & there.all(axis=0)
-
-
-def _check_signs(table: CsvTable, ranges: Array) -> None:
-    """Refuse a joint whose readings are mostly out of range and all in range with the opposite
-    sign.
-    """
-    wrong = np.flatnonzero(_reversed(table, ranges))
-    if not wrong.size:
-        return
-    column = int(wrong[0])
+    facts = best.hypothesis.facts
+    motors = [k for k in facts["motors"] if np.isfinite(ranges[k]).all()]
+    column, names = motors[0], listed([table.columns[k] for k in facts["motors"]], 7)
     row = int(np.argmin(_inside(table.values, ranges)[:, column]))
     low, high = ranges[column]
-    names = listed([table.columns[k] for k in wrong])
+    if best.hypothesis.code == "readings.units":
+        unit, expected, next_step = _UNITS[units[column]]
+        what = f"the readings look like {unit}"
+        expected = f"{expected}, between {low:g} and {high:g}"
+    elif best.hypothesis.code == "readings.sign":
+        what = f"the readings of {names} have the wrong sign"
+        expected = f"{low:g} to {high:g}, where all of them lie with the other sign"
+        next_step = (
+            "Turn the sign of this column round, or the axis and range in the mechanism file"
+        )
+    else:
+        unit = units[column]
+        scale, display = DISPLAY_UNITS[unit]
+        least, most = (
+            number(end * scale, 0 if unit == "m" else 1, signed=True) for end in facts["constants"]
+        )
+        what = (
+            f"the readings of {names} are off by one constant: they count from another place than"
+            " the mechanism file does, such as from the homing switch"
+        )
+        expected = (
+            f"{low:g} to {high:g}, where all of them lie with one number between {least} and {most}"
+            f" {display} added"
+        )
+        next_step = (
+            "Add the readings' constant to these columns, as far as you know it, or put it into the"
+            " mechanism file's offsets: what is left of it is calibrated"
+        )
     raise InputError(
-        f"the readings of {names} have the wrong sign",
+        what,
         where=table.where(row, column),
         found=f"{table.values[row, column]:g}",
-        expected=f"{low:g} to {high:g}, where all of them lie with the other sign",
-        next_step="Turn the sign of this column round, or the axis and range in the mechanism file",
-        code="readings.sign",
-    )
-
-
-def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
-    """Refuse readings with another zero point: readings of all joints, or of some, that are mostly
-    out of range and are all in range after one constant shift.
-    """
-    inside, near = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
-    if near.all():
-        return
-    outside = inside.mean(axis=0) < 0.5
-    for unit in dict.fromkeys(units):
-        same = np.array(units) == unit
-        for which in (same, same & outside):
-            if not which.any() or inside[:, which].mean() > 0.5 or not near[:, ~which].all():
-                continue
-            low, high = ranges[which].T
-            readings, slack = table.values[:, which], RANGE_MARGIN * (high - low)
-            # fmax and fmin ignore NaN: an unknown range allows any shift
-            least = float(np.fmax.reduce(low - slack - readings.min(axis=0)))
-            most = float(np.fmin.reduce(high + slack - readings.max(axis=0)))
-            if least <= most:
-                raise _shift_error(table, ranges, which, (least, most), unit)
-
-
-def _shift_error(
-    table: CsvTable, ranges: Array, which: Booleans, shift: tuple[float, float], unit: str
-) -> InputError:
-    """Error about joints ``which`` (m,) whose readings are in range after a shift (least, most)."""
-    column = int(np.flatnonzero(which)[0])
-    low, high = ranges[column]
-    scale, name = DISPLAY_UNITS[unit]
-    least, most = (number(end * scale, 0 if unit == "m" else 1, signed=True) for end in shift)
-    return InputError(
-        f"the readings of {listed([table.columns[k] for k in np.flatnonzero(which)], 7)} are off by"
-        " one constant: they count from another place than the mechanism file does, such as from"
-        " the homing switch",
-        where=table.where(0, column),
-        found=f"{table.values[0, column]:g}",
-        expected=f"{low:g} to {high:g}, where all of them lie with one number between {least} and"
-        f" {most} {name} added",
-        next_step="Add the readings' constant to these columns, as far as you know it, or put it"
-        " into the mechanism file's offsets: what is left of it is calibrated",
-        code="readings.zero",
+        expected=expected,
+        next_step=next_step,
+        code=best.hypothesis.code,
     )
 
 
