@@ -43,6 +43,7 @@ from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, listed
 
 MISPLACED_PROBABILITY = 0.05
@@ -461,7 +462,7 @@ def inconsistent_poses(
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations))
     by_board = by_board[: len(session.stations)] >= 0.5
     visible = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
-    used = measured & (estimate.edge_weights >= 0.5)
+    used = measured & (estimate.edge_weights >= INLIER_WEIGHT)
     visible[station[used], measurements.edges.leg[used]] = True
     few = visible.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
     lost = ((2 * inliers < count) | (inliers < FEWEST_EDGES) | few) & ~by_board

@@ -16,6 +16,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
 from pkmcal.identify.verdict import VERDICT
+from pkmcal.levels import MAJORITY
 from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_error, reversed_motor
 from pkmcal.observe import legs
@@ -42,8 +43,6 @@ CalibrationProgress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share done, 0 to 1."""
 ALLOWED_LEG_MISS = 2.0
 """Prior sigmas of a centre by which legs may miss the platform at the nearest nominal pose."""
-LEAST_REACHED_SHARE = 0.5
-"""Share of the configurations that the nominal model has to reach for the others to be accepted."""
 
 
 def check_observable(session: Session) -> None:
@@ -109,7 +108,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
         raise error.as_input(session.document["mechanism"]) from None
     # near the ends of its workspace a nominal model that is right to its tolerance may not close
     near = fk.error < ALLOWED_LEG_MISS * session.machine.document.tolerance.center
-    if near.all() or (most and near.mean() > LEAST_REACHED_SHARE):
+    if near.all() or (most and near.mean() > MAJORITY):
         _check_turns(session, fk.T_base_platform, near)
         return fk.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]

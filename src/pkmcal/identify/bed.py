@@ -19,6 +19,7 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import columns_of, eliminated_beside, prior_root
 from pkmcal.identify.tool import pose_by_parameters
+from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Column
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.solver.elimination import divisions, rows_on_shared
@@ -30,8 +31,6 @@ NOTICED_TOUCH_DEVIATIONS = 4.13
 """Standard deviations by which a touch has to be off what all others tell of it to be noticed: one
 right touch in a thousand seems to be, and four wrong ones in five are found (W. Baarda, A testing
 procedure for use in geodetic networks, 1968)."""
-BED_ROUNDING_SHARE = 1e-9
-"""Share of what a parameter does below which it is rounding."""
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 """Turn from one place to the next on a spiral that covers a disc evenly."""
 
@@ -146,12 +145,10 @@ def _nominal_root(machine: Machine, by: Array) -> Array:
     free, wide = (t.free_matrix() * t.tolerances_free() for t in (table, everything))
     by = by.reshape(-1, by.shape[-1])
     u, s, _ = np.linalg.svd(by @ free, full_matrices=False)
-    u = u[:, s > BED_ROUNDING_SHARE * s[0]]
+    u = u[:, s > ROUNDING * s[0]]
     shifted = by @ wide
     own = np.linalg.norm(shifted - u @ (u.T @ shifted), axis=0)
-    return np.column_stack(
-        [free, wide[:, own > BED_ROUNDING_SHARE * np.linalg.norm(shifted, axis=0)]]
-    )
+    return np.column_stack([free, wide[:, own > ROUNDING * np.linalg.norm(shifted, axis=0)]])
 
 
 def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tuple[Array, Array]:
@@ -210,9 +207,7 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
     rows = rows_on_shared(info.linear, info.reduced)[0][0]
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0] = 1.0
-    inverse = np.linalg.pinv(
-        (rows / scale).T @ (rows / scale), rcond=BED_ROUNDING_SHARE, hermitian=True
-    )
+    inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=ROUNDING, hermitian=True)
     inverse /= scale[:, None] * scale
     own = rows[: len(rows) - len(problem.prior)]
     # all that a configuration says, its pose aside, is one number: what was felt there
@@ -220,7 +215,7 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
     felt = s[:, :1] * vt[:, 0]
     gain = felt @ inverse
     remainder = 1 - np.sum(gain * felt, axis=1)
-    if remainder.min() < BED_ROUNDING_SHARE:
+    if remainder.min() < ROUNDING:
         return None
     shifted = height @ problem.free @ gain[:, problem.unknowns.machine].T
     return float(

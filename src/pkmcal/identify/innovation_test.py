@@ -25,10 +25,8 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.robust import as_pairs
 from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.strips import eliminated
-
-REJECTED_BELOW_WEIGHT = 0.5
-"""Weight below which a pose counts as rejected."""
 
 
 def innovations(info: Information, distance: Array, weight: Array, scale: Array) -> Array:
@@ -42,7 +40,7 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
     scale : (B,) noise scale of the poses.
     """
     kind = info.problem.kinds.poses
-    rejected = kind.present & (weight < REJECTED_BELOW_WEIGHT)
+    rejected = kind.present & (weight < INLIER_WEIGHT)
     if not rejected.any():
         return distance
     out, factor, count = distance.copy(), as_pairs(kind), info.problem.layout.n_equations

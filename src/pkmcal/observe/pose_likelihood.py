@@ -61,14 +61,18 @@ class LikelihoodOptions:
     elsewhere_turn: float = 0.2
     # standard deviation of its shift, relative to the distance between base and platform
     elsewhere_shift: float = 0.1
-    # smallest median distance between the silhouettes of two different poses: twice the largest
-    # scatter
-    apart: float = 8.0
     # steps of expectation maximization of a mixture that is used afterwards; within a descent
     # three suffice, for the poses change too
     mixture_rounds: int = 10
     # longest step of a pose, rad and m: the tables' slopes are valid nearby only
     longest_step: float = 0.1
+
+    @property
+    def apart(self) -> float:
+        """Smallest median distance between the silhouettes of two different poses, reduced pixels:
+        twice the largest scatter.
+        """
+        return 2 * self.last_reach
 
 
 LIKELIHOOD_OPTIONS = LikelihoodOptions()

@@ -17,6 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import InputError
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.candidates import (
@@ -42,18 +43,12 @@ AT_WORK = 60
 """Number of poses of the workspace at which the tool's accuracy is evaluated."""
 BETTERING_ROUNDS = 8
 """Maximum number of rounds of local improvement."""
-LEAST_ROUND_GAIN = 0.01
-"""Minimum relative gain of a round for another one to follow."""
 FOR_PLACES = 24
 """Number of configurations for the comparison of stations."""
 RANDOM_PLANS_COMPARED = 10
 """Number of random selections with which a plan is compared."""
 CAPTURE_MULTIPLES = (2, 4)
 """Multiples of the planned number of images for which the accuracy is predicted as well."""
-WORTHWHILE_ACCURACY_GAIN = 0.01
-"""Minimum relative gain of the tool's standard deviation by one more configuration at each station
-that makes it worthwhile.
-"""
 POSES_BETWEEN_CONFIGURATIONS = 8
 """Number of poses that are checked on the path between two configurations."""
 REROUTING_ATTEMPTS = 5
@@ -128,11 +123,11 @@ class MeasurementPlan:
     @property
     def pays_until(self) -> float | None:
         """Number of configurations at each station after which one more improves the tool by less
-        than :data:`WORTHWHILE_ACCURACY_GAIN`; None if all planned ones are worthwhile.
+        than a negligible share; None if all planned ones are worthwhile.
         """
         for before, after in pairwise(self.curve):
             each = 1 - (after.position / before.position) ** (1 / (after.count - before.count))
-            if each < WORTHWHILE_ACCURACY_GAIN and after.count <= self.promised.count:
+            if each < NEGLIGIBLE and after.count <= self.promised.count:
                 return before.count
         return None
 
@@ -259,7 +254,7 @@ class _Selection:
             best = pool.candidates.only(chosen)
             covariance = pool.info.covariance(pool.info.of(chosen))
             before, size = size, index.size(float(index.value(covariance)), len(covariance))
-            if size > (1 - LEAST_ROUND_GAIN) * before:
+            if size > (1 - NEGLIGIBLE) * before:
                 break
         return best
 

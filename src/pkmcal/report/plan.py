@@ -12,6 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, json_value, yaml_text
 from pkmcal.geometry.rigid import inverse
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.pages.plots import (
@@ -23,7 +24,7 @@ from pkmcal.pages.plots import (
     path_between_cameras,
     uncropped,
 )
-from pkmcal.planning.plan import WORTHWHILE_ACCURACY_GAIN, Accuracy, MeasurementPlan, TriedPlace
+from pkmcal.planning.plan import Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, number
@@ -136,7 +137,7 @@ def _worth_note(plan: MeasurementPlan) -> Finding:
     facts = {
         "tool_sigma": twice.position,
         "gain": 1 - twice.position / last.position,
-        "worthwhile": WORTHWHILE_ACCURACY_GAIN,
+        "worthwhile": NEGLIGIBLE,
     }
     if until is None:
         return note("plan.all_pay", **facts)
