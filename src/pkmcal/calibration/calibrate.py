@@ -67,7 +67,7 @@ from pkmcal.identify.unidentified import (
     observed_legs,
     only_heights,
 )
-from pkmcal.identify.verdict import RicherModel, judge
+from pkmcal.identify.verdict import RicherModel, assess
 from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -486,7 +486,7 @@ def _judge(
         *(one.finding for one in turns.responses),
         *found,
     )
-    verdict = judge(
+    verdict = assess(
         turns.observation,
         value.estimate,
         findings,

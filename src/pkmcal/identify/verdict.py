@@ -99,7 +99,7 @@ class RicherModel:
     failure: str = ""
 
 
-def judge(
+def assess(
     observation: Observation,
     estimate: Estimate,
     findings: Findings,
