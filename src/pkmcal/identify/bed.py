@@ -17,7 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import columns_of, eliminated_beside, prior_root
+from pkmcal.identify.score import columns_of, eliminate_beside, prior_root
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Column
@@ -187,7 +187,7 @@ def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, A
         divisions(*problem.extent), Information(problem, state).pieces(), strict=True
     ):
         linear = piece.linear
-        own, value = eliminated_beside(linear, columns(cut, linear) @ root)
+        own, value = eliminate_beside(linear, columns(cut, linear) @ root)
         parts.append((own.reshape(-1, own.shape[-1]), value.ravel()))
         reference = ~linear.shared_by[:, machine].any(axis=1)
         if not cut.start:

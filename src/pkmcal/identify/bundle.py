@@ -119,7 +119,7 @@ class BatchResult:
     robust weights 0..1 of each kind of measurement. scale : (B,) factors on the stated noise of
     each kind; the edges' is the annealing's, and one as soon as their noise was looked for. info :
     the problem as it was solved, weights and noise included, and what it says at the solution.
-    edges : their noise, as stated where it was not looked for; robust_weight : (B, K, G) by how
+    edges : their noise, as stated where it was not looked for; irls_weight : (B, K, G) by how
     much more or less each counts for it. stated : (B or 1,) the readings' noise before.
     """
 
@@ -128,7 +128,7 @@ class BatchResult:
     scale: Kinds[Array]
     info: Information
     edges: EdgeScatter
-    robust_weight: Array
+    irls_weight: Array
     stated: Array
     options: BatchOptions
 
@@ -236,7 +236,7 @@ def _settle(
     nearly = False
     for number in range(options.most_rounds):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
-        scale, edges, irls_weight = fit.scale, fit.edges, fit.robust_weight
+        scale, edges, irls_weight = fit.scale, fit.edges, fit.irls_weight
         if scale_noise:
             scale = Kinds(
                 np.ones_like(scale.edges),
@@ -569,7 +569,7 @@ def _estimate(
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
         edge_noise=result.edges.of_run(0),
-        edge_trust=assembled.places.edges.taken(result.robust_weight[0]),
+        edge_trust=assembled.places.edges.taken(result.irls_weight[0]),
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),
         configurations=assembled.observed,

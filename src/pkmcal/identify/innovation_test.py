@@ -26,7 +26,7 @@ from pkmcal.identify.robust import as_pairs
 from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
 from pkmcal.solver.kernels import INLIER_WEIGHT
-from pkmcal.solver.strips import eliminated
+from pkmcal.solver.strips import eliminate_strips
 
 
 def innovations(info: Information, distance: Array, weight: Array, scale: Array) -> Array:
@@ -47,7 +47,7 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
     for cut in divisions(*info.problem.extent):
         part, state = info.problem.among(cut), info.problem.state_among(info.state, cut)
         # R and W by the weighted rows
-        used = eliminated(part.compact(state), np.zeros(len(state.z)))
+        used = eliminate_strips(part.compact(state), np.zeros(len(state.z)))
         # A: the same rows without weights
         whole = Kinds(*(one.present[None].astype(float) for one in part.kinds))
         rows = part.weighted(whole).compact(state)

@@ -203,7 +203,7 @@ class ScoreTests:
         for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
             linear = piece.linear
             further = [by_random(cut, linear) @ root, columns(cut, linear)]
-            rows, remainder = eliminated_beside(linear, np.concatenate(further, axis=-1))
+            rows, remainder = eliminate_beside(linear, np.concatenate(further, axis=-1))
             count = taken = problem.unknowns.count + root.shape[1]
             wide: list[Array] = []
             for f in every:
@@ -396,7 +396,7 @@ def _basis_beside(assembled: Assembled, info: Information, beside: Sequence[Colu
     across, squared = np.zeros((basis.shape[1], count)), np.eye(count)
     na = len(basis)
     for cut, piece in zip(divisions(*assembled.problem.extent), info.pieces(), strict=True):
-        rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ root)
+        rows, _ = eliminate_beside(piece.linear, columns(cut, piece.linear) @ root)
         flat = rows.reshape(-1, na + count)
         across += (flat[:, :na] @ basis).T @ flat[:, na:]
         squared += flat[:, na:].T @ flat[:, na:]
@@ -440,7 +440,7 @@ def _products(
     for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
         linear = piece.linear
         further = [random(cut, linear) @ root, columns(cut, linear)]
-        rows, value = eliminated_beside(linear, np.concatenate(further, axis=-1))
+        rows, value = eliminate_beside(linear, np.concatenate(further, axis=-1))
         count = problem.unknowns.count
         if not cut.start:
             reference_values = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
@@ -472,7 +472,7 @@ def prior_root(columns: Sequence[Column]) -> Array:
     return np.array(block_diag(np.zeros((0, 0)), *(one.prior for one in columns)))
 
 
-def eliminated_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
+def eliminate_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
     """Rows (K', r, na + k) with columns (K', r, k) beside the unknowns' and residuals (K', r), of
     which the configurations' own unknowns are eliminated. Columns are zero in rows that are
     rejected or padding.
