@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pkmcal.calibration.localization import platform_poses, read_images, recognise
+from pkmcal.calibration.localization import localize_by_legs, platform_poses, read_images
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import pose_likelihood, station_localization
@@ -469,7 +469,9 @@ def test_a_place_that_half_of_the_images_miss_is_asked_about_again(tmp_path, mon
     simulate_session(folder, load_mechanism("3-rps"), camera_of_size((640, 480)), settings, seed=5)
     session = load_session(folder)
     visible = read_images(session)
-    (view,) = recognise(session, visible, platform_poses(session), [np.random.default_rng(0)]).views
+    (view,) = localize_by_legs(
+        session, visible, platform_poses(session), [np.random.default_rng(0)]
+    ).views
     localization = find_station(view, None, np.random.default_rng(1))
     true = load_truth(folder, session.machine).T_camera_base[0]
     eye, there = (inverse(T)[:3, 3] for T in (localization.T_camera_base, true))

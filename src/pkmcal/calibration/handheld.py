@@ -26,7 +26,7 @@ import numpy as np
 from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.case import Case, PriorScene
-from pkmcal.calibration.localization import CalibrationProgress, Recognition, locate_stations
+from pkmcal.calibration.localization import CalibrationProgress, LegLocalization, locate_stations
 from pkmcal.calibration.pose_scoring import ScoredPoses, register_images, rescore_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
@@ -75,7 +75,7 @@ class Localization:
     result : the case without the rejected hand-held images, or the error if there is none.
     """
 
-    recognition: Recognition | None
+    leg_localization: LegLocalization | None
     places: Mapping[int, PoseHypotheses]
     result: Case | PkmcalError
 
@@ -115,7 +115,7 @@ def localize(
     search = locate_stations(session, fixed, boards, rng, progress)
     places: dict[int, PoseHypotheses] = {}
     if search.error is not None:
-        return Localization(search.recognition, places, search.error)
+        return Localization(search.leg_localization, places, search.error)
     scene = PriorScene.as_drawn(session, search.T_camera_base)
     # hand-held images, and the reasons of those without a pose or with a contradictory one
     lost: dict[int, str] = {}
@@ -134,8 +134,8 @@ def localize(
         try:
             case = _without(case, lost)
         except PkmcalError as error:
-            return Localization(search.recognition, places, error)
-    return Localization(search.recognition, places, case)
+            return Localization(search.leg_localization, places, error)
+    return Localization(search.leg_localization, places, case)
 
 
 def search_by_hand(

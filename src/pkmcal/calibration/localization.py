@@ -194,7 +194,7 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
 
 
 @dataclass(frozen=True)
-class Recognition:
+class LegLocalization:
     """Localization of all stations.
 
     used : indices of the images that were used, by station; views : of these images.
@@ -210,14 +210,14 @@ class Recognition:
         return all(pose.good for pose in self.localizations)
 
 
-def recognise(
+def localize_by_legs(
     session: Session,
     images: list[StationImages],
     poses: Array,
     rngs: list[np.random.Generator],
     boards: Boards | None = None,
     starts: Array | None = None,
-) -> Recognition:
+) -> LegLocalization:
     """Localize every station that observes legs; nothing is raised.
 
     poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``images``.
@@ -252,7 +252,7 @@ def recognise(
         good[s] = pose.T_camera_base if pose and pose.good else None
     ahead = boards.joined(good)
     solution = _searched(views, [ahead[s] for s in at], solution, rngs)
-    return Recognition(views, tuple(_anywhere(views, solution, rngs)), in_view)
+    return LegLocalization(views, tuple(_anywhere(views, solution, rngs)), in_view)
 
 
 Search = LocalizedPose | None
@@ -300,7 +300,7 @@ def _better(one: LocalizedPose, other: Search) -> LocalizedPose:
 def mistake_in(
     session: Session,
     images: list[StationImages],
-    recognition: Recognition,
+    leg_localization: LegLocalization,
     rng: np.random.Generator,
 ) -> InputError | None:
     """The error about stations that were not recognised, or whose images a hypothesis explains
@@ -308,7 +308,7 @@ def mistake_in(
     its effect may be like any of theirs.
     """
     still = frozen_in(session)
-    if still is not None and not recognition.complete:  # an error in any case, and cheaper
+    if still is not None and not leg_localization.complete:  # an error in any case, and cheaper
         return still
     stations = [session.stations[p.station] for p in images]
     error = mistake(
@@ -325,9 +325,9 @@ def mistake_in(
             )
             for station, view, item, visible in zip(
                 stations,
-                recognition.views,
-                recognition.localizations,
-                recognition.used,
+                leg_localization.views,
+                leg_localization.localizations,
+                leg_localization.used,
                 strict=True,
             )
         ],
@@ -350,7 +350,7 @@ class StationSearch(NamedTuple):
     which mistake explains its images; poses are then incomplete.
     """
 
-    recognition: Recognition | None
+    leg_localization: LegLocalization | None
     T_camera_base: Array
     error: PkmcalError | None
 
@@ -386,7 +386,7 @@ def locate_stations(
     in words and the share done.
     """
     nowhere = np.full((len(session.station_names), 4, 4), np.nan)
-    value: Recognition | None = None
+    value: LegLocalization | None = None
     try:
         start_poses = prior_station_poses(session, boards)
         poses = platform_poses(session) if images else nowhere
@@ -397,7 +397,7 @@ def locate_stations(
         progress = progress or (lambda _text, _share: None)
         count = sum(len(p.images) for p in images)
         progress(f"Recognising the machine in {count} images", 0.2)
-        value = recognise(session, images, poses, rngs[1:], boards, start_poses)
+        value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
         progress("Comparing with what is often mixed up", 0.3)
         mixed_up = mistake_in(session, images, value, rngs[0])
         if mixed_up is not None:

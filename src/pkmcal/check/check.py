@@ -52,7 +52,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, decode
 from pkmcal.observe.pose_candidates import SAME_POSE_TURN
-from pkmcal.observe.quality import Quality, quality, unrecognised_quality
+from pkmcal.observe.quality import Quality, quality, unlocalized_quality
 from pkmcal.observe.station_localization import LocalizedPose
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, of_error
 from pkmcal.session.image_files import label_of
@@ -245,7 +245,7 @@ def _check_images(
         n_legs, observed = session.machine.n_legs, zip(session.stations, images, strict=True)
         return tuple(
             _station_check(
-                station, unrecognised_quality(p.images if p else [], n_legs), recognised=False
+                station, unlocalized_quality(p.images if p else [], n_legs), recognised=False
             )
             for station, p in observed
         )
@@ -301,7 +301,7 @@ def _check_images(
     parts: list[StationInspection] = []
     for p in whole:
         if p.station not in places:  # the search ended at the fault of another station
-            summary = unrecognised_quality(p.images, session.machine.n_legs)
+            summary = unlocalized_quality(p.images, session.machine.n_legs)
             stations[p.station] = _station_check(
                 session.stations[p.station], summary, recognised=False
             )
@@ -338,7 +338,7 @@ def _search_results(
 ) -> dict[int, LocalizedPose]:
     """Localized poses by station number, without stations that were not searched."""
     fixed = [p.station for p in images if not session.stations[p.station].handheld]
-    localizations = located.recognition.localizations if located.recognition else ()
+    localizations = located.leg_localization.localizations if located.leg_localization else ()
     places = dict(zip(fixed, localizations, strict=bool(localizations)))
     # for a hand-held image, the probability of a rival pose takes the place of that of chance
     for k, one in located.places.items():
@@ -365,7 +365,7 @@ def _check_station(
     leg_quality = (
         quality(images, machine, T_camera_base, poses[images.configuration])
         if recognised
-        else unrecognised_quality(images.images, machine.n_legs)
+        else unlocalized_quality(images.images, machine.n_legs)
     )
     summary = replace(
         _station_check(station, leg_quality, recognised=recognised),

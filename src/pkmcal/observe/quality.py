@@ -141,7 +141,7 @@ def _quality(window: ImageWindow, machine: Machine, options: QualityOptions) -> 
     )
 
 
-def unrecognised_quality(
+def unlocalized_quality(
     images: Sequence[Integers], n_legs: int, options: QualityOptions = QUALITY_OPTIONS
 ) -> Quality:
     """Quality of images in which the machine was not localized: exposure of all pixels."""
