@@ -19,8 +19,6 @@ FEW = 1 / 3
 """Share of the expected measurements below which too few were made."""
 MAJORITY = 0.5
 """Share beyond which more are than are not."""
-OUTLYING = 0.4
-"""Share of rejected measurements beyond which the rest may be the outliers."""
 NEARLY_ALL = 0.9
 """Share from which the rest does not matter: a tenth less changes a standard deviation by 5 %."""
 CAUSE_SHARE = 0.3

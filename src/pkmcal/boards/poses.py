@@ -40,7 +40,7 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
-from pkmcal.levels import CONTRADICTION_SIGMAS, OUTLYING
+from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.measurements import Column, PoseSet, Rejection
 from pkmcal.measurements.effects import by_board_size
 from pkmcal.observe.repeats import REPEAT_OPTIONS, groups_of
@@ -65,7 +65,7 @@ class BoardPoseOptions:
     # chance)
     moved: float = 4.0
     # largest share of single images that disagree; with more, the board never stood still
-    most_outlying: float = OUTLYING
+    most_outlying: float = 1 / 3
     # largest share of a pose's covariance that repeats have in common (numerical: keeps the rest
     # invertible)
     most_common: float = 0.99

@@ -23,7 +23,6 @@ from pkmcal.levels import (
     FEW,
     MAJORITY,
     NOISE_EXCESS,
-    OUTLYING,
     ROUNDING,
 )
 from pkmcal.measurements import OWN_SHADING, Observation
@@ -51,7 +50,7 @@ class VerdictOptions:
     # noise scale beyond which the model does not explain the images, or the poses
     too_noisy: float = 4.0
     # share of rejected edges beyond which the remaining ones may be the outliers
-    too_many_rejected: float = OUTLYING
+    too_many_rejected: float = 0.4
     # share of the platform's error by the nominal model that may remain undetermined. A calibration
     # reduces that error by a factor of twenty to fifty; a twentieth of it would be the result's
     # largest error, and more of the same images do not reduce it. A result whose standard deviation

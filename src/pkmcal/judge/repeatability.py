@@ -168,10 +168,7 @@ def study_repeats(
         _station_row(station_edges, names[station_edges.station]) for station_edges in parts
     )
     middle, bound = _over_legs(legs, 0.5), _over_legs(legs, 1.0)
-    results = [_finding(station) for station in stations] or [doubtful("repeats.none")]
-    if stations and all(station.promised < MOSTLY_COMMON for station in stations):
-        results.append(note("repeats.mostly_common"))
-    return RepeatStudy(legs, stations, middle, bound, tuple(results))
+    return RepeatStudy(legs, stations, middle, bound, repeat_findings(stations))
 
 
 def require_repeats(session: Session) -> None:
@@ -541,6 +538,14 @@ def _degrees(value: float) -> str:
 
 def _mm(value: float) -> str:
     return f"{value * 1e3:.2g} mm" if math.isfinite(value) else "–"
+
+
+def repeat_findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
+    """Findings about each station's repeats, and about the benefit of further ones."""
+    results = [_finding(station) for station in stations] or [doubtful("repeats.none")]
+    if stations and all(station.promised < MOSTLY_COMMON for station in stations):
+        results.append(note("repeats.mostly_common"))
+    return tuple(results)
 
 
 def _finding(station: StationScatter) -> Finding:
