@@ -349,10 +349,10 @@ def test_images_of_other_configurations_are_not_recognised():
 DIRECTIONS = DISTANCE_TABLE_OPTIONS.directions
 
 
-@pytest.mark.parametrize("at_once", [pose_likelihood.LIKELIHOOD_OPTIONS.places_at_once, 500])
+@pytest.mark.parametrize("at_once", [pose_likelihood.LIKELIHOOD_OPTIONS.points_at_once, 500])
 def test_places_that_are_only_weighed_find_what_those_find_that_descend(at_once):
     view = view_of(images())
-    view = replace(view, options=replace(view.options, places_at_once=at_once))
+    view = replace(view, options=replace(view.options, points_at_once=at_once))
     at = np.stack([rough_pose(seed) for seed in range(5)])
     every = np.arange(len(view.configuration))
     weighed = pose_likelihood.distances_under(view, at, every, 6)

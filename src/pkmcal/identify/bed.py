@@ -25,7 +25,7 @@ from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.solver.elimination import divisions, rows_on_shared
 from pkmcal.solver.ranks import column_space
 
-PLACES_OVER_BED = 60
+POINTS_OVER_BED = 60
 """Places all over the bed: where nobody probed counts as well."""
 NOTICED_TOUCH_DEVIATIONS = 4.13
 """Standard deviations by which a touch has to be off what all others tell of it to be noticed: one
@@ -117,12 +117,12 @@ def _over_the_disc(probed: Array) -> Array:
     middle = xy.mean(axis=0)
     plane = np.column_stack([np.ones(len(xy)), xy])
     height = np.linalg.lstsq(plane, probed[:, 2, 3], rcond=None)[0]
-    k = np.arange(PLACES_OVER_BED)
-    r = np.linalg.norm(xy - middle, axis=1).max() * np.sqrt((k + 0.5) / PLACES_OVER_BED)
+    k = np.arange(POINTS_OVER_BED)
+    r = np.linalg.norm(xy - middle, axis=1).max() * np.sqrt((k + 0.5) / POINTS_OVER_BED)
     places = middle + r[:, None] * np.stack(
         [np.cos(GOLDEN_ANGLE * k), np.sin(GOLDEN_ANGLE * k)], axis=1
     )
-    out = np.repeat(probed[:1], PLACES_OVER_BED, axis=0)
+    out = np.repeat(probed[:1], POINTS_OVER_BED, axis=0)
     out[:, :2, 3] = places
     out[:, 2, 3] = height[0] + places @ height[1:]
     return out

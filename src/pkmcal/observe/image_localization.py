@@ -167,7 +167,7 @@ def localize_image(
     hypotheses = hypotheses[np.argsort(-log_likelihood_ratio)]
     hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][: options.on_finest]
     # and, with the symmetric poses of the best two, at four times
-    return weighed_places(
+    return weighed_poses(
         view,
         image,
         np.concatenate([hypotheses, symmetric_poses(view, hypotheses[:2], options)]),
@@ -175,7 +175,7 @@ def localize_image(
     )
 
 
-def weighed_places(
+def weighed_poses(
     view: StationView,
     image: Integers,
     values: Array,

@@ -47,7 +47,7 @@ class LikelihoodOptions:
     least_gain: float = 0.1
     # number of silhouette points processed together, so that intermediate results stay in the
     # processor's cache (numerical: no effect on results)
-    places_at_once: int = 30_000
+    points_at_once: int = 30_000
     # smallest scatter of silhouettes: a bin of the chance distances
     least_sigma: float = DISTANCE_TABLE_OPTIONS.bin_width
     # truncation distance of the final score, and largest scatter of silhouettes about image edges
@@ -502,7 +502,7 @@ def _parts(view: StationView, count: int, places: int) -> list[slice]:
     points on each edge.
     """
     each = max(places * len(view.tubes), 1)
-    parts = max(min(round(count * each / view.options.places_at_once), count), 1)
+    parts = max(min(round(count * each / view.options.points_at_once), count), 1)
     ends = [count * k // parts for k in range(parts + 1)]
     return [slice(*pair) for pair in pairwise(ends)]
 

@@ -52,7 +52,7 @@ from pkmcal.measurements.poses import PoseData
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.simulation.edges import EDGE_TURN_PLACES, moved_outward
+from pkmcal.simulation.edges import EDGE_TURN_POINTS, moved_outward
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver.search import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
@@ -394,13 +394,13 @@ def _measured_edges(
         # Exact edge normals, and their rotations by a shift and a tilt of one pixel.
         exact = edge_normal(u, m, radius[:, own], SIDE_SIGNS[edges.side[own]])
         span = edges.span[own]
-        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, EDGE_TURN_PLACES)
+        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, EDGE_TURN_POINTS)
         points = contour_point(
             a[:, :, None], u[:, :, None], exact[:, :, None], radius[:, own, None],
             np.broadcast_to(along, (runs, *along.shape)),
         )  # fmt: skip
         rays = points / np.sqrt(dot(points, points))[..., None]
-        middle = rays[:, :, EDGE_TURN_PLACES // 2]
+        middle = rays[:, :, EDGE_TURN_POINTS // 2]
         frame = tangent_basis(exact, middle)
         flat = (x.reshape(-1, *x.shape[2:]) for x in (exact, frame, rays))
         shift, tilt = moved_outward(camera, *flat)
