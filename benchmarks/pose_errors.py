@@ -42,7 +42,7 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, with_forearms
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.edges import (
-    EDGE_TURN_PLACES,
+    EDGE_TURN_POINTS,
     EdgeNoise,
     disturbed,
     moved_outward,
@@ -359,7 +359,7 @@ def edges_of(
     start, end = a[k, e.leg], b[k, e.leg]
     u = line_through(start, end)[0]
     length = np.sqrt(dot(end - start, end - start))
-    along = e.span[:, :1] + (e.span[:, 1:] - e.span[:, :1]) * np.linspace(0, 1, EDGE_TURN_PLACES)
+    along = e.span[:, :1] + (e.span[:, 1:] - e.span[:, :1]) * np.linspace(0, 1, EDGE_TURN_POINTS)
     by_tube = {(leg, tube): r for leg, tube, r in zip(tubes.leg, tubes.tube, radius, strict=True)}
     r = np.array([by_tube[pair] for pair in zip(e.leg, e.tube, strict=True)])
     p = contour_point(start[:, None], u[:, None], e.normal[:, None], r[:, None], along)
@@ -393,7 +393,7 @@ def edges_of(
     parts = np.stack([by_shift * EDGE_NOISE.shift, by_tilt * EDGE_NOISE.tilt], axis=-1)
     edges = replace(
         e, configuration=rows[k], normal=normal,
-        basis=tangent_basis(normal, rays[:, EDGE_TURN_PLACES // 2]),
+        basis=tangent_basis(normal, rays[:, EDGE_TURN_POINTS // 2]),
         covariance=parts @ parts.mT, shift=by_shift,
     )  # fmt: skip
     # in the new basis the same up to a turn by the tilt's square

@@ -18,10 +18,10 @@ from pkmcal.boards.views import Boards, StationBoard
 from pkmcal.calibration.localization import (
     boards_of,
     check_observable,
+    localize_by_legs,
     localize_stations,
     platform_poses,
     read_images,
-    recognise,
 )
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
@@ -192,7 +192,7 @@ def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
     assert np.linalg.norm(inverse(T[1])[:3, 3] - [0.9, 0.9, 1.1]) > 0.3
     # without the board too: a pose by hand that shows nothing is only where the search begins
     rng = np.random.default_rng(1)
-    alone = recognise(session, images[1:], platform_poses(session), [rng])
+    alone = localize_by_legs(session, images[1:], platform_poses(session), [rng])
     assert alone.complete
     off = pose_difference(alone.localizations[0].T_camera_base, T[1])
     assert np.rad2deg(np.linalg.norm(off[:3])) < 3

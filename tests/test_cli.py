@@ -28,7 +28,7 @@ from pkmcal.commands.cli import main
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import inverse
-from pkmcal.identify.verdict import judge
+from pkmcal.identify.verdict import assess
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
@@ -466,7 +466,7 @@ def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
 def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
     value = calibrated
     others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
-    verdict = judge(value.observation, value.estimate, value.findings, others=others)
+    verdict = assess(value.observation, value.estimate, value.findings, others=others)
     value = replace(value, verdict=verdict)
     monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: value)
     done = run("calibrate", session)

@@ -10,8 +10,9 @@ import pytest
 import printers
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.identify.bed import bed_by_parameters
-from pkmcal.identify.confirmation import FAR_FROM_NOMINAL, rejections_of
+from pkmcal.identify.confirmation import rejections_of
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE
+from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.measurements.rows import Kinds
 from pkmcal.printers.session import write_printer_session
 from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_loss
@@ -40,7 +41,7 @@ def test_hypotheses_weigh_as_their_solutions_do(found):
     assert np.flatnonzero(estimate.pose_weights < 0.5).tolist() == [WRONG]
     assembled, info = estimate.linearized
     drawn = np.array(assembled.priors) == "nominal"
-    wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
+    wider = np.where(drawn, 1 / CONTRADICTION_SIGMAS, 1.0)
     problem = replace(
         info.problem,
         prior=wider[:, None] * info.problem.prior,

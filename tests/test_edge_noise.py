@@ -104,7 +104,7 @@ def test_heavy_tails_are_found_and_deviations_hold():
     result = solve_batch(assembled.problem, truth)
     # lighter than drawn, for the furthest are let go
     assert np.median(result.edges.dof) <= 10
-    assert result.robust_weight.min() < 0.3
+    assert result.irls_weight.min() < 0.3
     assert off(result, truth) == pytest.approx(1, abs=0.2)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from pkmcal.cameras.response import light_in
-from pkmcal.observe.grey_levels import PLACES_IN_ONE_ROW, levels_at
+from pkmcal.observe.grey_levels import POINTS_IN_ONE_ROW, levels_at
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
 
@@ -53,7 +53,7 @@ def test_of_no_places_there_are_no_levels():
     assert levels_at(IMAGE, np.zeros((0, 31)), np.zeros((0, 31)), blur=1.0).shape == (0, 31)
 
 
-@pytest.mark.parametrize("shape", [(7,), (PLACES_IN_ONE_ROW + 3,), (3, 5, PLACES_IN_ONE_ROW // 3)])
+@pytest.mark.parametrize("shape", [(7,), (POINTS_IN_ONE_ROW + 3,), (3, 5, POINTS_IN_ONE_ROW // 3)])
 def test_any_number_of_places_may_be_looked_up(shape):
     """In one row, or in rows that they do not fill."""
     rng = np.random.default_rng(2)

@@ -61,7 +61,7 @@ from pkmcal.session.exif import camera_by_exif
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.placement import places_by_hand
+from pkmcal.simulation.placement import rough_poses
 from pkmcal.simulation.truth import load_truth
 from rendered import rendered
 
@@ -290,7 +290,7 @@ def test_simulated_images_say_how_they_were_held(simulated):
 def test_places_by_hand_are_drawn_apart_and_rolled():
     """With few images too: one to three of a configuration, each from its own place."""
     machine, camera = load_mechanism("gough-stewart"), camera_of_size((400, 300))
-    places = places_by_hand(machine, (camera,) * 24, np.random.default_rng(0))
+    places = rough_poses(machine, (camera,) * 24, np.random.default_rng(0))
     at = np.array([place.position for place in places])
     apart = np.linalg.norm(at[:, None] - at, axis=-1) + 9 * np.eye(24)
     assert apart.min() > 0.02

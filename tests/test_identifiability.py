@@ -21,7 +21,7 @@ from pkmcal.identify.gauge import default_gauge, freedoms, generators, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import explain, observed_legs
-from pkmcal.identify.verdict import judge
+from pkmcal.identify.verdict import assess
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
@@ -79,7 +79,7 @@ def verdict(measurements, value):
         measurements.edges, value.edge_weights, measurements.n_stations, value.machine.n_legs
     )
     values = identifiability(value.linearized.info, value.machine)
-    return judge(observation, value, explain(values, value, observed))
+    return assess(observation, value, explain(values, value, observed))
 
 
 def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():

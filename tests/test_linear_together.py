@@ -14,7 +14,7 @@ from pkmcal.geometry.rigid import apply, look_at, perturb, register
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.gauge import BestFit, centre_index, generators, transformation
 from pkmcal.identify.unidentified import Findings
-from pkmcal.identify.verdict import judge
+from pkmcal.identify.verdict import assess
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.papers import linear
@@ -203,7 +203,7 @@ def test_verdict_says_how_far_the_method_goes(scenes):
         estimate.state.T_camera_base,
     )
     information = Identifiability(0, 0, 0, (), (), np.zeros(0))
-    verdict = judge(observation, estimate, Findings(information, (), (), 1.0), "linear")
+    verdict = assess(observation, estimate, Findings(information, (), (), 1.0), "linear")
     assert not verdict.usable
     (base,) = verdict.of("estimate.base_only")
     both, edges, nominal = (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pkmcal.calibration.localization import platform_poses, read_images, recognise
+from pkmcal.calibration.localization import localize_by_legs, platform_poses, read_images
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import pose_likelihood, station_localization
@@ -349,10 +349,10 @@ def test_images_of_other_configurations_are_not_recognised():
 DIRECTIONS = DISTANCE_TABLE_OPTIONS.directions
 
 
-@pytest.mark.parametrize("at_once", [pose_likelihood.LIKELIHOOD_OPTIONS.places_at_once, 500])
+@pytest.mark.parametrize("at_once", [pose_likelihood.LIKELIHOOD_OPTIONS.points_at_once, 500])
 def test_places_that_are_only_weighed_find_what_those_find_that_descend(at_once):
     view = view_of(images())
-    view = replace(view, options=replace(view.options, places_at_once=at_once))
+    view = replace(view, options=replace(view.options, points_at_once=at_once))
     at = np.stack([rough_pose(seed) for seed in range(5)])
     every = np.arange(len(view.configuration))
     weighed = pose_likelihood.distances_under(view, at, every, 6)
@@ -469,7 +469,9 @@ def test_a_place_that_half_of_the_images_miss_is_asked_about_again(tmp_path, mon
     simulate_session(folder, load_mechanism("3-rps"), camera_of_size((640, 480)), settings, seed=5)
     session = load_session(folder)
     visible = read_images(session)
-    (view,) = recognise(session, visible, platform_poses(session), [np.random.default_rng(0)]).views
+    (view,) = localize_by_legs(
+        session, visible, platform_poses(session), [np.random.default_rng(0)]
+    ).views
     localization = find_station(view, None, np.random.default_rng(1))
     true = load_truth(folder, session.machine).T_camera_base[0]
     eye, there = (inverse(T)[:3, 3] for T in (localization.T_camera_base, true))

@@ -14,7 +14,7 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tange
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.papers import linear
 from pkmcal.simulation import Settings
-from pkmcal.simulation.placement import StationPlace
+from pkmcal.simulation.placement import StationPose
 from rendered import rendered
 
 RADIUS = 0.014
@@ -115,7 +115,7 @@ def test_plain_and_m_regressions_collapse(method):
 def test_a_hexapod_seen_through_a_mirror(tmp_path):
     """Rendered images from between the legs, one place, to a fifth of the nominal error."""
     folder = Path(tmp_path) / "session"
-    station = StationPlace((0.01, -0.02, 0.07), (0.01, -0.02, 0.4), (0.0, -1.0, 0.0))
+    station = StationPose((0.01, -0.02, 0.07), (0.01, -0.02, 0.4), (0.0, -1.0, 0.0))
     settings = Settings(
         stations=(station,), configurations=8, rough_position=0.02, rough_angle=0.05
     )

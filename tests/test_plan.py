@@ -273,9 +273,9 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
 
 
 def test_places_stand_apart_and_better_one_alone(monkeypatch):
-    monkeypatch.setattr("pkmcal.planning.candidates.CAMERA_PLACES_A_RING", 6)
-    monkeypatch.setattr("pkmcal.planning.plan.FOR_PLACES", 8)
-    results = small(hexapod(1), monkeypatch, free_places=2)
+    monkeypatch.setattr("pkmcal.planning.candidates.CAMERA_POSES_A_RING", 6)
+    monkeypatch.setattr("pkmcal.planning.plan.CONFIGURATIONS_FOR_STATIONS", 8)
+    results = small(hexapod(1), monkeypatch, free_stations=2)
     chosen = [tried for tried in results.tried if tried.chosen]
     eyes = np.array([tried.place.position for tried in chosen])
     middle = results.subject.rig.machine.home()[:3, 3]

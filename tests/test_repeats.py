@@ -17,12 +17,12 @@ from pkmcal.geometry.rigid import dot, look_at, perturb
 from pkmcal.judge.repeatability import (
     Cylinders,
     RepeatStudy,
-    _findings,
     _station_row,
     _StationEdges,
     axis_coordinates,
     by_ends,
     fit_motions,
+    repeat_findings,
     require_repeats,
     study_repeats,
 )
@@ -347,7 +347,7 @@ def test_two_edges_of_a_leg_say_nothing_of_its_motion(machine, poses):
 
 
 def test_repeats_without_an_edge_in_common_are_no_accuracy():
-    (finding,) = _findings(())
+    (finding,) = repeat_findings(())
     assert finding.level is Level.DOUBTFUL
     assert finding.text.startswith("No edge shows in two images")
 

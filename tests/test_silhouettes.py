@@ -282,7 +282,7 @@ def test_without_images_by_hand_none_is_searched(tripod_calibration):
     session = tripod_calibration.session
     rng = np.random.default_rng(0)
     value = handheld.localize(session, read_images(session), Boards(), rng)
-    assert value.recognition is not None
+    assert value.leg_localization is not None
     assert value.places == {}
 
 

@@ -14,7 +14,7 @@ from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, explain, observed_legs
-from pkmcal.identify.verdict import VERDICT, judge, no_gain
+from pkmcal.identify.verdict import VERDICT, assess, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.conditions import conditions
@@ -39,7 +39,7 @@ def judged(scene, *views):
     values = identifiability(estimate.linearized.info, estimate.machine)
     observed = observed_legs(edges, estimate.edge_weights, measurements.n_stations, machine.n_legs)
     findings = explain(values, estimate, observed, conditions(machine, observed))
-    return observation, estimate, findings, judge(observation, estimate, findings)
+    return observation, estimate, findings, assess(observation, estimate, findings)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_light_that_moves_single_edges_is_warned_of(whole):
 
     def said_of(*shading):
         noise = replace(estimate.edge_noise, shading=np.array(shading))
-        verdict = judge(observation, replace(estimate, edge_noise=noise), findings)
+        verdict = assess(observation, replace(estimate, edge_noise=noise), findings)
         return verdict.of("edges.polished")
 
     (text,) = said_of(0.08, 0.2)
@@ -129,7 +129,7 @@ def test_the_share_of_the_drawings_error_decides(whole):
     least = VERDICT.undetermined_share * findings.by_nominal
 
     def verdict(*open_):
-        return judge(observation, estimate, replace(findings, unidentified=open_))
+        return assess(observation, estimate, replace(findings, unidentified=open_))
 
     below, above = verdict(sentence(0.9 * least)), verdict(sentence(1.1 * least))
     assert below.usable
@@ -149,9 +149,9 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
     observation, estimate, findings, _ = whole
     open_ = (sentence(2 * VERDICT.undetermined_share * findings.by_nominal),)
     findings = replace(findings, unidentified=open_)
-    assert not judge(observation, estimate, findings).usable
+    assert not assess(observation, estimate, findings).usable
     unsure = replace(estimate, joint_covariance=1e3 * estimate.joint_covariance)
-    assert judge(observation, unsure, findings).usable
+    assert assess(observation, unsure, findings).usable
 
 
 def test_a_result_that_is_no_gain_is_refused(whole):
@@ -161,7 +161,7 @@ def test_a_result_that_is_no_gain_is_refused(whole):
     for share, usable in ((0.9, True), (1.1, False)):
         factor = share * VERDICT.nominal_error_share * findings.by_nominal / sigma
         unsure = replace(estimate, joint_covariance=factor**2 * estimate.joint_covariance)
-        value = judge(observation, unsure, findings)
+        value = assess(observation, unsure, findings)
         assert value.usable == usable
         assert len(value.reasons) == (not usable)
     assert no_gain(np.nan, 1.0)
@@ -172,18 +172,18 @@ def test_without_a_degree_of_freedom_it_is_refused(whole):
     observation, estimate, findings, _ = whole
     for dof in (0.0, -4.0, 1.0):
         other = replace(estimate, statistics=replace(estimate.statistics, dof=dof))
-        assert judge(observation, other, findings).usable == (dof > 0)
+        assert assess(observation, other, findings).usable == (dof > 0)
 
 
 def test_what_the_drawing_knows_better_counts_where_a_value_is_undecided(whole):
     observation, estimate, findings, _ = whole
     name = "legs[3].length.offset"
     weak = replace(findings, weak=(sentence(findings.by_nominal, name),))
-    assert judge(observation, estimate, weak).usable
+    assert assess(observation, estimate, weak).usable
     share = estimate.data_share.copy()
     share[estimate.machine.parameters.index(name)] = 0.3
     undecided = replace(estimate, data_share=share)
-    assert not judge(observation, undecided, weak).usable
+    assert not assess(observation, undecided, weak).usable
 
 
 def test_what_is_not_identified_stands_in_the_file(apart):

@@ -40,6 +40,8 @@ NO_WORDS = frozenset(
         "photograph",
         "photographs",
         "photographed",
+        "recognise",
+        "recognition",
     }
 )
 """Words that are no part of an identifier: they do not name a quantity, or the glossary has another

@@ -30,7 +30,7 @@ from pkmcal.session.load import digests, load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.placement import StationPlace
+from pkmcal.simulation.placement import StationPose
 from pkmcal.simulation.truth import draw_truth
 from rendered import rendered
 
@@ -202,7 +202,7 @@ def stayed(demo, later):
     nominal = load_mechanism(demo.session / "mechanism.yaml")
     truth = load_truth(demo.session, nominal)
     camera = load_camera(next((demo.session / "cameras").iterdir()))
-    place = StationPlace.of(truth.T_camera_base[0])
+    place = StationPose.of(truth.T_camera_base[0])
     folder = later.folder / "stayed"
     imaged(folder, nominal, truth.machine, camera, 35, stations=(place,))
     assert load_session(folder).station_names == truth.stations[:1]

@@ -18,7 +18,7 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.motions import Situation, sizes
 from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.unidentified import conventions_held, explain
-from pkmcal.identify.verdict import judge
+from pkmcal.identify.verdict import assess
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
@@ -201,10 +201,10 @@ def test_a_search_that_has_not_settled_is_refused():
     nothing = Observation(
         EdgeSet.empty(), (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
-    assert judge(nothing, estimate, findings).usable
+    assert assess(nothing, estimate, findings).usable
     statistics = replace(estimate.statistics, stopped=Stop.STEPS.value, steps=100)
     unsettled = replace(estimate, statistics=statistics)
-    (reason,) = judge(nothing, unsettled, findings).reasons
+    (reason,) = assess(nothing, unsettled, findings).reasons
     assert "had not settled after 100 steps" in reason
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pkmcal
 from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration
-from pkmcal.calibration.localization import platform_poses, read_images, recognise
+from pkmcal.calibration.localization import localize_by_legs, platform_poses, read_images
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Truth, load_truth, simulate_session
@@ -53,7 +53,7 @@ class Case:
         """Rough and localized poses of the stations, T_camera_base (S, 4, 4) each."""
         poses = platform_poses(self.session)
         rngs = np.random.default_rng(0).spawn(len(self.images) + 1)
-        results = recognise(self.session, self.images, poses, rngs[1:])
+        results = localize_by_legs(self.session, self.images, poses, rngs[1:])
         by_hand = [s.T_camera_base for s in self.session.stations if s.T_camera_base is not None]
         return [np.stack(by_hand), np.stack([f.T_camera_base for f in results.localizations])]
 

@@ -320,7 +320,7 @@ def plan(_case: Case) -> Shot:
     """Poses of three cameras round a hexapod from a plan: the page's plot in space."""
     machine = pkmcal.load_mechanism(DEMO_MECHANISM)
     subject = of_machine(machine, [demo_camera()], machine.joint_names)
-    outcome = outcome_of(make_plan(subject, free_places=3))
+    outcome = outcome_of(make_plan(subject, free_stations=3))
     retained = tuple(part for part in outcome.parts if part.name == "where")
     html = page.page_html(replace(outcome, parts=retained, findings=()))
     return Shot(html, 1000, 1390)

@@ -16,8 +16,8 @@ from pkmcal.planning.defaults import (
     CONFIGURATIONS_A_CAPTURE,
     NOMINAL_CORNER_SIGMA,
     NOMINAL_EDGE_SIGMA,
-    PLACES_AROUND_A_MACHINE,
     PLANNED_IMAGE_SIZE,
+    STATIONS_AROUND_A_MACHINE,
     UNTOLD_READING_NOISE,
 )
 from pkmcal.planning.plan import MeasurementPlan
@@ -105,7 +105,7 @@ def plan(
     """
     folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
     planned = {
-        "count": count, "index": index, "together": together, "free_places": places,
+        "count": count, "index": index, "together": together, "free_stations": places,
         "best_of": best_of, "seed": seed, "progress": progress,
     }  # fmt: skip
     with threadpool_limits(1, "blas"):
@@ -134,7 +134,7 @@ def plan(
             one = board or places or view_angle(eye) > PANORAMIC_HALF_VIEW
             rig_subject = of_machine(
                 machine,
-                [eye] * (1 if one else PLACES_AROUND_A_MACHINE),
+                [eye] * (1 if one else STATIONS_AROUND_A_MACHINE),
                 machine.joint_names,
                 board=board_for(machine, "platform") if board else None,
                 tracker=tracker,

@@ -15,6 +15,7 @@ from pkmcal.arrays import THREADS, Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
 from pkmcal.boards.find import (
     BOARD_DETECTION_OPTIONS,
+    BoardDetectionOptions,
     Markers,
     charuco_detector,
     detect_board,
@@ -22,7 +23,12 @@ from pkmcal.boards.find import (
     dictionary,
     find_chessboard,
 )
-from pkmcal.boards.layout import MARKER_LAYOUT_OPTIONS, another_grid, marker_layout
+from pkmcal.boards.layout import (
+    MARKER_LAYOUT_OPTIONS,
+    MarkerLayoutOptions,
+    another_grid,
+    marker_layout,
+)
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.observe.images import decode
@@ -48,6 +54,9 @@ class OtherBoardOptions:
     size_difference: float = 0.1
     # fewest markers for a measurement of their size
     least_markers: int = 4
+    # detection of boards of other sizes, and layout of the markers of a grid
+    detection: BoardDetectionOptions = BOARD_DETECTION_OPTIONS
+    layout: MarkerLayoutOptions = MARKER_LAYOUT_OPTIONS
 
 
 OTHER_BOARD_OPTIONS = OtherBoardOptions()
@@ -70,13 +79,18 @@ def detect_boards(
     size = _common_size(files)
     with ThreadPoolExecutor(THREADS) as pool:
         detections = list(
-            pool.map(lambda path: _detect_in_file(path, size, board, quick=True), files)
+            pool.map(
+                lambda path: _detect_in_file(path, size, board, options.detection, quick=True),
+                files,
+            )
         )
         if not any(detection.success for detection in detections):
             # Check for another board before the slow methods run on all images.
             check_boards(files, detections, board, options=options)
         missed = [k for k, detection in enumerate(detections) if not detection.success]
-        again = pool.map(lambda k: _detect_in_file(files[k], size, board, quick=False), missed)
+        again = pool.map(
+            lambda k: _detect_in_file(files[k], size, board, options.detection, quick=False), missed
+        )
         for k, detection in zip(missed, again, strict=True):
             detections[k] = detection
     check_any(detections, board)  # a different board was reported above
@@ -84,9 +98,11 @@ def detect_boards(
     return tuple(detections)
 
 
-def _detect_in_file(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
+def _detect_in_file(
+    path: Path, size: tuple[int, int], board: Board, options: BoardDetectionOptions, *, quick: bool
+) -> Detection:
     """Detection in one image file."""
-    return detect_board(decode(path, size, path.name), board, path.name, quick)
+    return detect_board(decode(path, size, path.name), board, path.name, quick, options)
 
 
 def _common_size(files: Sequence[Path]) -> tuple[int, int]:
@@ -129,7 +145,7 @@ def check_boards(
         # A single image may show an object beside the board that looks like a continuation.
         image = decode(path, size, path.name)
         if board.type == "chessboard":
-            other = _larger_chessboard(image, board)
+            other = _larger_chessboard(image, board, options)
         else:
             markers = detect_markers(image, dictionary(board.document["dictionary"]))
             other = _markers_beyond(image, board, markers, options)
@@ -187,11 +203,11 @@ def _check_grid(
     """Raise `InputError` if the layout of a grid's markers contradicts its file."""
     aruco_dictionary = dictionary(board.document["dictionary"])
     layout = marker_layout(
-        [detect_markers(decode(p, size, p.name), aruco_dictionary) for p in paths]
+        [detect_markers(decode(p, size, p.name), aruco_dictionary) for p in paths], options.layout
     )
     if layout is None:
         return
-    other = another_grid(layout, board)
+    other = another_grid(layout, board, options.layout)
     if other is not None:
         raise _other_board_error(paths[0], other, board)
     marker, gap = board.document["marker"], board.document["gap"]
@@ -250,7 +266,7 @@ def marker_share(
 
     ids, corners = markers
     wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
-    large = wide.min(axis=1, initial=np.inf) > MARKER_LAYOUT_OPTIONS.least_side
+    large = wide.min(axis=1, initial=np.inf) > options.layout.least_side
     corners, wide = corners[large], wide[large]
     if len(corners) < options.least_markers:
         return None
@@ -285,11 +301,11 @@ def other_board(
     )
 
 
-def _larger_chessboard(image: Integers, board: Board) -> str | None:
+def _larger_chessboard(image: Integers, board: Board, options: OtherBoardOptions) -> str | None:
     """Description of a larger chessboard that contains the described one; None if there is none."""
     columns, rows = board.counts
     for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
-        if _all_corners(image, counts):
+        if _all_corners(image, counts, options.detection):
             return chessboard(counts, 1.0).described
     return None
 
@@ -338,16 +354,17 @@ def _other_chessboard(
             continue
         if not part and all(n <= m for n, m in zip(sorted(candidate), sorted(counts), strict=True)):
             continue
-        if _all_corners(image, candidate):
+        if _all_corners(image, candidate, options.detection):
             return chessboard(candidate, 1.0).described
     return None
 
 
-def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
+def _all_corners(image: Integers, counts: tuple[int, int], options: BoardDetectionOptions) -> bool:
     """Whether a chessboard of these counts is in the image with all corners fitted."""
-    if find_chessboard(image, counts, quick=True) is None:
+    if find_chessboard(image, counts, quick=True, options=options) is None:
         return False
-    return len(detect_board(image, chessboard(counts, 1.0)).ids) == counts[0] * counts[1]
+    detection = detect_board(image, chessboard(counts, 1.0), options=options)
+    return len(detection.ids) == counts[0] * counts[1]
 
 
 def _other_charuco(
@@ -370,15 +387,13 @@ def _other_charuco(
     scored = [(_charuco_corners(image, data, ids, corners), data) for data in layouts]
     mine = _charuco_corners(image, board.document, ids, corners)
     scored = [
-        item
-        for item in scored
-        if item[0][0] >= max(BOARD_DETECTION_OPTIONS.least_corners, mine[0] + 1)
+        item for item in scored if item[0][0] >= max(options.detection.least_corners, mine[0] + 1)
     ]
     if not scored:
         return None
     data = max(scored, key=lambda item: item[0])[1]
     other = board_from_document(Document(Path(), "", data, {}))
-    if len(detect_board(image, other).ids) <= mine[0]:
+    if len(detect_board(image, other, options=options.detection).ids) <= mine[0]:
         return None
     changed = bool(data["legacy"]) != bool(board.document.get("legacy", False))
     pattern = f" with legacy: {str(data['legacy']).lower()}" if changed else ""

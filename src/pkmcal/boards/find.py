@@ -34,8 +34,6 @@ class BoardDetectionOptions:
     steps: int = 12
     # step at which a corner has settled, px: a thirtieth of what the noise of a good image does
     settled: float = 1e-3
-    # squares by which the fit may move a corner that a detector has found
-    farthest: float = 0.25
     # smallest radius of a window, px: a smaller window holds too few pixels for seven unknowns
     least_radius: float = 2.5
     # largest radius of a window, px: lines bend in a larger one
@@ -46,8 +44,8 @@ class BoardDetectionOptions:
     least_explained: float = 0.6
     # longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur
     longest_step: tuple[float, ...] = (1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3)
-    # squares around a corner that its fit uses: longer edges contribute little more, and begin to
-    # bend
+    # squares around a corner that its fit uses, and by which it may move the corner: longer edges
+    # contribute little more, and begin to bend
     reach: float = 0.25
     # px by which an edge may leave its tangent within the window before its bend is modelled
     straight: float = 0.02
@@ -85,9 +83,10 @@ def detect_board(
     """
     if board.type == "chessboard":
         raw, mirrored, why = _chessboard(image, board, quick, options)
+    elif board.type == "charuco":
+        raw, mirrored, why = _charuco(image, board, options)
     else:
-        detect = _charuco if board.type == "charuco" else _marker_grid
-        raw, mirrored, why = detect(image, board)
+        raw, mirrored, why = _marker_grid(image, board)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     if len(raw[0]) < options.least_corners:
@@ -110,7 +109,9 @@ def detect_board(
     )
 
 
-def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
+def _charuco(
+    image: Integers, board: Board, options: BoardDetectionOptions
+) -> tuple[Raw, bool, str]:
     best: Raw = (np.zeros(0, dtype=int), np.zeros((0, 2)))
     markers = 0
     for mirrored in (False, True):
@@ -118,7 +119,7 @@ def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
         # By one threshold alone five times as fast: enough where it shows the whole board.
         for detector, enough in (
             (charuco_detector(board.document, quick=True), len(board.points)),
-            (charuco_detector(board.document), BOARD_DETECTION_OPTIONS.least_corners),
+            (charuco_detector(board.document), options.least_corners),
         ):
             corners, ids, _, marker_ids = detector.detectBoard(picture)
             markers = max(markers, _length(marker_ids))
@@ -718,7 +719,7 @@ def _judged(
         (remainder < (1 - options.least_explained) * variance)
         & (blur > options.blur_range[0] / 2)
         & (blur < np.maximum(options.blur_range[1], 0.2 * scale))
-        & (shifted < np.maximum(1.5, options.farthest * scale))
+        & (shifted < np.maximum(1.5, options.reach * scale))
         & (weight.sum(axis=1) > 12)
         & np.isfinite(p).all(axis=1)
     )

@@ -17,6 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.boards.board import Board
 from pkmcal.boards.find import Markers
+from pkmcal.levels import NEARLY_ALL
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class MarkerLayoutOptions:
     # fewest pairs of neighbours that determine the step of the ids along rows or columns
     least_neighbours: int = 4
     # least share of the pairs that agree on a step; misread ids are rare
-    agreement: float = 0.8
+    agreement: float = NEARLY_ALL
     # fewest contradictions to a described numbering, pairs of row neighbours in different rows or
     # ids out of range, for which it is wrong
     contradictions: int = 2

@@ -29,6 +29,7 @@ from pkmcal.boards.find import BOARD_DETECTION_OPTIONS, detect_board
 from pkmcal.boards.fit import (
     CAMERA_FIT_OPTIONS,
     BoardPoses,
+    CameraFitOptions,
     Views,
     board_poses,
     check_numbering,
@@ -39,9 +40,11 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
+from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.measurements import Column, PoseSet, Rejection
 from pkmcal.measurements.effects import by_board_size
 from pkmcal.observe.repeats import REPEAT_OPTIONS, groups_of
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import count, listed
 
 
@@ -53,7 +56,7 @@ class BoardPoseOptions:
     least_weight: float = BOARD_DETECTION_OPTIONS.least_corners
     # least difference of chi square between a pose and the board's other tilt, which from afar
     # looks the same: five standard deviations (statistical)
-    tilt_chi2: float = 25.0
+    tilt_chi2: float = CONTRADICTION_SIGMAS**2
     # difference between two images of a still board allowed beyond noise, px rms over the board. A
     # camera on a tripod keeps a tenth of a pixel; smaller movements hardly matter for edges of
     # legs, which are as uncertain
@@ -69,6 +72,8 @@ class BoardPoseOptions:
     # distance of a repeat from the median repeat, in standard deviations (root mean square of six
     # numbers), above which it is rejected, as a repeat of an edge
     outlying: float = REPEAT_OPTIONS.far
+    # fit of the poses, and the largest residual of a right board
+    fit: CameraFitOptions = CAMERA_FIT_OPTIONS
 
 
 BOARD_POSE_OPTIONS = BoardPoseOptions()
@@ -90,6 +95,7 @@ class BoardViews:
     views, poses : of these F images.
     rms : (F,) px.
     usable : (F,) whether the pose is unambiguous and has enough corners.
+    options : those of the poses, and of what follows from them.
     """
 
     station: int
@@ -102,6 +108,7 @@ class BoardViews:
     poses: BoardPoses
     rms: Array
     usable: Booleans
+    options: BoardPoseOptions = BOARD_POSE_OPTIONS
 
     @property
     def names(self) -> list[str]:
@@ -168,7 +175,7 @@ def board_views(
     _check_sides(board, detections)
     with_board = np.flatnonzero([detection.success for detection in detections])
     views = views_of([detection for detection in detections if detection.success], board)
-    poses = board_poses(camera, views)
+    poses = board_poses(camera, views, options.fit)
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
@@ -184,6 +191,7 @@ def board_views(
         poses,
         rms,
         usable,
+        options,
     )
     _check_explained(station_views)
     return station_views
@@ -250,8 +258,9 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
 
 def _check_explained(views: BoardViews) -> None:
     """Raise `InputError` if the corners contradict board and camera files."""
-    check_numbering(views.poses.residuals, views.views.pixels, views.board, "board.yaml")
-    limit = CAMERA_FIT_OPTIONS.residual_limit * views.camera.image_size[0]
+    fit = views.options.fit
+    check_numbering(views.poses.residuals, views.views.pixels, views.board, "board.yaml", fit)
+    limit = fit.residual_limit * views.camera.image_size[0]
     if not len(views.rms) or np.median(views.rms) <= limit:
         return
     worst = int(np.argmax(views.rms))
@@ -296,9 +305,7 @@ class Standing:
         return replace(poses, by_intrinsics=by)
 
 
-def standing_board(
-    views: BoardViews, options: BoardPoseOptions = BOARD_POSE_OPTIONS
-) -> Standing | None:
+def standing_board(views: BoardViews) -> Standing | None:
     """Pose of a still board in a station's images; None if no image has a usable pose.
 
     Raises `InputError` if the board or the camera moved between images.
@@ -306,9 +313,9 @@ def standing_board(
     if not views.usable.any():
         return None
     there, noise = _projected_corners(views)
-    agreed = _consistent_images(there, noise, views.usable, options)
+    agreed = _consistent_images(there, noise, views.usable, views.options)
     odd = views.usable & ~agreed
-    _check_still(views, there, agreed, options)
+    _check_still(views, there, agreed)
     T_camera_board, covariance, rest = _mean_pose(views, agreed)
     off = there[agreed] - there[agreed].mean(axis=0)
     scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
@@ -355,9 +362,7 @@ def _rms_distance(there: Array, other: Array) -> Array:
     return np.sqrt(np.nanmean(np.sum((there - other) ** 2, axis=-1), axis=-1))
 
 
-def _check_still(
-    views: BoardViews, there: Array, agreed: Booleans, options: BoardPoseOptions
-) -> None:
+def _check_still(views: BoardViews, there: Array, agreed: Booleans) -> None:
     """Raise `InputError` if consecutive images disagree with the rest, or too many others."""
     used = np.flatnonzero(views.usable)
     runs = [
@@ -371,7 +376,7 @@ def _check_still(
         )  # fmt: skip
         raise _movement_error(views, there, before, after)
     odd = int((views.usable & ~agreed).sum())
-    if odd > options.most_outlying * len(used) and odd > 1:
+    if odd > views.options.most_outlying * len(used) and odd > 1:
         raise InputError(
             "the board, or the camera, did not stand still",
             where=views.names[0].rpartition("/")[0] or views.names[0],
@@ -412,7 +417,7 @@ def _mean_pose(board_views: BoardViews, agreed: Booleans) -> tuple[Array, Array,
     """
     views, poses = board_views.views, board_views.poses
     # Means (N, 2) of the corners over the images.
-    used = agreed[:, None] & (poses.weight > 0.5)
+    used = agreed[:, None] & (poses.weight > INLIER_WEIGHT)
     count = used.sum(axis=0)
     pixels = np.where(used[..., None], views.pixels, 0.0).sum(axis=0)
     pixels = np.where(count[:, None] > 0, pixels / np.maximum(count, 1)[:, None], np.nan)
@@ -422,7 +427,9 @@ def _mean_pose(board_views: BoardViews, agreed: Booleans) -> tuple[Array, Array,
     single = np.sqrt(np.where(used, views.sigma**2, 0.0).sum(axis=0) / np.maximum(count, 1))
     noise = np.sqrt(np.sum(off**2) / freedom) if freedom > 0 else single
     sigma = noise / np.sqrt(np.maximum(count, 1))
-    mean = board_poses(board_views.camera, Views(views.points, pixels[None], sigma[None]))
+    mean = board_poses(
+        board_views.camera, Views(views.points, pixels[None], sigma[None]), board_views.options.fit
+    )
     covariance = mean.covariance[0] + _common_motion_covariance(
         board_views, agreed, mean.T_camera_board[0], noise
     )
@@ -511,9 +518,7 @@ def _deviation(delta: Array, covariance: Array) -> Array:
     return np.sqrt(np.mean(white**2, axis=-1))
 
 
-def one_a_configuration(
-    views: BoardViews, mount: int, options: BoardPoseOptions = BOARD_POSE_OPTIONS
-) -> tuple[PoseSet, tuple[Rejection, ...]]:
+def one_a_configuration(views: BoardViews, mount: int) -> tuple[PoseSet, tuple[Rejection, ...]]:
     """Measurements of a board on the platform, one for each configuration, and rejections of
     outlying repeats.
     """
@@ -523,13 +528,13 @@ def one_a_configuration(
         return PoseSet.empty(), ()
     sigma2 = float(np.median(views.views.sigma[views.views.visible]) ** 2)
     noise2 = views.poses.noise**2
-    common = min(noise2 / (noise2 + sigma2), options.most_common)
+    common = min(noise2 / (noise2 + sigma2), views.options.most_common)
     means = mean_poses(
         rows,
         views.poses.T_camera_board[usable],
         views.poses.covariance[usable],
         common,
-        options=options,
+        options=views.options,
     )
     odd = tuple(
         views.rejection(int(views.numbers[usable[k]]), ODD_BOARD_REASON.format(means.off[k]))

@@ -67,7 +67,7 @@ from pkmcal.identify.unidentified import (
     observed_legs,
     only_heights,
 )
-from pkmcal.identify.verdict import RicherModel, judge
+from pkmcal.identify.verdict import RicherModel, assess
 from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -77,6 +77,7 @@ from pkmcal.papers import PaperMethod
 from pkmcal.papers.conditions import conditions
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session, load_session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import listed
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ class Calibration(CalibrationSummary):
     def overview(self) -> Overview:
         """The figures of its summary."""
         session, e = self.session, self.estimate
-        edges, poses = e.edge_residuals[e.edge_weights >= 0.5], e.pose_residuals
+        edges, poses = e.edge_residuals[e.edge_weights >= INLIER_WEIGHT], e.pose_residuals
         return Overview(
             source=resolved(session.folder).name,
             method=self.method,
@@ -137,7 +138,9 @@ class Calibration(CalibrationSummary):
             poses=e.state.T_base_platform[e.configurations],
             stations=session.station_names,
             legs_observed=e.edge_weights.size > 0,
-            residuals=np.concatenate([edges.ravel(), poses[e.pose_weights >= 0.5].ravel()]),
+            residuals=np.concatenate(
+                [edges.ravel(), poses[e.pose_weights >= INLIER_WEIGHT].ravel()]
+            ),
             chi2=e.statistics.chi2_as_stated,
             warnings=session.warnings,
         )
@@ -478,7 +481,7 @@ def _judge(
         *(one.finding for one in turns.responses),
         *found,
     )
-    verdict = judge(
+    verdict = assess(
         turns.observation,
         value.estimate,
         findings,

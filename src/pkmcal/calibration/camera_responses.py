@@ -23,6 +23,7 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import ScoreTests
 from pkmcal.identify.verdict import POLISHED_SHADING
+from pkmcal.levels import MAJORITY
 from pkmcal.measurements import Column, EdgeSet, Measurements, concatenate
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.outcome.finding import Finding, doubtful, note
@@ -36,8 +37,6 @@ fifty edges show a wrong response by six standard deviations."""
 LEAST_RESPONSE_GAIN, MOST_TURN_DEVIATION = 2.7, 0.1
 """chi2 from which all images are measured by the other response, by chance in one session of ten;
 and the standard deviation of the change from which few images do not determine it."""
-LEAST_EDGE_SHARE = 0.5
-"""Share of the edges by the usual response that the other has to measure, to be right."""
 _Camera = tuple[str, Response]
 """A camera's file, and the usual response of its images' kind."""
 
@@ -122,7 +121,7 @@ def responses_by_edges(
         own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in questionable}
         every = {camera: measured(_otherwise(usual[camera])) for camera in questionable}
         # in the dark a wrong response leaves hardly an edge
-        every = {x: e for x, e in every.items() if len(e) > LEAST_EDGE_SHARE * own[x].sum()}
+        every = {x: e for x, e in every.items() if len(e) > MAJORITY * own[x].sum()}
         if not every:
             return ()
         there, _ = _scored(measurements, estimate, every)

@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.refinement import FEW_MEASURED, RefinementResult
+from pkmcal.calibration.refinement import RefinementResult
+from pkmcal.levels import FEW
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import placed_at
 from pkmcal.observe.repeats import combine_repeats
@@ -99,7 +100,7 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     )
     given_up = int(np.sum(mine & (turns.estimate.edge_weights < 0.5)))  # which are among both
     in_sight = int(np.sum(mine)) + missed - given_up
-    if not turns.images or measured >= FEW_MEASURED * in_sight:
+    if not turns.images or measured >= FEW * in_sight:
         return None
     angle = 2 * np.pi * np.arange(OFFSET_DIRECTIONS) / OFFSET_DIRECTIONS
     lateral = IMAGE_OFFSET * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -45,7 +45,7 @@ is what the machine's own parameters bend as well, and the data do not determine
 whose towers lean was refused for it."""
 LANDMARK_POSES = 200
 """Poses, evenly of all, by which the functions are made where there are more."""
-PLACES_ALONG_EDGE_SPAN = 9
+POINTS_ALONG_EDGE_SPAN = 9
 
 
 @dataclass(frozen=True)
@@ -310,7 +310,7 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
     T = state.T_camera_base[edges.station]
     a, b = (apply(T, x[edges.configuration, edges.leg]) for x in (ends.a, ends.b))
     u = line_through(a, b)[0]
-    part = np.linspace(0, 1, PLACES_ALONG_EDGE_SPAN)
+    part = np.linspace(0, 1, POINTS_ALONG_EDGE_SPAN)
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * part
     radius = machine.values[machine.layout.radius_of(edges.leg, edges.tube)]
     points = contour_point(

@@ -26,7 +26,7 @@ import numpy as np
 from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.case import Case, PriorScene
-from pkmcal.calibration.localization import CalibrationProgress, Recognition, locate_stations
+from pkmcal.calibration.localization import CalibrationProgress, LegLocalization, locate_stations
 from pkmcal.calibration.pose_scoring import ScoredPoses, register_images, rescore_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
@@ -43,6 +43,7 @@ from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, listed
 
 MISPLACED_PROBABILITY = 0.05
@@ -74,7 +75,7 @@ class Localization:
     result : the case without the rejected hand-held images, or the error if there is none.
     """
 
-    recognition: Recognition | None
+    leg_localization: LegLocalization | None
     places: Mapping[int, PoseHypotheses]
     result: Case | PkmcalError
 
@@ -114,7 +115,7 @@ def localize(
     search = locate_stations(session, fixed, boards, rng, progress)
     places: dict[int, PoseHypotheses] = {}
     if search.error is not None:
-        return Localization(search.recognition, places, search.error)
+        return Localization(search.leg_localization, places, search.error)
     scene = PriorScene.as_drawn(session, search.T_camera_base)
     # hand-held images, and the reasons of those without a pose or with a contradictory one
     lost: dict[int, str] = {}
@@ -133,8 +134,8 @@ def localize(
         try:
             case = _without(case, lost)
         except PkmcalError as error:
-            return Localization(search.recognition, places, error)
-    return Localization(search.recognition, places, case)
+            return Localization(search.leg_localization, places, error)
+    return Localization(search.leg_localization, places, case)
 
 
 def search_by_hand(
@@ -461,7 +462,7 @@ def inconsistent_poses(
     by_board = np.bincount(poses, estimate.pose_weights, len(session.stations))
     by_board = by_board[: len(session.stations)] >= 0.5
     visible = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
-    used = measured & (estimate.edge_weights >= 0.5)
+    used = measured & (estimate.edge_weights >= INLIER_WEIGHT)
     visible[station[used], measurements.edges.leg[used]] = True
     few = visible.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
     lost = ((2 * inliers < count) | (inliers < FEWEST_EDGES) | few) & ~by_board

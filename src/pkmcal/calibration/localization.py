@@ -16,6 +16,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.errors import GeometryError, InputError, PkmcalError, ResultError
 from pkmcal.identify.verdict import VERDICT
+from pkmcal.levels import MAJORITY
 from pkmcal.measurements.contract import LinkKind, kinds_of
 from pkmcal.mechanisms.reading_hypotheses import ReadingHypothesis, reading_error, reversed_motor
 from pkmcal.observe import legs
@@ -42,8 +43,6 @@ CalibrationProgress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share done, 0 to 1."""
 ALLOWED_LEG_MISS = 2.0
 """Prior sigmas of a centre by which legs may miss the platform at the nearest nominal pose."""
-LEAST_REACHED_SHARE = 0.5
-"""Share of the configurations that the nominal model has to reach for the others to be accepted."""
 
 
 def check_observable(session: Session) -> None:
@@ -109,7 +108,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
         raise error.as_input(session.document["mechanism"]) from None
     # near the ends of its workspace a nominal model that is right to its tolerance may not close
     near = fk.error < ALLOWED_LEG_MISS * session.machine.document.tolerance.center
-    if near.all() or (most and near.mean() > LEAST_REACHED_SHARE):
+    if near.all() or (most and near.mean() > MAJORITY):
         _check_turns(session, fk.T_base_platform, near)
         return fk.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]
@@ -190,7 +189,7 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
 
 
 @dataclass(frozen=True)
-class Recognition:
+class LegLocalization:
     """Localization of all stations.
 
     used : indices of the images that were used, by station; views : of these images.
@@ -206,14 +205,14 @@ class Recognition:
         return all(pose.good for pose in self.localizations)
 
 
-def recognise(
+def localize_by_legs(
     session: Session,
     images: list[StationImages],
     poses: Array,
     rngs: list[np.random.Generator],
     boards: Boards | None = None,
     starts: Array | None = None,
-) -> Recognition:
+) -> LegLocalization:
     """Localize every station that observes legs; nothing is raised.
 
     poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``images``.
@@ -248,7 +247,7 @@ def recognise(
         good[s] = pose.T_camera_base if pose and pose.good else None
     ahead = boards.joined(good)
     solution = _searched(views, [ahead[s] for s in at], solution, rngs)
-    return Recognition(views, tuple(_anywhere(views, solution, rngs)), in_view)
+    return LegLocalization(views, tuple(_anywhere(views, solution, rngs)), in_view)
 
 
 Search = LocalizedPose | None
@@ -296,7 +295,7 @@ def _better(one: LocalizedPose, other: Search) -> LocalizedPose:
 def mistake_in(
     session: Session,
     images: list[StationImages],
-    recognition: Recognition,
+    leg_localization: LegLocalization,
     rng: np.random.Generator,
 ) -> InputError | None:
     """The error about stations that were not recognised, or whose images a hypothesis explains
@@ -304,7 +303,7 @@ def mistake_in(
     its effect may be like any of theirs.
     """
     still = frozen_in(session)
-    if still is not None and not recognition.complete:  # an error in any case, and cheaper
+    if still is not None and not leg_localization.complete:  # an error in any case, and cheaper
         return still
     stations = [session.stations[p.station] for p in images]
     error = mistake(
@@ -321,9 +320,9 @@ def mistake_in(
             )
             for station, view, item, visible in zip(
                 stations,
-                recognition.views,
-                recognition.localizations,
-                recognition.used,
+                leg_localization.views,
+                leg_localization.localizations,
+                leg_localization.used,
                 strict=True,
             )
         ],
@@ -346,7 +345,7 @@ class StationSearch(NamedTuple):
     which mistake explains its images; poses are then incomplete.
     """
 
-    recognition: Recognition | None
+    leg_localization: LegLocalization | None
     T_camera_base: Array
     error: PkmcalError | None
 
@@ -382,7 +381,7 @@ def locate_stations(
     in words and the share done.
     """
     nowhere = np.full((len(session.station_names), 4, 4), np.nan)
-    value: Recognition | None = None
+    value: LegLocalization | None = None
     try:
         start_poses = prior_station_poses(session, boards)
         poses = platform_poses(session) if images else nowhere
@@ -393,7 +392,7 @@ def locate_stations(
         progress = progress or (lambda _text, _share: None)
         count = sum(len(p.images) for p in images)
         progress(f"Recognising the machine in {count} images", 0.2)
-        value = recognise(session, images, poses, rngs[1:], boards, start_poses)
+        value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
         progress("Comparing with what is often mixed up", 0.3)
         mixed_up = mistake_in(session, images, value, rngs[0])
         if mixed_up is not None:

@@ -34,6 +34,7 @@ from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.verdict import POLISHED_SHADING
+from pkmcal.levels import FEW, NEARLY_ALL
 from pkmcal.measurements import (
     EdgeSet,
     Measurements,
@@ -54,6 +55,7 @@ from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.outcome.finding import Finding, note, wrong
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.ranks import nonzero
 from pkmcal.wording import listed
 
@@ -68,10 +70,10 @@ that has settled: the second look moves it
 by one half or one, and looks that find other edges, of polished legs, by one again and again. Where
 a camera stands centimetres off and slides towards its place, edges lie where they are predicted,
 and each look moves the machine by four or more."""
-SETTLED_AT_ONCE = 1.0
+SETTLED_AT_ONCE = SETTLED_MACHINE_CHANGE / 2
 """The same of a second look that nothing follows: after one that moves the machine by more, another
 leaves a quarter of what the way there still makes of it."""
-SETTLED_EDGE_DISTANCE = 0.15
+SETTLED_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 10
 """Median distance (px) of edges from their prediction below which another look changes nothing:
 the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
 far."""
@@ -84,14 +86,8 @@ the deviations that they make larger are known to a twentieth."""
 MOST_BINNING = 4
 """Times that images are binned as at first, at most: to pictures of 256 pixels, in which a
 machine is still recognised."""
-FEW_MEASURED = 1 / 3
-"""Share of the edges by which the machine was found below which too few of them can be measured one
-by one, so that it is asked whether they are too blurred."""
 IMAGES_FOR_WIDTH = 4
 """StationImages of a station that are asked about that: a lens blurs all alike."""
-NEARLY_ALL = 0.9
-"""Share of the legs, found where all others put them, above which a second look for the rest would
-hardly move the estimate, from which edges are looked for next."""
 FEWEST_EDGES_TO_IDENTIFY = 24
 """Edges without which there is nothing to identify: one image of a hexapod shows as many."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
@@ -346,7 +342,8 @@ def _checked_pass(
     measure = partial(_measurement_pass, session, estimate=estimate, scatter=scatter, refine=refine)
     passes = measure(images, blur=blur, done=done)
     blur_by_station = _blur_of(passes, images)
-    if sum(len(one.edges) for one in passes) < FEW_MEASURED * len(estimate.edge_weights):
+    # few of the localized edges can be measured: they may be too blurred
+    if sum(len(one.edges) for one in passes) < FEW * len(estimate.edge_weights):
         blur_by_station |= _width_of_edges(images, estimate)
     while coarser := _binned(session, images, blur_by_station, more=True):
         images = coarser
@@ -523,6 +520,7 @@ def _first_estimate(
         start = start or begin(measurements)
         estimate = bundle(session.machine, measurements, start)
         lap("identify")
+        # a further pass for the remaining legs would hardly move the estimate
         if _share_agreeing(passes, measurements.edges, estimate) > NEARLY_ALL:
             break
         start = estimate.state
@@ -537,7 +535,7 @@ def _share_agreeing(passes: list[legs.StationEdges], edges: EdgeSet, estimate: E
     missed = sum(len(station_edges.rejected) for station_edges in passes)
     leg = np.stack([edges.station, edges.configuration, edges.leg], axis=-1)
     count = len(np.unique(leg, axis=0))
-    elsewhere = len(np.unique(leg[estimate.edge_weights < 0.5], axis=0))
+    elsewhere = len(np.unique(leg[estimate.edge_weights < INLIER_WEIGHT], axis=0))
     return (count - elsewhere) / (count + missed)
 
 
@@ -603,7 +601,7 @@ def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
     """Root mean square of the coarse edges' residuals, in what they state; 1 where they are too few
     to tell.
     """
-    squares = estimate.edge_residuals[coarse & (estimate.edge_weights >= 0.5)] ** 2
+    squares = estimate.edge_residuals[coarse & (estimate.edge_weights >= INLIER_WEIGHT)] ** 2
     return float(np.sqrt(squares.mean())) if squares.size > LEAST_NOISE_FREEDOM else 1.0
 
 
@@ -649,7 +647,7 @@ def observation_of(
     for k, station in enumerate(session.stations):
         binning[k] = of_camera.get(station.camera_file, 1)
     in_view = legs.joined_passes(passes, float("nan"), float("nan"))
-    given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
+    given_up = np.flatnonzero(estimate.edge_weights < INLIER_WEIGHT).tolist()
     return Observation(
         edges=in_view.edges,
         rejected=in_view.rejected
@@ -679,7 +677,7 @@ def _poses_given_up(
 ) -> tuple[Rejection, ...]:
     """Poses that do not fit the rest, with how far they lie off."""
     poses = measurements.poses
-    lost = np.flatnonzero(estimate.pose_weights < 0.5)
+    lost = np.flatnonzero(estimate.pose_weights < INLIER_WEIGHT)
     error = np.linalg.norm(estimate.pose_residuals, axis=1)
     return tuple(
         Rejection(

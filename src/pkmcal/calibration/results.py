@@ -171,7 +171,7 @@ def calibration_document(
         "model": calibration.session.model,
         "seed": calibration.seed,
         "gauge": estimate.gauge,
-        "parameters": _parameters(calibration),
+        "parameters": [asdict(row) for row in calibration.parameters],
         "covariance": estimate.covariance,
         "not_identified": not_identified,
         "identifiability": identifiability_of(calibration.findings),
@@ -225,11 +225,6 @@ def versions() -> Mapping[str, str]:
         except PackageNotFoundError:
             continue
     return results
-
-
-def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
-    """One entry for each parameter."""
-    return [asdict(row) for row in calibration.parameters]
 
 
 def identifiability_of(findings: Findings) -> dict[str, Any]:

@@ -31,14 +31,12 @@ from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Statistics
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine, with_exact_scales
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import listed
-
-SAVED_NUMBER_ROUNDING = 1e-9
-"""Relative difference below which two numbers of a file are equal: rounding causes 1e-15,
-editing a millionth."""
 
 Sigma3 = tuple[float | None, float | None, float | None]
 """None where the data do not determine the number."""
@@ -140,8 +138,13 @@ class SavedCalibration(CalibrationSummary):
         edges, poses = (residuals.get(key) or () for key in ("edges", "poses"))
         # residuals of inlying edges and poses
         parts = [
-            [x for row in edges if row[EDGE_WEIGHT] >= 0.5 for x in row[EDGE_RESIDUALS]],
-            [x for row in poses if row[POSE_WEIGHT] >= 0.5 for x in row[POSE_WEIGHT + 1 :]],
+            [x for row in edges if row[EDGE_WEIGHT] >= INLIER_WEIGHT for x in row[EDGE_RESIDUALS]],
+            [
+                x
+                for row in poses
+                if row[POSE_WEIGHT] >= INLIER_WEIGHT
+                for x in row[POSE_WEIGHT + 1 :]
+            ],
         ]
         # statistics, if the file has all that have no default
         reference_values = {f.name for f in fields(Statistics)}
@@ -495,9 +498,7 @@ def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> No
     if names != machine.parameters.names:
         raise _edited(document, "parameters", "the names of the mechanism's parameters")
     values = np.array([p.value for p in saved.parameters])
-    if not np.allclose(
-        values, machine.values, rtol=SAVED_NUMBER_ROUNDING, atol=SAVED_NUMBER_ROUNDING**2
-    ):
+    if not np.allclose(values, machine.values, rtol=ROUNDING, atol=ROUNDING**2):
         k = int(np.argmax(np.abs(values - machine.values)))
         raise _edited(document, f"parameters[{k + 1}].value", f"the value of {names[k]}")
 
@@ -557,13 +558,11 @@ def _check_covariance(document: Document, key: str, matrix: Array) -> None:
     """Raise `InputError` for a matrix that is not symmetric or not positive semidefinite."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
     limit = scale[:, None] * scale
-    good = not np.any(np.abs(matrix - matrix.T) > SAVED_NUMBER_ROUNDING * limit) and np.all(
-        np.diag(matrix) >= 0
-    )
+    good = not np.any(np.abs(matrix - matrix.T) > ROUNDING * limit) and np.all(np.diag(matrix) >= 0)
     if good:
         unit = np.where(limit > 0, matrix / np.where(limit > 0, limit, 1.0), 0.0)
         least = float(np.linalg.eigvalsh(0.5 * (unit + unit.T)).min(initial=0.0))
-        good = least > -SAVED_NUMBER_ROUNDING * len(matrix)
+        good = least > -ROUNDING * len(matrix)
     if not good:
         raise InputError(
             "the covariance is not that of any numbers: not symmetric, or a combination of them has"

@@ -15,7 +15,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.parameter_estimates import ParameterEstimates, parameter_estimates
-from pkmcal.identify.tool import NO_TURN, ToolError, checked_poses, tool_error
+from pkmcal.identify.tool import ToolError, checked_poses, tool_error
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.wording import brief, count, number
@@ -146,7 +147,7 @@ class CalibrationSummary(ABC):
             finite = np.isfinite(place)
             if finite.any():
                 angle = float(np.rad2deg(turn[finite].mean()))
-                turned = f", {brief(angle)}°" if angle > np.rad2deg(NO_TURN) else ""
+                turned = f", {brief(angle)}°" if angle > np.rad2deg(ROUNDING) else ""
                 where = f"{brief(float(place[finite].max()) * 1e3)} mm at worst"
                 out.append(
                     (name, f"{brief(float(place[finite].mean()) * 1e3)} mm{turned} ({where})")

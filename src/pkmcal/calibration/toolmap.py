@@ -14,6 +14,7 @@ from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.geometry.rigid import pose, pose_difference
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.tool import ToolError, tool_error
+from pkmcal.levels import NEGLIGIBLE, TRANSLATION_TURN
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.mechanisms.region import Region, poses_in
@@ -30,16 +31,11 @@ SLICE_HEIGHT_SHARES = (0.15, 0.5, 0.85)
 """Heights of the slices, as shares of the range of those poses."""
 SLICE_MARGIN_SHARE = 0.08
 """Extension of the slices beyond those poses to either side, as a share of their range."""
-NO_EXTENT = 1e-3
-"""Share of the poses' largest range below which the range along an axis is zero."""
 LEAST_CELLS, LEAST_FILLED_SHARE = 3, 0.4
 """Fewest rows and columns of cells, and smallest share of reachable cells among these, for a
 slice: a platform that can only shift as it rotates has one orientation in few places."""
 MOST_OFF_CELL_MIDDLE = 0.25
 """Largest distance, in cells, by which rods and axes may put a pose off its cell's middle."""
-MOST_SLICE_TURN = np.deg2rad(3.0)
-"""Largest rotation in a slice of one orientation, for misaligned axes rotate a platform that
-should only shift."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +171,7 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
     low, high = places.min(axis=0), places.max(axis=0)
     wide = high - low
     box = low - SLICE_MARGIN_SHARE * wide, high + SLICE_MARGIN_SHARE * wide
-    flat = wide <= NO_EXTENT * wide.max()
+    flat = wide <= NEGLIGIBLE * wide.max()
     middle = (low + high) / 2
     if flat[2]:
         # a planar machine has one horizontal slice
@@ -229,7 +225,7 @@ def _slice(
     there = closed.T_base_platform
     off = pose_difference(there, wanted)
     good = closed.converged & (np.linalg.norm(off[:, 3:], axis=1) < MOST_OFF_CELL_MIDDLE * cell)
-    good &= np.linalg.norm(off[:, :3], axis=1) < MOST_SLICE_TURN
+    good &= np.linalg.norm(off[:, :3], axis=1) < TRANSLATION_TURN
     good &= reachable(limits, there).inside & region.holds(limits, wanted)
     rows = np.full(len(good), -1)
     rows[good] = first + np.arange(np.count_nonzero(good))

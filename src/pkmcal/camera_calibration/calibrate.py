@@ -15,6 +15,7 @@ from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.fit import (
     CAMERA_FIT_OPTIONS,
     CameraFit,
+    CameraFitOptions,
     Views,
     check_numbering,
     covariance_of,
@@ -22,8 +23,10 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.camera_calibration.model_selection import (
     DISTORTION_CANDIDATES,
+    MODEL_SELECTION_OPTIONS,
     Candidate,
     HeldOut,
+    ModelSelectionOptions,
     best_of,
     camera_candidates,
     fitted_to_all,
@@ -36,7 +39,9 @@ from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest
 from pkmcal.geometry.rigid import dot
+from pkmcal.levels import MAJORITY
 from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import listed
 
 
@@ -65,12 +70,15 @@ class CalibrationCheckOptions:
     # columns and rows of cells by which the coverage of the image is counted
     cells: tuple[int, int] = (8, 6)
     # share of cells with corners below which a warning is given
-    least_covered: float = 0.5
-    # correlation above which two intrinsics are reported as hardly separable
-    strong_correlation: float = 0.95
+    least_covered: float = MAJORITY
+    # selection of the model, and fit of its candidates
+    selection: ModelSelectionOptions = MODEL_SELECTION_OPTIONS
+    fit: CameraFitOptions = CAMERA_FIT_OPTIONS
 
 
 CALIBRATION_CHECK_OPTIONS = CalibrationCheckOptions()
+STRONG_CORRELATION = 0.95
+"""Correlation from which two intrinsics are reported as hardly separable."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ class CameraCalibration:
     @property
     def inliers(self) -> Booleans:
         """Whether corners (V, N) are in use: detected, with a weight of at least one half."""
-        return np.isfinite(self.residuals).all(axis=-1) & (self.weight >= 0.5)
+        return np.isfinite(self.residuals).all(axis=-1) & (self.weight >= INLIER_WEIGHT)
 
     @property
     def correlations(self) -> tuple[tuple[str, str, float], ...]:
@@ -135,7 +143,7 @@ class CameraCalibration:
             (names[i], names[j], float(rho[i, j]))
             for i in range(len(names))
             for j in range(i + 1, len(names))
-            if abs(rho[i, j]) >= CALIBRATION_CHECK_OPTIONS.strong_correlation
+            if abs(rho[i, j]) >= STRONG_CORRELATION
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
@@ -181,11 +189,10 @@ def calibrate_images(
     paths: Sequence[Path | str],
     board: Board,
     model: str = "auto",
-    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
     _check_model_name(model)
-    return calibrate_camera(detect_boards(paths, board), board, model, options=options)
+    return calibrate_camera(detect_boards(paths, board), board, model)
 
 
 def calibrate_camera(
@@ -206,23 +213,26 @@ def calibrate_camera(
     image_size = used[0].image_size
     views = views_of(used, board)
     # Choose the model and its coefficients on a subset of the corners.
-    pool = camera_candidates(thinned(views), image_size, tuple(DISTORTION_CANDIDATES))
+    selection = options.selection
+    pool = camera_candidates(
+        thinned(views, selection), image_size, tuple(DISTORTION_CANDIDATES), selection
+    )
     mine = tuple(c for c in pool if model in ("auto", c.model))
     if not mine:
         raise no_fit(model, pool)
-    chosen = best_of(mine)
-    model_warnings = check_model(model, chosen, best_of(pool), options=options)
+    chosen = best_of(mine, selection)
+    model_warnings = check_model(model, chosen, best_of(pool, selection), options=options)
     # Fit all corners, with the covariance scaled by the disagreement of the views.
     fit = fitted_to_all(chosen, views)
     check_corners(fit, views, board, options=options)
     by_noise, poses_by_noise, _ = covariance_of(fit, views)
-    spread = spread_of_views(fit, views)
+    spread = spread_of_views(fit, views, selection)
     covariance = by_noise * spread**2
     check_determined(fit, covariance, views, options=options)
     # Test on held-out views.
-    tested = held_out(fit, views, board.lines)
-    check_explained(tested.rms, fit.camera)
-    inliers = (fit.weight >= 0.5) & views.visible
+    tested = held_out(fit, views, board.lines, selection)
+    check_explained(tested.rms, fit.camera, options)
+    inliers = (fit.weight >= INLIER_WEIGHT) & views.visible
     lengths = np.sum(np.nan_to_num(fit.residuals) ** 2, axis=-1)
     calibration = CameraCalibration(
         camera=replace(fit.camera, covariance=covariance),
@@ -292,7 +302,11 @@ def check_model(
     """Warnings about a model chosen by the user that is worse than another; raises `InputError` if
     it does not fit.
     """
-    if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
+    if (
+        model == "auto"
+        or best.model == chosen.model
+        or not is_worse(chosen, best, options.selection)
+    ):
         return []
     ratio = chosen.left_out / best.left_out
     if ratio > options.unfit_ratio:
@@ -353,9 +367,11 @@ def check_corners(
     """Raise `InputError` if the corners contradict the board file, and `ResultError` if too many
     corners are rejected.
     """
-    check_numbering(fit.residuals, views.pixels, board, "the board file")
+    check_numbering(fit.residuals, views.pixels, board, "the board file", options.fit)
     visible = views.visible
-    rejected = 1 - float((visible & (fit.weight >= 0.5)).sum()) / max(int(visible.sum()), 1)
+    rejected = 1 - float((visible & (fit.weight >= INLIER_WEIGHT)).sum()) / max(
+        int(visible.sum()), 1
+    )
     if rejected <= options.most_lost:
         return
     raise ResultError(
@@ -367,9 +383,9 @@ def check_corners(
     )
 
 
-def check_explained(rms: float, camera: Camera) -> None:
+def check_explained(rms: float, camera: Camera, options: CalibrationCheckOptions) -> None:
     """Raise `ResultError` if the best model does not explain the images."""
-    limit = CAMERA_FIT_OPTIONS.residual_limit * camera.image_size[0]
+    limit = options.fit.residual_limit * camera.image_size[0]
     if rms <= limit:
         return
     raise ResultError(

@@ -26,8 +26,9 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.solver.elimination import eliminate
-from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE
+from pkmcal.solver.kernels import INLIER_WEIGHT, NO_WEIGHT_DISTANCE
 
 FOCAL_RANGES = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of starting values for the pixels per radian at the image's centre, as a share of its
@@ -53,7 +54,7 @@ class ModelSelectionOptions:
     # (statistical)
     chance_ratio: float = 1.5
     # least relative decrease of the held-out error that justifies a coefficient
-    least_gain: float = 0.01
+    least_gain: float = NEGLIGIBLE
     # number of corners used for the selection; the final fit uses all
     most_corners: int = 1500
     # fewest corners that determine a board's pose (derived)
@@ -164,7 +165,7 @@ def held_out(
 ) -> HeldOut:
     """Errors of each part of the views under a camera refitted to the other parts."""
     count = len(fit.T_camera_board)
-    inliers = (fit.weight >= 0.5) & views.visible
+    inliers = (fit.weight >= INLIER_WEIGHT) & views.visible
     residuals = np.full(views.pixels.shape, np.nan)
     bends: list[Array] = []
     part_of = np.arange(count) % min(options.parts, count)
@@ -316,7 +317,7 @@ def camera_candidates(
         np.minimum(_squares(residuals, views.visible), limit) for residuals in held_out_residuals
     ]
     best = int(np.argmin([np.sum(squares) for squares in bounded]))
-    used = (fits[best][2].weight > 0.5) & views.visible
+    used = (fits[best][2].weight > INLIER_WEIGHT) & views.visible
     pool = [
         Candidate(
             model=model,

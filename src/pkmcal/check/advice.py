@@ -16,7 +16,6 @@ from pkmcal.check.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_OPTIONS
-from pkmcal.observe.quality import QUALITY_OPTIONS
 from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.planning.first import EdgesOf
@@ -156,8 +155,8 @@ def _lost_edges(
     finite = lost & np.isfinite(contrast)
     brighter = np.fmax(level, behind)
     kinds = {
-        "white": brighter >= QUALITY_OPTIONS.saturated,
-        "black": brighter <= QUALITY_OPTIONS.black,
+        "white": brighter >= station.quality.options.saturated,
+        "black": brighter <= station.quality.options.black,
     }
     kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < usual / 2)
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])

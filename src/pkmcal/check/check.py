@@ -34,7 +34,7 @@ from pkmcal.calibration.localization import (
 )
 from pkmcal.calibration.model_violations import model_violations
 from pkmcal.check.advice import advice
-from pkmcal.check.forecast import forecast
+from pkmcal.check.forecast import NEAR_END, forecast
 from pkmcal.check.inspection import Inspection, StationInspection
 from pkmcal.check.results import BoardCheck, JointCheck, SessionCheck, StationCheck
 from pkmcal.check.sentences import (
@@ -51,7 +51,8 @@ from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, decode
-from pkmcal.observe.quality import Quality, quality, unrecognised_quality
+from pkmcal.observe.pose_candidates import SAME_POSE_TURN
+from pkmcal.observe.quality import Quality, quality, unlocalized_quality
 from pkmcal.observe.station_localization import LocalizedPose
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, of_error
 from pkmcal.session.image_files import label_of
@@ -61,10 +62,6 @@ from pkmcal.wording import listed
 
 BROKEN_IMAGES_NAMED = 10
 """Number of broken images of a station that are reported individually; the others are counted."""
-OTHER_MODE = np.deg2rad(20.0)
-"""Rotation to another assembly mode below which one can be mistaken for the other, rad."""
-STROKE_END_SHARE = 0.15
-"""Part of a joint's range, at either end, whose readings count as extreme."""
 
 
 def check_session(
@@ -165,7 +162,13 @@ def _decode_images(session: Session) -> tuple[list[StationImages | None], list[F
             rows.append(photo.configuration)
             files.append((photo.path, label))
         if broken > BROKEN_IMAGES_NAMED:
-            more = _more_broken_error(session, number, broken - BROKEN_IMAGES_NAMED)
+            more = InputError(
+                "images cannot be decoded",
+                where=f"session.yaml, stations.{station.name}",
+                found=f"{broken - BROKEN_IMAGES_NAMED} more of this station",
+                expected="whole PNG or JPEG files",
+                next_step="Copy them again from the camera, or remove them",
+            )
             findings.append(of_error(more, station=station.name))
         at = np.array(rows, dtype=int)
         images = Pictures([p for p, _ in files], station.camera.image_size,
@@ -176,18 +179,6 @@ def _decode_images(session: Session) -> tuple[list[StationImages | None], list[F
         )  # fmt: skip
         out.append(whole if rows else None)
     return out, findings
-
-
-def _more_broken_error(session: Session, number: int, count: int) -> InputError:
-    """Error on the broken images of a station that are not reported individually."""
-    name = session.stations[number].name
-    return InputError(
-        "images cannot be decoded",
-        where=f"session.yaml, stations.{name}",
-        found=f"{count} more of this station",
-        expected="whole PNG or JPEG files",
-        next_step="Copy them again from the camera, or remove them",
-    )
 
 
 @dataclass(frozen=True)
@@ -222,7 +213,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _NominalKinematic
     if weak:
         findings.append(doubtful("configurations.singular_readings", listed(weak), names=weak))
     turns = np.linalg.norm(pose_difference(modes, poses[0])[:, :3], axis=-1)
-    if np.any((turns > 1e-3) & (turns < OTHER_MODE)):
+    if np.any((turns > 1e-3) & (turns < SAME_POSE_TURN)):
         turn = float(np.rad2deg(turns[turns > 1e-3].min()))
         first_name = session.configurations[0]
         findings.append(doubtful("configurations.other_assembly", first_name, turn=turn))
@@ -254,7 +245,7 @@ def _check_images(
         n_legs, observed = session.machine.n_legs, zip(session.stations, images, strict=True)
         return tuple(
             _station_check(
-                station, unrecognised_quality(p.images if p else [], n_legs), recognised=False
+                station, unlocalized_quality(p.images if p else [], n_legs), recognised=False
             )
             for station, p in observed
         )
@@ -310,7 +301,7 @@ def _check_images(
     parts: list[StationInspection] = []
     for p in whole:
         if p.station not in places:  # the search ended at the fault of another station
-            summary = unrecognised_quality(p.images, session.machine.n_legs)
+            summary = unlocalized_quality(p.images, session.machine.n_legs)
             stations[p.station] = _station_check(
                 session.stations[p.station], summary, recognised=False
             )
@@ -347,7 +338,7 @@ def _search_results(
 ) -> dict[int, LocalizedPose]:
     """Localized poses by station number, without stations that were not searched."""
     fixed = [p.station for p in images if not session.stations[p.station].handheld]
-    localizations = located.recognition.localizations if located.recognition else ()
+    localizations = located.leg_localization.localizations if located.leg_localization else ()
     places = dict(zip(fixed, localizations, strict=bool(localizations)))
     # for a hand-held image, the probability of a rival pose takes the place of that of chance
     for k, one in located.places.items():
@@ -374,7 +365,7 @@ def _check_station(
     leg_quality = (
         quality(images, machine, T_camera_base, poses[images.configuration])
         if recognised
-        else unrecognised_quality(images.images, machine.n_legs)
+        else unlocalized_quality(images.images, machine.n_legs)
     )
     summary = replace(
         _station_check(station, leg_quality, recognised=recognised),
@@ -480,8 +471,8 @@ def joint_checks(session: Session) -> tuple[JointCheck, ...]:
         readings, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
         stroke = high - low
         ends = (
-            int(np.sum(readings < low + STROKE_END_SHARE * stroke)),
-            int(np.sum(readings > high - STROKE_END_SHARE * stroke)),
+            int(np.sum(readings < low + NEAR_END * stroke)),
+            int(np.sum(readings > high - NEAR_END * stroke)),
         )
         used = float(np.ptp(readings) / stroke)
         checks.append(JointCheck(name, float(readings.min()), float(readings.max()), used, ends))

@@ -27,7 +27,7 @@ from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, draw_configurations
 
 NEAR_END = 0.15
 """Part of a joint's range, at either end, whose readings count as extreme."""
-SECOND_PLACE_TURN = np.pi / 2
+SECOND_STATION_TURN = np.pi / 2
 """Angle around the machine of a second station, rad: the direction that one camera determines
 worst, along its line of sight, the other determines best.
 """
@@ -173,7 +173,7 @@ def _with_second_station(capture: _Capture) -> _Capture:
     rig = capture.rig
     (one,) = (x for x in rig.instruments if isinstance(x, LegsFrom))
     middle = np.concatenate([rig.machine.base_centers(), capture.T_base_platform[:, :3, 3]])
-    turn, centre = rotation(np.array([0.0, 0.0, SECOND_PLACE_TURN])), middle.mean(axis=0)
+    turn, centre = rotation(np.array([0.0, 0.0, SECOND_STATION_TURN])), middle.mean(axis=0)
     there = one.T_camera_base @ inverse(pose(turn, centre - turn @ centre))
     pairs = capture.pairs.copy()
     pairs[1::2, 0] = 1

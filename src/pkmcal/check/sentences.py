@@ -13,7 +13,9 @@ from pkmcal.arrays import Array
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.results import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
 from pkmcal.files import resolved
+from pkmcal.identify.verdict import VERDICT
 from pkmcal.judge.repeatability import RepeatStudy, part_of
+from pkmcal.levels import MAJORITY
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Mark, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note
@@ -23,20 +25,10 @@ from pkmcal.wording import count, listed
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost; a highlight has a tenth."""
-TOO_DARK = 0.5
-"""Share of black pixels on the legs beyond which they have no shading left."""
 BLUR_STILL_MEASURED = 1.7
 """Blur (px) beyond which edges are measured badly: the model of an edge ends at 1.5."""
-FEW_LEGS = 0.5
-"""Share of the legs found in a station's images below which the station hardly contributes."""
 POOR_CORNERS = 0.5
 """Residual of corners (px rms) beyond that of any sharp image of a flat board."""
-LITTLE_USED = 0.5
-"""Share of a joint's range below which its configurations are crowded."""
-FEW_CONFIGURATIONS = 8
-"""Number of configurations below which standard deviations are large and mistakes are not
-detected.
-"""
 STATION_LEGEND = (
     "By chance: probability of other readings fitting as well (of an image by",
     "hand, another place); good below 0.001, or 0.01 near a pose or by hand.",
@@ -83,11 +75,11 @@ def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
     where = "legs" if station.recognised else "pictures"
     if station.saturated > OVEREXPOSED_PIXEL_SHARE:
         findings.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
-    if station.black > TOO_DARK:
+    if station.black > MAJORITY:
         findings.append(doubtful("images.black", **at, share=station.black, where=where))
     if station.blur > BLUR_STILL_MEASURED:
         findings.append(doubtful("images.blurred", **at, blur=station.blur))
-    if station.recognised and station.legs < FEW_LEGS * n_legs:
+    if station.recognised and station.legs < MAJORITY * n_legs:
         findings.append(doubtful("images.few_legs", **at, number=station.legs, of=n_legs))
     return findings
 
@@ -111,13 +103,13 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
     findings: list[Finding] = []
     if session.heights_alone:  # the bed determines the configurations
         return findings
-    crowded = [joint for joint in joints if joint.used < LITTLE_USED]
+    crowded = [joint for joint in joints if joint.used < MAJORITY]
     if crowded:
         names = [joint.name for joint in crowded]
         least = min(joint.used for joint in crowded)
         findings.append(note("readings.crowded", listed(names), columns=names, share=least))
     count = len(session.configurations)
-    if count < FEW_CONFIGURATIONS:
+    if count < VERDICT.few_configurations:
         findings.append(note("configurations.too_few", number=count))
     return findings + _repeated_pose_findings(session)
 
@@ -253,7 +245,7 @@ def _joints_table(joints: tuple[JointCheck, ...]) -> Table:
                 _number(joint.used, "{:.0%}"),
                 f"{joint.ends[0]} + {joint.ends[1]}" if math.isfinite(joint.used) else "–",
             ),
-            mark=Level.NOTE if joint.used < LITTLE_USED else "good",
+            mark=Level.NOTE if joint.used < MAJORITY else "good",
         )
         for joint in joints
     )

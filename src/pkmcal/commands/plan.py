@@ -23,7 +23,7 @@ PLAN_FILES = {
     "plan.csv": "the readings, in the order to be measured",
     "plan.json": NUMBERS_DESCRIPTION,
 }
-STATION_PLACES_FILES = {"stations.yaml": "the places, for session.yaml"}
+STATION_POSES_FILES = {"stations.yaml": "the places, for session.yaml"}
 
 
 def plan(
@@ -120,9 +120,9 @@ def plan(
 
     session = session_folder(subject)
     folder = out or default_output((session or Path()) / "plan")
-    files = {**PLAN_FILES, **(STATION_PLACES_FILES if places or best_of else {})}
+    files = {**PLAN_FILES, **(STATION_POSES_FILES if places or best_of else {})}
     over = check_own_folder(
-        folder, {**PLAN_FILES, **STATION_PLACES_FILES}, "what plan writes", "an earlier plan"
+        folder, {**PLAN_FILES, **STATION_POSES_FILES}, "what plan writes", "an earlier plan"
     )
     sized = None if session is not None or camera else camera_of_size(parsed_size(size))
     with console.progress(as_json) as progress:

@@ -26,7 +26,7 @@ from pkmcal.observe.predict import (
 )
 from pkmcal.simulation.edges import EdgeNoise, disturbed, responses
 
-IMAGED_EDGE_PLACES = 5
+IMAGED_EDGE_POINTS = 5
 """Samples along an edge; more samples change its noise by less than a tenth."""
 IN_VIEW = 0.5
 """Share of a leg's edge that must be in the image; with less, a tracker loses the leg."""
@@ -56,7 +56,7 @@ class Eye:
         picked = np.array(rows)
         return cls(true, camera, TubeList(*(getattr(every, f.name)[picked] for f in fields(every))))
 
-    def points(self, poses: Array, readings: Array, places: int = IMAGED_EDGE_PLACES) -> EdgePoints:
+    def points(self, poses: Array, readings: Array, places: int = IMAGED_EDGE_POINTS) -> EdgePoints:
         """Samples (R, E, n) along the edges at poses (R, 4, 4) and readings (R, m)."""
         legs = legs_in_camera(self.true.machine, self.true.T_camera_base, poses, readings)
         return edge_points(self.true.machine, self.camera, legs, self.tubes, places)
@@ -72,7 +72,7 @@ class Eye:
         """(R, s) legs with more than half of an edge behind another leg."""
         machine = self.true.machine
         legs = legs_in_camera(machine, self.true.T_camera_base, poses, readings)
-        points = edge_points(machine, self.camera, legs, self.tubes, IMAGED_EDGE_PLACES)
+        points = edge_points(machine, self.camera, legs, self.tubes, IMAGED_EDGE_POINTS)
         clear = unobstructed(machine, self.camera, legs, self.tubes, points, 0.0)
         with np.errstate(invalid="ignore"):
             inside = points.valid & self.camera.in_image(points.pixel, margin=4.0)

@@ -68,7 +68,7 @@ AT_GOAL_DEVIATIONS = 5.0
 """RMS of the law's error, in standard deviations, below which a machine at rest is at its goal."""
 UNSEEN_READING_SIGMA = 0.05
 """Standard deviation of a reading, in m or rad, above which an image does not determine it."""
-OTHER_PLACE_ANGLE = 0.02
+OTHER_POSITION_ANGLE = 0.02
 """RMS angle, in rad, that is more than noise: with readings at rest and edges this far from the
 goal, the law has reached another equilibrium."""
 NO_EDGES_TEXT = (
@@ -295,7 +295,7 @@ class VisualServo:
         still = bool(np.max(np.abs(off)) <= self.tolerance)
         # a single direction has more noise than that angle: compare images in standard deviations
         typical = _root_mean_square(task.error / np.sqrt(3)) / noise if above_limit else np.inf
-        converged = still and (error < OTHER_PLACE_ANGLE or typical < AT_GOAL_DEVIATIONS)
+        converged = still and (error < OTHER_POSITION_ANGLE or typical < AT_GOAL_DEVIATIONS)
         warnings = self._warnings(sample, used, slowed, outside)
         if still and not converged:
             elsewhere = (

@@ -17,21 +17,20 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import columns_of, eliminated_beside, prior_root
+from pkmcal.identify.score import columns_of, eliminate_beside, prior_root
 from pkmcal.identify.tool import pose_by_parameters
+from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Column
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.solver.elimination import divisions, rows_on_shared
 from pkmcal.solver.ranks import column_space
 
-PLACES_OVER_BED = 60
+POINTS_OVER_BED = 60
 """Places all over the bed: where nobody probed counts as well."""
 NOTICED_TOUCH_DEVIATIONS = 4.13
 """Standard deviations by which a touch has to be off what all others tell of it to be noticed: one
 right touch in a thousand seems to be, and four wrong ones in five are found (W. Baarda, A testing
 procedure for use in geodetic networks, 1968)."""
-BED_ROUNDING_SHARE = 1e-9
-"""Share of what a parameter does below which it is rounding."""
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 """Turn from one place to the next on a spiral that covers a disc evenly."""
 
@@ -118,12 +117,12 @@ def _over_the_disc(probed: Array) -> Array:
     middle = xy.mean(axis=0)
     plane = np.column_stack([np.ones(len(xy)), xy])
     height = np.linalg.lstsq(plane, probed[:, 2, 3], rcond=None)[0]
-    k = np.arange(PLACES_OVER_BED)
-    r = np.linalg.norm(xy - middle, axis=1).max() * np.sqrt((k + 0.5) / PLACES_OVER_BED)
+    k = np.arange(POINTS_OVER_BED)
+    r = np.linalg.norm(xy - middle, axis=1).max() * np.sqrt((k + 0.5) / POINTS_OVER_BED)
     places = middle + r[:, None] * np.stack(
         [np.cos(GOLDEN_ANGLE * k), np.sin(GOLDEN_ANGLE * k)], axis=1
     )
-    out = np.repeat(probed[:1], PLACES_OVER_BED, axis=0)
+    out = np.repeat(probed[:1], POINTS_OVER_BED, axis=0)
     out[:, :2, 3] = places
     out[:, 2, 3] = height[0] + places @ height[1:]
     return out
@@ -146,12 +145,10 @@ def _nominal_root(machine: Machine, by: Array) -> Array:
     free, wide = (t.free_matrix() * t.tolerances_free() for t in (table, everything))
     by = by.reshape(-1, by.shape[-1])
     u, s, _ = np.linalg.svd(by @ free, full_matrices=False)
-    u = u[:, s > BED_ROUNDING_SHARE * s[0]]
+    u = u[:, s > ROUNDING * s[0]]
     shifted = by @ wide
     own = np.linalg.norm(shifted - u @ (u.T @ shifted), axis=0)
-    return np.column_stack(
-        [free, wide[:, own > BED_ROUNDING_SHARE * np.linalg.norm(shifted, axis=0)]]
-    )
+    return np.column_stack([free, wide[:, own > ROUNDING * np.linalg.norm(shifted, axis=0)]])
 
 
 def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tuple[Array, Array]:
@@ -190,7 +187,7 @@ def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, A
         divisions(*problem.extent), Information(problem, state).pieces(), strict=True
     ):
         linear = piece.linear
-        own, value = eliminated_beside(linear, columns(cut, linear) @ root)
+        own, value = eliminate_beside(linear, columns(cut, linear) @ root)
         parts.append((own.reshape(-1, own.shape[-1]), value.ravel()))
         reference = ~linear.shared_by[:, machine].any(axis=1)
         if not cut.start:
@@ -210,9 +207,7 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
     rows = rows_on_shared(info.linear, info.reduced)[0][0]
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0] = 1.0
-    inverse = np.linalg.pinv(
-        (rows / scale).T @ (rows / scale), rcond=BED_ROUNDING_SHARE, hermitian=True
-    )
+    inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=ROUNDING, hermitian=True)
     inverse /= scale[:, None] * scale
     own = rows[: len(rows) - len(problem.prior)]
     # all that a configuration says, its pose aside, is one number: what was felt there
@@ -220,7 +215,7 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
     felt = s[:, :1] * vt[:, 0]
     gain = felt @ inverse
     remainder = 1 - np.sum(gain * felt, axis=1)
-    if remainder.min() < BED_ROUNDING_SHARE:
+    if remainder.min() < ROUNDING:
         return None
     shifted = height @ problem.free @ gain[:, problem.unknowns.machine].T
     return float(

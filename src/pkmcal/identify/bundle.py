@@ -22,7 +22,11 @@ from pkmcal.identify.covariance import (
     reduced_rows,
 )
 from pkmcal.identify.edge_noise import EDGE_NOISE, EdgeNoiseOptions, edge_noise
-from pkmcal.identify.error_correlation import covariance_of_correlated
+from pkmcal.identify.error_correlation import (
+    ERROR_CORRELATION,
+    ErrorCorrelationOptions,
+    covariance_of_correlated,
+)
 from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.external_reliability import covariance_of_undetected
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
@@ -38,6 +42,7 @@ from pkmcal.identify.noise import (
     LEAST_NOISE_FREEDOM,
     NOISE,
     Components,
+    NoiseOptions,
     NoiseShares,
     components,
     counts,
@@ -60,7 +65,7 @@ from pkmcal.measurements.effects import SHADING, SHIFT_SIGMA
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import rank_of_normal
-from pkmcal.solver.search import STEP_TOLERANCE, Solution, Stop, minimise
+from pkmcal.solver.search import SEARCH, STEP_TOLERANCE, SearchOptions, Solution, Stop, minimise
 
 
 @dataclass(frozen=True)
@@ -80,8 +85,6 @@ class BatchOptions:
     # the same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
     # how far it goes: at most by how much further
     furthest_noise_pace: float = 3.0
-    # logarithm of a step of that noise that was not cut short
-    uncut_noise_log_step: float = 0.99 * float(np.log(NOISE.largest_step))
     # rounds in which the tails of the edges' noise are chosen; they are steps, and two that are
     # alike would take turns for ever
     free_rounds: int = 6
@@ -95,6 +98,14 @@ class BatchOptions:
     robust: RobustOptions = ROBUST
     edge_noise: EdgeNoiseOptions = EDGE_NOISE
     line_shading: LineShadingOptions = LINE_SHADING
+    noise: NoiseOptions = NOISE
+    search: SearchOptions = SEARCH
+    error_correlation: ErrorCorrelationOptions = ERROR_CORRELATION
+
+    @property
+    def uncut_noise_log_step(self) -> float:
+        """Logarithm of a step of the readings' noise that was not cut short."""
+        return 0.99 * float(np.log(self.noise.largest_step))
 
 
 BATCH = BatchOptions()
@@ -108,7 +119,7 @@ class BatchResult:
     robust weights 0..1 of each kind of measurement. scale : (B,) factors on the stated noise of
     each kind; the edges' is the annealing's, and one as soon as their noise was looked for. info :
     the problem as it was solved, weights and noise included, and what it says at the solution.
-    edges : their noise, as stated where it was not looked for; robust_weight : (B, K, G) by how
+    edges : their noise, as stated where it was not looked for; irls_weight : (B, K, G) by how
     much more or less each counts for it. stated : (B or 1,) the readings' noise before.
     """
 
@@ -117,8 +128,9 @@ class BatchResult:
     scale: Kinds[Array]
     info: Information
     edges: EdgeScatter
-    robust_weight: Array
+    irls_weight: Array
     stated: Array
+    options: BatchOptions
 
     @cached_property
     def components(self) -> Components:
@@ -128,7 +140,11 @@ class BatchResult:
     @cached_property
     def reading_noise(self) -> NoiseShares:
         """How large the readings' noise shows itself."""
-        return noise_shares(self.info, READING_ROWS_KIND)
+        return self.noise_of(READING_ROWS_KIND)
+
+    def noise_of(self, kind: int) -> NoiseShares:
+        """Independent residuals of a kind of rows, which determine its noise."""
+        return noise_shares(self.info, kind, self.options.noise)
 
     @cached_property
     def covariance(self) -> Array:
@@ -136,7 +152,7 @@ class BatchResult:
         wrong ones do unnoticed.
         """
         unnoticed = covariance_of_undetected(self.info, self.weight.edges)
-        return covariance_of_correlated(self.info) + unnoticed
+        return covariance_of_correlated(self.info, self.options.error_correlation) + unnoticed
 
     @property
     def noise_scale(self) -> Array:
@@ -185,7 +201,8 @@ def solve_batch(
         scale = value.scale if scale_noise else ones
     begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
     irls_weight, stated = np.ones_like(every.edges), problem.joint_noise
-    fit = _solved(problem, state, weight, scale, steps, begin, irls_weight, stated, STEP_TOLERANCE)
+    solved = partial(_solved, options=options)
+    fit = solved(problem, state, weight, scale, steps, begin, irls_weight, stated, STEP_TOLERANCE)
     if robust or scale_noise:
         settle = partial(
             _settle, robust=robust, scale_noise=scale_noise, least=least, options=options
@@ -219,7 +236,7 @@ def _settle(
     nearly = False
     for number in range(options.most_rounds):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
-        scale, edges, irls_weight = fit.scale, fit.edges, fit.robust_weight
+        scale, edges, irls_weight = fit.scale, fit.edges, fit.irls_weight
         if scale_noise:
             scale = Kinds(
                 np.ones_like(scale.edges),
@@ -272,12 +289,15 @@ def _settle(
             irls_weight,
             fit.stated,
             options.nearly_solved,
+            options,
         )
         nearly = True
     if not nearly:
         return fit
     # what the search of the last round has left to go
-    solution, info = _searched(fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE)
+    solution, info = _searched(
+        fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE, options
+    )
     return replace(fit, solution=solution, info=info)
 
 
@@ -336,21 +356,24 @@ def _solved(
     irls_weight: Array,
     stated: Array,
     tolerance: float,
+    options: BatchOptions,
 ) -> BatchResult:
     """The problem solved with these weights up to a tolerance, from a state that ``steps`` (B,)
     have led to.
     """
     parts = zip(weight._replace(edges=weight.edges * irls_weight), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
-    solution, info = _searched(used, state, steps, tolerance)
-    return BatchResult(solution, weight, scale, info, edges, irls_weight, stated)
+    solution, info = _searched(used, state, steps, tolerance, options)
+    return BatchResult(solution, weight, scale, info, edges, irls_weight, stated, options)
 
 
 def _searched(
-    problem: Problem, state: BatchState, steps: Integers, tolerance: float
+    problem: Problem, state: BatchState, steps: Integers, tolerance: float, options: BatchOptions
 ) -> tuple[Solution, Information]:
     """The solution up to a tolerance, from a state that ``steps`` (B,) have led to."""
-    solution = minimise(problem.as_noisy_as_at(state), state, tolerance=tolerance)
+    solution = minimise(
+        problem.as_noisy_as_at(state), state, tolerance=tolerance, options=options.search
+    )
     solution = replace(solution, steps=steps + solution.steps)
     return solution, Information(problem, solution.state, solution.normal)
 
@@ -546,7 +569,7 @@ def _estimate(
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
         edge_noise=result.edges.of_run(0),
-        edge_trust=assembled.places.edges.taken(result.robust_weight[0]),
+        edge_trust=assembled.places.edges.taken(result.irls_weight[0]),
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),
         configurations=assembled.observed,
@@ -620,12 +643,12 @@ def _statistics(
         dof_poses=freedom[POSE_ROWS_KIND],
         reading_scale=float(result.reading_scale[0]),
         reading_range=_range(result.reading_noise, result.reading_scale),
-        pose_range=_range(noise_shares(result.info, POSE_ROWS_KIND), result.scale.poses),
+        pose_range=_range(result.noise_of(POSE_ROWS_KIND), result.scale.poses),
         chi2_links=chi2[3],
         n_links=n_links,
         link_scale=float(result.scale.links[0]),
         dof_links=freedom[LINK_ROWS_KIND],
-        link_range=_range(noise_shares(result.info, LINK_ROWS_KIND), result.scale.links),
+        link_range=_range(result.noise_of(LINK_ROWS_KIND), result.scale.links),
         shading=float(np.median(problem.shading[0])) if problem.shading.size else SHADING_SIGMA,
         look_scatter=float(np.sqrt(imputation_covariance)),
     )

@@ -13,7 +13,7 @@ that was rejected among seven with seven unknowns is as likely right as any othe
 that lies twenty standard deviations off is surely wrong.
 
 A rejection has to be confirmed by measurements, not by the nominal model, which the calibration is
-to correct. So prior sigmas are ``FAR_FROM_NOMINAL`` times as wide here.
+to correct. So prior sigmas are ``CONTRADICTION_SIGMAS`` times as wide here.
 
 Hypotheses are solved to first order about the estimate, with each configuration's own unknowns
 eliminated; a hypothesis changes the normal equations of one configuration or two.
@@ -34,13 +34,12 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import as_pairs
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
-from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE, final_loss
+from pkmcal.solver.kernels import INLIER_WEIGHT, NO_WEIGHT_DISTANCE, final_loss
 
-FAR_FROM_NOMINAL = 5.0
-"""Change from the nominal model, in prior sigmas, beyond which a person should check a value."""
 NORMAL_RIDGE = 1e-12
 """Ridge on a normal matrix with unit diagonal, for directions that are not determined."""
 MOST_REJECTED_UNITS = 50
@@ -121,14 +120,14 @@ def rejected_units(measurements: Measurements, estimate: Estimate) -> tuple[Reje
     are rejected.
     """
     poses, edges = measurements.poses, measurements.edges
-    lost = np.flatnonzero(estimate.pose_weights < 0.5).tolist()
+    lost = np.flatnonzero(estimate.pose_weights < INLIER_WEIGHT).tolist()
     out = [RejectedUnit(k, int(poses.station[k]), int(poses.configuration[k])) for k in lost]
     image = np.stack([edges.station, edges.configuration], axis=1)
     image, own = np.unique(image, axis=0, return_inverse=True)
-    rejected = np.bincount(own.ravel(), estimate.edge_weights < 0.5, len(image))
+    rejected = np.bincount(own.ravel(), estimate.edge_weights < INLIER_WEIGHT, len(image))
     every = np.bincount(own.ravel(), minlength=len(image))
     out += [RejectedUnit(-1, int(s), int(c)) for s, c in image[2 * rejected > every]]
-    lost = np.flatnonzero(estimate.link_weights < 0.5).tolist()
+    lost = np.flatnonzero(estimate.link_weights < INLIER_WEIGHT).tolist()
     ends = measurements.link_ends
     out += [RejectedUnit(-1, -1, int(ends[k, 1]), link=k) for k in lost]
     return tuple(out)
@@ -146,7 +145,7 @@ def rejections_of(measurements: Measurements, estimate: Estimate, tool: Array) -
     # problem at the solution, with wider priors
     assembled, info = estimate.linearized
     drawn = np.array(assembled.priors) == "nominal"
-    wider = np.where(drawn, 1 / FAR_FROM_NOMINAL, 1.0)
+    wider = np.where(drawn, 1 / CONTRADICTION_SIGMAS, 1.0)
     problem, state = info.problem, info.state
     problem = replace(
         problem, prior=wider[:, None] * problem.prior, prior_target=wider * problem.prior_target
@@ -254,7 +253,7 @@ class _Cases(NamedTuple):
                 rows.append(LINK_ROW if of_links else row)
             else:
                 own = (edges.station == unit.station) & (edges.configuration == unit.configuration)
-                own = np.flatnonzero(own & (estimate.edge_weights < 0.5))
+                own = np.flatnonzero(own & (estimate.edge_weights < INLIER_WEIGHT))
                 places = assembled.places.edges
                 row = int(places.row[own[0]])
                 weight.edges[places.row[own], places.place[own]] = 1.0

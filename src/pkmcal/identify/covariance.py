@@ -30,6 +30,7 @@ from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.levels import NAMED_SHARE
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.solver.elimination import (
     Linear,
@@ -320,7 +321,7 @@ def _direction(
     table: ParameterTable, weights: Array, vector: Array, value: float
 ) -> ParameterDirection:
     order = np.argsort(-np.abs(weights), kind="stable")
-    order = order[np.abs(weights[order]) > 0.15 * np.abs(weights).max()][:8]
+    order = order[np.abs(weights[order]) > NAMED_SHARE * np.abs(weights).max()][:8]
     names = table.free_names()
     size = np.abs(vector / table.tolerance).max()
     return ParameterDirection(

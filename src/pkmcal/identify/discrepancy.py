@@ -55,7 +55,7 @@ from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.score import (
     columns_of,
-    eliminated_beside,
+    eliminate_beside,
     shared_basis,
 )
 from pkmcal.measurements import Column
@@ -370,7 +370,7 @@ def _products(assembled: Assembled, info: Information, listed: Sequence[Column])
     for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS):
         piece = Information(problem.among(cut), problem.state_among(info.state, cut))
         linear = piece.linear
-        rows, residuals = eliminated_beside(linear, columns(cut, linear))
+        rows, residuals = eliminate_beside(linear, columns(cut, linear))
         own, extra = rows[..., :count] @ basis, rows[..., count:].reshape(-1, n)
         own, residuals = own.reshape(-1, basis.shape[1]), residuals.ravel()
         if not cut.start:

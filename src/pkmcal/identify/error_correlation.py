@@ -35,6 +35,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.reduced_edges import reduced_edges
 from pkmcal.identify.scatter import NUMBERS_AN_EDGE, shift_squares
+from pkmcal.levels import ROUNDING
 from pkmcal.measurements.line_cells import LineCells
 from pkmcal.solver.search import take
 
@@ -46,14 +47,15 @@ class ErrorCorrelationOptions:
     # largest number of edges whose tilts are compared, of configurations evenly among all: c then
     # has a standard deviation of a few hundredths
     most_tilts: int = 800
-    # information of pairs of tilts, or a probability, below which it is rounding
-    rounding: float = 1e-9
     # mean of c without data
     uninformed_share: float = 0.5
 
 
+ERROR_CORRELATION = ErrorCorrelationOptions()
+
+
 def covariance_of_correlated(
-    info: Information, options: ErrorCorrelationOptions = ErrorCorrelationOptions()
+    info: Information, options: ErrorCorrelationOptions = ERROR_CORRELATION
 ) -> Array:
     """Covariance (B, na, na) of the shared unknowns at a solution, with correlated errors of edges.
 
@@ -141,7 +143,7 @@ class _Tilts(NamedTuple):
         together = self.configuration[:, None] == self.configuration
         taken = self.shared @ self.shared.T + np.where(together, self.own @ self.own.T, 0.0)
         rest = np.eye(len(self.value)) - taken
-        square = self.value @ self.value / max(np.trace(rest), options.rounding)
+        square = self.value @ self.value / max(np.trace(rest), ROUNDING)
         pairs = np.zeros_like(rest)
         for own, _, correlation in cells.correlated_groups():
             mine = np.flatnonzero((self.cell >= own.start) & (self.cell < own.stop))
@@ -149,13 +151,13 @@ class _Tilts(NamedTuple):
             pairs[np.ix_(mine, mine)] = correlation[np.ix_(place, place)] - np.eye(len(mine))
         product = pairs @ rest
         information = np.sum(product * product.T)
-        if square == 0 or information <= options.rounding:
+        if square == 0 or information <= ROUNDING:
             return options.uninformed_share
         values = (self.value @ pairs @ self.value / square - np.trace(product)) / information
         sigma = np.sqrt(2 / information)
         low, high = -values / sigma, (1 - values) / sigma
         density = np.exp(-(np.array([low, high]) ** 2) / 2) / np.sqrt(2 * np.pi)
         within = ndtr(high) - ndtr(low)
-        if within < options.rounding:
+        if within < ROUNDING:
             return float(np.clip(values, 0.0, 1.0))
         return float(values + sigma * (density[0] - density[1]) / within)

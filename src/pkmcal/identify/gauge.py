@@ -29,6 +29,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.state import State, estimated_unknowns
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.layout import LimbLayout
 
@@ -290,7 +291,7 @@ def _allowed(machine: Machine, shifted: Array, candidates: Array) -> Array:
     _, s, vt = np.linalg.svd(outside)
     size = np.zeros(candidates.shape[1])
     size[: s.size] = s
-    return candidates @ vt[size < 1e-9].T
+    return candidates @ vt[size < ROUNDING].T
 
 
 def respecting_motion(motion: Array) -> Array:

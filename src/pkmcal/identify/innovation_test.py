@@ -25,10 +25,8 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.robust import as_pairs
 from pkmcal.measurements.rows import Kinds
 from pkmcal.solver.elimination import divisions
-from pkmcal.solver.strips import eliminated
-
-REJECTED_BELOW_WEIGHT = 0.5
-"""Weight below which a pose counts as rejected."""
+from pkmcal.solver.kernels import INLIER_WEIGHT
+from pkmcal.solver.strips import eliminate_strips
 
 
 def innovations(info: Information, distance: Array, weight: Array, scale: Array) -> Array:
@@ -42,14 +40,14 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
     scale : (B,) noise scale of the poses.
     """
     kind = info.problem.kinds.poses
-    rejected = kind.present & (weight < REJECTED_BELOW_WEIGHT)
+    rejected = kind.present & (weight < INLIER_WEIGHT)
     if not rejected.any():
         return distance
     out, factor, count = distance.copy(), as_pairs(kind), info.problem.layout.n_equations
     for cut in divisions(*info.problem.extent):
         part, state = info.problem.among(cut), info.problem.state_among(info.state, cut)
         # R and W by the weighted rows
-        used = eliminated(part.compact(state), np.zeros(len(state.z)))
+        used = eliminate_strips(part.compact(state), np.zeros(len(state.z)))
         # A: the same rows without weights
         whole = Kinds(*(one.present[None].astype(float) for one in part.kinds))
         rows = part.weighted(whole).compact(state)

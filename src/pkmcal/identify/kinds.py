@@ -14,7 +14,7 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements.readings import joint_rows
 from pkmcal.solver.elimination import divisions, flat
-from pkmcal.solver.strips import Compact, Eliminated, eliminated
+from pkmcal.solver.strips import Compact, Eliminated, eliminate_strips
 
 EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND = range(4)
 ROWS_KINDS = 4
@@ -66,7 +66,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
-        eliminated_part = eliminated(rows, np.zeros(n_runs))
+        eliminated_part = eliminate_strips(rows, np.zeros(n_runs))
         values.append(rows.value)
         every += eliminated_part.strips_normal + eliminated_part.rows_normal
         if part.kinds.edges.present.any():
@@ -87,7 +87,7 @@ def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
-        eliminated_part = eliminated(rows, np.zeros(len(state.z)))
+        eliminated_part = eliminate_strips(rows, np.zeros(len(state.z)))
         parts.append(_rows_of_kind(part, rows, eliminated_part, by_reading, kind))
     return KindRows(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 

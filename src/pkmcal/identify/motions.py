@@ -23,6 +23,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
+from pkmcal.levels import ALIGNED_ANGLE, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
 from pkmcal.wording import DISPLAY_UNITS, decimals, joined, named, number, split_name, with_unit
@@ -34,15 +35,8 @@ form about as many."""
 MOST_SIZES = 3
 """Largest number of sizes that are tried together, besides all of them; the number of combinations
 grows as powers of two."""
-ALIGNED_AXIS_COSINE = 0.985
-"""Cosine (10 degrees) of the angle between a direction and an axis up to which the direction has
-that axis's name."""
 THROUGH_AXIS_DISTANCE = 0.05
 """Distance of a joint from an axis, relative to the joints' spread, up to which it lies on it."""
-NEGLIGIBLE_CHANGE_SHARE = 1e-3
-"""Coefficient of a change, relative to its largest one, below which it is negligible."""
-UNTOLD_SIZE_CHANGE = 0.01
-"""Change of a size beside another one's 1 mm, in mm or degrees, below which it is omitted."""
 MOST_VALUES_LISTED = 5
 """Largest number of terms in a sentence, the last of which may stand for all smaller ones."""
 
@@ -50,6 +44,35 @@ Advice = Literal[
     "more", "photograph", "tie", "caliper", "more or caliper", "turn", "drawing", "size"
 ]  # fmt: skip
 """Kind of advice: see :mod:`pkmcal.identify.sentences`."""
+
+
+@dataclass(frozen=True)
+class UnidentifiedOptions:
+    """Constants of the sentences on what the data do not determine."""
+
+    # shares of a motion (squared) that lie in the open space for it to explain part of that space:
+    # first those that fit exactly, since many motions are similar once frames are removed, then
+    # those that fit nearly. The space is that of the estimate, whose noise of poses bends
+    # directions that would be exact
+    inside: tuple[float, float] = (0.999, 0.95)
+    # information, in units of the prior's, below which a direction counts as unidentified: the data
+    # then decide less than a tenth of its variance. Platforms that only translate seem to rotate by
+    # their poses' noise, so unidentifiable directions have a trace of information
+    weak: float = 1 / 3
+    # reweighting steps to the sparsest coefficients, and how much less those of frames cost, which
+    # no sentence contains
+    sparse_steps: int = 20
+    frame_weight: float = 10.0
+
+    @property
+    def new_sine(self) -> float:
+        """Sine of the angle to the motions so far below which a motion describes nothing new: it
+        nearly lies in their space.
+        """
+        return float(np.sqrt(1 - self.inside[1]))
+
+
+UNIDENTIFIED = UnidentifiedOptions()
 
 
 @dataclass(frozen=True)
@@ -62,6 +85,7 @@ class Situation:
     imaged : whether legs are in images; otherwise only boards, poses or heights were
     measured.
     heights : whether nothing but heights was measured.
+    options : those of the sentences.
     """
 
     machine: Machine
@@ -69,6 +93,7 @@ class Situation:
     T_base_platform: Array
     imaged: bool = True
     heights: bool = False
+    options: UnidentifiedOptions = UNIDENTIFIED
 
     @cached_property
     def legs(self) -> tuple[int, ...]:
@@ -308,7 +333,7 @@ def _sliding(_s: Situation, coefficients: Array) -> str:
     if len(coefficients) > 1:
         return "can grow and shift along itself, its two joints and its length together"
     base, platform = np.abs(coefficients[0])
-    if min(base, platform) < NEGLIGIBLE_CHANGE_SHARE * max(base, platform):
+    if min(base, platform) < NEGLIGIBLE * max(base, platform):
         if base > platform:
             return "can grow while its base joint moves back along it"
         return "can grow while its platform joint moves on along it"
@@ -333,7 +358,7 @@ def directions_in_words(vectors: Array) -> str:
 def _axis_name(vector: Array) -> str:
     """Name of the axis that a vector (3,) is parallel to, empty for none."""
     size = np.abs(vector) / max(float(np.linalg.norm(vector)), 1e-300)
-    return AXIS_LETTERS[int(np.argmax(size))] if size.max() > ALIGNED_AXIS_COSINE else ""
+    return AXIS_LETTERS[int(np.argmax(size))] if size.max() > np.cos(ALIGNED_ANGLE) else ""
 
 
 def _carriers(s: Situation, leg: int) -> Iterator[tuple[NamedChanges, str]]:
@@ -478,7 +503,7 @@ def changes(values: Array, labels: tuple[tuple[str, str], ...]) -> tuple[list[st
     factor = one / (scale[first] * values[first])
     values_out = values * factor * scale
     order = [first, *(k for k in np.argsort(-np.abs(values_out), kind="stable") if k != first)]
-    order = [k for k in order if abs(values_out[k]) > UNTOLD_SIZE_CHANGE]
+    order = [k for k in order if abs(values_out[k]) > NEGLIGIBLE]
     texts: list[str] = []
     for k in order:
         places = decimals(abs(values_out[k])) if k != first else int(one < 1)
@@ -585,7 +610,7 @@ def rigid_words(twists: Array, points: Array, legs: tuple[int, ...]) -> str:
     middle = points[list(legs)].mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=-1))))
     omega, tau = twists[:, :3] * spread, twists[:, 3:]
-    least = 1e-2 * max(float(np.linalg.norm(np.c_[omega, tau], axis=1).max()), 1e-300)
+    least = NEGLIGIBLE * max(float(np.linalg.norm(np.c_[omega, tau], axis=1).max()), 1e-300)
     u, s, vt = np.linalg.svd(omega, full_matrices=True)
     turns = int(np.sum(s > least))
     shifts = (u[:, turns:].T @ np.c_[omega, tau])[:, 3:]  # combinations that do not turn

@@ -37,7 +37,8 @@ from pkmcal.identify.problem import Problem
 from pkmcal.measurements.rows import Kinds
 
 LEAST_NOISE_FREEDOM = 5.0
-"""Degrees of freedom below which a sum of squares determines no noise."""
+"""Degrees of freedom n below which a sum of squares determines no noise: the relative standard
+deviation 1 / sqrt(2 n) of the noise is a third."""
 
 
 @dataclass(frozen=True)

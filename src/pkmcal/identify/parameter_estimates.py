@@ -11,6 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
+from pkmcal.levels import MAJORITY, ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.wording import LARGEST_DECIMALS, decimals, number
 
@@ -25,11 +26,6 @@ REPR_ROWS = 12
 """Rows of the table that its repr shows."""
 Decider = Literal["data", "drawing", "frame", "fixed"]
 
-DATA_DECIDES_SHARE = 0.5
-"""Share of a parameter's information from which on its value counts as decided by the data."""
-ROUNDING_SIGMA = 1e-9
-"""Standard deviations (m or rad) below which they are rounding: a nanometre."""
-
 
 def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> tuple[Decider, ...]:
     """What decides each parameter: data, drawing (the nominal model), frame or fixed.
@@ -42,8 +38,8 @@ def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> t
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return tuple(
         "fixed" if name in table.fixed
-        else "frame" if sigma[k] <= ROUNDING_SIGMA
-        else "data" if data_share[k] >= DATA_DECIDES_SHARE
+        else "frame" if sigma[k] <= ROUNDING
+        else "data" if data_share[k] >= MAJORITY
         else "drawing"
         for k, name in enumerate(table.names)
     )  # fmt: skip

@@ -18,7 +18,7 @@ from pkmcal.identify.covariance import Information
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.scatter import NUMBERS_AN_EDGE
 from pkmcal.solver.elimination import divisions
-from pkmcal.solver.strips import Eliminated, StripLayout, eliminated
+from pkmcal.solver.strips import Eliminated, StripLayout, eliminate_strips
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def reduced_edges(info: Information) -> Iterator[ReducedEdges]:
     for cut in divisions(info.state.T_base_platform.shape[1], problem.n_rows * n_runs):
         part, state = problem.among(cut), problem.state_among(info.state, cut)
         rows = part.compact(state)
-        eliminated_part, layout = eliminated(rows, np.zeros(n_runs)), rows.strips.layout
+        eliminated_part, layout = eliminate_strips(rows, np.zeros(n_runs)), rows.strips.layout
         # direction of a shift outward in each edge's residuals
         v = part.data.by_shift
         norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))

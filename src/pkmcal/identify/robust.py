@@ -25,6 +25,7 @@ from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements.rows import Kinds, RowsOfKind
 from pkmcal.solver.kernels import (
     FULL_WEIGHT_DISTANCE,
+    INLIER_WEIGHT,
     final_loss,
     final_weights,
     geman_mcclure_weights,
@@ -51,7 +52,7 @@ class RobustOptions:
     most_stages: int = 30
     # Geman-McClure scale in units of the residuals' robust scale: an inlier at two of these keeps
     # two thirds of its weight
-    geman_mcclure_scale: float = 4.0
+    geman_mcclure_scale: float = FULL_WEIGHT_DISTANCE
     # factors on LEAST_SCALE that are tried as a kind's noise scale: powers of two up to this one
     largest_power: int = 12
     # fixed-point steps to a kind's noise scale after that
@@ -217,7 +218,7 @@ def robust_start(
     """
     annealed = anneal(problem, start, options)
     rejects = [
-        np.any(kind.present & (weight < 0.5), axis=(1, 2))
+        np.any(kind.present & (weight < INLIER_WEIGHT), axis=(1, 2))
         for kind, weight in zip(problem.kinds, annealed.weight, strict=True)
     ]
     runs = np.flatnonzero(np.any(rejects, axis=0))

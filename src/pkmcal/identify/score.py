@@ -48,6 +48,7 @@ from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.measurements import Column
 from pkmcal.solver.elimination import Linear, divisions, eliminate
 from pkmcal.solver.ranks import inverse_root
@@ -55,11 +56,6 @@ from pkmcal.solver.ranks import inverse_root
 OBSERVABLE_SQUARE_SHARE = 1e-10
 """Smallest share of a violation's squared rows, after projection, that counts as observable; less
 is rounding. A ten-thousandth is left of a reading, a hundred times sharper than the edges."""
-ROUNDING_LENGTH_SHARE = 1e-9
-"""Length of a violation's column, as a share of its longest one, below which it is rounding, as for
-a shift of a height probe along the bed."""
-UNTOLD_HIDDEN_SHARE = 0.01
-"""Share of a number in unobservable directions from which its value is not given."""
 MOST_VIOLATIONS_SOUGHT = 4
 """Most violations that are named; a session with more has another fault."""
 
@@ -177,7 +173,8 @@ class ScoreTests:
         value, sigma = -free.inverse @ free.value, np.sqrt(np.diag(free.inverse))
         factors = [self._variance * self._scatter.get(k, 1.0) for k in freed]
         sigma = sigma * np.sqrt(np.repeat(factors, [made.count(k) for k in freed]))
-        sigma[free.hidden > UNTOLD_HIDDEN_SHARE] = np.inf
+        # no value where a part of the number is unobservable
+        sigma[free.hidden > NEGLIGIBLE] = np.inf
         cuts = np.cumsum([made.count(k) for k in freed])[:-1]
         return [
             OneStepUpdate(
@@ -206,7 +203,7 @@ class ScoreTests:
         for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
             linear = piece.linear
             further = [by_random(cut, linear) @ root, columns(cut, linear)]
-            rows, remainder = eliminated_beside(linear, np.concatenate(further, axis=-1))
+            rows, remainder = eliminate_beside(linear, np.concatenate(further, axis=-1))
             count = taken = problem.unknowns.count + root.shape[1]
             wide: list[Array] = []
             for f in every:
@@ -347,7 +344,8 @@ class _ProjectedColumns:
         lengths = [np.zeros(0)]
         for k in freed:
             length = np.sqrt(np.maximum(np.diag(made.between(k, k)), 0.0))
-            least = ROUNDING_LENGTH_SHARE * length.max(initial=0.0)
+            # columns that are rounding, as for a shift of a height probe along the bed
+            least = ROUNDING * length.max(initial=0.0)
             lengths.append(np.where(length > least, length, np.inf))
         squared = [np.zeros((0, 0)), *(made.across(k, freed) for k in freed)][len(freed) > 0 :]
         return cls(np.concatenate(lengths), np.concatenate(squared), made.with_residuals(freed))
@@ -398,7 +396,7 @@ def _basis_beside(assembled: Assembled, info: Information, beside: Sequence[Colu
     across, squared = np.zeros((basis.shape[1], count)), np.eye(count)
     na = len(basis)
     for cut, piece in zip(divisions(*assembled.problem.extent), info.pieces(), strict=True):
-        rows, _ = eliminated_beside(piece.linear, columns(cut, piece.linear) @ root)
+        rows, _ = eliminate_beside(piece.linear, columns(cut, piece.linear) @ root)
         flat = rows.reshape(-1, na + count)
         across += (flat[:, :na] @ basis).T @ flat[:, na:]
         squared += flat[:, na:].T @ flat[:, na:]
@@ -442,7 +440,7 @@ def _products(
     for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
         linear = piece.linear
         further = [random(cut, linear) @ root, columns(cut, linear)]
-        rows, value = eliminated_beside(linear, np.concatenate(further, axis=-1))
+        rows, value = eliminate_beside(linear, np.concatenate(further, axis=-1))
         count = problem.unknowns.count
         if not cut.start:
             reference_values = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
@@ -474,7 +472,7 @@ def prior_root(columns: Sequence[Column]) -> Array:
     return np.array(block_diag(np.zeros((0, 0)), *(one.prior for one in columns)))
 
 
-def eliminated_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
+def eliminate_beside(linear: Linear, columns: Array) -> tuple[Array, Array]:
     """Rows (K', r, na + k) with columns (K', r, k) beside the unknowns' and residuals (K', r), of
     which the configurations' own unknowns are eliminated. Columns are zero in rows that are
     rejected or padding.

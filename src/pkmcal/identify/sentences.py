@@ -12,22 +12,14 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.motions import AXIS_LETTERS, NamedChanges, Situation, changes
+from pkmcal.levels import NAMED_SHARE, NEGLIGIBLE, ROUNDING, TRANSLATION_TURN
 from pkmcal.mechanisms.parameters import EVERY_LEG
 from pkmcal.wording import capital, in_full, joined, listed, named, split_name, ways
 
-LEAST_PLATFORM_MOVE = 0.01
-"""Displacement of the platform, relative to a joint centre's prior sigma, below which it counts as
-not moved: a hundredth of the nominal model's uncertainty is negligible beside any calibration's."""
 MOST_SENTENCES = 8
 """Largest number of sentences in a report."""
 MOST_NAMES_IN_SENTENCE = 5
 """Largest number of parameters named in a sentence."""
-NAMED_CHANGE_SHARE = 0.15
-"""Change relative to the greatest one, both in prior sigmas, from which on a parameter is named."""
-SHIFT_ONLY_TURN = 0.02
-"""Rotation (rad) of the platform between configurations below which they only translate it."""
-ZERO_AXIS_COMPONENT = 1e-9
-"""Component of a nominal axis below which the file can fix it by itself."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +89,12 @@ def sentence(
     weak : the data contain information about it, but less than the nominal model does.
     """
     table = around.machine.parameters
-    matters = shifted > LEAST_PLATFORM_MOVE * float(table.tolerance[table.of_kind("center")].mean())
+    # negligible beside the nominal model's uncertainty is negligible beside any calibration's
+    matters = shifted > NEGLIGIBLE * float(table.tolerance[table.of_kind("center")].mean())
     # parameters that change most
     size = np.linalg.norm(open_motion.own, axis=0)
     order = np.argsort(-np.round(size, 6), kind="stable")
-    rows = order[: int(np.sum(size > NAMED_CHANGE_SHARE * size.max()))]
+    rows = order[: int(np.sum(size > NAMED_SHARE * size.max()))]
     names = tuple(table.names[k] for k in rows)
     several = len(open_motion.legs) > 1
     reference_values, n = (
@@ -237,7 +230,7 @@ def _more(around: Situation, legs: tuple[int, ...]) -> str:
     if len(poses) == 1:
         return f"{take} more configurations, so that {elsewhere} too"
     turn = rotation_vector(poses[:, :3, :3] @ poses[0, :3, :3].T)
-    if around.machine.layout.motion[:3].any() and np.abs(turn).max() < SHIFT_ONLY_TURN:
+    if around.machine.layout.motion[:3].any() and np.abs(turn).max() < TRANSLATION_TURN:
         return f"Turn the platform in some configurations, so that {elsewhere}"
     what = "lengths" if around.machine.layout.rod_reads.any() else "readings"
     return f"{take} configurations in which {elsewhere}, with {what} near both ends of their range"
@@ -251,7 +244,7 @@ def _enough(around: Situation, motion: NamedChanges, names: tuple[str, ...]) -> 
         return names
     table = around.machine.parameters
     axes = [n for n in sorted(names) if ".axis." in n]
-    axes = [n for n in axes if abs(table.nominal[table.index(n)]) < ZERO_AXIS_COMPONENT]
+    axes = [n for n in axes if abs(table.nominal[table.index(n)]) < ROUNDING]
     return tuple(axes[:1]) or tuple(n for n in names if ".platform." in n) or names
 
 

@@ -16,6 +16,7 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold
@@ -31,8 +32,6 @@ AS_REGULAR = 0.7
 near a singular pose any error is amplified, and no machine works there."""
 POSES_AROUND_SEED = 4
 """Seed of the samples."""
-NO_TURN = 1e-9
-"""Rotation below which it is rounding, rad."""
 
 
 def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
@@ -249,7 +248,7 @@ def without_frames(
     if not every:
         followed = np.linalg.qr(freedoms(machine))[0]
         u, s, _ = np.linalg.svd(rest - followed @ (followed.T @ rest), full_matrices=False)
-        rest = u[:, s > 1e-9]
+        rest = u[:, s > ROUNDING]
     finite = np.asarray(np.isfinite(change).all(axis=(1, 2)))
     values = np.flatnonzero(finite) if fitted is None else fitted[finite[fitted]]
     if not rest.shape[1] or not values.size:

@@ -20,10 +20,18 @@ from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.identify.assembly import machine_size
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.motions import NamedChanges, Situation, all_radii, candidates
+from pkmcal.identify.motions import (
+    NamedChanges,
+    Situation,
+    UnidentifiedOptions,
+    all_radii,
+    candidates,
+)
 from pkmcal.identify.sentences import OpenMotion, Sentence, few, sentence
 from pkmcal.identify.tool import platform_by_parameters
+from pkmcal.levels import MAJORITY
 from pkmcal.mechanisms import Machine
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.ranks import nonzero
 
 if TYPE_CHECKING:
@@ -31,23 +39,6 @@ if TYPE_CHECKING:
     from pkmcal.identify.covariance import Identifiability, ParameterDirection
     from pkmcal.measurements import EdgeSet, Measurements
 
-INSIDE_OPEN_SHARES = (0.999, 0.95)
-"""Shares of a motion (squared) that lie in the open space for it to explain part of that space:
-first those that fit exactly, since many motions are similar once frames are removed, then those
-that fit nearly. The space is that of the estimate, whose noise of poses bends directions that would
-be exact."""
-WEAK_INFORMATION = 1 / 3
-"""Information, in units of the prior's, below which a direction counts as unidentified: the data
-then decide less than a tenth of its variance. Platforms that only translate seem to rotate by their
-poses' noise, so unidentifiable directions have a trace of information."""
-UNIDENTIFIED_SHARE = 0.5
-"""Standard deviation of a mount's position or rotation, relative to its prior, from which on the
-data do not determine it."""
-NEW_CHANGE_SINE = 0.1
-"""Sine of the angle to the motions so far below which a motion describes nothing new."""
-STEPS_TO_FEWEST_NUMBERS, CHEAP_FRAME_WEIGHT = 20, 10.0
-"""Reweighting steps to the sparsest coefficients, and how much less those of frames cost, which no
-sentence contains."""
 CONVENTION_NULL_SHARE = 1e-6
 """Residual effect of a fixed parameter, in m per m or rad, that the free parameters cannot
 reproduce, below which it is a convention: both are derivatives of one machine, equal but for
@@ -77,7 +68,7 @@ class Findings:
 
     identifiability : rank and spectrum of the information.
     unidentified : sentences on directions without information, or with less than
-    ``WEAK_INFORMATION``.
+    ``UnidentifiedOptions.weak``.
     weak : sentences on directions of which the nominal model contains more information.
     by_drawing : displacement of the platform by the prior sigmas of all parameters, m, as
     ``Sentence.moves_platform``.
@@ -127,8 +118,9 @@ def explain(
         return describe(around, direction_vectors(directions, machine), np.array(reference), effect)
 
     # directions by information
-    lost = (*ranks.unidentified, *(d for d in ranks.weak if d.information < WEAK_INFORMATION))
-    weak = tuple(d for d in ranks.weak if d.information >= WEAK_INFORMATION)
+    least = around.options.weak
+    lost = (*ranks.unidentified, *(d for d in ranks.weak if d.information < least))
+    weak = tuple(d for d in ranks.weak if d.information >= least)
     # poses and heights mix weakly identified directions with unidentified ones: only both together
     # have names
     sentences = (*text(lost), *text(weak)) if imaged else text((*lost, *weak))
@@ -159,12 +151,12 @@ def identified(machine: Machine, covariance: Array) -> Booleans:
     or the start of the search, and are not reported as numbers.
 
     The prior of a target's position is the machine's size, and that of its rotation one radian; a
-    number whose standard deviation is not below half of its prior's is not determined by the data.
+    number of whose information the data hold less than the prior is not determined by the data.
 
     covariance : (..., 6, 6), rad and m.
     """
-    sigma = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 0.0))
-    return sigma < UNIDENTIFIED_SHARE * np.repeat([1.0, machine_size(machine)], 3)
+    variance = np.einsum("...ii->...i", covariance)
+    return variance < MAJORITY * np.repeat([1.0, machine_size(machine)], 3) ** 2
 
 
 def direction_vectors(directions: tuple[ParameterDirection, ...], machine: Machine) -> Array:
@@ -174,7 +166,7 @@ def direction_vectors(directions: tuple[ParameterDirection, ...], machine: Machi
 
 def observed_legs(edges: EdgeSet, weights: Array, n_stations: int, n_legs: int) -> Booleans:
     """Legs that each station measures, (S, L), without rejected edges; weights (N,)."""
-    inliers = np.asarray(weights) >= 0.5
+    inliers = np.asarray(weights) >= INLIER_WEIGHT
     out = np.zeros((n_stations, n_legs), dtype=bool)
     out[edges.station[inliers], edges.leg[inliers]] = True
     return out
@@ -239,8 +231,8 @@ def describe(
 
     null : (n, P) changes of all parameters in their units, any basis.
     information : (n,) singular values of the data's information on each direction, in units of the
-    prior, 0 by default: from ``WEAK_INFORMATION`` on the sentence is that the nominal model knows
-    it better, not that it is free.
+    prior, 0 by default: from ``UnidentifiedOptions.weak`` on the sentence is that the nominal model
+    knows it better, not that it is free.
     effect : (r, P) as returned by :func:`platform_by_parameters`.
     """
     machine = around.machine
@@ -250,9 +242,11 @@ def describe(
     if effect is None:
         effect = platform_by_parameters(machine, around.T_base_platform)
     if not around.imaged:  # boards and trackers do not measure tubes
-        space = _without(space, _within(all_radii(around).columns, space, INSIDE_OPEN_SHARES[0]))
+        space = _without(space, _within(all_radii(around).columns, space, around.options.inside[0]))
     results = _merged(around, _explained(around, space))
-    text = [sentence(around, part, space.unit, *_moves(part, space, effect)) for part in results]
+    text = [
+        sentence(around, part, space.unit, *_moves(around, part, space, effect)) for part in results
+    ]
     return few(text)
 
 
@@ -288,23 +282,24 @@ def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
 def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
     """Motions that lie in the open space, each with the part that it is the first to explain."""
     parts: list[OpenMotion] = []
+    options = around.options
     done = np.zeros((0, space.rows.shape[1]))
     reference_values, whole = list(candidates(around)), space
     for motion, inside in [
-        *((m, share) for share in INSIDE_OPEN_SHARES for m in reference_values[:-1]),
+        *((m, share) for share in options.inside for m in reference_values[:-1]),
         (reference_values[-1], 0.0),
     ]:
         if len(done) == len(whole.rows):
             break
         names = _within(motion.columns, space, inside)
         # the part that no earlier motion explains
-        new = _directions(names - (names @ done.T) @ done)
+        new = _directions(names - (names @ done.T) @ done, options)
         if len(new) == 0:
             continue
         if motion is reference_values[-1]:
             names = new
         done = _orthonormal(np.concatenate([done, new]))
-        numbers = _coefficients(motion, space, names)
+        numbers = _coefficients(motion, space, names, options)
         own = numbers @ motion.columns.T / space.unit
         parts.append(OpenMotion(motion, motion.legs, names, numbers, own, len(new)))
         if motion.convention:
@@ -324,12 +319,12 @@ def _without(space: _Open, directions: Array) -> _Open:
     )
 
 
-def _directions(rows: Array) -> Array:
+def _directions(rows: Array, options: UnidentifiedOptions) -> Array:
     """Orthonormal directions (k, P) of rows, those of negligible size removed."""
     if rows.size == 0:
         return rows[:0]
     _, s, vt = np.linalg.svd(rows, full_matrices=False)
-    return vt[s > NEW_CHANGE_SINE]
+    return vt[s > options.new_sine]
 
 
 def _within(changes: Array, space: _Open, inside: float) -> Array:
@@ -347,7 +342,9 @@ def _within(changes: Array, space: _Open, inside: float) -> Array:
     return u[:, s**2 > inside].T @ space.rows
 
 
-def _coefficients(motion: NamedChanges, space: _Open, values: Array) -> Array:
+def _coefficients(
+    motion: NamedChanges, space: _Open, values: Array, options: UnidentifiedOptions
+) -> Array:
     """Coefficients (k, m) of a motion for directions ``values`` (k, P), frames excluded.
 
     Frames leave a choice. Of a single change the coefficients with the smallest sum of magnitudes
@@ -360,9 +357,9 @@ def _coefficients(motion: NamedChanges, space: _Open, values: Array) -> Array:
     weight = np.ones(both.shape[1])
     few = len(values) == 1 and m > 1 and not (motion.how or motion.convention)
     solved = np.linalg.lstsq(both, values.T, rcond=1e-6)[0]
-    for _ in range(STEPS_TO_FEWEST_NUMBERS if few else 0):
+    for _ in range(options.sparse_steps if few else 0):
         weight[:m] = np.sqrt(np.abs(solved[:m, 0]) / max(np.abs(solved[:m, 0]).max(), 1e-300))
-        weight[m:] = CHEAP_FRAME_WEIGHT
+        weight[m:] = options.frame_weight
         solved = np.linalg.lstsq(both * weight, values.T, rcond=1e-6)[0] * weight[:, None]
     return (solved[:m] / scale[:, None]).T
 
@@ -388,15 +385,15 @@ def _with_last_leg(part: OpenMotion, parts: list[OpenMotion]) -> OpenMotion:
     return part
 
 
-def _moves(part: OpenMotion, space: _Open, effect: Array) -> tuple[float, bool]:
+def _moves(around: Situation, part: OpenMotion, space: _Open, effect: Array) -> tuple[float, bool]:
     """Displacement of the platform by a motion, m, and whether the data contain information about
     it.
     """
-    value = _directions(part.space)
+    value = _directions(part.space, around.options)
     mixed = value @ space.rows.T
     shifted = effect @ (space.unit[:, None] * value.T)
     covariance = mixed @ space.covariance @ mixed.T
     # the posterior's information is the prior's, which is 1 in these units, plus the data's
     data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
     worst = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
-    return float(np.sqrt(np.sum((shifted @ covariance) * shifted))), worst >= WEAK_INFORMATION
+    return float(np.sqrt(np.sum((shifted @ covariance) * shifted))), worst >= around.options.weak

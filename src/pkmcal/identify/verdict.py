@@ -11,7 +11,6 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.confirmation import FAR_FROM_NOMINAL
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import freedoms, generators
@@ -19,11 +18,20 @@ from pkmcal.identify.parameter_estimates import decided_by
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, only_heights
+from pkmcal.levels import (
+    CAUSE_SHARE,
+    CONTRADICTION_SIGMAS,
+    FEW,
+    MAJORITY,
+    NOISE_EXCESS,
+    ROUNDING,
+)
 from pkmcal.measurements import OWN_SHADING, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note, wrong
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.search import Stop
 
 if TYPE_CHECKING:
@@ -50,9 +58,9 @@ class VerdictOptions:
     # is larger anyway is no worse for it
     undetermined_share: float = 0.05
     # share of configurations near a singular pose from which on the estimate is not reliable
-    singular_share: float = 0.5
+    singular_share: float = MAJORITY
     # share of what is undetermined from which on a single cause becomes a reason of its own
-    large_cause_share: float = 0.3
+    large_cause_share: float = CAUSE_SHARE
     # displacement relative to the platform's standard deviation from which on a cause is worth a
     # warning; one half makes the total larger by an eighth
     worth_reporting: float = 0.5
@@ -65,16 +73,14 @@ class VerdictOptions:
     reading_residual: float = 6.0
     contradicted_share: float = 0.02
     # edges of a leg, relative to the median of all legs, below which the leg is seldom in view
-    few_edges_share: float = 0.3
+    few_edges_share: float = FEW
     # factor on the edges' stated noise that is worth a warning: the standard deviations contain it
-    edge_scatter: float = 1.5
+    edge_scatter: float = NOISE_EXCESS
     # configurations below which a note says that they are few
     few_configurations: int = 10
     # heights of a bed, where a wrong one moves the tool by little more than its standard deviation
     # before it is detected (benchmarks/heights.py)
     enough_touches: int = 15
-    # share of a variance below which it is rounding
-    rounding: float = 1e-9
 
 
 VERDICT = VerdictOptions()
@@ -91,7 +97,7 @@ class RicherModel:
     scale: float
 
 
-def judge(
+def assess(
     observation: Observation,
     estimate: Estimate,
     findings: Findings,
@@ -120,9 +126,10 @@ def judge(
     # reasons against the result by what is undetermined
     undetermined = [_undetermined(s, Level.WRONG) for s in large]
     if bed:
-        undetermined = list(_bed_unknown(bed, options))
+        undetermined = list(_no_gain("bed", bed.sigma, bed.by_drawing, options))
     elif not large:
-        undetermined = list(_platform_unknown(estimate, findings.by_nominal, options))
+        sigma, nominal = platform_sigma(estimate), findings.by_nominal
+        undetermined = list(_no_gain("platform", sigma, nominal, options))
     # all findings, in the order of the report
     every = (
         *_estimate_misfit(estimate, method, options),
@@ -200,19 +207,12 @@ def no_gain(sigma: float, by_drawing: float, options: VerdictOptions = VERDICT) 
     return not sigma <= options.nominal_error_share * by_drawing
 
 
-def _platform_unknown(
-    estimate: Estimate, by_drawing: float, options: VerdictOptions
+def _no_gain(
+    subject: str, sigma: float, by_drawing: float, options: VerdictOptions
 ) -> Iterator[Finding]:
-    """Wrong if measurements of the platform do not improve on the nominal model."""
-    sigma = platform_sigma(estimate)
+    """Wrong if the measurements do not improve on the nominal model; see :func:`no_gain`."""
     if no_gain(sigma, by_drawing, options):
-        yield wrong("platform.no_gain", sigma=sigma, nominal_sigma=by_drawing)
-
-
-def _bed_unknown(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
-    """Wrong if heights do not improve on the nominal model."""
-    if no_gain(bed.sigma, bed.by_drawing, options):
-        yield wrong("bed.no_gain", sigma=bed.sigma, nominal_sigma=bed.by_drawing)
+        yield wrong(f"{subject}.no_gain", sigma=sigma, nominal_sigma=by_drawing)
 
 
 def _touch_unnoticed(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
@@ -250,7 +250,9 @@ def _estimate_misfit(estimate: Estimate, method: str, options: VerdictOptions) -
     redundancy.
     """
     s = estimate.statistics
-    rejected = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
+    rejected = (
+        float(np.mean(estimate.edge_weights < INLIER_WEIGHT)) if estimate.edge_weights.size else 0.0
+    )
     if s.noise_scale > options.too_noisy and method != "bundle":
         yield wrong("estimate.method_misfit", method=method, scale=s.noise_scale)
     elif s.noise_scale > options.too_noisy:
@@ -262,7 +264,7 @@ def _estimate_misfit(estimate: Estimate, method: str, options: VerdictOptions) -
     if s.stopped == Stop.STEPS.value:
         yield wrong("estimate.not_converged", steps=s.steps)
     if method == "linear":
-        yield _base_alone(estimate, options)
+        yield _base_alone(estimate)
 
 
 def _readings_misfit(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
@@ -280,7 +282,7 @@ def _readings_misfit(estimate: Estimate, options: VerdictOptions) -> Iterator[Fi
         )
 
 
-def _base_alone(estimate: Estimate, options: VerdictOptions) -> Finding:
+def _base_alone(estimate: Estimate) -> Finding:
     """Finding on [B]'s linear method, which determines the base only, and on its accuracy.
 
     The variance by the edges alone is found by removing the prior: in units of the prior's
@@ -296,12 +298,12 @@ def _base_alone(estimate: Estimate, options: VerdictOptions) -> Finding:
     )
     # principal axes of the prior
     values, vectors = np.linalg.eigh(before)
-    above_limit = values > options.rounding * values[-1]
+    above_limit = values > ROUNDING * values[-1]
     unit = vectors[:, above_limit] * np.sqrt(values[above_limit])
     inverse = vectors[:, above_limit] / np.sqrt(values[above_limit])
     v, axes = np.linalg.eigh(inverse.T @ together @ inverse)
     # e, and back to metres
-    by_edges = v / np.maximum(1 - v, options.rounding)
+    by_edges = v / np.maximum(1 - v, ROUNDING)
     alone = np.sum((unit @ axes) ** 2 * by_edges)
     edges, prior, both = (
         float(np.sqrt(x / len(before))) for x in (alone, np.trace(before), np.trace(together))
@@ -319,7 +321,9 @@ def _poses_misfit(
     better = {"model": richer and richer.name, "model_scale": richer and richer.scale}
     if s.pose_scale > options.too_noisy:
         yield wrong("poses.misfit", scale=s.pose_scale, **better)
-    share = float(np.mean(estimate.pose_weights < 0.5)) if estimate.pose_weights.size else 0.0
+    share = (
+        float(np.mean(estimate.pose_weights < INLIER_WEIGHT)) if estimate.pose_weights.size else 0.0
+    )
     if share > options.too_many_rejected:
         yield wrong("poses.rejected_share", share=share, limit=options.too_many_rejected)
     least = max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(s.dof_poses))
@@ -391,13 +395,14 @@ def _warnings(
     """Findings on values far from the nominal model, and on what increases standard deviations."""
     table = estimate.machine.parameters
     change = np.abs(_from_nominal(estimate.machine))
-    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR_FROM_NOMINAL]
+    # a person should check these values
+    far = [table.names[k] for k in np.argsort(-change) if change[k] > CONTRADICTION_SIGMAS]
     if far:
         yield doubtful(
             "machine.far_from_nominal",
             ", ".join(far),
             parameters=far,
-            tolerances=FAR_FROM_NOMINAL,
+            tolerances=CONTRADICTION_SIGMAS,
             most=float(change.max()),
         )
     in_view = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)

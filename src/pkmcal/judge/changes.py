@@ -30,8 +30,11 @@ from pkmcal.judge.causes import (
     zeros,
 )
 from pkmcal.judge.fixed_machine import Evidence
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 
+CHANGE_ALPHA = 0.01
+"""False-alarm rate: share of unchanged machines that are reported as changed."""
 LEAST_OBSERVABLE_DEVIATIONS = 1.0
 """Minimum effect, in standard deviations, of a change by one prior sigma, for its direction to be
 tested; less observable directions would only add noise to the test.
@@ -154,7 +157,7 @@ def change(evidence: Evidence, cause: Cause) -> Change:
     covariance = inverse @ inverse.T
     # a number that is partly unobservable is not reported
     lost = (
-        1 - np.diag(inverse @ observable.gain) > 1e-2
+        1 - np.diag(inverse @ observable.gain) > NEGLIGIBLE
         if observable.gain.size
         else np.ones(len(cause.sizes), bool)
     )

@@ -11,6 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers, rms
 from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
+from pkmcal.levels import NOISE_EXCESS
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import nonzero
@@ -21,10 +22,6 @@ RATIO_INTERVAL_PROBABILITY = 0.95
 """Probability of the stated interval of the ratio."""
 UNEXPLAINED_RESIDUAL_CHANCE = 1e-3
 """p-value below which the standard deviations do not explain the residuals."""
-ALLOWED_RESIDUAL_EXCESS = 1.5
-"""Accepted ratio of residuals to standard deviations: the latter cover noise, and shading and
-lenses add a few tenths in any images.
-"""
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class Promise:
     deviations. common : (m,) common offset of each reading in all configurations, m or rad.
     common_sigma : (m,) its standard deviation. common_chance : p-value of all offsets being zero.
     usual, steady : whether the residuals, and their common offsets, agree with the standard
-    deviations times ALLOWED_RESIDUAL_EXCESS. expected : (n, m) standard deviations of the
+    deviations times NOISE_EXCESS. expected : (n, m) standard deviations of the
     residuals, m or rad. by_noise : (n, m) those by the noise of images and readings alone.
     """
 
@@ -274,10 +271,9 @@ def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
         common=common,
         common_sigma=np.sqrt(np.diag(spread)),
         common_chance=float(chdtrc(dof_common, chi2_common)),
-        usual=bool(chdtrc(dof, chi2 / ALLOWED_RESIDUAL_EXCESS**2) > UNEXPLAINED_RESIDUAL_CHANCE),
+        usual=bool(chdtrc(dof, chi2 / NOISE_EXCESS**2) > UNEXPLAINED_RESIDUAL_CHANCE),
         steady=bool(
-            chdtrc(dof_common, chi2_common / ALLOWED_RESIDUAL_EXCESS**2)
-            > UNEXPLAINED_RESIDUAL_CHANCE
+            chdtrc(dof_common, chi2_common / NOISE_EXCESS**2) > UNEXPLAINED_RESIDUAL_CHANCE
         ),
         expected=np.sqrt(np.diag(covariance)).reshape(shape),
         by_noise=np.sqrt(np.maximum(np.diag(noise), 0.0)).reshape(shape),

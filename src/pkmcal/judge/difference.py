@@ -15,7 +15,9 @@ from pkmcal.calibration.toolmap import ToolMap, map_of
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import json_value
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.judge.changes import CHANGE_ALPHA
 from pkmcal.judge.machine_change import MachineChange, machine_change
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import REGION_AXES, Region
 from pkmcal.outcome import Verdict
@@ -23,10 +25,6 @@ from pkmcal.outcome.finding import Finding, note, wrong
 from pkmcal.wording import amount, brief, count, listed, number
 
 DIFFERENCE_FORMAT = 1
-DIFFERENCE_ALPHA = 0.01
-"""False-alarm rate: share of unchanged machines that are reported as changed."""
-SAME_NUMBER_DIFFERENCE = 1e-9
-"""Difference (m or rad) below which numbers are equal."""
 MOST_CHANGES_NAMED = 4
 """Maximum number of changes that the verdict names."""
 
@@ -80,9 +78,9 @@ class MachineDifference:
     def ordered(self) -> list[int]:
         """Indices of the parameters that differ, the most significant first."""
         size = np.abs(self.change.change)
-        some = np.flatnonzero(size > SAME_NUMBER_DIFFERENCE)
+        some = np.flatnonzero(size > ROUNDING)
         if self.change.dof:
-            sigma = np.maximum(self.change.sigma, SAME_NUMBER_DIFFERENCE)
+            sigma = np.maximum(self.change.sigma, ROUNDING)
             size = size / sigma
         else:
             size = size / self.a.machine.parameters.tolerance
@@ -91,7 +89,7 @@ class MachineDifference:
     @property
     def significant(self) -> list[int]:
         """Indices of the significant parameters; between nominal models, of all that differ."""
-        return [k for k in self.ordered if not self.chances[k] >= DIFFERENCE_ALPHA / 2]
+        return [k for k in self.ordered if not self.chances[k] >= CHANGE_ALPHA / 2]
 
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
@@ -105,6 +103,12 @@ class MachineDifference:
             }
             for side in (self.a, self.b)
         ]
+        if isinstance(self.tool, str):
+            tool = {"why_not": self.tool}
+        else:
+            whole = self.tool.document()
+            keys = {"region": "region", "poses": "poses", "change": "drawing_off", "sigma": "sigma"}
+            tool = {key: whole[old] for key, old in keys.items()}
         return json_value(
             {
                 "pkmcal_diff": DIFFERENCE_FORMAT,
@@ -127,23 +131,11 @@ class MachineDifference:
                     }
                     for k, name in enumerate(table.names)
                 ],
-                "tool": {"why_not": self.tool}
-                if isinstance(self.tool, str)
-                else _tool_document(self.tool),
+                "tool": tool,
                 "shared_configurations": self.shared,
                 "assumed": self.assumed,
             }
         )
-
-
-def _tool_document(tool_map: ToolMap) -> dict[str, Any]:
-    document = tool_map.document()
-    return {
-        "region": document["region"],
-        "poses": document["poses"],
-        "change": document["drawing_off"],
-        "sigma": document["sigma"],
-    }
 
 
 def difference(
@@ -180,10 +172,8 @@ def difference(
     # Significance of the change, as a whole and by parameter.
     chance, chances = _p_values(change)
     least = float(np.nanmin(chances, initial=1.0))
-    held = (change.sigma <= SAME_NUMBER_DIFFERENCE) & (
-        np.abs(change.change) > SAME_NUMBER_DIFFERENCE
-    )
-    changed = bool(chance < DIFFERENCE_ALPHA / 2 or least < DIFFERENCE_ALPHA / 2 or held.any())
+    held = (change.sigma <= ROUNDING) & (np.abs(change.change) > ROUNDING)
+    changed = bool(chance < CHANGE_ALPHA / 2 or least < CHANGE_ALPHA / 2 or held.any())
     free = free_of_gauge(change.machine, change.covariance)
     out = MachineDifference(
         a=one,
@@ -230,7 +220,7 @@ def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
 def _same_nominal_model(one: SavedCalibration, other: SavedCalibration) -> bool:
     """Whether two calibrations have the same nominal values and prior sigmas."""
     first, second = (saved.machine.parameters.tolerance for saved in (one, other))
-    same = np.allclose(one.nominal, other.nominal, rtol=0, atol=SAME_NUMBER_DIFFERENCE)
+    same = np.allclose(one.nominal, other.nominal, rtol=0, atol=ROUNDING)
     return same and np.allclose(first, second)
 
 
@@ -273,7 +263,7 @@ def _p_values(change: MachineChange) -> tuple[float, Array]:
     from scipy.special import chdtrc, ndtr
 
     sigma = change.sigma
-    has_sigma = sigma > SAME_NUMBER_DIFFERENCE
+    has_sigma = sigma > ROUNDING
     chances = np.full(len(sigma), np.nan)
     single = 2 * ndtr(-np.abs(change.change[has_sigma]) / sigma[has_sigma])
     chances[has_sigma] = np.minimum(1.0, single * change.dof)
@@ -328,7 +318,7 @@ def _with_verdict(d: MachineDifference) -> MachineDifference:
         for side in (d.a, d.b)
         if side.saved is not None and not side.saved.verdict.usable
     ]
-    if not np.any(np.abs(d.change.change) > SAME_NUMBER_DIFFERENCE):
+    if not np.any(np.abs(d.change.change) > ROUNDING):
         headline = "The two are the same: no number differs by more than rounding."
     elif not d.changed:
         headline = (
@@ -399,6 +389,6 @@ def change_text(d: MachineDifference, k: int) -> str:
     sign = "+" if value >= 0 else "−"
     if unit in ("m", "rad"):
         text = f"{sign}{amount(abs(value), unit)}"
-        return f"{text} (±{amount(sigma, unit)})" if sigma > SAME_NUMBER_DIFFERENCE else text
+        return f"{text} (±{amount(sigma, unit)})" if sigma > ROUNDING else text
     text = f"{sign}{abs(value):.2g}"
-    return f"{text} (±{sigma:.2g})" if sigma > SAME_NUMBER_DIFFERENCE else text
+    return f"{text} (±{sigma:.2g})" if sigma > ROUNDING else text

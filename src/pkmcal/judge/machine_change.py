@@ -31,17 +31,9 @@ from pkmcal.identify.gauge import (
     moved_centres,
 )
 from pkmcal.identify.state import State
+from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import numerical_rank
-
-NULL_VARIANCE_SHARE = 0.99
-"""Part of the nominal model's variance that is left, from which on data say nothing of a direction.
-"""
-SETTLED_ESTIMATE_SHARE = 0.01
-"""Of a standard deviation: to which the search for an estimate settles, so that two from the same
-data are never held against a spread of nothing."""
-CHANGE_VARIANCE_FLOOR = 1e-9
-"""Of a tolerance squared: a variance below it is rounding."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +75,8 @@ def machine_change(
     """
     held = replace(a, parameters=replace(a.parameters, nominal=a.values))
     table, layout = held.parameters, held.layout
-    before = _state(table.unit_axes(b.values))
+    none = np.zeros((0, 4, 4))
+    before = State(table.unit_axes(b.values), none, none)
     e, f = alignment(held, before, BestFit())
     there = moved_centres(layout, before.theta, e, f)
     carried = carried_errors(layout, before, e, f)
@@ -105,18 +98,14 @@ def machine_change(
     spreads = [None if c is None else invariant @ c @ invariant.T for c in (cov_a, cov_b)]
     spread, null_space = _spread(spreads, y.size, same_nominal, shared)
     outward = table.free_matrix() * tolerance @ rest
+    determined = null_space.T @ y  # the part that the data determine
     return MachineChange(
         machine=held.with_values(there),
         change=change,
         covariance=outward @ spread @ outward.T,
-        chi2=_chi2(null_space.T @ y, null_space.T @ spread @ null_space),
+        chi2=float(determined @ np.linalg.solve(null_space.T @ spread @ null_space, determined)),
         dof=null_space.shape[1],
     )
-
-
-def _state(theta: Array) -> State:
-    none = np.zeros((0, 4, 4))
-    return State(theta, none, none)
 
 
 def _spread(
@@ -127,7 +116,8 @@ def _spread(
     if not reference_values:
         return np.zeros((size, size)), np.zeros((size, 0))
     values, vectors = np.linalg.eigh(np.mean(reference_values, axis=0))
-    null_vectors = vectors[:, values < NULL_VARIANCE_SHARE]
+    # directions of which data leave nearly all of the nominal model's variance are undetermined
+    null_vectors = vectors[:, values < 1 - NEGLIGIBLE]
     if len(reference_values) == 1:
         return reference_values[0], null_vectors
     one, other = (_firm(c) for c in reference_values)
@@ -136,14 +126,16 @@ def _spread(
     unit = np.eye(len(one))
     joint = shared * (lesser - unit) + (unit if same_nominal else 0.0)
     cross = one @ joint @ other
-    spread = one + other - cross - cross.T + SETTLED_ESTIMATE_SHARE**2 * (one + other)
+    # each estimate converged to a negligible share of its deviation, so that two from the same data
+    # are never compared with a spread of zero
+    spread = one + other - cross - cross.T + NEGLIGIBLE**2 * (one + other)
     return spread, null_vectors
 
 
 def _firm(covariance: Array) -> Array:
     """Covariance in tolerances, no larger than the nominal model's, no smaller than rounding."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    return (vectors * np.clip(values, CHANGE_VARIANCE_FLOOR, 1.0)) @ vectors.T
+    return (vectors * np.clip(values, ROUNDING, 1.0)) @ vectors.T
 
 
 def _lesser(one: Array, other: Array) -> Array:
@@ -153,7 +145,3 @@ def _lesser(one: Array, other: Array) -> Array:
     values, vectors = np.linalg.eigh(back @ one @ back.T)
     outward = root @ vectors
     return (outward * np.minimum(values, 1.0)) @ outward.T
-
-
-def _chi2(y: Array, covariance: Array) -> float:
-    return float(y @ np.linalg.solve(covariance, y)) if y.size else 0.0

@@ -27,6 +27,7 @@ from pkmcal.identify.gauge import pose_generators
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.judge.fixed_machine import Held, hold, too_little
+from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine
@@ -39,16 +40,9 @@ SOFT_READING_NOISE = 0.01
 """Standard deviation (m, rad) of readings in the estimate of stations and poses: tens of times the
 uncertainty by an image, so that an observed pose hardly depends on them.
 """
-LEAST_REDUNDANCY_SHARE = 1e-2
-"""Minimum redundancy of a reading, the part of its error in its own residual; below it hardly
-anything but the reading determined the pose: the uncertainty by observations was ten times
-SOFT_READING_NOISE.
-"""
 FRAME_LAYING_STEPS = 20
 FRAMES_LAID_CHANGE = 1e-10
 """Change of the frames (m, rad) below which their registration has converged."""
-UNREAD_FRAME_CHANGE_SHARE = 1e-9
-"""Relative size of singular values below which a change of the frames moves no reading."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +107,9 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
     redundancy = np.eye(m) - along - beside @ beside.mT  # L
-    if float(np.linalg.eigvalsh(redundancy).min(initial=1.0)) < LEAST_REDUNDANCY_SHARE:
+    # below this redundancy hardly anything but the readings determined the pose: the uncertainty
+    # by the observations was ten times SOFT_READING_NOISE
+    if float(np.linalg.eigvalsh(redundancy).min(initial=1.0)) < NEGLIGIBLE:
         raise too_little(machine, measurements)
     alone = np.linalg.inv(redundancy)
     units = _reading_per_sigma(held)[..., None] * alone
@@ -276,9 +272,7 @@ def closing_frame_changes(
             q = np.linalg.qr(c.rows.by_internal)[0]
             rest = np.eye(q.shape[-2]) - q @ q.mT
             jac, value = rest @ jac, (rest @ value[..., None])[..., 0]
-        y, _, rank, _ = np.linalg.lstsq(
-            jac.reshape(-1, 12), -value.reshape(-1), rcond=UNREAD_FRAME_CHANGE_SHARE
-        )
+        y, _, rank, _ = np.linalg.lstsq(jac.reshape(-1, 12), -value.reshape(-1), rcond=ROUNDING)
         used = int(rank)
         e, f = perturb(np.eye(4), y[:6]) @ e, perturb(np.eye(4), y[6:]) @ f
         if np.abs(y).max() < FRAMES_LAID_CHANGE:

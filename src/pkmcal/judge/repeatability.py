@@ -21,6 +21,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, skew
+from pkmcal.levels import ALIGNED_ANGLE, CAUSE_SHARE, NEARLY_ALL
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages
@@ -39,14 +40,9 @@ from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.solver.ranks import nonzero
 
-CAUSE_NAMED_SHARE = 0.3
-"""Share of the scatter, above chance, from which a motion is reported as its cause."""
 LEGS_BETTER_SHARE = 0.1
 """Share by which separate motions of the legs must explain more than one motion of the whole to
 be the cause."""
-MOST_EXPLAINED_BY_CHANCE = 0.9
-"""Share explained by chance from which nothing is inferred about a motion: too few edges are
-affected by it."""
 MOSTLY_COMMON = 0.5
 """Scatter, relative to the images' own estimate, below which averaging repeats gains less than
 an eighth."""
@@ -62,10 +58,6 @@ REPEATS_TABLE_LEGEND = (
     "θ and z come from the leg's width in the image, so they scatter most.",
     "Shift, tilt: of its edges, as a whole and at their ends.",
 )
-
-LEVEL_AXIS_SINE = float(np.sin(np.deg2rad(10.0)))
-"""Component u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2)
-is far away or does not exist (errata)."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +115,9 @@ class StationScatter:
         """
         best = "camera" if self.camera >= self.platform else "platform"
         whole = max(self.camera, self.platform)
-        if self.legs > max(CAUSE_NAMED_SHARE, whole + LEGS_BETTER_SHARE):
+        if self.legs > max(CAUSE_SHARE, whole + LEGS_BETTER_SHARE):
             return "legs"
-        return best if whole > CAUSE_NAMED_SHARE else "noise"
+        return best if whole > CAUSE_SHARE else "noise"
 
 
 @dataclass(frozen=True)
@@ -176,7 +168,7 @@ def study_repeats(
         _station_row(station_edges, names[station_edges.station]) for station_edges in parts
     )
     middle, bound = _over_legs(legs, 0.5), _over_legs(legs, 1.0)
-    return RepeatStudy(legs, stations, middle, bound, _findings(stations))
+    return RepeatStudy(legs, stations, middle, bound, repeat_findings(stations))
 
 
 def require_repeats(session: Session) -> None:
@@ -387,11 +379,8 @@ def _explained(station_edges: _StationEdges, rows: Array, groups: Groups) -> flo
         share(station_edges.turn[station_edges.same.exchanged(rng)]) for _ in range(REPEAT_SHUFFLES)
     ]
     chance = float(np.mean(shuffled))
-    return (
-        (share(station_edges.turn) - chance) / (1 - chance)
-        if chance < MOST_EXPLAINED_BY_CHANCE
-        else 0.0
-    )
+    # where chance explains nearly all, too few edges are affected by the motion
+    return (share(station_edges.turn) - chance) / (1 - chance) if chance < NEARLY_ALL else 0.0
 
 
 @dataclass(frozen=True)
@@ -494,7 +483,7 @@ def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:
     psi = (u[:, 0] * du[:, 1] - u[:, 1] * du[:, 0]) / across**2
     theta = du[:, 2] / across
     # change of the point with y = 0
-    uy = np.where(np.abs(u[:, 1]) < LEVEL_AXIS_SINE, np.nan, u[:, 1])[:, None]
+    uy = np.where(np.abs(u[:, 1]) < np.sin(ALIGNED_ANGLE), np.nan, u[:, 1])[:, None]
     ay, day, duy = a[:, 1, None], motion[:, 1, None], du[:, 1, None]
     point = motion[:, :3] - day / uy * u + ay / uy**2 * duy * u - ay / uy * du
     return np.stack([psi, theta, point[:, 0], point[:, 2]], axis=-1)
@@ -551,7 +540,7 @@ def _mm(value: float) -> str:
     return f"{value * 1e3:.2g} mm" if math.isfinite(value) else "–"
 
 
-def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
+def repeat_findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
     """Findings about each station's repeats, and about the benefit of further ones."""
     results = [_finding(station) for station in stations] or [doubtful("repeats.none")]
     if stations and all(station.promised < MOSTLY_COMMON for station in stations):

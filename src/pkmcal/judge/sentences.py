@@ -22,8 +22,15 @@ from pkmcal.judge.changes import (
     StationTest,
     Suspect,
 )
-from pkmcal.judge.comparison import NominalComparison, Ratio, finite_rms, improvement_ratio
+from pkmcal.judge.comparison import (
+    UNEXPLAINED_RESIDUAL_CHANCE,
+    NominalComparison,
+    Ratio,
+    finite_rms,
+    improvement_ratio,
+)
 from pkmcal.judge.holdouts import HoldOut
+from pkmcal.levels import NOISE_EXCESS
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -44,12 +51,8 @@ MOSTLY_NOISE = 2**0.5
 """Factor on the noise of images within which noise is more than half of the mean square."""
 POOR_REGION_FACTOR = 2.0
 """Ratio of a region's errors to those of the used configurations from which it is reported."""
-NOISIER_IMAGES_FACTOR = 1.5
-"""Ratio to the calibration's noise from which images are no longer of the same kind."""
 STEEL_EXPANSION = 12e-6
 """Thermal expansion of steel, 1/K, to illustrate a common scale."""
-UNEXPLAINED_CHANCE = 1e-3
-"""p-value of the unexplained rest below which it is reported."""
 MOST_OTHERS = 4
 """Maximum number of rival causes that are named."""
 
@@ -385,7 +388,7 @@ def _change_verdict(
     else:
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
     reasons = [_cause_finding(f, k, names) for k, f in enumerate(findings)]
-    if judged.rest.dof and judged.rest.chance < UNEXPLAINED_CHANCE:
+    if judged.rest.dof and judged.rest.chance < UNEXPLAINED_RESIDUAL_CHANCE:
         remainder = {"chi2": judged.rest.chi2, "dof": judged.rest.dof, "chance": judged.rest.chance}
         reasons.append(wrong("watch.unexplained", **remainder))
     return Verdict(False, headline, (*reasons, *warnings, _next_step(findings)))
@@ -491,7 +494,7 @@ def _warnings(around: ComparedSession) -> tuple[Finding, ...]:
     if both.any():
         names = [*compress(around.configurations, both)]
         out.append(doubtful("watch.known_configurations", listed(names, 4), names=names))
-    if around.noisier > NOISIER_IMAGES_FACTOR:
+    if around.noisier > NOISE_EXCESS:
         out.append(doubtful("watch.noisier", scale=around.noisier))
     return tuple(out)
 

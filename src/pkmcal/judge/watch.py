@@ -25,7 +25,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.identify.assembly import observed_configurations
 from pkmcal.judge.causes import magnified
-from pkmcal.judge.changes import ChangeTests, StationTest, detect_changes
+from pkmcal.judge.changes import CHANGE_ALPHA, ChangeTests, StationTest, detect_changes
 from pkmcal.judge.fixed_machine import Held, Trust, change_evidence, hold
 from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
@@ -36,8 +36,6 @@ from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
 WATCH_FORMAT = 1
-WATCH_ALPHA = 0.01
-"""False-alarm rate: share of unchanged machines that are flagged."""
 NOTHING_NEW = (
     "there is nothing new in this session: the calibration was made from it",
     "images, or poses, that were taken after the calibration",
@@ -103,7 +101,7 @@ def watch_machine(
     calibration: SavedCalibration | Path | str,
     session: Session | Path | str,
     *,
-    alpha: float = WATCH_ALPHA,
+    alpha: float = CHANGE_ALPHA,
     seed: int = 0,
     same_place: Sequence[str] = (),
     progress: CalibrationProgress | None = None,

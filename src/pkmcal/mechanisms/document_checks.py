@@ -14,6 +14,7 @@ import numpy as np
 
 from pkmcal.errors import InputError
 from pkmcal.files.documents import field_path
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms.carriers.contract import (
     IN_PLANE,
     PLANAR_MOTIONS,
@@ -31,10 +32,6 @@ from pkmcal.mechanisms.document import (
 from pkmcal.mechanisms.joints import equations
 from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
 from pkmcal.wording import listed
-
-SAME_NUMBER_ROUNDING = 1e-9
-"""Difference (m, or of components of directions) between equal numbers of a file due to the
-rounding of text."""
 
 PlaceInDocument: TypeAlias = Callable[..., str]
 
@@ -136,7 +133,7 @@ def _check_scales(document: MechanismDocument, place: PlaceInDocument) -> None:
                 found=str(leg.scale),
                 expected="scale on legs whose length, crank or slider a motor moves",
             )
-        if columns[j] >= 0 and abs(leg.scale - first.scale) > SAME_NUMBER_ROUNDING:
+        if columns[j] >= 0 and abs(leg.scale - first.scale) > ROUNDING:
             raise InputError(
                 f"leg {j + 1} has another scale than the other legs on its motor",
                 where=place("legs", j, "scale"),
@@ -157,7 +154,7 @@ def _check_equal(
     values = [getattr(node, field) for node in nodes]
     for j, value in zip(legs[1:], values[1:], strict=True):
         if (value is None) != (values[0] is None) or (
-            value is not None and np.abs(np.subtract(value, values[0])).max() > SAME_NUMBER_ROUNDING
+            value is not None and np.abs(np.subtract(value, values[0])).max() > ROUNDING
         ):
             body = platform_carriers()[document.legs[j].platform.joint].body
             raise InputError(

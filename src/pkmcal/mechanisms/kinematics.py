@@ -25,6 +25,7 @@ from pkmcal.geometry.batches import (
     stepped,
 )
 from pkmcal.geometry.rigid import perturb, pose, rotation
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms.closure import (
     BaseEnds,
     Closure,
@@ -56,8 +57,6 @@ SECOND_RODS_STEPS = 15
 four."""
 SECOND_RODS_SETTLED = 1e-15
 """Step of readings (rad) and hinges below which these steps have converged."""
-SAME_EQUATION = 1e-9
-"""Singular value of the scaled rows below which they are linearly dependent."""
 LEVELLING_STEPS = 3
 """Gauss-Newton steps to the least-squares pose of an overdetermined machine. Each multiplies the
 remaining distance by the ratio of the closure error to a rod."""
@@ -479,7 +478,7 @@ def mobility(layout: LimbLayout, theta: Array, pose: Array) -> int:
     """
     c = closure_at(layout, theta, pose)
     every = np.concatenate([scaled_rows(c), c.by_reading[..., None] * layout.of_motor], axis=-1)
-    return every.shape[-1] - int(np.linalg.matrix_rank(every, tol=SAME_EQUATION))
+    return every.shape[-1] - int(np.linalg.matrix_rank(every, tol=ROUNDING))
 
 
 def on_manifold(

@@ -15,11 +15,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
+from pkmcal.levels import ROUNDING
 
 EVERY_LEG = "legs[*]"
 """Beginning of an entry that stands for all legs."""
-PARALLEL_AXES_TOLERANCE = 1e-9
-"""Largest difference between components of parallel axes in the nominal model."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ class ParameterTable:
         if len(whole) > 1:
             return whole
         k = self.index(entry)
-        if self.kinds[k] == "axis" and abs(self.nominal[k]) > PARALLEL_AXES_TOLERANCE:
+        if self.kinds[k] == "axis" and abs(self.nominal[k]) > ROUNDING:
             raise InputError(
                 what=f"{entry} cannot be held alone: an axis is one direction",
                 expected=f"the whole axis, {entry.rpartition('.')[0]!r}",
@@ -152,7 +151,7 @@ class ParameterTable:
     def _check_parallel(self, group: tuple[str, ...], members: list[list[tuple[str, int]]]) -> None:
         """Check that tied axes are whole and parallel in the nominal model."""
         axes = np.array([[s * self.nominal[self.index(n)] for n, s in m] for m in members])
-        if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > PARALLEL_AXES_TOLERANCE:
+        if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > ROUNDING:
             raise InputError(
                 what="axes that differ in the nominal model are tied",
                 found=", ".join(group),
@@ -213,7 +212,7 @@ class ParameterTable:
         axis = self.nominal[first[0] : first[0] + 3]
         held = [np.eye(3)[i] for k in first for i in range(3) if k + i in fixed]
         span = np.array([axis, *held])
-        rank = int(np.linalg.matrix_rank(span, tol=PARALLEL_AXES_TOLERANCE))
+        rank = int(np.linalg.matrix_rank(span, tol=ROUNDING))
         basis = np.linalg.svd(span)[2][rank:].T
         out = np.zeros((len(self), basis.shape[1]))
         for k in first:

@@ -9,6 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose_difference
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.mechanisms.workspace import (
     ALLOWED_CONSTRAINT_ERROR,
@@ -24,9 +25,6 @@ REGION_AXES = ("x", "y", "z")
 TRIES_A_WANTED_POSE = 200
 """Most candidate poses for each pose wanted; if the machine can take a smaller share, fewer poses
 are returned."""
-CROOKED_PATH_SHARE = 0.02
-"""Share of the longest path below which a direction does not count as a freedom: misaligned axes
-allow small movements."""
 AT_LEAST = 5000
 """Fewest candidate poses before a region counts as out of reach."""
 REGION_POSES_AT_ONCE = 4096
@@ -122,7 +120,8 @@ def within_reach(limits: Limits, region: Region) -> Within:
     if len(free):
         near, far = straight_path_spans(limits, limits.home, free, ROUGH_EFFORT)
         low, high = low + near @ free, high + far @ free
-        moves = int(np.count_nonzero(far - near > CROOKED_PATH_SHARE * (far - near).max()))
+        # misaligned axes allow small movements in other directions
+        moves = int(np.count_nonzero(far - near > NEGLIGIBLE * (far - near).max()))
     for k, (name, side) in enumerate(zip(REGION_AXES, region.sides, strict=True)):
         if side is not None and (
             side[1] < low[k] - ALLOWED_CONSTRAINT_ERROR

@@ -17,6 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms.kinematics import (
     MAX_STEPS,
     NEAR_SINGULAR,
@@ -200,8 +201,6 @@ ROUGH_EFFORT = Effort(steps=40, halvings=14, newton=6, rounds=1)
 """Resolution for a bounding box of the workspace."""
 PATH_POSES_AHEAD = 8
 """Poses of each path in one batch."""
-PATH_DISTANCE_SHARE = 0.99
-"""Share of the wanted distance that must remain after projection onto constant rods and axes."""
 GRID_POSES_AT_ONCE = 20_000
 """Poses of a grid in one batch."""
 
@@ -340,12 +339,12 @@ def _projected(
     settled = on_manifold(limits.layout, limits.theta, poses, effort.newton).T_base_platform
     for _ in range(effort.rounds):
         behind = distances - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-        if np.all(np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * 1e-2 * distances):
+        if np.all(np.abs(behind) <= NEGLIGIBLE**2 * distances):
             break
         ahead = perturb(settled, twists * behind[..., None])
         settled = on_manifold(limits.layout, limits.theta, ahead, effort.newton).T_base_platform
     behind = distances - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
-    reached = np.abs(behind) <= (1 - PATH_DISTANCE_SHARE) * distances
+    reached = np.abs(behind) <= NEGLIGIBLE * distances
     return np.where(reached[..., None, None], settled, poses)
 
 

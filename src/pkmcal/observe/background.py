@@ -63,9 +63,6 @@ class BackgroundOptions:
     # angle from the epipolar planes within which these are counted, rad: three times the largest
     # spread
     window: float = np.radians(2.0)
-    # smallest angle between two rays at which their intersection is used as a landmark, rad: five
-    # times the largest spread (derived)
-    least_parallax: float = np.radians(3.0)
     # number of landmark triples tried by RANSAC for the pose of an image: a share of one correct
     # landmark in ten suffices to draw three correct ones (derived)
     triples: int = 3000
@@ -79,6 +76,13 @@ class BackgroundOptions:
     turn_reach: float = 6.0
     # spacing of these rotations, degrees
     turn_step: float = 2.0
+
+    @property
+    def least_parallax(self) -> float:
+        """Smallest angle between two rays, rad, at which their intersection is used as a landmark:
+        five times the largest spread.
+        """
+        return 5 * max(self.spreads)
 
     @cached_property
     def turns(self) -> Array:

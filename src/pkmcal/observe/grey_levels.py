@@ -18,10 +18,10 @@ INTERPOLATION_MARGIN = 2
 MOST_ROWS_INTERPOLATED = 32_000
 """Largest number of rows or columns, of the image and of the array of points, that cv2.remap
 accepts: slightly less than 2**15."""
-PLACES_A_ROW = 512
+POINTS_A_ROW = 512
 """Row length of the array of points passed to cv2.remap; shorter rows take half as much time
 again."""
-PLACES_IN_ONE_ROW = 2**14
+POINTS_IN_ONE_ROW = 2**14
 """Largest number of points passed as one row. Rows are distributed among threads, and waking
 these costs more than so few points take."""
 BLUR_KERNEL_END = 4.0
@@ -68,7 +68,7 @@ def interpolated(picture: Any, x: Array, y: Array, how: int) -> Array:
     """Values of an array (height, width) at columns x and rows y (...), interpolated by cv2.remap.
 
     Outside the array the value at its border is returned. No side of the array may be longer than
-    MOST_ROWS_INTERPOLATED, and the points may be no more than as many rows of PLACES_A_ROW, 16
+    MOST_ROWS_INTERPOLATED, and the points may be no more than as many rows of POINTS_A_ROW, 16
     million.
 
     how : cv2.INTER_NEAREST, INTER_LINEAR or INTER_CUBIC.
@@ -78,8 +78,8 @@ def interpolated(picture: Any, x: Array, y: Array, how: int) -> Array:
     if not x.size:
         return np.zeros(x.shape, dtype=np.float32)
     # arrange the points in rows, the last one padded with zeros
-    rows = -(-x.size // PLACES_A_ROW) if x.size > PLACES_IN_ONE_ROW else 1
-    flat = np.empty((2, rows * PLACES_A_ROW if rows > 1 else x.size), dtype=np.float32)
+    rows = -(-x.size // POINTS_A_ROW) if x.size > POINTS_IN_ONE_ROW else 1
+    flat = np.empty((2, rows * POINTS_A_ROW if rows > 1 else x.size), dtype=np.float32)
     flat[0, : x.size], flat[1, : x.size] = x.ravel(), y.ravel()
     flat[:, x.size :] = 0.0
     across, down = flat.reshape(2, rows, -1)

@@ -167,7 +167,7 @@ def localize_image(
     hypotheses = hypotheses[np.argsort(-log_likelihood_ratio)]
     hypotheses = hypotheses[distinct_silhouettes(fine, hypotheses, one)][: options.on_finest]
     # and, with the symmetric poses of the best two, at four times
-    return weighed_places(
+    return weighed_poses(
         view,
         image,
         np.concatenate([hypotheses, symmetric_poses(view, hypotheses[:2], options)]),
@@ -175,7 +175,7 @@ def localize_image(
     )
 
 
-def weighed_places(
+def weighed_poses(
     view: StationView,
     image: Integers,
     values: Array,
@@ -220,13 +220,12 @@ def finest_view(
     image: StationImages,
     joints: Array,
     poses: Array,
-    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> StationView:
     """View of one image with the finest tables.
 
     joints, poses : of all configurations of the session; the latter are T_base_platform.
     """
-    tables = distance_tables([image.images[0]], options.tables_at(4))
+    tables = distance_tables([image.images[0]], IMAGE_LOCALIZATION_OPTIONS.tables_at(4))
     return StationView(machine, image.camera, image.configuration, joints, poses, tables)
 
 
@@ -234,7 +233,6 @@ def refine_local(
     view: StationView,
     T_camera_base: Array,
     scatter: float,
-    options: ImageLocalizationOptions = IMAGE_LOCALIZATION_OPTIONS,
 ) -> tuple[Array, float]:
     """Likeliest pose near another (4, 4), and its log-likelihood ratio.
 
@@ -243,6 +241,7 @@ def refine_local(
 
     scatter : as the parameter ``widest`` of :func:`refine_ml`.
     """
+    options = IMAGE_LOCALIZATION_OPTIONS
     rng, one = np.random.default_rng(0), np.zeros(1, dtype=int)
     ends = view.machine.ends_at(view.joints, view.poses)
     middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)

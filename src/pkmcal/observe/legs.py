@@ -28,6 +28,7 @@ from pkmcal.cameras.contract import PIXEL_PARAMETERS
 from pkmcal.cameras.response import light_of_levels
 from pkmcal.geometry.cylinders import SIDE_SIGNS
 from pkmcal.geometry.rigid import of_components
+from pkmcal.levels import FEW, NEARLY_ALL
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
@@ -69,15 +70,15 @@ def first_binning(image_size: tuple[int, int]) -> int:
     return max(round(max(image_size) / USUAL_PICTURE_LENGTH), 1)
 
 
-def sharp_binning(binning: int, blur: float, options: ProfileOptions = PROFILE_OPTIONS) -> int:
+def sharp_binning(binning: int, blur: float) -> int:
     """Binning at which edges, with this blur (px) at a present binning, are as sharp as usual.
 
     Smaller bins would resolve the lens's blur without further information. Twice the present
     binning where the blur exceeds those that profiles can explain.
     """
-    if blur > options.blurs[-1] - 1e-6:  # up to rounding
+    if blur > PROFILE_OPTIONS.blurs[-1] - 1e-6:  # up to rounding
         return 2 * binning
-    return min(max(int(binning * blur / options.usual_blur), 1), binning)
+    return min(max(int(binning * blur / PROFILE_OPTIONS.usual_blur), 1), binning)
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,10 @@ class EdgeOptions:
     # pixels; on longer edges so many exhaust the information that shading leaves
     most_profiles: int = 8
     # smallest share of a segment's points that must be clear for its mean profile to be used
-    fewest_share: float = 1 / 3
+    fewest_share: float = FEW
     # distance in pixels from the outlines of other legs: the outer reach of a profile (3) and of
     # the search around it (1.5), rounded up
-    clearance: float = 5.0
+    clearance: float = float(np.ceil(PROFILE_OPTIONS.reach_outside + PROFILE_OPTIONS.shift_reach))
     # largest trial shift of a leg's ends relative to its middle, px, once its position is known to
     # a pixel
     tilt_reach: float = 1.0
@@ -143,8 +144,6 @@ class LegSearchOptions:
     gradient_half: float = 1.5
     # ratio of the second best score to the best one from which a leg's position is ambiguous
     rival_share: float = 0.95
-    # distance from the best position from which another one is a rival instead of its flank
-    rival_away: float = 4.0
     # fewest visible edge points for the search of a leg, of which each edge has as many as samples
     fewest: int = 8
     # standard deviation of edges from the search: one step of it
@@ -152,9 +151,14 @@ class LegSearchOptions:
     # number of points along an edge
     samples: int = 12
     # share of a leg's points below which it counts as hidden instead of not found
-    in_sight: float = 0.1
+    in_sight: float = 1 - NEARLY_ALL
     # distance from the outlines of other legs
     clearance: float = EdgeOptions.clearance
+
+    @property
+    def rival_away(self) -> int:
+        """Distance from the best position, px, from which another one is no part of its flank."""
+        return 2 * self.peak_half_width
 
     @cached_property
     def tilts(self) -> Array:

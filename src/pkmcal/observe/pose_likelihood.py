@@ -47,7 +47,7 @@ class LikelihoodOptions:
     least_gain: float = 0.1
     # number of silhouette points processed together, so that intermediate results stay in the
     # processor's cache (numerical: no effect on results)
-    places_at_once: int = 30_000
+    points_at_once: int = 30_000
     # smallest scatter of silhouettes: a bin of the chance distances
     least_sigma: float = DISTANCE_TABLE_OPTIONS.bin_width
     # truncation distance of the final score, and largest scatter of silhouettes about image edges
@@ -61,14 +61,18 @@ class LikelihoodOptions:
     elsewhere_turn: float = 0.2
     # standard deviation of its shift, relative to the distance between base and platform
     elsewhere_shift: float = 0.1
-    # smallest median distance between the silhouettes of two different poses: twice the largest
-    # scatter
-    apart: float = 8.0
     # steps of expectation maximization of a mixture that is used afterwards; within a descent
     # three suffice, for the poses change too
     mixture_rounds: int = 10
     # longest step of a pose, rad and m: the tables' slopes are valid nearby only
     longest_step: float = 0.1
+
+    @property
+    def apart(self) -> float:
+        """Smallest median distance between the silhouettes of two different poses, reduced pixels:
+        twice the largest scatter.
+        """
+        return 2 * self.last_reach
 
 
 LIKELIHOOD_OPTIONS = LikelihoodOptions()
@@ -498,7 +502,7 @@ def _parts(view: StationView, count: int, places: int) -> list[slice]:
     points on each edge.
     """
     each = max(places * len(view.tubes), 1)
-    parts = max(min(round(count * each / view.options.places_at_once), count), 1)
+    parts = max(min(round(count * each / view.options.points_at_once), count), 1)
     ends = [count * k // parts for k in range(parts + 1)]
     return [slice(*pair) for pair in pairwise(ends)]
 

@@ -23,6 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, evenly
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
+from pkmcal.levels import MAJORITY, OUTLIER_SIGMAS
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe.predict import EdgePoints, TubeList
 from pkmcal.solver.kernels import cauchy_weights
@@ -50,7 +51,7 @@ class ProfileOptions:
     clear_outside: float = 1.0
     # standard deviations by which the brightness returns towards the background behind a strip
     # (statistical: 3 in 1000 samples by chance)
-    highlight_deviations: float = 3.0
+    highlight_deviations: float = OUTLIER_SIGMAS
     # spacing of the samples: half of the pixel that limits the image's resolution
     step: float = 0.5
     # largest trial shift of the edge from its prediction, which is correct to a pixel
@@ -100,9 +101,11 @@ class ProfileOptions:
     # largest distance of a profile's edge from that of its leg as a whole: further away are
     # highlights, which all points of an edge may show consistently
     own_edge: float = 0.5
-    # standard deviation of a position from which on a profile has no edge: that of the window
-    # itself
-    faint_sigma: float = 0.5
+
+    @property
+    def faint_sigma(self) -> float:
+        """Standard deviation of a position, px, from which a profile has no edge: the window."""
+        return self.own_edge
 
     @cached_property
     def shifts(self) -> Array:
@@ -509,9 +512,9 @@ class EdgeFitOptions:
     rounds: int = 8
     # squared distance from the fit, in variances, below which a position is an inlier: three
     # sigmas (statistical: 3 in 1000 rejected by chance)
-    inlier_square: float = 9.0
+    inlier_square: float = OUTLIER_SIGMAS**2
     # smallest share of an edge's positions that are inliers: a minority may lie on another line
-    majority: float = 0.5
+    majority: float = MAJORITY
 
 
 EDGE_FIT_OPTIONS = EdgeFitOptions()

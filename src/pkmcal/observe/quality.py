@@ -61,6 +61,7 @@ class Quality:
     level, behind : (K, E) grey levels beside each edge, on the leg and on its background, in the
         order of ``tubes_of``; NaN where no point of the edge is visible.
     half_width : (K, E) px of the tube there.
+    options : those of the figures.
     """
 
     legs: Booleans
@@ -71,6 +72,7 @@ class Quality:
     level: Array = field(default_factory=lambda: np.zeros((0, 0)))
     behind: Array = field(default_factory=lambda: np.zeros((0, 0)))
     half_width: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    options: QualityOptions = QUALITY_OPTIONS
 
     @property
     def contrast(self) -> Array:
@@ -92,12 +94,13 @@ def quality(
     """
     placed = Placed(images, T_camera_base, poses)
     parts = [_quality(window, machine, options) for window in windows([placed])]
-    each = (f.name for f in fields(Quality))
+    each = (f.name for f in fields(Quality) if f.name != "options")
     return Quality(
         *(
             np.concatenate([getattr(station_edges, name) for station_edges in parts])
             for name in each
-        )
+        ),
+        options=options,
     )
 
 
@@ -134,10 +137,11 @@ def _quality(window: ImageWindow, machine: Machine, options: QualityOptions) -> 
         level=_middle(across[..., near & (offsets < 0)].mean(axis=-1), clear),
         behind=_middle(across[..., near & (offsets > 0)].mean(axis=-1), clear),
         half_width=_middle(half_width[..., 0], clear),
+        options=options,
     )
 
 
-def unrecognised_quality(
+def unlocalized_quality(
     images: Sequence[Integers], n_legs: int, options: QualityOptions = QUALITY_OPTIONS
 ) -> Quality:
     """Quality of images in which the machine was not localized: exposure of all pixels."""
@@ -154,6 +158,7 @@ def unrecognised_quality(
         saturated=shares[:, 0],
         black=shares[:, 1],
         blur=np.full(count, np.nan),
+        options=options,
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot
+from pkmcal.levels import CONTRADICTION_SIGMAS, MAJORITY
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe.legs import StationEdges
 from pkmcal.outcome.finding import note
@@ -32,13 +33,13 @@ class RepeatOptions:
     prior_freedom: float = 10.0
     # distance of a repeat from the others, in standard deviations, beyond which it is rejected
     # (statistical: 6 in 10^7 of normal errors)
-    far: float = 5.0
+    far: float = CONTRADICTION_SIGMAS
     # distance, in stated standard deviations, within which a repeat is an inlier however well the
     # others agree
     harmless: float = 1.0
     # share of a configuration's repeats that must be exceeded by those with an edge: edges that
     # are measured now and then are faint, and may well be a pixel off
-    majority: float = 0.5
+    majority: float = MAJORITY
 
 
 REPEAT_OPTIONS = RepeatOptions()

@@ -16,6 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
+from pkmcal.levels import MAJORITY
 from pkmcal.observe.distance_tables import DistanceTables
 from pkmcal.observe.pose_candidates import same_pose
 from pkmcal.observe.predict import LegsInCamera, TubeList, of_edges, visible_stretch
@@ -29,7 +30,7 @@ class ShadowOptions:
     along: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9)
     # share of the samples, over all images, above which a pose lies on pixels that became darker,
     # or brighter: the majority
-    changed: float = 0.5
+    changed: float = MAJORITY
 
 
 SHADOW_OPTIONS = ShadowOptions()

@@ -16,7 +16,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.observe.legs import EDGE_OPTIONS, StationEdges
-from pkmcal.observe.pose_likelihood import StationView, first_mixture, linearize_distances
+from pkmcal.observe.pose_likelihood import (
+    LIKELIHOOD_OPTIONS,
+    StationView,
+    first_mixture,
+    linearize_distances,
+)
 from pkmcal.observe.predict import edge_points, legs_in_camera, unobstructed
 from pkmcal.observe.profiles import EDGE_FIT_OPTIONS, EdgeFitOptions, edge_set, fit_edges
 
@@ -32,7 +37,7 @@ class SilhouetteOptions:
     least_weight: float = 0.05
     # largest scatter of silhouettes about image edges, reduced pixels, once the machine is
     # accurate to a few pixels: half of the search's
-    widest: float = 2.0
+    widest: float = LIKELIHOOD_OPTIONS.last_reach / 2
     # distance in pixels from the outlines of other legs
     clearance: float = EDGE_OPTIONS.clearance
     # fit of the edges' planes

@@ -34,6 +34,7 @@ from pkmcal.geometry.rigid import cross, dot, perturb, register
 from pkmcal.identify.bundle import BATCH
 from pkmcal.identify.gauge import centre_index
 from pkmcal.identify.line_shading import common_shading
+from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE, LEAST_SCALE, clean_norm
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
@@ -46,8 +47,6 @@ MOST_GAUSS_NEWTON_STEPS, MOST_VARIANCE_ROUNDS = 30, 30
 """Maximum number of Gauss-Newton steps with given variances, and of updates of the variances."""
 PREDICTED_MOVE_SETTLED = 1e-6
 """Predicted change of the rows in the last step, relative to the residuals."""
-FEW_FREEDOMS_FOR_NOISE = 5.0
-"""Degrees of freedom up to which the noise scale is not estimated."""
 USE_DEFAULT_METHOD = "Use the joint method (bundle), which is the default"
 ONE_RESIDUAL_FACTOR = FULL_WEIGHT_DISTANCE / float(
     clean_norm(CLEAN_TAIL_SHARE, np.ones((), dtype=int))
@@ -97,7 +96,7 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
         # the noise scale makes chi2 equal to its degrees of freedom, as in the joint estimate
         freedom = np.sum(weight) - np.sum(weight[:, None] * (jac @ half) ** 2) / scale**2
         before = weight, scale, shading
-        if freedom > FEW_FREEDOMS_FOR_NOISE:
+        if freedom > LEAST_NOISE_FREEDOM:
             scale = float(np.sqrt(np.sum(weight * residual**2) / freedom))
             scale = max(scale, LEAST_SCALE)
         # standard deviation of the lines' shading

@@ -19,14 +19,14 @@ from pkmcal.simulation.drives import ball_of, legs_space
 from pkmcal.simulation.placement import (
     PANORAMIC_HALF_VIEW,
     READING_RANGE_SHARES,
-    StationPlace,
+    StationPose,
     draw_configurations,
     fitting_distance,
     usable,
     view_angle,
 )
 
-CAMERA_PLACES_A_RING = 12
+CAMERA_POSES_A_RING = 12
 """Number of camera poses on a ring around the machine."""
 CAMERA_RING_HEIGHTS = np.deg2rad([5.0, 22.0, 40.0, 60.0])
 """Elevations of the rings: angles of the line of sight above the ground, rad."""
@@ -93,9 +93,9 @@ def neighbours(
     return Configurations(joints[good], poses[good])
 
 
-def camera_ring_places(
+def camera_ring_poses(
     machine: Machine, camera: Camera, board: BoardBody | None = None
-) -> tuple[StationPlace, ...]:
+) -> tuple[StationPose, ...]:
     """Poses of a camera on a sphere around the machine, at the distance at which it fills the
     image.
 
@@ -111,14 +111,14 @@ def camera_ring_places(
         )
     centre, radius = ball_of(legs_space(machine))
     away = fitting_distance(machine, camera, board) * radius
-    out: list[StationPlace] = []
+    out: list[StationPose] = []
     for k, height in enumerate(CAMERA_RING_HEIGHTS):
         for azimuth in (
-            2 * np.pi * (np.arange(CAMERA_PLACES_A_RING) + 0.5 * (k % 2)) / CAMERA_PLACES_A_RING
+            2 * np.pi * (np.arange(CAMERA_POSES_A_RING) + 0.5 * (k % 2)) / CAMERA_POSES_A_RING
         ):
             level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             direction = np.cos(height) * level + np.array([0.0, 0.0, np.sin(height)])
-            out.append(StationPlace(_tuple(centre + away * direction), _tuple(centre)))
+            out.append(StationPose(_tuple(centre + away * direction), _tuple(centre)))
     return tuple(out)
 
 

@@ -7,7 +7,7 @@ CONFIGURATIONS_A_CAPTURE = 15
 """Number of configurations at each station."""
 PLANNED_IMAGE_SIZE = (1280, 960)
 """Image size in px of a machine's camera without a camera file."""
-PLACES_AROUND_A_MACHINE = 3
+STATIONS_AROUND_A_MACHINE = 3
 """Number of stations for a machine, unless a board or a panoramic camera needs only one."""
 NOMINAL_EDGE_SIGMA = 0.1
 """Standard deviation (px) of an edge's shift, and of its ends by tilt, before any image is

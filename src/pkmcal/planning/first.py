@@ -20,6 +20,7 @@ from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
+from pkmcal.levels import MAJORITY, NEGLIGIBLE
 from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
@@ -28,6 +29,7 @@ from pkmcal.observe.image_batches import StationImages, placed_at
 from pkmcal.observe.predict import tubes_of
 from pkmcal.session.load import Session
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.solver.kernels import INLIER_WEIGHT
 
 FIRST_IMAGES_A_STATION = 3
 """Number of first images of a station that are measured, as users take them before the main
@@ -43,14 +45,10 @@ SHARED_EDGES_WEIGHT = 2.0
 """Weight of all edges of a kind at a station, in numbers of edges, relative to the leg's own: it
 limits the influence of chance in three images.
 """
-EXPECTED_EDGE_FREE_SHARE = 0.5
-"""Minimum visible part of an edge from which it is expected: edges are fitted to as much."""
 EXACT_EDGE_NOISE = EdgeNoise(1e-3, 1e-3)
 """Negligible noise (px) of edges that are simulated for their position and their turn by a
 pixel.
 """
-SAME_LENGTH = 0.01
-"""Minimum bandwidth of the logarithm of edge lengths, for edges of equal length."""
 FIRST_EDGES_SEED = 7
 
 
@@ -76,7 +74,7 @@ class EdgePool(NamedTuple):
         mean = np.average(at, weights=self.weight)
         spread = np.sqrt(np.average((at - mean) ** 2, weights=self.weight))
         effective = self.weight.sum() ** 2 / np.sum(self.weight**2)
-        width = max(spread * effective**-0.2, SAME_LENGTH)
+        width = max(spread * effective**-0.2, NEGLIGIBLE)  # for edges of equal length
         far = ((np.log(length)[:, None] - at) / width) ** 2 / 2
         # subtracting far.min() assigns lengths outside the sampled range to the nearest samples
         chance = self.weight * np.exp(far.min(axis=1, keepdims=True) - far)
@@ -207,8 +205,8 @@ def _edge_information(
     length = np.ptp(ideal.span, axis=1)
     longest = np.zeros(n_edges)
     np.maximum.at(longest, place(ideal)[2], length)
-    whole[place(ideal)] = length > EXPECTED_EDGE_FREE_SHARE * longest[place(ideal)[2]]
-    inlier[place(edges.select(estimate.edge_weights > 0.5))] = True
+    whole[place(ideal)] = length > MAJORITY * longest[place(ideal)[2]]
+    inlier[place(edges.select(estimate.edge_weights > INLIER_WEIGHT))] = True
     inlier &= expected
     # Information of each edge in px^-2 of shift and tilt.
     unit = np.zeros((*shape, 2, 2))
@@ -234,7 +232,7 @@ def _edge_information(
         scale * np.sqrt(edges.covariance[:, 0, 0]) / pixel, estimate.edge_noise.shading[edges.tube]
     )
     for s, j in np.ndindex(len(images), n_legs):
-        mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)
+        mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > INLIER_WEIGHT)
         sigma[s, j] = np.median(across[mine]) if mine.any() else np.nan
     by_station = tuple(
         EdgesOf(own, whole[s, p.configuration], (inlier & whole)[s, p.configuration])

@@ -42,7 +42,7 @@ from pkmcal.planning.route import motor_spans
 from pkmcal.solver.elimination import eliminate
 from pkmcal.wording import listed
 
-UNMEASURED_PLACE_SIGMA = 1.0
+UNMEASURED_POSE_SIGMA = 1.0
 """Prior sigma (m and rad) of the poses of stations and mounts, so that every selection has a
 covariance. An image has a thousand times more information.
 """
@@ -177,7 +177,7 @@ def information_of(
         prior = prior[~prior[:, u.machine].any(axis=1)]
     total = prior.T @ prior
     for part in (u.stations, u.mounts):
-        total[part, part] += np.eye(part.stop - part.start) / UNMEASURED_PLACE_SIGMA**2
+        total[part, part] += np.eye(part.stop - part.start) / UNMEASURED_POSE_SIGMA**2
     if calibration_prior is not None:
         at, added = _prior_information(
             calibration_prior, machine, problem, rig.T_station_base, directions

@@ -17,11 +17,12 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.calibration.saved_calibration import CalibrationPrior
 from pkmcal.errors import InputError
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.candidates import (
     Configurations,
-    camera_ring_places,
+    camera_ring_poses,
     configurations,
     neighbours,
 )
@@ -32,7 +33,7 @@ from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
 from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import Subject
 from pkmcal.ranges import check_number
-from pkmcal.simulation.placement import StationPlace, usable
+from pkmcal.simulation.placement import StationPose, usable
 
 PLAN_CANDIDATES = 400
 """Minimum number of candidate configurations."""
@@ -42,18 +43,12 @@ AT_WORK = 60
 """Number of poses of the workspace at which the tool's accuracy is evaluated."""
 BETTERING_ROUNDS = 8
 """Maximum number of rounds of local improvement."""
-LEAST_ROUND_GAIN = 0.01
-"""Minimum relative gain of a round for another one to follow."""
-FOR_PLACES = 24
+CONFIGURATIONS_FOR_STATIONS = 24
 """Number of configurations for the comparison of stations."""
 RANDOM_PLANS_COMPARED = 10
 """Number of random selections with which a plan is compared."""
 CAPTURE_MULTIPLES = (2, 4)
 """Multiples of the planned number of images for which the accuracy is predicted as well."""
-WORTHWHILE_ACCURACY_GAIN = 0.01
-"""Minimum relative gain of the tool's standard deviation by one more configuration at each station
-that makes it worthwhile.
-"""
 POSES_BETWEEN_CONFIGURATIONS = 8
 """Number of poses that are checked on the path between two configurations."""
 REROUTING_ATTEMPTS = 5
@@ -75,14 +70,14 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class TriedPlace:
+class TriedStation:
     """Candidate pose of a camera.
 
     alone : standard deviation (m) of the platform's position with all configurations observed from
     there. chosen : whether it is part of the plan.
     """
 
-    place: StationPlace
+    place: StationPose
     alone: float
     chosen: bool
 
@@ -120,7 +115,7 @@ class MeasurementPlan:
     work: Array
     blocked: Booleans
     travel: tuple[float, float]
-    tried: tuple[TriedPlace, ...] = ()
+    tried: tuple[TriedStation, ...] = ()
     together: bool = False
 
     __repr__ = short_repr
@@ -128,11 +123,11 @@ class MeasurementPlan:
     @property
     def pays_until(self) -> float | None:
         """Number of configurations at each station after which one more improves the tool by less
-        than :data:`WORTHWHILE_ACCURACY_GAIN`; None if all planned ones are worthwhile.
+        than a negligible share; None if all planned ones are worthwhile.
         """
         for before, after in pairwise(self.curve):
             each = 1 - (after.position / before.position) ** (1 / (after.count - before.count))
-            if each < WORTHWHILE_ACCURACY_GAIN and after.count <= self.promised.count:
+            if each < NEGLIGIBLE and after.count <= self.promised.count:
                 return before.count
         return None
 
@@ -144,7 +139,7 @@ def plan_measurements(
     index: str = "tool",
     region: Region | None = None,
     together: bool | None = None,
-    free_places: int | None = None,
+    free_stations: int | None = None,
     best_of: int | None = None,
     seed: int = PLAN_SEED,
     progress: ShareProgress | None = None,
@@ -154,14 +149,14 @@ def plan_measurements(
     count : configurations at each station; in total, if all stations measure together. index : one
     of :data:`~pkmcal.planning.exchange.PLAN_INDICES`. region : workspace in which the tool's
     accuracy counts; by default all reachable poses. together : whether all stations measure every
-    configuration; by default if they have cameras of their own or there is a tracker. free_places :
-    number of stations to choose on a sphere around the machine. best_of : number of the rig's
-    stations to choose. seed : of all random numbers. progress : callback with the share done.
-    Raises InputError for what cannot be planned.
+    configuration; by default if they have cameras of their own or there is a tracker.
+    free_stations : number of stations to choose on a sphere around the machine. best_of : number of
+    the rig's stations to choose. seed : of all random numbers. progress : callback with the share
+    done. Raises InputError for what cannot be planned.
     """
     progress = progress or (lambda _share: None)
     rig, rng = subject.rig, np.random.default_rng(seed)
-    _check(rig, count, index, free_places, best_of)
+    _check(rig, count, index, free_stations, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
     # Candidate configurations, by which stations are chosen first, if they are free.
@@ -169,10 +164,10 @@ def plan_measurements(
         rig.machine, max(PLAN_CANDIDATES, CANDIDATES_FOR_EACH_WANTED * count), rng
     )
     progress(0.1)
-    tried: tuple[TriedPlace, ...] = ()
-    if free_places or best_of:
+    tried: tuple[TriedStation, ...] = ()
+    if free_stations or best_of:
         rig, prior, tried = _with_stations(
-            subject, work, candidates, count, index, free_places, best_of
+            subject, work, candidates, count, index, free_stations, best_of
         )
         subject = replace(subject, rig=rig, prior=prior)
     progress(0.3)
@@ -190,14 +185,16 @@ def plan_measurements(
     return _routed_plan(subject, selection, chosen, pool, region, together, tried, rng)
 
 
-def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
+def _check(
+    rig: Rig, count: int, index: str, free_stations: int | None, best_of: int | None
+) -> None:
     rig.machine.check_free("fixed")
     if index not in PLAN_INDICES:
         raise InputError(
             "there is no such index", where="--index", found=index, expected=", ".join(PLAN_INDICES)
         )
     check_number("plan", "configurations", count, "--configurations")
-    check_number("plan", "places", free_places, "--places")
+    check_number("plan", "places", free_stations, "--places")
     check_number("plan", "best_of", best_of, "--best-of")
     if rig.machine.layout.n_internal:
         raise InputError(
@@ -206,7 +203,7 @@ def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: i
             next_step="Plan for the machine with one rod a forearm, such as h4",
         )
     cameras = [one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom)]
-    if free_places and not cameras:
+    if free_stations and not cameras:
         raise InputError(
             "there is no camera whose place could be chosen",
             where="--places",
@@ -259,7 +256,7 @@ class _Selection:
             best = pool.candidates.only(chosen)
             covariance = pool.info.covariance(pool.info.of(chosen))
             before, size = size, index.size(float(index.value(covariance)), len(covariance))
-            if size > (1 - LEAST_ROUND_GAIN) * before:
+            if size > (1 - NEGLIGIBLE) * before:
                 break
         return best
 
@@ -295,7 +292,7 @@ def _routed_plan(
     pool: _Pool,
     region: Region,
     together: bool,
-    tried: tuple[TriedPlace, ...],
+    tried: tuple[TriedStation, ...],
     rng: np.random.Generator,
 ) -> MeasurementPlan:
     """Plan of the chosen configurations, in the order of the shortest path, with its predicted
@@ -440,21 +437,23 @@ def _with_stations(
     candidates: Configurations,
     count: int,
     index: str,
-    free_places: int | None,
+    free_stations: int | None,
     best_of: int | None,
-) -> tuple[Rig, CalibrationPrior | None, tuple[TriedPlace, ...]]:
+) -> tuple[Rig, CalibrationPrior | None, tuple[TriedStation, ...]]:
     """Rig with the best stations, on a sphere or among its own.
 
     The information of each station on the machine, with the station's pose and shading eliminated,
     comes from configurations spread over all; stations are then chosen as configurations are.
     """
     rig = subject.rig
-    if free_places:
+    if free_stations:
         wide, poses = _on_sphere(rig)
     else:
-        wide, poses = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
+        wide, poses = rig, tuple(StationPose.of(T) for T in rig.T_station_base)
     # Rows of the same few configurations from each station.
-    few = np.unique(np.linspace(0, len(candidates.joints) - 1, FOR_PLACES).astype(int))
+    few = np.unique(
+        np.linspace(0, len(candidates.joints) - 1, CONFIGURATIONS_FOR_STATIONS).astype(int)
+    )
     part = Configurations(*(x[few] for x in candidates))
     machine_prior = subject.prior and subject.prior.only(())
     infos = [
@@ -484,13 +483,13 @@ def _with_stations(
     number = np.arange(len(rows), dtype=float)[:, None]
     whole = CandidateRows(rows, same, number, start, np.eye(len(start)), first.work)
     rule = PLAN_INDICES[index](whole)
-    wanted = free_places or best_of or 1
+    wanted = free_stations or best_of or 1
     best = np.sort(exchanged(whole, greedy(whole, wanted, rule).chosen, rule))
     tried = tuple(
-        TriedPlace(place, float(alone[k]), bool(k in best)) for k, place in enumerate(poses)
+        TriedStation(place, float(alone[k]), bool(k in best)) for k, place in enumerate(poses)
     )
     chosen = wide.only(best.tolist())
-    if free_places:
+    if free_stations:
         names = tuple(f"place{n + 1}" for n in range(len(best)))
         return replace(chosen, names=names), machine_prior, tried
     prior = subject.prior and subject.prior.only(best.tolist())
@@ -509,11 +508,11 @@ def _view_information(
         return None
 
 
-def _on_sphere(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:
+def _on_sphere(rig: Rig) -> tuple[Rig, tuple[StationPose, ...]]:
     """Rig with its first camera at every pose on a sphere, with the instruments of that camera."""
     one = next(one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom))
     board = "platform" if isinstance(one, BoardFrom) else None
-    spots = camera_ring_places(rig.machine, one.camera, board)
+    spots = camera_ring_poses(rig.machine, one.camera, board)
     T = np.stack([spot.T_camera_base() for spot in spots])
     mine = [other for other in rig.instruments if other.station == one.station]
     instruments = tuple(

@@ -51,9 +51,9 @@ def read_touches(path: Path, printer: Printer) -> Touches:
     elif text.startswith(HEIGHT_MAP_TITLE):
         points, heights = _height_map_points(text, label), 0.0
     elif values := _TRIGGERED.findall(text):
-        points, heights = _means_by_place(np.array(values, dtype=float)), dz
+        points, heights = _means_by_position(np.array(values, dtype=float)), dz
     elif values := _CONTACT.findall(text):
-        points, heights = _means_by_place(np.array(values, dtype=float)) - [dx, dy, 0.0], 0.0
+        points, heights = _means_by_position(np.array(values, dtype=float)) - [dx, dy, 0.0], 0.0
     elif values := _HEIGHTS.findall(text):
         points, heights = _sequence_points(text, label, values[-1][0]), 0.0
     else:
@@ -86,7 +86,7 @@ def _table_points(path: Path, label: str) -> Array:
     return MM_A_METRE * table.values[:, [table.columns.index(c) for c in "xyz"]]
 
 
-def _means_by_place(points: Array) -> Array:
+def _means_by_position(points: Array) -> Array:
     """Mean points (m, 3) of the points (n, 3) with equal x and y, in the order of first contact."""
     places = list(dict.fromkeys(map(tuple, points[:, :2].tolist())))
     return np.array([points[(points[:, :2] == place).all(axis=1)].mean(axis=0) for place in places])

@@ -25,7 +25,8 @@ from pkmcal.errors import PkmcalError
 from pkmcal.files import output_lock, write_folder
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
+from pkmcal.identify.tool import ToolError, centres_and_tool
+from pkmcal.levels import ROUNDING
 from pkmcal.measurements import LinkSet, Observation
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome
@@ -380,13 +381,13 @@ def _fit(session: Session, estimate: Estimate) -> Figure:
 
 def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:
     """Position, and orientation unless the platform does not turn, with units."""
-    turn = ((brief(float(np.rad2deg(orientation))), "°"),) if orientation > NO_TURN else ()
+    turn = ((brief(float(np.rad2deg(orientation))), "°"),) if orientation > ROUNDING else ()
     return ((brief(position * 1e3), "mm"), *turn)
 
 
 def _turn_text(orientation: float) -> str:
     """Orientation (rad) as the rest of a sentence; empty for a platform that does not turn."""
-    return f", {brief(float(np.rad2deg(orientation)))}°" if orientation > NO_TURN else ""
+    return f", {brief(float(np.rad2deg(orientation)))}°" if orientation > ROUNDING else ""
 
 
 def _centre_name(centres: tuple[Centres, ...], position: int) -> str:

@@ -8,8 +8,8 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.toolmap import ToolMap
-from pkmcal.identify.tool import NO_TURN
 from pkmcal.judge.difference import MachineDifference
+from pkmcal.levels import ROUNDING
 from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table
 from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT, coloured, space_layout
 from pkmcal.report.watch import NO_VALUE_SIGN, chance_text
@@ -100,7 +100,7 @@ def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
     _, after = d.tool.evenly
     kinds = [("Position, mm", after.off_position * 1e3, after.position * 1e3)]
     turn = np.rad2deg(after.off_orientation)
-    if np.nanmax(turn, initial=0.0) > np.rad2deg(NO_TURN):
+    if np.nanmax(turn, initial=0.0) > np.rad2deg(ROUNDING):
         kinds.append(("Turn, °", turn, np.rad2deg(after.orientation)))
     rows: list[Row] = []
     for name, off, sigma in kinds:

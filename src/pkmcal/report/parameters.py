@@ -15,12 +15,12 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.files import json_text
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.parameter_estimates import (
-    ROUNDING_SIGMA,
     ParameterEstimate,
     ParameterEstimates,
     parameter_estimates,
 )
 from pkmcal.identify.unidentified import Findings, only_heights
+from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
@@ -173,7 +173,7 @@ def parameter_groups(estimates: ParameterEstimates) -> tuple[ParameterGroup, ...
 def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
     """Row of a parameter."""
     factor, unit = DISPLAY_UNITS.get(one.unit, (1.0, one.unit.replace("1", "")))
-    sigma = one.sigma if one.sigma > ROUNDING_SIGMA else 0.0
+    sigma = one.sigma if one.sigma > ROUNDING else 0.0
     numbers = (one.drawing * factor, one.value * factor, one.change * factor, sigma * factor)
     places = decimals(numbers[3])
     others = [n for group in table.tied if one.name in group for n in group if n != one.name]
@@ -255,7 +255,7 @@ def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
     again = {name for group in table.tied for name in group[1:]}
     own = np.array([name not in again for name in table.names], dtype=bool)
     # parameters with a standard deviation, the first of each tie
-    free = np.flatnonzero((sigma > ROUNDING_SIGMA) & own)
+    free = np.flatnonzero((sigma > ROUNDING) & own)
     rho = estimate.covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
     whole = np.array([_whole_axis(table.names[k]) for k in free])
     return free, rho, np.triu(whole[:, None] != whole, 1)

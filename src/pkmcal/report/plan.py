@@ -12,6 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, json_value, yaml_text
 from pkmcal.geometry.rigid import inverse
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.pages.plots import (
@@ -23,12 +24,12 @@ from pkmcal.pages.plots import (
     path_between_cameras,
     uncropped,
 )
-from pkmcal.planning.plan import WORTHWHILE_ACCURACY_GAIN, Accuracy, MeasurementPlan, TriedPlace
+from pkmcal.planning.plan import Accuracy, MeasurementPlan, TriedStation
 from pkmcal.planning.rig import BoardFrom, LegsFrom
-from pkmcal.simulation.placement import StationPlace
+from pkmcal.simulation.placement import StationPose
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, number
 
-PLAN_TABLE_FILE, PLAN_PLACES_FILE = "plan.csv", "stations.yaml"
+PLAN_TABLE_FILE, PLAN_STATIONS_FILE = "plan.csv", "stations.yaml"
 PLAN_FORMAT = 1
 PLAN_READING_DECIMALS = 6
 """Decimals of a reading in metres or radians."""
@@ -62,8 +63,8 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     }
     parts = [_order(plan), _curve(plan)]
     if plan.tried:
-        texts[PLAN_PLACES_FILE] = yaml_text(stations_document(plan))
-        parts.append(_camera_places(plan))
+        texts[PLAN_STATIONS_FILE] = yaml_text(stations_document(plan))
+        parts.append(_camera_poses(plan))
     if _cameras(plan):
         parts.append(_space(plan))
     parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
@@ -136,7 +137,7 @@ def _worth_note(plan: MeasurementPlan) -> Finding:
     facts = {
         "tool_sigma": twice.position,
         "gain": 1 - twice.position / last.position,
-        "worthwhile": WORTHWHILE_ACCURACY_GAIN,
+        "worthwhile": NEGLIGIBLE,
     }
     if until is None:
         return note("plan.all_pay", **facts)
@@ -264,7 +265,7 @@ def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
     return list(out.values())
 
 
-def _camera_places(plan: MeasurementPlan) -> Part:
+def _camera_poses(plan: MeasurementPlan) -> Part:
     """Section on the camera's places, and what the best of them give alone."""
     order = sorted(plan.tried, key=lambda tried: (not tried.chosen, tried.alone))[:12]
     rows = [
@@ -283,7 +284,7 @@ def _camera_places(plan: MeasurementPlan) -> Part:
         ("position, m", "looks at, m", "tool from there alone"),
         tuple(rows),
         "Base frame. Chosen as a set: two places that see the same badly do not help each other."
-        f" {PLAN_PLACES_FILE} holds them as session.yaml wants them;"
+        f" {PLAN_STATIONS_FILE} holds them as session.yaml wants them;"
         " to a few centimetres is enough.",
         words=(0, 1),
     )
@@ -339,7 +340,7 @@ def _space(plan: MeasurementPlan) -> Part:
     return Part("where", "In space", plots=(plot,))
 
 
-def _candidate_markers(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
+def _candidate_markers(tried: tuple[TriedStation, ...]) -> dict[str, Any]:
     """Markers at candidate places, coloured by the accuracy that each gives alone."""
     at = np.array([one.place.position for one in tried])
     value = np.array([one.alone for one in tried]) * 1e3
@@ -366,7 +367,7 @@ def stations_document(plan: MeasurementPlan) -> dict[str, Any]:
             "camera": "cameras/camera.yaml",
             "images": f"images/{name}/{{configuration}}.png",
             "observe": observe[0] if len(observe) == 1 else observe,
-            "pose": StationPlace.of(T_camera_base).rounded(3),
+            "pose": StationPose.of(T_camera_base).rounded(3),
         }
     return {"stations": out}
 

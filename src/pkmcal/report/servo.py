@@ -31,7 +31,7 @@ SERVO_CURVE_POINTS = 300
 """Points of a curve."""
 LEAST_SERVO_ERROR_SHARE = 1e-5
 """Lower limit of curves, as a share of the initial error."""
-SERVO_EDGE_PLACES = 17
+SERVO_EDGE_POINTS = 17
 """Points along a drawn edge; in a mirror edges are curved."""
 SERVO_METHOD_TEXT = (
     "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
@@ -629,7 +629,7 @@ def _pixels(s: Study, poses: Array, places: int) -> Array:
 
 def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[dict[str, Any]]:
     """Traces of the edges at a pose."""
-    pixels = _pixels(s, pose, SERVO_EDGE_PLACES)[0]
+    pixels = _pixels(s, pose, SERVO_EDGE_POINTS)[0]
     return [
         _line_trace(
             f"edges {name}",

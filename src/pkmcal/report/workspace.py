@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.toolmap import NO_EXTENT, Slice, ToolMap
+from pkmcal.calibration.toolmap import Slice, ToolMap
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import NO_TURN
+from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages.plots import (
     COMMON_AXIS_LAYOUT,
@@ -77,7 +77,7 @@ def _narrow(tool_map: ToolMap) -> bool:
     """Whether the region, rather than the machine, leaves no plane for slices."""
     named = any(side is not None and side[0] == side[1] for side in tool_map.region.sides)
     wide = np.ptp(tool_map.evenly[1].T_base_platform[:, :3, 3], axis=0)
-    return named and int(np.count_nonzero(wide > NO_EXTENT * wide.max())) < 2
+    return named and int(np.count_nonzero(wide > NEGLIGIBLE * wide.max())) < 2
 
 
 def _headline(tool_map: ToolMap) -> str:
@@ -101,7 +101,7 @@ def _table(tool_map: ToolMap) -> Table:
     """Table of the median and the largest error over the evenly spread poses."""
     before, after = tool_map.evenly
     rows: list[Row] = []
-    turns = float(np.nanmax(before.orientation)) > NO_TURN
+    turns = float(np.nanmax(before.orientation)) > ROUNDING
     kinds = (
         ("By the nominal model's tolerances, σ", before.position, before.orientation),
         ("Nominal model's error", after.off_position, after.off_orientation),
@@ -376,7 +376,7 @@ def _space(session: Session, estimate: Estimate, tool_map: ToolMap) -> Plot | No
         return None
     components, names = axes
     sigma, turn = after.position * 1e3, np.rad2deg(after.orientation)
-    turns = bool(np.nanmax(turn) > np.rad2deg(NO_TURN))
+    turns = bool(np.nanmax(turn) > np.rad2deg(ROUNDING))
     columns = [sigma, after.off_position * 1e3, turn if turns else np.zeros_like(turn)]
     hover = "<br>".join(f"{name}: %{{{k}:.3g}}" for k, name in zip("xyz", names, strict=True))
     hover += "<br>σ %{customdata[0]:.3g} mm"

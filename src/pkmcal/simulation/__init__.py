@@ -10,7 +10,7 @@ and camera poses; `truth` draws the true values of a session, and `session` writ
 from pkmcal.simulation.board import board_for
 from pkmcal.simulation.drives import to_simulate, with_forearms
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.placement import StationPlace
+from pkmcal.simulation.placement import StationPose
 from pkmcal.simulation.render import Sensor
 from pkmcal.simulation.session import simulate_session
 from pkmcal.simulation.truth import Settings, Truth, draw_truth, load_truth, true_machine
@@ -19,7 +19,7 @@ __all__ = [
     "EdgeNoise",
     "Sensor",
     "Settings",
-    "StationPlace",
+    "StationPose",
     "Truth",
     "board_for",
     "draw_truth",

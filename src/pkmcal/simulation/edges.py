@@ -26,9 +26,9 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import TubeList, tubes_of
 from pkmcal.simulation.placement import one_a_station
 
-PLACES_ALONG_EDGE = 48
+POINTS_ALONG_EDGE = 48
 """Samples along each tube: a hidden stretch is bounded to a fiftieth of the tube."""
-EDGE_TURN_PLACES = 13
+EDGE_TURN_POINTS = 13
 """Samples for an edge's response to a shift and a tilt, which is as smooth as the lens distortion.
 """
 JOINT_HOUSING = 0.005
@@ -109,7 +109,7 @@ def visible_edges(
     normal = edge_normal(u, m, radius, SIDE_SIGNS[tubes.side])
     first = np.broadcast_to(tubes.start + JOINT_HOUSING, length.shape)
     last = np.minimum(tubes.stop, length) - JOINT_HOUSING
-    where = np.linspace(0, 1, PLACES_ALONG_EDGE)
+    where = np.linspace(0, 1, POINTS_ALONG_EDGE)
     along = first[..., None] + (last - first)[..., None] * where
     points = contour_point(
         a_e[..., None, :], u[..., None, :], normal[..., None, :], radius[:, None], along
@@ -134,7 +134,7 @@ def visible_edges(
     edges = EdgeSet(
         station=np.zeros(len(edge), dtype=int), configuration=photo,
         leg=tubes.leg[edge], tube=tubes.tube[edge], side=tubes.side[edge], normal=normal,
-        basis=tangent_basis(normal, rays[:, PLACES_ALONG_EDGE // 2]),
+        basis=tangent_basis(normal, rays[:, POINTS_ALONG_EDGE // 2]),
         covariance=np.zeros((len(edge), 2, 2)), shift=np.zeros((len(edge), 2)), span=span,
     )  # fmt: skip
     return edges, rays
@@ -197,12 +197,12 @@ def _with_errors(
     camera: Camera, edges: EdgeSet, rays: Array, noise: EdgeNoise, rng: np.random.Generator
 ) -> EdgeSet:
     """Edges with noise, its covariance, and the derivative of the normal by an outward shift."""
-    few = rays[:, np.linspace(0, PLACES_ALONG_EDGE - 1, EDGE_TURN_PLACES).astype(int)]
+    few = rays[:, np.linspace(0, POINTS_ALONG_EDGE - 1, EDGE_TURN_POINTS).astype(int)]
     by_shift, by_tilt = moved_outward(camera, edges.normal, edges.basis, few)
     normal = disturbed(edges.normal, edges.basis, by_shift, by_tilt, noise, rng)
     parts = np.stack([by_shift * noise.shift, by_tilt * noise.tilt], axis=-1)
     return replace(
-        edges, normal=normal, basis=tangent_basis(normal, rays[:, PLACES_ALONG_EDGE // 2]),
+        edges, normal=normal, basis=tangent_basis(normal, rays[:, POINTS_ALONG_EDGE // 2]),
         covariance=parts @ parts.mT, shift=by_shift,
     )  # fmt: skip
 

@@ -44,7 +44,7 @@ PANORAMIC_HALF_VIEW = np.deg2rad(95)
 NEAREST_HALF_VIEW = np.deg2rad(35)
 """Largest half angle, in rad, under which a camera sees the machine; nearer, legs occlude each
 other."""
-CAMERA_PLACES_TRIED = 24
+CAMERA_POSES_TRIED = 24
 """Number of candidate poses round the machine for a single camera."""
 HOME_LEG_GAP = 0.03
 """Gap between two legs in an image at home, in image widths, with which they stay apart elsewhere.
@@ -218,7 +218,7 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
 
 
 @dataclass(frozen=True)
-class StationPlace:
+class StationPose:
     """Camera pose as a user gives it, base frame, m: the ``pose`` of a station in session.yaml."""
 
     position: Vector
@@ -226,7 +226,7 @@ class StationPlace:
     up: Vector = (0.0, 0.0, 1.0)
 
     @classmethod
-    def of(cls, T_camera_base: Array) -> StationPlace:
+    def of(cls, T_camera_base: Array) -> StationPose:
         """Pose of a camera from T_camera_base (4, 4), looking at a point one metre ahead."""
         T = inverse(T_camera_base)
         position, forward, up = T[:3, 3], T[:3, 2], -T[:3, 1]
@@ -264,7 +264,7 @@ def default_stations(
     *,
     distance: float | None = None,
     elevation: float | None = None,
-) -> tuple[StationPlace, ...]:
+) -> tuple[StationPose, ...]:
     """One pose for each camera: spaced evenly round the machine with random deviations.
 
     A single camera takes the candidate from which every leg is seen best, unless it sees a board on
@@ -278,7 +278,7 @@ def default_stations(
     """
     space = legs_space(machine)
     start = rng.uniform(0, 2 * np.pi)
-    poses: list[StationPlace] = []
+    poses: list[StationPose] = []
     arc = board is not None and not _is_flat(space)
     for k, camera in enumerate(cameras):
         half = view_angle(camera)
@@ -300,14 +300,14 @@ def default_stations(
     return tuple(poses)
 
 
-def places_by_hand(
+def rough_poses(
     machine: Machine, cameras: tuple[Camera, ...], rng: np.random.Generator
-) -> tuple[StationPlace, ...]:
+) -> tuple[StationPose, ...]:
     """One pose for each image of a person who walks round the machine, evenly with random
     deviations.
     """
     centre, radius = ball_of(legs_space(machine))
-    start, out = rng.uniform(0, 2 * np.pi), list[StationPlace]()
+    start, out = rng.uniform(0, 2 * np.pi), list[StationPose]()
     # three turns about the machine, so that images of one configuration are not side by side
     turn = 2 * np.pi * 3 / len(cameras) * (1 + 1 / (3 * len(cameras)))
     for k, camera in enumerate(cameras):
@@ -325,7 +325,7 @@ def places_by_hand(
         up = rotation(roll * forward) @ np.array([0.0, 0.0, 1.0])
         up = up - (up @ forward) * forward
         out.append(
-            StationPlace(_rounded(position), _rounded(target), _rounded(up / np.linalg.norm(up)))
+            StationPose(_rounded(position), _rounded(target), _rounded(up / np.linalg.norm(up)))
         )
     return tuple(out)
 
@@ -349,13 +349,13 @@ def _clearest(
     start: float,
     rng: np.random.Generator,
     elevation: float | None,
-) -> StationPlace:
+) -> StationPose:
     """Candidate on the ring, ``away`` from the machine in its own radius, with the best worst leg.
 
     The score of a candidate is the visible share of the leg that is seen least at home.
     """
     space = legs_space(machine)
-    azimuths = start + 2 * np.pi * np.arange(CAMERA_PLACES_TRIED) / CAMERA_PLACES_TRIED
+    azimuths = start + 2 * np.pi * np.arange(CAMERA_POSES_TRIED) / CAMERA_POSES_TRIED
     poses = [_outside(space, away, azimuth, rng, elevation) for azimuth in azimuths]
     tubes, home = tubes_of(machine), machine.home()[None]
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
@@ -389,7 +389,7 @@ def view_angle(camera: Camera) -> float:
 
 def rough_pose(
     T_camera_base: Array, distance: float, shift: float, turn: float, rng: np.random.Generator
-) -> StationPlace:
+) -> StationPose:
     """Hand-measured pose: off by ``shift`` (m) and ``turn`` (rad) in random directions.
 
     distance : from the camera to its target, m.
@@ -399,7 +399,7 @@ def rough_pose(
     rot = rotation(turn * axis / np.linalg.norm(axis)) @ T_base_camera[:3, :3]
     position = T_base_camera[:3, 3] + shift * direction / np.linalg.norm(direction)
     # a pose measured by hand has no digits below a tenth of a millimetre
-    return StationPlace(
+    return StationPose(
         _rounded(position), _rounded(position + distance * rot[:, 2]), _rounded(-rot[:, 1])
     )
 
@@ -415,7 +415,7 @@ def _outside(
     azimuth: float,
     rng: np.random.Generator,
     elevation: float | None,
-) -> StationPlace:
+) -> StationPose:
     """Pose on a ring round the machine's points (n, 3), low, or high for a flat machine."""
     centre, radius = ball_of(points)
     usual = np.deg2rad(rng.uniform(42, 55) if _is_flat(points) else rng.uniform(7, 17))
@@ -426,10 +426,10 @@ def _outside(
     target = centre + rng.uniform(-0.03, 0.03, 3) * radius
     up = np.array([*rng.normal(0, 0.04, 2), 1.0])
     position = centre + distance * radius * direction
-    return StationPlace(_rounded(position), _rounded(target), _rounded(up))
+    return StationPose(_rounded(position), _rounded(target), _rounded(up))
 
 
-def _inside(machine: Machine, rng: np.random.Generator) -> StationPlace:
+def _inside(machine: Machine, rng: np.random.Generator) -> StationPose:
     """Pose between the legs, a little above the base joints, looking at the platform."""
     a, b = (ends.reshape(-1, 3) for ends in reaches(machine))
     middle, rise = a.mean(axis=0), b.mean(axis=0) - a.mean(axis=0)
@@ -438,7 +438,7 @@ def _inside(machine: Machine, rng: np.random.Generator) -> StationPlace:
     angle = rng.uniform(0, 2 * np.pi)
     target = position + rise + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0]) * width
     up = (float(np.cos(angle)), float(np.sin(angle)), 0.0)
-    return StationPlace(_rounded(position), _rounded(target), _rounded(np.array(up)))
+    return StationPose(_rounded(position), _rounded(target), _rounded(np.array(up)))
 
 
 def in_picture(

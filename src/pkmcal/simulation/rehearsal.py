@@ -15,7 +15,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
-from pkmcal.simulation.placement import StationPlace
+from pkmcal.simulation.placement import StationPose
 from pkmcal.simulation.truth import RequestedConfigurations
 
 PLAN_FILE = "plan.json"
@@ -54,7 +54,7 @@ class Rehearsal(NamedTuple):
 
     machine: Machine
     cameras: tuple[Camera, ...]
-    places: tuple[StationPlace, ...]
+    places: tuple[StationPose, ...]
     requested: RequestedConfigurations
     board: Board | None
 
@@ -92,7 +92,7 @@ def rehearsal_of(plan: Path | str) -> Rehearsal:
     return Rehearsal(
         machine,
         tuple(camera_from_document(_inside(document, s.camera)) for s in results.stations),
-        tuple(StationPlace.of(inverse(np.array(s.T_base_camera))) for s in results.stations),
+        tuple(StationPose.of(inverse(np.array(s.T_base_camera))) for s in results.stations),
         RequestedConfigurations(joints, np.array(pairs, dtype=int).reshape(-1, 2)),
         None if results.board is None else board_from_document(_inside(document, results.board)),
     )

@@ -27,13 +27,13 @@ from pkmcal.session.readings import same_pose
 from pkmcal.session.schema import BoardBody
 from pkmcal.simulation.board import place_board
 from pkmcal.simulation.placement import (
-    StationPlace,
+    StationPose,
     default_stations,
     draw_configurations,
     in_picture,
-    places_by_hand,
     platform_unfolded,
     rough_pose,
+    rough_poses,
 )
 from pkmcal.simulation.render import Sensor
 from pkmcal.simulation.surfaces import Light, Style
@@ -79,7 +79,7 @@ class Settings:
     vary by ``breathing``, one standard deviation; ``stations`` is then ignored.
     """
 
-    stations: int | tuple[StationPlace, ...] = 3
+    stations: int | tuple[StationPose, ...] = 3
     configurations: int = 15
     shared: bool = False
     tolerance: float = 1.0
@@ -124,7 +124,7 @@ class Truth:
     stations: tuple[str, ...]
     configurations: tuple[str, ...]
     T_camera_base: Array
-    rough: tuple[StationPlace, ...]
+    rough: tuple[StationPose, ...]
     T_base_platform: Array
     joints: Array
     readings: Array
@@ -166,7 +166,7 @@ def draw_truth(
     machine = true_machine(nominal, settings.tolerance, rngs["machine"])
     poses = settings.stations
     if settings.handheld:
-        poses = places_by_hand(nominal, cameras, rngs["stations"])
+        poses = rough_poses(nominal, cameras, rngs["stations"])
     elif isinstance(poses, int):
         in_view = settings.board_on if settings.board is not None else None
         poses = default_stations(nominal, cameras, rngs["stations"], in_view)
@@ -392,7 +392,7 @@ def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
         stations=stations,
         configurations=configurations,
         T_camera_base=T_camera_base,
-        rough=tuple(StationPlace.of(T) for T in T_camera_base),
+        rough=tuple(StationPose.of(T) for T in T_camera_base),
         T_base_platform=np.array([c["T_base_platform"] for c in data["configurations"].values()]),
         joints=joints,
         readings=joints,

@@ -26,6 +26,8 @@ FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE = 4.0, 6.5
 """Distances, in standard deviations, up to which final weights are 1 and from which on they are 0:
 of clean pairs of residuals 3 in 10^4 lose part of their weight and none all of it, so efficiency is
 above 0.999."""
+INLIER_WEIGHT = 0.5
+"""Weight from which a measurement counts as an inlier; below it, as rejected."""
 
 
 def cauchy_weights(square: Array, scale: float = CAUCHY_SCALE) -> Array:

@@ -24,30 +24,44 @@ from pkmcal.solver.strips import (
     total,
 )
 
-LEAST_DAMPING = 1e-14
-"""First damping, practically none: most starts are near the solution, where a full step is best,
-and damping costs steps along directions that are poorly determined."""
-DAMPING_GROWTH = 8.0
-"""Factor on the damping after a refused step, and on this factor after each further one in a row:
-from LEAST_DAMPING to 0.01 in five steps."""
-STRONG_DAMPING = 1e-2
-"""Damping from which on every step is small, so that a small step is no sign of convergence."""
-MOST_DAMPING = 1e9
-"""Damping beyond which steps are below rounding: no step downhill exists."""
 STEP_TOLERANCE = 1e-7
 """A search ends with a step whose change of all fitted values together, in standard deviations, is
 smaller: a ten-millionth of the noise, and above the rounding of some 1e-9."""
-REFUSED_STEP_TOLERANCE = 1e-3
-"""The same for a step that raises the cost although the linear model predicts a decrease: the
-residuals' rounding is so large where a direction is a million times less determined than others."""
-COST_ROUNDING = 1e-13
-"""Relative rounding error of the cost."""
 CACHED_PROBLEM_PARTS = 16
 """Parts of a problem whose intermediate results of the residuals, some 5 MB each, are kept for the
 Jacobian. Parts beyond are computed again, so that memory does not grow with the problem."""
 
 Runs = TypeVar("Runs")
 """An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """Constants of the step control."""
+
+    # first damping, practically none: most starts are near the solution, where a full step is best,
+    # and damping costs steps along directions that are poorly determined
+    least_damping: float = 1e-14
+    # factor on the damping after a refused step, and on this factor after each further one in a
+    # row: from the least damping to 0.01 in five steps
+    growth: float = 8.0
+    # damping from which on every step is small, so that a small step is no sign of convergence
+    strong_damping: float = 1e-2
+    # damping beyond which steps are below rounding: no step downhill exists
+    most_damping: float = 1e9
+    # ratio of the actual to the predicted decrease of the cost above which an accepted step's
+    # damping is multiplied by the factor beside it, and the factor below all of them
+    less_damping: tuple[tuple[float, float], ...] = ((0.5, 0.05), (0.2, 0.5))
+    more_damping: float = 2.0
+    # as STEP_TOLERANCE, for a step that raises the cost although the linear model predicts a
+    # decrease: the residuals' rounding is so large where a direction is a million times less
+    # determined than others
+    refused_step_tolerance: float = 1e-3
+    # relative rounding error of the cost
+    cost_rounding: float = 1e-13
+
+
+SEARCH = SearchOptions()
 
 
 class Stop(Enum):
@@ -187,6 +201,7 @@ def minimise(
     start: Any,
     max_steps: int = 100,
     tolerance: float = STEP_TOLERANCE,
+    options: SearchOptions = SEARCH,
 ) -> Solution:
     """Minimize the sum of squares from ``start``, all runs at once; each stops on its own.
 
@@ -201,12 +216,13 @@ def minimise(
     n_runs = _count(start)
     cuts = divisions(n_runs, prod(rows))
     if len(cuts) < 2:
-        return _minimised(_Divided.of(problem, n_runs, *rows), start, values, max_steps, tolerance)
+        whole = _Divided.of(problem, n_runs, *rows)
+        return _minimised(whole, start, values, max_steps, tolerance, options)
     results: list[Solution] = []
     for cut in cuts:
         runs = np.arange(cut.start, cut.stop)
         part = _Divided.of(problem.select(runs), len(runs), *rows)
-        results.append(_minimised(part, take(start, runs), None, max_steps, tolerance))
+        results.append(_minimised(part, take(start, runs), None, max_steps, tolerance, options))
     return Solution(
         _each(lambda *states: np.concatenate(states), *(one.state for one in results)),
         np.concatenate([one.cost for one in results]),
@@ -269,17 +285,18 @@ def _minimised(
     values: list[Values] | None,
     max_steps: int,
     tolerance: float,
+    options: SearchOptions,
 ) -> Solution:
     """:func:`minimise` of a few runs; values : residuals at the start, if known."""
     n_runs = _count(start)
     cost, steps = np.full(n_runs, np.inf), np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
-    active, search = np.arange(n_runs), _Search.begun(n_runs)
+    active, search = np.arange(n_runs), _Search.begun(n_runs, options)
     state, part, here, at = start, problem, start, values
     normal: Array | None = None
     for _ in range(max_steps):
         # a step of the active runs
-        new, gain = _try(part, here, at, search, tolerance)
+        new, gain = _try(part, here, at, search, tolerance, options)
         steps[active] += 1
         here, at = _accepted_state(here, new, gain)
         # accepted states into the result
@@ -322,32 +339,35 @@ class _Search(NamedTuple):
     size: Array
 
     @classmethod
-    def begun(cls, n_runs: int) -> _Search:
+    def begun(cls, n_runs: int, options: SearchOptions) -> _Search:
         """Step control before the first step."""
-        return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, DAMPING_GROWTH, np.inf)))
+        return cls(*(np.full(n_runs, x) for x in (options.least_damping, options.growth, np.inf)))
 
-    def after(self, accepted: Booleans, ratio: Array, size: Array) -> _Search:
+    def after(
+        self, accepted: Booleans, ratio: Array, size: Array, options: SearchOptions
+    ) -> _Search:
         """Step control after a step; ratio : actual by predicted decrease of the cost."""
-        less = np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2.0))
+        conditions = [ratio > least for least, _ in options.less_damping]
+        factors = [factor for _, factor in options.less_damping]
+        less = np.select(conditions, factors, options.more_damping)
         damping = self.damping * np.where(accepted, less, self.growth)
         return _Search(
-            np.clip(damping, LEAST_DAMPING, MOST_DAMPING),
-            np.where(accepted, DAMPING_GROWTH, DAMPING_GROWTH * self.growth),
-            np.where(accepted & self.undamped, size, np.inf),
+            np.clip(damping, options.least_damping, options.most_damping),
+            np.where(accepted, options.growth, options.growth * self.growth),
+            np.where(accepted & self.undamped(options), size, np.inf),
         )
 
-    @property
-    def undamped(self) -> Booleans:
+    def undamped(self, options: SearchOptions) -> Booleans:
         """Whether the next step is a full Gauss-Newton step."""
-        return self.damping <= LEAST_DAMPING
+        return self.damping <= options.least_damping
 
-    def remaining(self, size: Array) -> Array:
+    def remaining(self, size: Array, options: SearchOptions) -> Array:
         """Estimated distance to the solution after a full step of this size.
 
         Steps that shrink by a factor q each leave ``q / (1 - q)`` of the last (Hairer and Wanner,
         Solving Ordinary Differential Equations II, IV.8).
         """
-        shrinking = self.undamped & np.isfinite(self.size) & (size < self.size)
+        shrinking = self.undamped(options) & np.isfinite(self.size) & (size < self.size)
         return np.where(shrinking, size**2 / np.where(shrinking, self.size - size, 1.0), np.inf)
 
 
@@ -368,6 +388,7 @@ def _try(
     values: list[Values] | None,
     search: _Search,
     tolerance: float,
+    options: SearchOptions,
 ) -> tuple[Any, _Gain]:
     """Try one damped step of every run; returns the states after the step, and its result.
 
@@ -382,12 +403,12 @@ def _try(
     # convergence by the linear model
     size, unit = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
     # near the end a step changes the cost by less than the cost's rounding, which cannot be judged
-    small = (size < tolerance * unit) | (np.abs(promised) < COST_ROUNDING * cost)
-    last = search.remaining(size) < tolerance * unit
+    small = (size < tolerance * unit) | (np.abs(promised) < options.cost_rounding * cost)
+    last = search.remaining(size, options) < tolerance * unit
     usable = [part.usable for part in normal.parts]
     any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     trial = problem.problem.retract(state, shared, np.concatenate(own, axis=1))
-    if np.all(search.undamped & any_usable & (small | last)):
+    if np.all(search.undamped(options) & any_usable & (small | last)):
         # full steps as short as these decrease the cost as predicted: no trial is needed
         every = np.ones(len(cost), dtype=bool)
         stop = [Stop.CONVERGED] * len(cost)
@@ -399,25 +420,29 @@ def _try(
         for part, use in zip(values, usable, strict=True)
     )
     ratio = (cost - cost_trial) / np.maximum(promised, 1e-300)
-    accepted = cost_trial <= cost * (1 + COST_ROUNDING)
+    accepted = cost_trial <= cost * (1 + options.cost_rounding)
     small |= accepted & last
     # a step that is refused by rounding only is taken: the linear model is the better evidence
-    little = (
-        ~accepted & (promised < (REFUSED_STEP_TOLERANCE * unit) ** 2) & (damping < STRONG_DAMPING)
-    )
+    least = options.refused_step_tolerance
+    little = ~accepted & (promised < (least * unit) ** 2) & (damping < options.strong_damping)
     small, accepted = (
         small | little,
-        accepted | (little & (cost_trial - cost < REFUSED_STEP_TOLERANCE**2)),
+        accepted | (little & (cost_trial - cost < least**2)),
     )
-    stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
-    cost, search = np.where(accepted, cost_trial, cost), search.after(accepted, ratio, size)
+    stop = [
+        _reason(*run, options) for run in zip(any_usable, small, accepted, damping, strict=True)
+    ]
+    cost = np.where(accepted, cost_trial, cost)
+    search = search.after(accepted, ratio, size, options)
     return trial, _Gain(accepted, values, cost, search, normal.matrix, stop)
 
 
-def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
+def _reason(
+    usable: bool, small: bool, accepted: bool, damping: float, options: SearchOptions
+) -> Stop:
     """Stop reason of one run after a step."""
     if not usable:
         return Stop.NOT_FINITE
-    if small and damping < STRONG_DAMPING:
+    if small and damping < options.strong_damping:
         return Stop.CONVERGED
-    return Stop.STALLED if not accepted and damping >= MOST_DAMPING else Stop.RUNNING
+    return Stop.STALLED if not accepted and damping >= options.most_damping else Stop.RUNNING

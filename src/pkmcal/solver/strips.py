@@ -182,7 +182,7 @@ class Eliminated(NamedTuple):
         return rows.mT @ rows
 
 
-def eliminated(rows: Compact, damping: Array) -> Eliminated:
+def eliminate_strips(rows: Compact, damping: Array) -> Eliminated:
     """Eliminate the own unknowns with Marquardt damping (B,), zero for none.
 
     The damping's rows sqrt(damping) diag(column norms) are appended, so that a configuration that
@@ -291,7 +291,7 @@ class NormalPart(NamedTuple):
 
 def _part(rows: Compact, damping: Array) -> NormalPart:
     """Reduced normal equations of one part."""
-    eliminated_part = eliminated(rows, damping)
+    eliminated_part = eliminate_strips(rows, damping)
     taken_up = flat(eliminated_part.along_strips).mT @ flat(eliminated_part.fitted[..., None])
     residual = flat(rows.by_shared).mT @ flat(eliminated_part.residual[..., None])
     gradient = eliminated_part.slope + (residual - taken_up)[..., 0]

@@ -32,7 +32,7 @@ TO_FILL = {
     "board.yaml": "write down which board it is, and measure its squares",
 }
 """Task that remains for the user in each file."""
-STARTER_PLACE_NAMES = ("front", "left", "right", "back")
+STARTER_STATION_NAMES = ("front", "left", "right", "back")
 OBSERVE_ENTRY_VALUES = {"legs": "legs", "board": "board", "both": "[legs, board]"}
 STARTER_BOARD_TEXT = """\
 # The board on the platform: a ChArUco board printed on something stiff and flat. Other kinds, and
@@ -160,8 +160,8 @@ def board_text(square: int = STARTER_SQUARE_SIDE) -> str:
 def _station_names(count: int) -> list[str]:
     """Names of the stations."""
     return [
-        *STARTER_PLACE_NAMES,
-        *(f"place{k + 1}" for k in range(len(STARTER_PLACE_NAMES), count)),
+        *STARTER_STATION_NAMES,
+        *(f"place{k + 1}" for k in range(len(STARTER_STATION_NAMES), count)),
     ][:count]
 
 
@@ -262,7 +262,7 @@ def _starter_texts(name: str) -> tuple[str, ...]:
                 (True, False),
                 (True, False),
                 OBSERVED_CHOICES,
-                range(1, len(STARTER_PLACE_NAMES) + 1),
+                range(1, len(STARTER_STATION_NAMES) + 1),
             )
         )
     return (template,)

@@ -39,12 +39,12 @@ from pkmcal.identify.gauge import (
     in_gauge,
     transformation,
 )
-from pkmcal.identify.parameter_estimates import ROUNDING_SIGMA
 from pkmcal.identify.start import middle_pose
 from pkmcal.identify.state import State
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import VERDICT
+from pkmcal.levels import ROUNDING
 from pkmcal.measurements import OWN_SHADING, SHADING_CORRELATION_ANGLE, SHADING_SIGMA
 from pkmcal.measurements.edges import EdgeData
 from pkmcal.measurements.effects import SHIFT_SIGMA, lines
@@ -52,7 +52,7 @@ from pkmcal.measurements.poses import PoseData
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.simulation.edges import EDGE_TURN_PLACES, moved_outward
+from pkmcal.simulation.edges import EDGE_TURN_POINTS, moved_outward
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver.search import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
@@ -224,7 +224,7 @@ class SimulatedCalibrations:
         covariance = np.zeros((len(theta),) * 2) if fit.covariance is None else fit.covariance[run]
         true_theta = machine.parameters.unit_axes(in_gauge(machine, true, self.gauge).theta)
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        sigma = np.where(sigma > ROUNDING_SIGMA, sigma, np.nan)
+        sigma = np.where(sigma > ROUNDING, sigma, np.nan)
         # An axis is a unit vector: its largest component follows from the other two, and changes
         # only to second order when the axis turns.
         axes = machine.parameters.axes
@@ -300,7 +300,7 @@ def tool_error_and_sigma(
     variance = np.einsum("kip,pq,kiq->ki", by_parameters, covariance, by_parameters)
     out = np.full((2, len(joints), 6), np.nan)
     out[0, good], out[1, good] = error, np.sqrt(np.maximum(variance, 0.0))
-    out[:, out[1] < ROUNDING_SIGMA] = np.nan  # the machine cannot move in this direction
+    out[:, out[1] < ROUNDING] = np.nan  # the machine cannot move in this direction
     return out[0], out[1]
 
 
@@ -394,13 +394,13 @@ def _measured_edges(
         # Exact edge normals, and their rotations by a shift and a tilt of one pixel.
         exact = edge_normal(u, m, radius[:, own], SIDE_SIGNS[edges.side[own]])
         span = edges.span[own]
-        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, EDGE_TURN_PLACES)
+        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, EDGE_TURN_POINTS)
         points = contour_point(
             a[:, :, None], u[:, :, None], exact[:, :, None], radius[:, own, None],
             np.broadcast_to(along, (runs, *along.shape)),
         )  # fmt: skip
         rays = points / np.sqrt(dot(points, points))[..., None]
-        middle = rays[:, :, EDGE_TURN_PLACES // 2]
+        middle = rays[:, :, EDGE_TURN_POINTS // 2]
         frame = tangent_basis(exact, middle)
         flat = (x.reshape(-1, *x.shape[2:]) for x in (exact, frame, rays))
         shift, tilt = moved_outward(camera, *flat)

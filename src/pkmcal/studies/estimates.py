@@ -94,7 +94,7 @@ class ToolPlaces(NamedTuple):
     readings: Array
 
 
-def tool_places(data: SimulatedRuns, wanted: Array) -> ToolPlaces:
+def tool_positions(data: SimulatedRuns, wanted: Array) -> ToolPlaces:
     """Poses near the wanted ones (n, 4, 4) that each true machine can reach, and its readings."""
     layout, theta = data.machine.layout, data.theta[:, None]
     poses = on_manifold(layout, theta, wanted).T_base_platform if layout.n_internal else wanted

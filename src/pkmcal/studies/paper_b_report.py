@@ -72,7 +72,7 @@ PAPER_B_COLUMNS = [
     Column("pixel", 3, 3),
     Column("cad", 1, 1),
 ]
-DRAWN_EDGE_PLACES = 9
+DRAWN_EDGE_POINTS = 9
 """Number of points of a plotted edge."""
 DRAWN_ERROR_ENLARGEMENT = 10.0
 """Factor by which plotted errors are enlarged."""
@@ -327,9 +327,9 @@ def _configuration_plot(ran: ControlledHexapod, readings: Array) -> dict[str, An
     machine, camera, T = ran.eye.true.machine, ran.eye.camera, ran.eye.true.T_camera_base
     pose = machine.forward(readings)
     edges = (
-        ran.eye.points(pose[None], readings[None], DRAWN_EDGE_PLACES)
+        ran.eye.points(pose[None], readings[None], DRAWN_EDGE_POINTS)
         .pixel[0]
-        .reshape(-1, 2, DRAWN_EDGE_PLACES, 2)
+        .reshape(-1, 2, DRAWN_EDGE_POINTS, 2)
     )
     ends = machine.ends_at(readings, pose)
     base, platform = apply(T, ends.a), apply(T, ends.b)

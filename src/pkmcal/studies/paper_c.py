@@ -30,7 +30,7 @@ from pkmcal.studies.estimates import (
     joint,
     nominal_estimate,
     tool_errors,
-    tool_places,
+    tool_positions,
 )
 from pkmcal.studies.paper_c_machine import (
     PAPER_C_BOARD_POSE,
@@ -178,7 +178,7 @@ class H4ByBoard:
         """Errors of the tool; for the paper's machine as truth, also the paper's validation."""
         space, lines = batch.generator(COMPARED_POSES_STREAM), batch.generator(RULED_LINES_STREAM)
         near, far = (
-            tool_places(data, workspace(PAPER_C_COMPARED_POSES, space, larger))
+            tool_positions(data, workspace(PAPER_C_COMPARED_POSES, space, larger))
             for larger in (1.0, LARGER_WORKSPACE_FACTOR)
         )
         papers = batch.population == "design"

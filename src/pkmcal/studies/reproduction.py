@@ -22,7 +22,6 @@ from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Key, StudySetting
 from pkmcal.wording import brief, count, number
 
-REPRODUCED_PAPERS = ("a", "b", "c")
 PrintedFigures = Mapping[Key, Mapping[str, str]]
 """Figures of a prototype as printed, by key and quantity."""
 MONTE_CARLO_NOTE = ", its Monte-Carlo error aside"

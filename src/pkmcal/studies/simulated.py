@@ -129,7 +129,7 @@ def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
         mounts = (Mount("board", "platform"),)
     stations = len(view.T_camera_base)
     return Measurements(
-        _places_of_axes(view),
+        _positions_of_axes(view),
         data.joints[run, :n],
         data.noise.reading,
         stations,
@@ -139,7 +139,7 @@ def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
     )
 
 
-def _places_of_axes(view: Viewpoints) -> EdgeSet:
+def _positions_of_axes(view: Viewpoints) -> EdgeSet:
     """One edge for each axis, with its indices and no numbers."""
     legs = view.legs.reshape(-1)
     n, each = len(legs), view.legs.shape[1]

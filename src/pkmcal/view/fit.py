@@ -29,7 +29,7 @@ LEAST_CHANCE_DISPLAYED = 1e-9
 """Probability below which no digits are displayed."""
 
 
-def recognised_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
+def localized_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
     """Localized pose with its overlay, and in words how certain the pose is.
 
     The search starts at the request's pose, or everywhere. Without success the pose remains

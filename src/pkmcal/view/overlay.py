@@ -99,9 +99,9 @@ def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
 
 def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     """Pose in the form of session.yaml, with the digits that are written there."""
-    from pkmcal.simulation.placement import StationPlace
+    from pkmcal.simulation.placement import StationPose
 
-    return StationPlace.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
+    return StationPose.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
 
 
 def _joint(viewed: Viewed, request: ViewRequest, k: int) -> Array:

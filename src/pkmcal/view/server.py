@@ -68,9 +68,9 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return edge_search(viewed, request)
 
     def fit(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
-        from pkmcal.view.fit import recognised_overlay
+        from pkmcal.view.fit import localized_overlay
 
-        return recognised_overlay(viewed, request)
+        return localized_overlay(viewed, request)
 
     def save(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
         pose = placed_by_hand(viewed, request).T_camera_base

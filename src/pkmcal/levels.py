@@ -1,0 +1,41 @@
+"""Levels that decisions of all packages share: what is rounding, negligible, few, a majority, or
+more than noise.
+
+Probabilities of false alarms are in :mod:`pkmcal.identify.false_alarm` and, of hypotheses, in
+:mod:`pkmcal.outcome.hypotheses`. Limits of one algorithm are fields of its options.
+"""
+
+from __future__ import annotations
+
+from math import radians
+
+ROUNDING = 1e-9
+"""Size, relative or in m and rad, below which a number is rounding: computations with exact
+derivatives leave 1e-12 to 1e-14, decimal text of files less than a nanometre."""
+NEGLIGIBLE = 0.01
+"""Share of an effect or of a standard deviation that is negligible: added independently, it changes
+the whole by 5e-5."""
+FEW = 1 / 3
+"""Share of the expected measurements below which too few were made."""
+MAJORITY = 0.5
+"""Share beyond which more are than are not."""
+NEARLY_ALL = 0.9
+"""Share from which the rest does not matter: a tenth less changes a standard deviation by 5 %."""
+CAUSE_SHARE = 0.3
+"""Share of an effect from which a single cause is named beside others."""
+NAMED_SHARE = 0.15
+"""Share of the greatest of several changes, each in its prior sigma, from which a parameter is
+named."""
+OUTLIER_SIGMAS = 3.0
+"""Standard deviations beyond which one of many measurements is an outlier: 3 in 1000 of normal
+errors."""
+CONTRADICTION_SIGMAS = 5.0
+"""Standard deviations beyond which a statement is contradicted: 6 in 10^7 of normal errors."""
+NOISE_EXCESS = 1.5
+"""Ratio of errors to their standard deviations that is no reason for a report: standard deviations
+contain noise, and shading and lenses add a few tenths in any images."""
+ALIGNED_ANGLE = radians(10.0)
+"""Angle (rad) to an axis or a plane within which a direction has its name."""
+TRANSLATION_TURN = radians(3.0)
+"""Rotation (rad) of a platform below which it only translates: misaligned axes rotate a platform
+that should only shift."""
