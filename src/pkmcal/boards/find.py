@@ -143,7 +143,7 @@ def charuco_detector(data: dict[str, Any], quick: bool = False) -> Any:
 
 
 def _thresholds(quick: bool) -> Any:
-    """How OpenCV looks for markers: by three thresholds, or quick, by the finest alone."""
+    """Parameters of OpenCV's marker detection: three thresholds, or quick, the finest alone."""
     import cv2
 
     how = cv2.aruco.DetectorParameters()
@@ -249,7 +249,7 @@ def find_chessboard(
 def _attempts(
     image: Integers, counts: tuple[int, int], quick: bool, options: BoardDetectionOptions
 ) -> Iterator[Array]:
-    """What OpenCV finds by several ways, the fastest and most successful first."""
+    """Corners by OpenCV's detectors in turn, the fastest and most successful first."""
     import cv2
 
     thorough = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -316,7 +316,8 @@ def _oriented(image: Integers, grid: Array) -> Array:
 def _first_square_light(image: Integers, grid: Array) -> bool:
     """True where the square whose last corner is the grid's first is lighter than its neighbours.
 
-    Told by all inner squares, by turns of equal colour, since one may lie in a shadow.
+    Decided by all inner squares, of which alternate ones have equal colours, since one may lie in
+    a shadow.
     """
     centre = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     x, y = np.rint(centre).astype(int).reshape(-1, 2).T
@@ -353,7 +354,7 @@ def _fitted(image: Integers, board: Board, raw: Raw, options: BoardDetectionOpti
         )
     window = Window(options.reach, margin, True)
     fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window, options=options)
-    # How lines bend is told by the fitted corners; the detector's are too rough for it.
+    # The bend of lines is measured by the fitted corners; the detector's are too rough for it.
     sides, bends = _axes(board, ids, fitted.pixels)
     if np.abs(bends).max() * options.reach**2 / 2 < options.straight:
         return fitted
@@ -410,7 +411,9 @@ def _nanmean(*parts: Array) -> Array:
 
 
 def _marker_axes(ids: Integers, pixels: Array) -> Array:
-    """As :func:`_axes`, with a marker's sides, away from the corner; ids come in fours."""
+    """Axes of a marker's corners, as :func:`_axes`, with the marker's sides away from the corner;
+    ids come in fours.
+    """
     corner = pixels.reshape(-1, 4, 2)
     top, right = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1]
     bottom, left = corner[:, 2] - corner[:, 3], corner[:, 3] - corner[:, 0]
@@ -420,10 +423,11 @@ def _marker_axes(ids: Integers, pixels: Array) -> Array:
 
 
 class Window(NamedTuple):
-    """Which pixels around a corner count, in squares of the board from the corner.
+    """Pixels around a corner that are fitted, in squares of the board from the corner.
 
-    reach : as far along the edges. margin : as far across them (a ChArUco board's markers begin
-    behind it); reach again where nothing is printed inside the squares.
+    reach : extent along the edges.
+    margin : extent across them (a ChArUco board's markers begin behind it); equal to ``reach``
+        where nothing is printed inside the squares.
     saddle : two dark squares meet at the corner, not one.
     """
 
@@ -533,9 +537,9 @@ def _normals(angle: Array) -> Array:
 
 
 class _Shape(NamedTuple):
-    """What a corner's picture is made of: offsets x, y of its pixels from where it is looked for
-    (n, 2, m) px, curvatures (n, 2) 1/px of its two edges towards their positive sides, and whether
-    two dark squares meet.
+    """Model of the image of a corner: offsets x, y of its pixels from the predicted corner (n, 2,
+    m) px, curvatures (n, 2) 1/px of its two edges towards their positive sides, and whether two
+    dark squares meet.
     """
 
     offsets: Array
@@ -628,7 +632,7 @@ class _Fit(NamedTuple):
         return after, step
 
     def select(self, keep: Booleans) -> _Fit:
-        """Of some of the corners."""
+        """Fit of some of the corners."""
         if keep.all():
             return self
         parts = self._asdict().items()
@@ -708,7 +712,7 @@ def _judged(
     scale: Array,
     options: BoardDetectionOptions,
 ) -> Corners:
-    """Where the fit is a corner, and how sure its place is by what it leaves unexplained."""
+    """Corners that the fit accepts, with standard deviations by its residuals."""
     p = fitted.unknowns
     total = np.maximum(weight.sum(axis=1), 1e-9)
     mean = np.sum(weight * grey, axis=1) / total

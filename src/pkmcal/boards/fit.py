@@ -358,12 +358,15 @@ def _robust_scale(off: Array, sigma: Array, visible: Booleans) -> float:
 
 
 class BoardPoses(NamedTuple):
-    """Where a board was in each of V views.
+    """Poses of a board in V views.
 
-    T_camera_board : (V, 4, 4). covariance : (V, 6, 6) of (omega, tau), left perturbation, by the
-    corners' noise alone. by_intrinsics : (V, 6, n) derivative by the camera's parameters; with
-    their covariance C a pose's whole covariance is covariance + by_intrinsics C by_intrinsics^T.
-    residuals : (V, N, 2) px. weight : (V, N). noise : px beyond the corners' own.
+    T_camera_board : (V, 4, 4).
+    covariance : (V, 6, 6) of (omega, tau), left perturbation, by the corners' noise alone.
+    by_intrinsics : (V, 6, n) derivative by the camera's parameters; with their covariance C a
+        pose's whole covariance is covariance + by_intrinsics C by_intrinsics^T.
+    residuals : (V, N, 2) px.
+    weight : (V, N).
+    noise : px beyond the corners' own.
     """
 
     T_camera_board: Array
@@ -406,10 +409,10 @@ def settled_poses(camera: Camera, views: Views, start: Array | None = None) -> A
 
 
 def tilted_back(T_camera_board: Array, points: Array) -> Array:
-    """The pose that looks almost the same from far away: the board tilted the other way.
+    """Pose of the board tilted the other way, which from far away has almost the same image.
 
-    Half a turn about the line of sight through the board's middle undoes, in the picture, half a
-    turn of the board about its own normal.
+    In the image, half a turn about the line of sight through the board's middle cancels half a turn
+    of the board about its own normal.
     """
     middle = points.mean(axis=0)
     rot = T_camera_board[..., :3, :3]

@@ -386,7 +386,7 @@ def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> S
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
-    # a pose that the machine cannot take is told before any work
+    # a pose that the machine cannot reach is reported before any work
     platform_poses(session, most=not legs_stations(session))
     refinement_of(session, refine_camera)
     clock.lap("load")
@@ -575,7 +575,7 @@ def _findings(
         measurements.n_stations,
         estimate.machine.n_legs,
     )
-    if not len(measurements.edges):  # of no leg can be said that it was not seen
+    if not len(measurements.edges):  # no leg can be reported as not visible
         observed = np.ones_like(observed)
     values = identifiability(estimate.linearized.info, estimate.machine)
     counted = conditions(estimate.machine, observed) if len(measurements.edges) else ()

@@ -1,9 +1,8 @@
-"""What a session's images and tables measured, put together; cameras refined with it.
+"""Measurements of a session as one set, and the refinement of its cameras.
 
-A camera's intrinsics, where they are refined, are those of its calibration plus F u: F F^T is the
-calibration's covariance, and the u are unknowns of the estimate with unit variance. The focal
-lengths of images by hand breathe besides: each image's are larger than its camera's by an
-unknown of its own.
+The intrinsics of a refined camera are those of its calibration plus F u: F F^T is the calibration's
+covariance, and the u are unknowns of the estimate with unit variance. The focal lengths of images
+by hand breathe besides: those of each image exceed its camera's by an unknown of its own.
 """
 
 from __future__ import annotations
@@ -33,12 +32,14 @@ from pkmcal.session.load import Session
 
 @dataclass(frozen=True)
 class CameraRefinement:
-    """The cameras of a session and where their refinement stands.
+    """Cameras of a session, and the present state of their refinement.
 
-    files, calibrated : names and cameras as calibrated, C of them. factor : (C, n, r) the F above,
-    r = 0 where cameras are held. at : (C, r). of_station : (S,) file of each station's camera.
-    breathes : (S,) whether the station is an image by hand. breath : (S,) excess of its focal
-    lengths, relative.
+    files, calibrated : names and cameras as calibrated, C of them.
+    factor : (C, n, r) the F above, r = 0 where cameras are held.
+    at : (C, r) the u.
+    of_station : (S,) file of each station's camera.
+    breathes : (S,) whether the station is an image by hand.
+    breath : (S,) excess of its focal lengths, relative.
     """
 
     files: tuple[str, ...]
@@ -67,7 +68,7 @@ class CameraRefinement:
         return self.refined or bool(self.breathes.any())
 
     def camera(self, file: str) -> Camera:
-        """A camera with its intrinsics at the present place."""
+        """Camera with its present intrinsics."""
         camera = self.calibrated[self.files.index(file)]
         if not self.refined:
             return camera
@@ -75,13 +76,13 @@ class CameraRefinement:
         return replace(camera, parameters=camera.parameters + change)
 
     def at_station(self, number: int) -> Camera:
-        """The camera of a station, with its own focal lengths where these breathe."""
+        """Camera of a station, with its own focal lengths where these breathe."""
         camera = self.camera(self.of_station[number])
         excess = self.breath[number] * camera.focal_part
         return replace(camera, parameters=camera.parameters + excess)
 
     def of(self, stations: Integers) -> CameraRefinement:
-        """The same for some of the stations, by their numbers."""
+        """Refinement of some of the stations, by their numbers."""
         return replace(
             self,
             of_station=tuple(self.of_station[k] for k in stations),
@@ -90,7 +91,7 @@ class CameraRefinement:
         )
 
     def change(self, file: str) -> Array:
-        """What the intrinsics have changed by so far, (n,), as wide as the widest camera's."""
+        """Change of a camera's intrinsics so far, (n,), padded to the widest camera's."""
         number = self.files.index(file)
         return self.factor[number] @ self.at[number]
 
@@ -104,7 +105,7 @@ class CameraRefinement:
         return replace(self, at=at, breath=breath)
 
     def result(self, estimate: Estimate, file: str) -> Camera:
-        """A camera as the last estimate has it, with its covariance."""
+        """Camera by an estimate, with its covariance."""
         camera = self.updated(estimate).camera(file)
         if not self.refined:
             return camera
@@ -116,11 +117,12 @@ class CameraRefinement:
 
 
 def edges_by_camera(observation: Observation, cameras: Sequence[Camera]) -> Array:
-    """Turns (N, 2, n) of the measured normals by their camera's parameters, their pixels held.
+    """Derivative (N, 2, n) of the measured normals by their camera's parameters, at fixed pixels.
 
-    cameras : (S,) of the stations that have one, which come first; n of the widest. A plane that
-    holds the rays r has ``r . n = 0``; as rays turn by dr, ``r . dn = -n . dr``, least squares over
-    the pixels that support an edge.
+    cameras : (S,) of the stations that have one, which come first; n of the widest.
+
+    A plane that holds the rays r has ``r . n = 0``; as rays rotate by dr, ``r . dn = -n . dr``,
+    least squares over the pixels that support an edge.
     """
     edges, at = observation.edges, observation.point_edge
     widest = max((len(camera.parameters) for camera in cameras), default=0)
@@ -139,9 +141,9 @@ def edges_by_camera(observation: Observation, cameras: Sequence[Camera]) -> Arra
 
 
 def refinement_of(session: Session, refine: bool) -> CameraRefinement:
-    """The session's cameras, held or to be refined; an InputError where there is none.
+    """Cameras of the session, held or to be refined; raises InputError if there are none.
 
-    A camera of which EXIF alone tells is refined in any case.
+    A camera with intrinsics by EXIF alone is refined in any case.
     """
     cameras = {s.camera_file: s.camera for s in session.stations}
     rough = {s.camera_file for s in session.stations if s.from_exif}
@@ -169,8 +171,8 @@ def refinement_of(session: Session, refine: bool) -> CameraRefinement:
 
 
 def covariance_root(camera: Camera) -> Array:
-    """F (n, r) of a camera; what its calibration held fixed has no variance and no column. A camera
-    whose file states no covariance has a usual one.
+    """F (n, r) of a camera; parameters that its calibration held have no variance and no column. A
+    camera whose file states no covariance has a usual one.
     """
     stated = camera.covariance
     covariance = camera.usual_covariance() if stated is None else stated
@@ -187,8 +189,11 @@ def measurements_of(
     edges: EdgeSet | None = None,
     cameras: CameraRefinement | None = None,
 ) -> Measurements:
-    """What is measured; no cameras at a first look, which is too coarse to refine any."""
-    # What targets are fixed to: the board, then each tracker's own, then the points of links.
+    """Measurements of a session's images and tables, by the present cameras.
+
+    cameras : None for the first, coarse estimate, which cannot refine any.
+    """
+    # Mounts: the board, then each tracker's target, then the points of links.
     mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
     poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
     focal_at = np.zeros(0)
@@ -236,7 +241,7 @@ def measurements_of(
 
 
 def _with_focal(measured: Set, cameras: CameraRefinement) -> Set:
-    """What was measured, with what the excess of each image's focal lengths does to it."""
+    """Measurements with their derivative by the excess of each image's focal lengths."""
     each = [
         cameras.camera(file) if breathes else None
         for file, breathes in zip(cameras.of_station, cameras.breathes, strict=True)
@@ -245,8 +250,10 @@ def _with_focal(measured: Set, cameras: CameraRefinement) -> Set:
 
 
 def by_focal(by: Array, station: Integers, cameras: Sequence[Camera | None]) -> Array:
-    """What focal lengths that grow by their own size do, (N, d), where measurements answer to their
-    camera's parameters by ``by`` (N, d, n). station : (N,); of those without a camera nothing.
+    """Derivative (N, d) of measurements by the relative excess of the focal lengths, from that by
+    their camera's parameters ``by`` (N, d, n).
+
+    station : (N,); zero for stations without a camera.
     """
     focal = np.zeros((int(station.max(initial=-1)) + 1, by.shape[-1]))
     for k, camera in enumerate(cameras[: len(focal)]):

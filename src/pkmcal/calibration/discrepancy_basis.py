@@ -1,11 +1,11 @@
-"""What a session's model may leave out smoothly: components of the discrepancy, and what to say.
+"""Components of the model discrepancy of a session, and their findings.
 
-Errors of the readings over the workspace (legs that give way under load, commanded axes that
-droop), with the motors' last steps (backlash, lag), with time (warmth); a base that moves with the
+Errors of the readings over the workspace (legs that yield under load, commanded axes that droop),
+with the motors' last steps (backlash, lag), with time (warming); a base that moves with the
 platform; stations that creep; legs that are no straight cylinders; a bed that is not flat. Heights
-know only the last: what else varies over the workspace lifts the tool as an uneven bed does. Each
-is one entry of
-:func:`discrepancy_components`; :mod:`pkmcal.identify.discrepancy` says how their scales are found.
+determine only the last: other errors over the workspace lift the tool as an uneven bed does. Each
+is one entry of :func:`discrepancy_components`; their scales are estimated in
+:mod:`pkmcal.identify.discrepancy`.
 """
 
 from __future__ import annotations

@@ -203,7 +203,7 @@ def size_notes(
         if sigma <= UNTOLD_BOARD_SIZE_SIGMA * tolerance:
             yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
-        # of the estimate's two sources, the prior is the file's: the rest is what all else tells
+        # without the prior from the file, the estimate is that of all other data
         other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
         facts = {"tolerance": 100 * tolerance}
         if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT * tolerance:

@@ -99,9 +99,9 @@ def upside_down(session: Session, turns: RefinementResult) -> tuple[Ranked[Upsid
         own = [k for k, (mine, _) in enumerate(cameras.values()) if mine == file]
         value = np.concatenate([fits[k].value for k in own])
         sigma = np.concatenate([fits[k].sigma for k in own])
-        reference_values = _file_sigma(camera)
-        alone = [_log_odds(value[[k]], sigma[[k]], reference_values) for k in range(len(own))]
-        odds = _log_odds(value, sigma, reference_values)
+        file_sigma = _file_sigma(camera)
+        alone = [_log_odds(value[[k]], sigma[[k]], file_sigma) for k in range(len(own))]
+        odds = _log_odds(value, sigma, file_sigma)
         if odds > OPTIONS.report and min(alone) > -OPTIONS.report:
             names = [list(cameras)[k] for k in own]
             hypothesis = upside_down_images(file, names, camera.turned_by_half())
@@ -124,8 +124,8 @@ def _file_sigma(camera: Camera) -> float:
         return np.inf
     if camera.covariance is None:
         return USUAL_CENTRE_ERROR / length
-    reference_values = camera.covariance[CENTER, CENTER] + LEAST_CENTRE_ERROR**2 * np.eye(2)
-    return float(centre @ np.linalg.solve(reference_values, centre)) ** -0.5
+    covariance = camera.covariance[CENTER, CENTER] + LEAST_CENTRE_ERROR**2 * np.eye(2)
+    return float(centre @ np.linalg.solve(covariance, centre)) ** -0.5
 
 
 def _log_odds(value: Array, sigma: Array, file_sigma: float) -> float:

@@ -418,14 +418,14 @@ def prior_station_poses(session: Session, boards: Boards) -> Array:
     """
     given = [station.T_camera_base for station in session.stations]
     given = boards.joined(given) + _tracker_starts(session)
-    reference_values = np.array([np.full((4, 4), np.nan) if T is None else T for T in given])
-    reference_values = reference_values.reshape(-1, 4, 4)
+    T_camera_base = np.array([np.full((4, 4), np.nan) if T is None else T for T in given])
+    T_camera_base = T_camera_base.reshape(-1, 4, 4)
     by_hand = np.array([station.handheld for station in session.stations], dtype=bool)
-    lost = np.isnan(reference_values[: len(session.stations), 0, 0]) & ~by_hand
+    lost = np.isnan(T_camera_base[: len(session.stations), 0, 0]) & ~by_hand
     legs_tell = any(lost[k] and k not in boards.stations for k in legs_stations(session))
     if boards.body == "base" or not boards.stations or legs_tell or not lost.any():
-        return reference_values
-    return _by_poses(session, boards, reference_values)
+        return T_camera_base
+    return _by_poses(session, boards, T_camera_base)
 
 
 def _by_poses(session: Session, boards: Boards, start_poses: Array) -> Array:

@@ -131,7 +131,7 @@ def model_violations(
     listed = [one for family in families for one in family]
     first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
-    reference_values = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
+    tube_scores = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
     in_view = np.flatnonzero(estimate.configurations)
 
     def declared(k: int) -> Column:
@@ -152,8 +152,8 @@ def model_violations(
             beside=beside,
             variance=1 + measurements.imputation_covariance,
         )
-        value = tests.significant([k for k, _ in reference_values])
-        return tests, [*value, *reference_values]
+        value = tests.significant([k for k, _ in tube_scores])
+        return tests, [*value, *tube_scores]
 
     tests, value = tested(())
     discrepancy = discrepancy_of(
@@ -308,7 +308,7 @@ def _of_lens(facts: Mapping[str, Any], **where: str) -> Callable[[Array, Array],
 
 @dataclass(frozen=True)
 class CameraChange:
-    """What a change of cameras' parameters does to all that they see: edges (N, 2, n) and poses (M,
+    """Derivative of measurements by a change of cameras' parameters: edges (N, 2, n) and poses (M,
     6, n), with the station of each, (N,) and (M,).
     """
 

@@ -40,8 +40,8 @@ from pkmcal.wording import listed
 
 
 class MeasuredPlatforms(NamedTuple):
-    """Where n measured poses have the platform, T_base_platform (n, 4, 4), the configuration of
-    each, and the covariance (n, m, m) of the readings that follow from each.
+    """Platform poses by n measured poses, T_base_platform (n, 4, 4), the configuration of each, and
+    the covariance (n, m, m) of the readings that follow from each.
     """
 
     machine: Machine
@@ -236,8 +236,8 @@ def _misnamed(session: Session, name: str, other: str, both: bool) -> Finding:
 def _platforms(
     measurements: Measurements, estimate: Estimate, which: Integers
 ) -> tuple[Array, Array]:
-    """Where measured poses say that the platform was, T_base_platform (n, 4, 4), and the covariance
-    (n, m, m) of the readings that follow from it; NaN where the machine cannot take it.
+    """Platform poses by the measured poses, T_base_platform (n, 4, 4), and the covariance (n, m, m)
+    of the readings that follow from them; NaN where the machine cannot reach one.
     """
     poses, state = measurements.poses.select(which), estimate.state
     T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]

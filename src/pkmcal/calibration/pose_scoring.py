@@ -243,15 +243,13 @@ def rescore_poses(
         if before.edges and fits[number] / hypotheses.unit < best - MOST_BEHIND_BEST:
             break  # the prior does not allow a change that large
         try:
-            reference_values, cost = evaluate_pose(session, before, p.station, T, view)
+            scene, cost = evaluate_pose(session, before, p.station, T, view)
         except PkmcalError as error:  # such as too few legs measured
             failures.append(str(error))
             continue
-        changed = replace(
-            view, machine=reference_values.machine, all_poses=reference_values.T_base_platform
-        )
+        changed = replace(view, machine=scene.machine, all_poses=scene.T_base_platform)
         there, fit = refine_ml(
-            changed, reference_values.T_camera_base[[p.station]], one, 16, 6, SILHOUETTE_SCATTER
+            changed, scene.T_camera_base[[p.station]], one, 16, 6, SILHOUETTE_SCATTER
         )
         at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
     previous = ScoredPoses(np.stack(at), np.array(fits), np.array(paid), tuple(failures))

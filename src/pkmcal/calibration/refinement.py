@@ -1,6 +1,6 @@
-"""Observation and identification in turns: what is known so far predicts where to look.
+"""Alternating observation and identification: each estimate predicts the edges to be measured.
 
-The nominal model and the rough poses find the machine in the images; legs found to a pixel
+The nominal model and the rough poses localize the machine in the images; legs found to a pixel
 give a first estimate; that predicts edges to a pixel, whose sub-pixel positions give the next.
 Boards and tables of poses need no prediction: they are measured once.
 """
@@ -60,36 +60,36 @@ from pkmcal.solver.ranks import nonzero
 from pkmcal.wording import listed
 
 MOST_MEASUREMENT_PASSES = 3
-"""Looks at the edges, each from the estimate before, after which nothing but the machine itself is
-asked to have settled, and before which refined cameras are not."""
+"""Measurement passes after which convergence is judged by the machine's parameters alone. Refined
+cameras need all of them."""
 MOST_BAD_PASSES = 9
-"""Most looks of one that does not."""
+"""Upper bound of the measurement passes."""
 SETTLED_MACHINE_CHANGE = 2.0
-"""Standard deviations, root mean square over what the data tell, by which a look may move a machine
-that has settled: the second look moves it
-by one half or one, and looks that find other edges, of polished legs, by one again and again. Where
-a camera stands centimetres off and slides towards its place, edges lie where they are predicted,
-and each look moves the machine by four or more."""
+"""Largest change of a converged machine by a measurement pass, root mean square over the determined
+directions, in standard deviations. The second pass changes it by one half or one, and passes over
+polished legs, which measure other edges each time, by one every time. A camera that starts
+centimetres off and moves slowly towards its pose predicts edges that agree, but each pass changes
+the machine by four or more."""
 SETTLED_AT_ONCE = SETTLED_MACHINE_CHANGE / 2
-"""The same of a second look that nothing follows: after one that moves the machine by more, another
-leaves a quarter of what the way there still makes of it."""
+"""The same for ending after the second pass: if that changes the machine by more, a further pass
+reduces the remaining dependence on the starting point to a quarter."""
 SETTLED_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 10
-"""Median distance (px) of edges from their prediction below which another look changes nothing:
-the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
-far."""
+"""Median distance (px) of edges from their prediction below which a further pass changes nothing:
+the first pass corrects a pixel, the second the remaining effect of shading, and profiles reach ten
+times as far."""
 ASTRAY_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 3
-"""The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
-over the profiles' reach, so that the median of hundreds of places is half of it."""
+"""The same (px), of the first pass, above which its edges may be those of other objects: edges
+found by chance are uniform over the profiles' reach, so that their median is half of it."""
 IMPUTATION_PASSES = 6
-"""Looks from machines as likely as the one that was found: with some thirty numbers told in each,
-the deviations that they make larger are known to a twentieth."""
+"""Imputations, measurement passes from machines drawn from the estimate's distribution: with some
+thirty parameters in each, the standard deviations that they enlarge are known to a twentieth."""
 MOST_BINNING = 4
-"""Times that images are binned as at first, at most: to pictures of 256 pixels, in which a
-machine is still recognised."""
+"""Largest binning, relative to the first: to images of 256 pixels, in which a machine can still be
+localized."""
 IMAGES_FOR_WIDTH = 4
-"""StationImages of a station that are asked about that: a lens blurs all alike."""
+"""Images of a station from which that blur is estimated: a lens blurs all of them equally."""
 FEWEST_EDGES_TO_IDENTIFY = 24
-"""Edges without which there is nothing to identify: one image of a hexapod shows as many."""
+"""Fewest edges of a calibration: one image of a hexapod shows as many."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
 _OFF = (
     "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
@@ -100,12 +100,12 @@ _POINT_OFF = "the measurement lies {:.0f} standard deviations from where all oth
 
 
 class RefinementResult(NamedTuple):
-    """What the last turn left.
+    """Estimate of the last measurement pass, with its inputs.
 
-    images : as they were looked at. blur : px, of their edges, by station. scatter : of coarse
-    edges, see :class:`PriorScene`. start : from where the estimate was sought. change : by how
-    many of its deviations the last look has moved the machine, as SETTLED_MACHINE_CHANGE has it.
-    failures : why passes from machines as likely gave no estimate.
+    images : as they were measured, with their binning. blur : of their edges, px, by station.
+    scatter : of coarse edges, see :class:`PriorScene`. start : initial state of the last estimate.
+    change : of the machine by the last pass, in its standard deviations, as
+    SETTLED_MACHINE_CHANGE. failures : why imputations gave no estimate.
     """
 
     observation: Observation
@@ -122,7 +122,7 @@ class RefinementResult(NamedTuple):
 
     @property
     def reasons(self) -> tuple[Finding, ...]:
-        """A reason where the machine did not settle, and a note where passes failed."""
+        """A reason if the machine did not converge, and a note if imputations failed."""
         if self.failures:
             why = self.failures[0].rstrip(".")
             failed = note(
@@ -140,9 +140,9 @@ def refine_alternating(
     progress: CalibrationProgress,
     lap: Callable[[str], None],
 ) -> RefinementResult:
-    """Observation and identification in turns, the search narrowing.
+    """Alternate measurement passes and estimates until neither edges nor machine change.
 
-    lap : called with the name of a step that is done.
+    lap : called with the name of each completed step, for its time.
     """
     session, images, boards, _ = case
     total, machine = sum(len(p.images) for p in images), session.machine
@@ -227,15 +227,16 @@ def refine_alternating(
 def imputation_variance(
     case: Case, turns: RefinementResult, rng: np.random.Generator, progress: CalibrationProgress
 ) -> RefinementResult:
-    """The same, with what depends on where edges were looked for among the deviations.
+    """Add the variance due to the choice of edges to the covariance, by multiple imputation.
 
-    Which border is a leg's, where two lie side by side, is found by where the leg should be, and no
-    residual shows it: all edges of a look are where that look's machine has them. So they are
-    looked for from machines as likely as the one that was found, and the variance between the
-    estimates is added to that of one (Rubin, Multiple imputation for nonresponse in surveys, 1987,
-    3.1). One look is kept, not their mean: its residuals and weights are those that are told. What
-    looks scatter by hardly follows the machine that is drawn, so it counts as independent, in pairs
-    too. Of painted legs on a tripod the edges are the same from anywhere, and nothing is asked.
+    Where two borders lie side by side, the prediction decides which of them is taken for the leg's
+    edge. No residual shows a wrong choice, because all edges of a pass agree with the machine that
+    predicted them. So edges are measured again from machines drawn from the estimate's
+    distribution, and the variance between their estimates is added to the variance of one (Rubin,
+    Multiple imputation for nonresponse in surveys, 1987, 3.1). The first pass is kept, not the
+    mean, so that residuals and weights are those of the reported estimate. The estimates hardly
+    follow the machines that were drawn, so they count as independent, antithetic pairs too. Edges
+    of painted legs from a tripod do not depend on the prediction, and nothing is repeated.
     """
     session, estimate = case.session, turns.estimate
     by_hand = any(session.stations[p.station].handheld for p in turns.images)
@@ -257,7 +258,7 @@ def imputation_variance(
             failures.append(str(error))
             continue
         offsets.append(ended.state.theta)
-    variance = 1.0  # as much again as noise, where hardly a look ends
+    variance = 1.0  # as large as the noise's, if fewer than two imputations gave an estimate
     if len(offsets) > 1:
         apart = np.stack(offsets) - np.mean(offsets, axis=0)
         variance = _variance(apart, estimate) * len(offsets) / (len(offsets) - 1)
@@ -269,8 +270,10 @@ def imputation_variance(
 def _as_likely(
     session: Session, estimate: Estimate, rng: np.random.Generator
 ) -> Iterator[Estimate]:
-    """Estimates as likely as one, in pairs to both sides of it: machine, stations, cameras, and
-    platforms as the readings then have them.
+    """Draws from the estimate's distribution, in antithetic pairs.
+
+    Machine, stations and cameras are drawn; the platform's poses are by forward kinematics of the
+    readings.
     """
     assembled, info = estimate.linearized
     problem, half = info.problem, info.root[0]
@@ -290,8 +293,8 @@ def _as_likely(
 
 
 def _variance(changes: Array, estimate: Estimate) -> float:
-    """Mean square of changes (N, P) of the machine's parameters, in the variance that the noise
-    gives them.
+    """Mean square of changes (N, P) of the machine's parameters, relative to their variance due to
+    noise.
     """
     machine, n = estimate.machine, len(estimate.machine.values)
     info = estimate.linearized.info
@@ -300,7 +303,7 @@ def _variance(changes: Array, estimate: Estimate) -> float:
     noise = machine_covariance(info.problem, machine, estimate.state, shared, gauge)[:n, :n]
     covariance = estimate.joint_covariance[:n, :n]
     size = np.sqrt(np.diag(covariance))
-    size[size == 0] = np.inf  # of what is exactly known
+    size[size == 0] = np.inf  # exactly known parameters
     value, vectors = np.linalg.eigh(covariance / np.outer(size, size))
     above_rounding = nonzero(value)
     white = vectors[:, above_rounding] / np.sqrt(value[above_rounding]) / size[:, None]
@@ -317,7 +320,7 @@ def _measurement_pass(
     refine: bool,
     done: legs.ImageBatchesInUse | None = None,
 ) -> list[legs.StationEdges]:
-    """The edges of all images, where an estimate has them."""
+    """Edges of all images, measured where the estimate predicts them."""
     whole = partial(_with_silhouettes, session, estimate, scatter, refine)
 
     def station_edges(some: Sequence[StationImages]) -> list[legs.StationEdges]:
@@ -336,8 +339,10 @@ def _checked_pass(
     refine: bool,
     done: legs.ImageBatchesInUse,
 ) -> tuple[list[legs.StationEdges], Sequence[StationImages], BlurByStation]:
-    """A look, the images as they were looked at, and their blur: binned more where edges are
-    too blurred to be measured, which must not lead an estimate astray.
+    """Measurement pass, its images and their blur, by station.
+
+    Images whose edges are too blurred to be measured are binned more and measured again, before
+    they enter an estimate.
     """
     measure = partial(_measurement_pass, session, estimate=estimate, scatter=scatter, refine=refine)
     passes = measure(images, blur=blur, done=done)
@@ -355,13 +360,13 @@ def _checked_pass(
 def _blur_of(
     passes: Sequence[legs.StationEdges], images: Sequence[StationImages]
 ) -> dict[int, float]:
-    """Px, by station."""
+    """Blur (px) by station."""
     return {p.station: edges.blur for p, edges in zip(images, passes, strict=True)}
 
 
 def _width_of_edges(images: Sequence[StationImages], estimate: Estimate) -> dict[int, float]:
-    """Px, by station, by how far the steps of some images reach: profiles tell no blur that is
-    wider than they are. Nothing of stations whose edges do not tell it.
+    """Blur (px) by station, from the width of the edges in some images: profiles determine no blur
+    that is wider than themselves. Stations whose edges do not determine it are absent.
     """
     out: dict[int, float] = {}
     for p in images:
@@ -381,9 +386,10 @@ def _binned(
     *,
     more: bool,
 ) -> list[StationImages]:
-    """The images as they should be looked at, where their edges, so blurred (px) by station,
-    ask for ``more`` pixels as one, or for fewer; nothing where none does. All of one camera alike,
-    for its lens is the same.
+    """Images with the binning that the blur of their edges requires; an empty list if none changes.
+
+    blur : px, by station. more : bin more pixels than now, otherwise fewer. Images of one camera
+    are binned equally, because its lens is the same.
     """
     of_camera: dict[str, list[float]] = {}
     files = [session.stations[p.station].camera_file for p in images]
@@ -402,12 +408,12 @@ def _binned(
 def _counted(
     progress: CalibrationProgress, text: str, total: int, share: float
 ) -> legs.ImageBatchesInUse:
-    """A callback of images looked at, told with how many there are of them."""
+    """Callback that reports the number of measured images out of the total."""
     lock, done_count = Lock(), [0]
     progress(text, share)
 
     def done(more: int) -> None:
-        with lock:  # stations are looked at beside one another
+        with lock:  # stations are measured in parallel
             done_count[0] += more
             progress(f"{text}: {done_count[0]} of {total} images", share)
 
@@ -415,18 +421,17 @@ def _counted(
 
 
 def _without_camera_changes(state: State) -> State:
-    """A state whose cameras are where their edges were measured."""
+    """State without changes of the cameras: those are in the measurements."""
     other = {c: x for c, x in state.columns.items() if c not in (INTRINSICS, FOCAL_EXCESS)}
     return replace(state, columns=other)
 
 
 def initial_guess(machine: Machine, measurements: Measurements, prior_state: State) -> State:
-    """``prior_state``, or [A]'s four steps on the edges where these explain the edges better.
+    """``prior_state``, or the state by [A]'s four steps if that explains the edges better.
 
-    The four steps need no first guess, so they find the way back when the nominal model or an
-    earlier estimate has gone astray. Judged by the median misfit, which wrong edges do not move.
-    Any machine: the steps refuse in words where the data do not allow them, and ``prior_state``
-    remains.
+    The four steps need no initial guess, so they recover from a nominal model or an earlier
+    estimate that is far off. Compared by the median misfit, which is robust to wrong edges. Where
+    the steps refuse the data, ``prior_state`` remains.
     """
     from pkmcal.papers.four_step import four_step
 
@@ -444,8 +449,9 @@ def identify_poses(
     cameras: CameraRefinement,
     progress: CalibrationProgress,
 ) -> RefinementResult:
-    """The same without legs: what poses say does not depend on the estimate, but for the cameras
-    that are refined with it.
+    """Identification by boards, trackers and links alone.
+
+    Their measurements do not depend on the estimate, except through refined cameras.
     """
     progress("Identifying", 0.6)
     machine = session.machine
@@ -463,10 +469,10 @@ def identify_poses(
 
 
 def _feasible_start(session: Session, measurements: Measurements, start: State) -> State:
-    """The start where the nominal model cannot take all readings: from a first estimate by the
-    rest.
+    """Initial state with all configurations closed: where the nominal model does not close at all
+    readings, by an estimate from the others.
 
-    Raises `InputError` for readings that the machine so found cannot take either.
+    Raises `InputError` for readings at which that estimate does not close either.
     """
     drawn = session.forward.converged
     if drawn.all():
@@ -492,19 +498,21 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
 def _first_estimate(
     case: Case, total: int, progress: CalibrationProgress, lap: Callable[[str], None]
 ) -> Estimate:
-    """Of images by hand, from what was measured when they were placed; else from legs that are
-    looked for as wholes, where they should be, and, unless nearly all were there, again where the
-    first look has put them.
+    """Estimate by whole legs, to a pixel.
+
+    Images by hand have edges from their localization. In others, legs are searched as wholes
+    around their prediction, and, unless nearly all agree with the estimate, once more around its
+    own prediction.
     """
-    session, images, boards, reference_values = case
+    session, images, boards, scene = case
     begin = partial(
         start_state,
-        reference_values.machine,
-        T_camera_base_guess=reference_values.T_camera_base,
-        forward=session.forward if reference_values.machine is session.machine else None,
+        scene.machine,
+        T_camera_base_guess=scene.T_camera_base,
+        forward=session.forward if scene.machine is session.machine else None,
     )
-    if all(p.station in reference_values.edges for p in images):
-        placed = of_stations({p.station: reference_values.edges[p.station] for p in images})
+    if all(p.station in scene.edges for p in images):
+        placed = of_stations({p.station: scene.edges[p.station] for p in images})
         measurements = measurements_of(session, boards, placed)
         return bundle(session.machine, measurements, begin(measurements))
     start: State | None = None
@@ -513,7 +521,7 @@ def _first_estimate(
         ("Finding the legs again", legs.LEG_SEARCH_OPTIONS.repeated_reach, 0.4),
     ):
         done = _counted(progress, text, total, share)
-        search = partial(_whole_legs, scene=reference_values, reach=reach, done=done)
+        search = partial(_whole_legs, scene=scene, reach=reach, done=done)
         passes = _search_pass(images, search)
         measurements = measurements_of(session, boards, _edges(passes))
         lap("observe")
@@ -524,14 +532,12 @@ def _first_estimate(
         if _share_agreeing(passes, measurements.edges, estimate) > NEARLY_ALL:
             break
         start = estimate.state
-        reference_values = PriorScene(estimate.machine, start.T_camera_base, start.T_base_platform)
+        scene = PriorScene(estimate.machine, start.T_camera_base, start.T_base_platform)
     return estimate
 
 
 def _share_agreeing(passes: list[legs.StationEdges], edges: EdgeSet, estimate: Estimate) -> float:
-    """Share of the legs that were looked for, hidden ones too, that were found where all others put
-    them.
-    """
+    """Share of the searched legs, hidden ones included, that agree with the estimate."""
     missed = sum(len(station_edges.rejected) for station_edges in passes)
     leg = np.stack([edges.station, edges.configuration, edges.leg], axis=-1)
     count = len(np.unique(leg, axis=0))
@@ -569,10 +575,10 @@ def _with_silhouettes(
     images: StationImages,
     edges: legs.StationEdges,
 ) -> legs.StationEdges:
-    """A look at an image by hand, and where an edge could not be measured in it, where its
-    silhouettes lie, coarse: what has a place of its own in each image is told by few edges.
+    """Edges of an image by hand, with coarse silhouettes in place of edges that were not measured.
 
-    scatter : by how much more or less these scatter than each says.
+    The pose of such an image is determined by its own few edges, so none should be missing.
+    scatter : standard deviation of the coarse ones, relative to the stated one.
     """
     if not session.stations[images.station].handheld:
         return edges
@@ -598,9 +604,7 @@ def _with_silhouettes(
 
 
 def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
-    """Root mean square of the coarse edges' residuals, in what they state; 1 where they are too few
-    to tell.
-    """
+    """Root mean square residual of coarse edges in stated standard deviations; 1 for too few."""
     squares = estimate.edge_residuals[coarse & (estimate.edge_weights >= INLIER_WEIGHT)] ** 2
     return float(np.sqrt(squares.mean())) if squares.size > LEAST_NOISE_FREEDOM else 1.0
 
@@ -609,8 +613,10 @@ def _search_pass(
     images: Sequence[StationImages],
     measure: Callable[[Sequence[StationImages]], list[legs.StationEdges]],
 ) -> list[legs.StationEdges]:
-    """A look at all stations, repeats as one: together, or two at a time where images have to
-    be decoded for it, which runs beside Python.
+    """Edges of all stations, repeats combined.
+
+    Stations are measured together, or in parallel where their images must be decoded, which
+    releases the interpreter's lock.
     """
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in images)
     if pixels <= CACHED_IMAGE_BYTES:
@@ -638,10 +644,11 @@ def observation_of(
     estimate: Estimate,
     images: Sequence[StationImages] = (),
 ) -> Observation:
-    """The last looks joined, with what the estimate gave up among the rejected. images : as
-    they were looked at.
+    """Joined edges of the last pass, with those that the estimate rejected among the rejected.
+
+    images : as they were measured.
     """
-    # a station that observes a board alone has that of its camera, whose edge shift is in it
+    # a station that observes a board alone has its camera's, because they share the edge shift
     of_camera = {session.stations[p.station].camera_file: p.binning for p in images}
     binning = np.ones(len(estimate.state.T_camera_base), dtype=int)
     for k, station in enumerate(session.stations):

@@ -257,7 +257,7 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     for s, (name, file, number, response) in enumerate(sources):
         T_camera_base = estimate.state.T_camera_base[s]
         covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
-        reference_values = _sigma_where_identified(estimate, covariance)
+        sigma = _sigma_where_identified(estimate, covariance)
         out.append(
             {
                 "name": name,
@@ -265,8 +265,8 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
                 "response": response,
                 "binning": None if response is None else calibration.observation.binning[s],
                 "T_base_camera": inverse(T_camera_base),
-                "sigma_rotation": reference_values[:3],
-                "sigma_translation": reference_values[3:],
+                "sigma_rotation": sigma[:3],
+                "sigma_translation": sigma[3:],
                 "photographs": number,
                 **_focal_scale(calibration, s),
             }
@@ -290,13 +290,13 @@ def _station_covariance(calibration: Calibration) -> dict[str, Any]:
         for name, covariance in zip(names, covariances, strict=True)
         if None in _sigma_where_identified(estimate, covariance)
     }
-    retained_rows = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
+    determined = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
     n = len(estimate.machine.parameters)
-    rows = rows_of_stations(n, retained_rows)
+    rows = rows_of_stations(n, determined)
     joint = of_inverse_poses(
-        estimate.joint_covariance[np.ix_(rows, rows)], estimate.state.T_camera_base[retained_rows]
+        estimate.joint_covariance[np.ix_(rows, rows)], estimate.state.T_camera_base[determined]
     )
-    return {"stations": [names[k] for k in retained_rows], "rows": joint[n:]}
+    return {"stations": [names[k] for k in determined], "rows": joint[n:]}
 
 
 def rows_of_stations(n: int, stations: Integers) -> Integers:
@@ -338,15 +338,15 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
         if mount.tolerance > 0 and (estimated := next(sizes, None)):
             size = {"size": 1 + estimated[0], "sigma_size": estimated[1]}
         body = "platform" if estimate.state.on_platform[m] else "base"
-        reference_values = _sigma_where_identified(estimate, estimate.mount_covariance[m])
+        sigma = _sigma_where_identified(estimate, estimate.mount_covariance[m])
         out.append(
             {
                 "name": mount.name,
                 **size,
                 "fixed_to": body,
                 f"T_{body}_target": estimate.state.T_mount[m],
-                "sigma_rotation": reference_values[:3],
-                "sigma_translation": reference_values[3:],
+                "sigma_rotation": sigma[:3],
+                "sigma_translation": sigma[3:],
             }
         )
     return out

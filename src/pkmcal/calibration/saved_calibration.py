@@ -147,10 +147,8 @@ class SavedCalibration(CalibrationSummary):
             ],
         ]
         # statistics, if the file has all that have no default
-        reference_values = {f.name for f in fields(Statistics)}
-        statistics = {
-            k: v for k, v in (document.get("statistics") or {}).items() if k in reference_values
-        }
+        names = {f.name for f in fields(Statistics)}
+        statistics = {k: v for k, v in (document.get("statistics") or {}).items() if k in names}
         needed = {f.name for f in fields(Statistics) if f.default is MISSING}
         whole = needed <= statistics.keys()
         return Overview(
@@ -511,31 +509,31 @@ def _covariance(document: Document, saved: _Saved) -> tuple[tuple[str, ...], Arr
 
     Poses in the file are T_base_camera; the result is that of the inverse poses.
     """
-    count, reference_values = len(saved.parameters), saved.station_covariance
+    count, of_stations = len(saved.parameters), saved.station_covariance
     _check_size(document, "covariance", saved.covariance, (count, count), "list of parameters")
-    if reference_values is None:
+    if of_stations is None:
         matrix = np.array(saved.covariance)
         _check_covariance(document, "covariance", matrix)
         return (), matrix
     poses = {station.name: np.array(station.T_base_camera) for station in saved.stations}
-    if not set(reference_values.stations) <= set(poses):
+    if not set(of_stations.stations) <= set(poses):
         raise _edited(document, "station_covariance.stations", "names of the stations")
-    more = 6 * len(reference_values.stations)
+    more = 6 * len(of_stations.stations)
     key = "station_covariance"
     _check_size(
         document,
         key,
-        reference_values.rows,
+        of_stations.rows,
         (more, count + more),
         "lists of parameters and stations",
     )
-    rows = np.array(reference_values.rows).reshape(more, count + more)
+    rows = np.array(of_stations.rows).reshape(more, count + more)
     upper = np.concatenate([np.array(saved.covariance), rows[:, :count].T], axis=1)
     matrix = np.concatenate([upper, rows])
     _check_covariance(document, "covariance", matrix[:count, :count])
     _check_covariance(document, key, matrix)
-    values = np.array([poses[name] for name in reference_values.stations]).reshape(-1, 4, 4)
-    return reference_values.stations, of_inverse_poses(matrix, values)
+    values = np.array([poses[name] for name in of_stations.stations]).reshape(-1, 4, 4)
+    return of_stations.stations, of_inverse_poses(matrix, values)
 
 
 def _check_size(

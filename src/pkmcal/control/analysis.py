@@ -225,13 +225,13 @@ class _Slope:
 
 def _distinct(joints: Array, which: Booleans, goal_of: Integers) -> Integers:
     """Row numbers of the distinct poses among the selected rows, for each goal."""
-    retained_rows: list[int] = []
+    distinct_rows: list[int] = []
     for row in np.flatnonzero(which):  # few distinct poses: a loop is cheap
-        same = [k for k in retained_rows if goal_of[k] == goal_of[row]]
+        same = [k for k in distinct_rows if goal_of[k] == goal_of[row]]
         off = joints[same] - joints[row]
         if (
             not same
             or np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-1)).min() > DIFFERENT_POSE_DISTANCE
         ):
-            retained_rows.append(int(row))
-    return np.array(retained_rows, dtype=int)
+            distinct_rows.append(int(row))
+    return np.array(distinct_rows, dtype=int)

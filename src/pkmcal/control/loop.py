@@ -274,13 +274,13 @@ class VisualServo:
         stop = self._unfit(sample, used, task)
         if stop is not None:
             return stop
-        above_limit = noise > 0
+        has_noise = noise > 0
         sigma = np.full(self.machine.n_joints, np.nan)
-        if above_limit:
+        if has_noise:
             # covariance of the readings' distances: R (N^T N)^-1 R^T for rows with unit variance
             factor = task.readings @ np.linalg.inv(task.matrix.T @ task.matrix)
             sigma = noise * np.sqrt(np.sum(factor * task.readings, axis=1))
-        vague = float(sigma.max()) if above_limit else 0.0
+        vague = float(sigma.max()) if has_noise else 0.0
         if vague > UNSEEN_READING_SIGMA:
             return self._stopped(sample, Status.LOST, self._missing(sample, used))
         self._started = True
@@ -294,7 +294,7 @@ class VisualServo:
             return self._stopped(sample, Status.OUT_OF_RANGE, why)
         still = bool(np.max(np.abs(off)) <= self.tolerance)
         # a single direction has more noise than that angle: compare images in standard deviations
-        typical = _root_mean_square(task.error / np.sqrt(3)) / noise if above_limit else np.inf
+        typical = _root_mean_square(task.error / np.sqrt(3)) / noise if has_noise else np.inf
         converged = still and (error < OTHER_POSITION_ANGLE or typical < AT_GOAL_DEVIATIONS)
         warnings = self._warnings(sample, used, slowed, outside)
         if still and not converged:

@@ -101,15 +101,15 @@ def _station(
             expected=" or ".join(names),
         )
     wanted = [one for one in saved.stations if name in (None, one.name)]
-    reference_values = [one for one in wanted if eye is not None or one.name in source.cameras]
-    if not reference_values:
+    candidates = [one for one in wanted if eye is not None or one.name in source.cameras]
+    if not candidates:
         raise InputError(
             "the station's camera file was not found",
             where=str(saved.path.parent),
             expected=", ".join(sorted({one.camera for one in wanted})),
             next_step="Name the session with --session, or the camera's file with --camera",
         )
-    return reference_values[0]
+    return candidates[0]
 
 
 def _of_nominal(

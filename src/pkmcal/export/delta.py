@@ -661,10 +661,7 @@ def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array)
 
 
 def redo(source: MachineSource) -> tuple[Finding, ...]:
-    """What has to be measured again with these values in a firmware.
-
-    Nothing for a nominal model.
-    """
+    """Measurements to repeat with these values in a firmware; none for a nominal model."""
     if not source.calibrated:
         return ()
     bed = "unknown" if source.bed is None else "probed"

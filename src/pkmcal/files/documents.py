@@ -195,10 +195,10 @@ class Document:
 
         A missing field has the line of its nearest parent, and none at the top.
         """
-        reference_values = keys
-        while reference_values and reference_values not in self.lines:
-            reference_values = reference_values[:-1]
-        line = f", line {self.lines[reference_values]}" if reference_values else ""
+        nearest = keys
+        while nearest and nearest not in self.lines:
+            nearest = nearest[:-1]
+        line = f", line {self.lines[nearest]}" if nearest else ""
         return f"{self.label}{line}" + (f", {field_path(keys)}" if keys else "")
 
 

@@ -43,10 +43,11 @@ _TRANSPOSING_ORIENTATIONS = range(5, 9)
 
 @dataclass(frozen=True)
 class Exif:
-    """How an image was taken (CIPA DC-008).
+    """Settings of an image's capture (CIPA DC-008).
 
-    orientation : 1 to 8, as in the standard; 1 where the file has none. focal_35mm : focal length
-    (mm) of the lens with the same field of view on film of 36 x 24 mm; None where unknown.
+    orientation : 1 to 8, as in the standard; 1 where the file has none.
+    focal_35mm : focal length (mm) of the lens with the same field of view on film of 36 x 24 mm;
+        None where unknown.
     """
 
     orientation: int = 1

@@ -79,8 +79,8 @@ def any_unit(data: object) -> bool:
 def split_head(head: str) -> tuple[str, Unit | None]:
     """Name of a column and the unit in its head, if there is one."""
     match = _HEAD.fullmatch(head)
-    reference_values = unit(match[2] or match[3]) if match else None
-    return (match[1], reference_values) if match and reference_values else (head, None)
+    column_unit = unit(match[2] or match[3]) if match else None
+    return (match[1], column_unit) if match and column_unit else (head, None)
 
 
 def no_such(kind: str, value: object) -> str:
@@ -94,11 +94,11 @@ def _read(kind: str, value: Any) -> Any:
     match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
     if not match:
         return value
-    reference_values = unit(match[2])
-    if reference_values is None or reference_values.kind not in kind.split(" or "):
+    stated_unit = unit(match[2])
+    if stated_unit is None or stated_unit.kind not in kind.split(" or "):
         raise ValueError(no_such(kind, value))
     # decimal arithmetic, so that 269.3 mm equals 0.2693
-    return float(Decimal(match[1]) * Decimal(repr(reference_values.factor)))
+    return float(Decimal(match[1]) * Decimal(repr(stated_unit.factor)))
 
 
 Metres = Annotated[float, BeforeValidator(partial(_read, "m"))]

@@ -137,13 +137,9 @@ def _phrases(
     if kind == "missing":
         return "this is missing", None, _description(schemas) or "a value"
     if kind == "extra_forbidden":
-        reference_values = _schema_keys(schemas)
-        guess = closest(str(keys[-1]), reference_values)
-        expected = (
-            f"{guess} (known here: {', '.join(reference_values)})"
-            if guess
-            else listed(reference_values, 12)
-        )
+        allowed = _schema_keys(schemas)
+        guess = closest(str(keys[-1]), allowed)
+        expected = f"{guess} (known here: {', '.join(allowed)})" if guess else listed(allowed, 12)
         return "this key is not known", str(keys[-1]), expected or None
     # unions by a tag
     if kind in ("union_tag_invalid", "union_tag_not_found"):

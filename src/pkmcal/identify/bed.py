@@ -1,10 +1,11 @@
-"""What heights of a flat bed tell of a machine: how flat it will be, and how little of x and y.
+"""Accuracy over the bed of a machine calibrated by heights: flatness, and the little that they
+determine along x and y.
 
-What the mechanism file holds because a firmware cannot hold it otherwise, towers that lean and
-motors that go further than told, bends the bed all the same. So deviations are those of a wider
-model, in which all that has a tolerance is free and the bed is as uneven as the data show it: its
-best values say how far the machine as estimated is off, as far as the heights show that, and its
-covariance what they leave open.
+Errors that a firmware cannot represent, such as towers that lean and motors that go further than
+commanded, are held by the mechanism file and bend the bed all the same. The standard deviations are
+therefore those of a wider model, in which every value with a tolerance is free and the bed is as
+uneven as estimated. The best values of that model are the errors of the estimated machine as far as
+the heights determine them, and its covariance contains the undetermined part.
 """
 
 from __future__ import annotations
@@ -26,26 +27,31 @@ from pkmcal.solver.elimination import divisions, rows_on_shared
 from pkmcal.solver.ranks import column_space
 
 POINTS_OVER_BED = 60
-"""Places all over the bed: where nobody probed counts as well."""
+"""Points over the bed at which heights are evaluated, probed or not."""
 NOTICED_TOUCH_DEVIATIONS = 4.13
-"""Standard deviations by which a touch has to be off what all others tell of it to be noticed: one
-right touch in a thousand seems to be, and four wrong ones in five are found (W. Baarda, A testing
-procedure for use in geodetic networks, 1968)."""
+"""Standard deviations by which a wrong height is off the prediction by the others to be detected:
+with a false alarm of one in a thousand, four of five wrong ones are (W. Baarda, A testing procedure
+for use in geodetic networks, 1968).
+"""
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-"""Turn from one place to the next on a spiral that covers a disc evenly."""
+"""Angle between consecutive points on a spiral that covers a disc evenly."""
 
 
 @dataclass(frozen=True)
 class Bed:
-    """How well the platform is known over the disc about the places that were probed.
+    """Accuracy of the platform over the disc around the probed points.
 
-    radius : of the disc, m. sigma : standard deviation (m, root mean square over the disc) of the
-    platform's height above the bed, the bed's own height and tilt aside, tolerances of held values
-    included; by_drawing : the same by the nominal model's tolerances alone. sideways : of its place
-    along the bed, frames aside. size : of how much larger or smaller all is along the bed, a share.
+    radius : of the disc, m.
+    sigma : standard deviation (m, root mean square over the disc) of the platform's height above
+        the bed, apart from the bed's own height and tilt, with the prior sigmas of held values.
+    by_drawing : the same by the nominal model's prior sigmas alone.
+    sideways : standard deviation of its position along the bed, apart from frames, m.
+    size : standard deviation of the scale along the bed, a share.
     z : of the platform's origin, m, base frame, in the middle of the disc where the first table's
-    height is 0. touches : how many heights. unnoticed : m, as sigma, by which one wrong height, the
-    worst of them, bends the bed and is just not noticed; None where any would go unnoticed.
+        height is 0.
+    touches : number of heights.
+    unnoticed : m, as sigma: effect on the bed of one wrong height, the worst of them, that is just
+        not detected; None where any would not be detected.
     """
 
     radius: float
@@ -59,16 +65,18 @@ class Bed:
 
 
 def bed_by_parameters(estimate: Estimate) -> Array:
-    """How the parameters bend the bed, (n, P): for a change v of them ``norm(out @ v)`` is that of
-    the tool's height over the disc (m, root mean square), the bed's height and tilt aside.
+    """Derivative (n, P) of the bed's shape by the parameters: for a change v of them ``norm(out @
+    v)`` is the change of the tool's height over the disc (m, root mean square), apart from the
+    bed's height and tilt.
     """
     poses, _, height = _bent(estimate)
     return height / np.sqrt(len(poses))
 
 
 def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
-    """Poses (n, 4, 4) over the disc, and by the parameters there the platform's place (n, 3, P) and
-    its height above the bed (n, P), this without the bed's own height and tilt.
+    """Poses (n, 4, 4) over the disc, and derivatives by the parameters there: of the platform's
+    position (n, 3, P), and of its height above the bed (n, P), apart from the bed's own height and
+    tilt.
     """
     machine = estimate.machine
     poses = _over_the_disc(estimate.state.T_base_platform[estimate.configurations])
@@ -83,7 +91,10 @@ def _bent(estimate: Estimate) -> tuple[Array, Array, Array]:
 
 
 def bed_of(estimate: Estimate, uneven: Sequence[Column]) -> Bed:
-    """The bed of an estimate from heights alone; uneven : the model discrepancy found."""
+    """Accuracy over the bed of an estimate from heights alone.
+
+    uneven : columns of the estimated model discrepancy.
+    """
     machine = estimate.machine
     poses, by, height = _bent(estimate)
     xy = poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0)
@@ -110,8 +121,8 @@ def bed_of(estimate: Estimate, uneven: Sequence[Column]) -> Bed:
 
 
 def _over_the_disc(probed: Array) -> Array:
-    """Poses (n, 4, 4) of the platform all over the disc about the places that were probed, in the
-    plane through these.
+    """Poses (n, 4, 4) of the platform over the disc around the probed points, in the plane through
+    them.
     """
     xy = probed[:, :2, 3]
     middle = xy.mean(axis=0)
@@ -128,17 +139,17 @@ def _over_the_disc(probed: Array) -> Array:
     return out
 
 
-def _less(rows: Array, reference_values: Array) -> Array:
-    """Rows (n, P) without what the columns of ``reference_values`` (n, m) can make of them."""
-    return rows - reference_values @ np.linalg.lstsq(reference_values, rows, rcond=None)[0]
+def _less(rows: Array, span: Array) -> Array:
+    """Rows (n, P) without their projection on the columns of ``span`` (n, m)."""
+    return rows - span @ np.linalg.lstsq(span, rows, rcond=None)[0]
 
 
 def _nominal_root(machine: Machine, by: Array) -> Array:
-    """R (P, m): the nominal model's covariance R R^T of the free parameters, and of those held ones
-    that do something no free one does. by : (n, 3, P) how the parameters move the platform.
+    """R (P, m) with R R^T the prior covariance of the free parameters, and of those held ones whose
+    effect no free one has.
 
-    What a free one stands for, as a tower's place for that of the rod's lower end, would count
-    twice.
+    A held one whose effect a free one has, as the lower end of a rod and the tower's position,
+    would count twice. by : (n, 3, P) derivative of the platform's position by the parameters.
     """
     table = machine.parameters
     everything = machine_from_document(machine.document.model_copy(update={"fixed": ()})).parameters
@@ -152,9 +163,11 @@ def _nominal_root(machine: Machine, by: Array) -> Array:
 
 
 def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tuple[Array, Array]:
-    """Of the parameters in the model in which all vary that the nominal model R (P, m) lets vary,
-    and the bed as ``uneven``: how far the best values are from the estimate's (P,), and a root (P,
-    m) of their covariance.
+    """Estimate of the parameters in the wider model: difference (P,) of its best values from the
+    estimate's, and a root (P, m) of their covariance.
+
+    nominal : R (P, m), prior of the parameters that vary.
+    uneven : columns of the bed.
     """
     rows, remainder = _rows_beside(estimate, uneven)
     table = estimate.machine.parameters
@@ -173,9 +186,11 @@ def _wider(estimate: Estimate, nominal: Array, uneven: Sequence[Column]) -> tupl
 
 
 def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, Array]:
-    """What the heights say of all parameters and of the l random effects, these in their prior
-    deviations: rows (r, P + l) and residuals (r,). Poses, the bed's place and all other unknowns
-    are eliminated; nothing that is known beforehand of the parameters is in them.
+    """Information of the heights on all parameters and on the l random effects, these in their
+    prior deviations: rows (r, P + l) and residuals (r,).
+
+    Poses, the bed's pose and all other unknowns are eliminated; priors of the parameters are left
+    out.
     """
     assembled, info = estimate.linearized
     problem, state = info.problem.opened(info.state)
@@ -201,7 +216,9 @@ def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, A
 
 
 def _unnoticed(estimate: Estimate, height: Array) -> float | None:
-    """How far one wrong height may bend the bed unnoticed, ``Bed.unnoticed``; height : (n, P)."""
+    """Effect on the bed of one wrong height that is just not detected, ``Bed.unnoticed``; height :
+    (n, P).
+    """
     info = estimate.linearized.info
     problem, state = info.problem, info.state
     rows = rows_on_shared(info.linear, info.reduced)[0][0]
@@ -210,7 +227,7 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
     inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=ROUNDING, hermitian=True)
     inverse /= scale[:, None] * scale
     own = rows[: len(rows) - len(problem.prior)]
-    # all that a configuration says, its pose aside, is one number: what was felt there
+    # each configuration, its pose eliminated, has one number: the height there
     _, s, vt = np.linalg.svd(own.reshape(state.T_base_platform.shape[1], -1, own.shape[1]))
     felt = s[:, :1] * vt[:, 0]
     gain = felt @ inverse
@@ -224,7 +241,7 @@ def _unnoticed(estimate: Estimate, height: Array) -> float | None:
 
 
 def _deviation(rows: Array, off: Array, root: Array, places: int) -> float:
-    """Standard deviation of rows (n, P), root mean square over so many places, of parameters that
-    are ``off`` (P,) with the covariance of a root (P, m).
+    """Standard deviation of rows (n, P), root mean square over so many places, for parameters with
+    the offset ``off`` (P,) and the covariance root (P, m).
     """
     return float(np.sqrt((np.sum((rows @ off) ** 2) + np.sum((rows @ root) ** 2)) / places))

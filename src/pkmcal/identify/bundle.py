@@ -1,7 +1,7 @@
-"""The joint estimate: all unknowns from all measurements, maximum likelihood and robust.
+"""Joint estimate of all unknowns from all measurements: robust maximum likelihood.
 
 Machine parameters, stations, platform poses and edge shifts are estimated together from edges,
-readings and the nominal model, each divided by its standard deviation.
+poses, links, readings and the nominal model, each divided by its standard deviation.
 """
 
 from __future__ import annotations
@@ -72,21 +72,21 @@ from pkmcal.solver.search import SEARCH, STEP_TOLERANCE, SearchOptions, Solution
 class BatchOptions:
     """Constants of the alternation of weights, noise and solution."""
 
-    # standard deviations, of all fitted values together, that a round's solution may have left to
-    # go, mostly after two steps: far less than the next round's weights and deviations change. Only
-    # where these have settled is it brought to its end
+    # standard deviations, of all unknowns together, that a round's solution may still be off the
+    # optimum, mostly after two steps: far less than the effect of the next round's weights. Only
+    # after these have converged is it solved to the end
     nearly_solved: float = 1e-3
     # largest number of rounds
     most_rounds: int = 30
-    # a round brings the deviations of shading and of the edges a part of the way only; from this
-    # round on, as they go on as they began, they go by so much further
+    # a round makes part of the step of the deviations of shading and edges; from this
+    # round on the step is extrapolated by this factor
     scatter_pace: float = 1.6
     first_paced_round: int = 2
-    # the same of the readings' noise, whose steps shrink by a factor each, so that two of them tell
-    # how far it goes: at most by how much further
+    # the same of the readings' noise, whose steps shrink geometrically, so that two of them give
+    # the factor; its upper bound
     furthest_noise_pace: float = 3.0
-    # rounds in which the tails of the edges' noise are chosen; they are steps, and two that are
-    # alike would take turns for ever
+    # rounds in which the tails of the edges' noise are chosen; they are discrete, and two that are
+    # equally likely could alternate for ever
     free_rounds: int = 6
     # relative change of a noise scale below which it has converged
     scale_change: float = 1e-3
@@ -113,14 +113,16 @@ BATCH = BatchOptions()
 
 @dataclass(frozen=True)
 class BatchResult:
-    """The joint estimate of B runs, with the weights and the noise that it found.
+    """Joint estimate of B runs, with the estimated weights and noise.
 
-    solution : states, cost, stops; the steps of all searches before it counted. weight : (B, K, G)
-    robust weights 0..1 of each kind of measurement. scale : (B,) factors on the stated noise of
-    each kind; the edges' is the annealing's, and one as soon as their noise was looked for. info :
-    the problem as it was solved, weights and noise included, and what it says at the solution.
-    edges : their noise, as stated where it was not looked for; irls_weight : (B, K, G) by how
-    much more or less each counts for it. stated : (B or 1,) the readings' noise before.
+    solution : states, cost, stops; steps are those of all searches together.
+    weight : (B, K, G) robust weights 0..1 of each kind of measurement.
+    scale : (B,) factors on the stated noise of each kind; that of edges is from the annealing, and
+        one once their noise is estimated.
+    info : linearized problem at the solution, with these weights and this noise.
+    edges : noise of the edges, as stated where it was not estimated.
+    irls_weight : (B, K, G) of each edge under that noise.
+    stated : (B or 1,) noise of the readings as stated.
     """
 
     solution: Solution
@@ -134,12 +136,12 @@ class BatchResult:
 
     @cached_property
     def components(self) -> Components:
-        """What is left of each kind of rows, and how much of it is expected."""
+        """Sum of squares of each kind of rows, and its expected value."""
         return components(self.info, self.weight)
 
     @cached_property
     def reading_noise(self) -> NoiseShares:
-        """How large the readings' noise shows itself."""
+        """Likelihood of factors on the readings' noise."""
         return self.noise_of(READING_ROWS_KIND)
 
     def noise_of(self, kind: int) -> NoiseShares:
@@ -148,21 +150,21 @@ class BatchResult:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (B, na, na) of the shared unknowns, with what edges have in common and what
-        wrong ones do unnoticed.
+        """Covariance (B, na, na) of the shared unknowns, with correlated edge errors and undetected
+        outliers.
         """
         unnoticed = covariance_of_undetected(self.info, self.weight.edges)
         return covariance_of_correlated(self.info, self.options.error_correlation) + unnoticed
 
     @property
     def noise_scale(self) -> Array:
-        """What the edges in use scatter by, in times of what they are stated with, (B,)."""
+        """Scatter of the edges in use relative to their stated noise, (B,)."""
         problem = self.info.problem
         return self.edges.factor(problem.blocks, problem.data, self.weight.edges)
 
     @property
     def reading_scale(self) -> Array:
-        """The factor on the readings' stated noise, (B,)."""
+        """Factor on the readings' stated noise, (B,)."""
         used = self.info.problem.joint_noise
         return np.broadcast_to(used / self.stated, len(self.scale.poses))
 
@@ -177,19 +179,19 @@ def solve_batch(
     hopeless: float = np.inf,
     options: BatchOptions = BATCH,
 ) -> BatchResult:
-    """All runs of a problem from their starts; see :func:`bundle` for the options.
+    """Solve all runs of a problem from their starts; see :func:`bundle` for the options.
 
-    scale_readings : with ``scale_noise``, the readings' noise too; not where the machine is held,
-    whose changes would be taken for noise.
-    hopeless : all runs are left as they are where, after a search, the poses' noise has to be
-    larger than stated by more than this factor.
+    scale_readings : with ``scale_noise``, estimate the readings' noise too. False where the machine
+        is held, because its changes would be taken for noise.
+    hopeless : return all runs as they are if, after a search, the poses' noise has to be larger
+        than stated by more than this factor.
     """
     n_runs = start.z.shape[0]
     ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs), np.ones(n_runs))
     present = (kind.present.astype(float) for kind in problem.kinds)
     every = Kinds(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
-    # Begun with as much as a whole camera's shift may be: a prior that is too narrow would make
-    # outliers of the edges that speak against it.
+    # The shading starts with the prior of a whole camera's shift: a narrow prior would make
+    # outliers of edges that contradict it.
     n_lines = problem.shading.shape[1]
     least = options.least_shading_share * problem.shading[:, :1]
     if scale_noise and n_lines:
@@ -225,10 +227,10 @@ def _settle(
     hopeless: float,
     options: BatchOptions,
 ) -> BatchResult:
-    """Weights, noise and solution in turns until none changes any more.
+    """Alternate weights, noise and solution until none of them changes.
 
-    by_data : (B,) runs whose readings' noise is as the data show it, not as stated. least : px, of
-    the lines' shading.
+    by_data : (B,) runs whose readings' noise is estimated instead of stated.
+    least : lower bound of the lines' shading, px.
     """
     estimates_shading = scale_noise and fit.info.problem.shading.size > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.n_effective.any())
@@ -294,7 +296,7 @@ def _settle(
         nearly = True
     if not nearly:
         return fit
-    # what the search of the last round has left to go
+    # complete the search of the last round
     solution, info = _searched(
         fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE, options
     )
@@ -304,14 +306,15 @@ def _settle(
 def _readings_step(
     fit: BatchResult, by_data: Booleans, before: Array, made: Array, options: BatchOptions
 ) -> tuple[Array, Array]:
-    """The step of the readings' noise that the data ask for, and the one to make, after which they
-    will ask for none: by the secant through this and what they asked for before the last step that
-    was made. Logarithms, (B,) all; nothing is asked where no run's readings are judged.
+    """Logarithmic step (B,) of the readings' noise that the data require, and the step to make.
+
+    The latter is extrapolated by the secant through this and the previous required step, so that no
+    further step should be required. Unchanged where no run's readings' noise is estimated.
     """
     if not by_data.any():
         return before, made
     log_factor = np.log(fit.reading_noise.factor())
-    # what is asked for at most is not all that is missing
+    # a step that was cut short is not all that is missing
     shrinks = (
         (log_factor * before > 0)
         & (np.abs(log_factor) < np.abs(before))
@@ -322,8 +325,8 @@ def _readings_step(
 
 
 def _readings_speak(fit: BatchResult) -> Booleans:
-    """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
-    nothing else was measured, so that it is only the unit of all deviations.
+    """Runs (B,) whose readings' noise is estimated: where the data contradict the stated one, or
+    where nothing else was measured, so that it is only the unit of all standard deviations.
     """
     noise = fit.reading_noise
     alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
@@ -358,9 +361,7 @@ def _solved(
     tolerance: float,
     options: BatchOptions,
 ) -> BatchResult:
-    """The problem solved with these weights up to a tolerance, from a state that ``steps`` (B,)
-    have led to.
-    """
+    """Solution with given weights up to a tolerance, from a state reached after ``steps`` (B,)."""
     parts = zip(weight._replace(edges=weight.edges * irls_weight), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
     solution, info = _searched(used, state, steps, tolerance, options)
@@ -370,7 +371,7 @@ def _solved(
 def _searched(
     problem: Problem, state: BatchState, steps: Integers, tolerance: float, options: BatchOptions
 ) -> tuple[Solution, Information]:
-    """The solution up to a tolerance, from a state that ``steps`` (B,) have led to."""
+    """Solution up to a tolerance, from a state reached after ``steps`` (B,)."""
     solution = minimise(
         problem.as_noisy_as_at(state), state, tolerance=tolerance, options=options.search
     )
@@ -379,10 +380,11 @@ def _searched(
 
 
 def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) -> EdgeScatter:
-    """The edges' noise: of each tube where light moves edges; else their errors are normal, as
-    stated but for one factor of all, which makes their chi2 equal its degrees of freedom. That is
-    what the likelihood would say too, but for the edges that it counts as stated; and tails would
-    take for their own what readings stated wrong do to some edges. number : of the round.
+    """Noise of the edges: by tube where light shifts edges, otherwise one factor for all.
+
+    The one factor makes their chi2 equal its degrees of freedom, with normal errors. That is also
+    the optimum of the likelihood, except that edges count as stated; heavy tails would absorb the
+    effect of wrong readings on some edges. number : of the round.
     """
     if by_tube:
         late = number >= options.free_rounds
@@ -409,8 +411,10 @@ def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) 
 
 
 def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
-    """The factor on the stated noise of poses, or of links, that makes their chi2 equal its degrees
-    of freedom, (B,), from the one in use; kept as it is where too few remain to judge it.
+    """Factor (B,) on the stated noise of poses, or of links, that makes their chi2 equal its
+    degrees of freedom.
+
+    scale : (B,) factor in use, kept where too few measurements remain to judge it.
     """
     kinds = fit.info.problem.kinds
     if not (kinds.poses if kind == POSE_ROWS_KIND else kinds.links).present.any():
@@ -422,7 +426,7 @@ def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
 
 
 def _shading_of(fit: BatchResult, least: Array, options: LineShadingOptions) -> Array:
-    """The fit's :func:`common_shading`."""
+    """Standard deviations of the lines' shading by :func:`common_shading`."""
     problem, unit = fit.info.problem, fit.info.problem.shading
     lines = problem.unknowns.of_code(SHADING)
     half = unit[..., None] * fit.info.root[:, lines]
@@ -435,18 +439,18 @@ def _shading_of(fit: BatchResult, least: Array, options: LineShadingOptions) -> 
 
 @dataclass(frozen=True)
 class MarginalPrior:
-    """What measurements and the nominal model told of a machine.
+    """Information of measurements and nominal model on a machine, as the prior of another estimate.
 
-    free : (n,) its free unknowns; root : (n, n) of their information, ``root^T root`` the inverse
-    of their covariance whatever the other unknowns are.
+    free : (n,) its free unknowns.
+    root : (n, n) with ``root^T root`` the inverse of their marginal covariance.
     """
 
     free: Array
     root: Array
 
     def like(self, before: MarginalPrior) -> bool:
-        """Whether the machine has changed since by less than half its deviations, as it does until
-        a quarter as much again is told of it.
+        """Whether the machine changed by less than half its standard deviations, as it does until
+        the information has grown by a quarter.
         """
         change = 2 * self.root @ (self.free - before.free)
         return float(change @ change) < len(change)
@@ -466,19 +470,21 @@ def bundle(
     hopeless: float = np.inf,
     options: BatchOptions = BATCH,
 ) -> Estimate:
-    """The joint estimate of one session.
+    """Joint estimate of one session.
 
-    start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
-    use_prior : take the nominal model's values as measurements with their tolerances; radii and
-        edge shifts keep theirs in any case. marginal_prior : what other measurements told of the
-        machine, with the nominal model in it, in the nominal model's place, whether that is taken
-        or not.
-    robust : let go of edges and poses that do not fit. scale_noise : where the residuals
-        ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each;
-        scale_readings : and that of the readings, which may become less.
-    gauge : frames of the result, three centres by default. hopeless : for what is only tried,
-    the factor on the poses' noise beyond which it is given up.
-    Raises ResultError where the search cannot start, is given up, or ends without an answer.
+    start : initial value of every unknown, see :func:`pkmcal.identify.start.start_state`.
+    use_prior : use the nominal model's values as measurements with their prior sigmas; radii and
+        edge shifts keep theirs in any case.
+    marginal_prior : information of other measurements and of the nominal model on the machine, in
+        place of the nominal model, whatever ``use_prior``.
+    robust : reject edges, poses and links that do not fit.
+    scale_noise : estimate factors on the stated noise of edges, poses and links where the residuals
+        require it.
+    scale_readings : estimate that of the readings too, which may become smaller.
+    gauge : frames of the result, three centres by default.
+    hopeless : factor on the poses' noise above which the search is given up, for trials.
+
+    Raises ResultError if the search cannot start, is given up, or does not converge.
     """
     gauge = gauge or default_gauge(machine)
     assembled = assemble(
@@ -486,7 +492,7 @@ def bundle(
     )
     batch = batch_of(machine, assembled, start)
     problem = assembled.problem
-    # mounts are known to be near their start, as far as nothing else tells
+    # the prior of mounts is centred at their start
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
     problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
     if marginal_prior is not None:
@@ -518,9 +524,9 @@ def bundle(
 
 
 def marginalize_to_machine(estimate: Estimate) -> MarginalPrior:
-    """What an estimate knows of the machine, for the estimate of other measurements.
+    """Information of an estimate on the machine, for the estimate of other measurements.
 
-    The frames are as little known as by the nominal model, about where the estimate has them.
+    The frames have the nominal model's uncertainty, about their place in the estimate.
     """
     info = estimate.linearized.info
     rows, _ = reduced_rows(info, ("machine",), silent=())
@@ -536,7 +542,7 @@ def _estimate(
     result: BatchResult,
     gauge: Gauge,
 ) -> Estimate:
-    """The result in the gauge, with everything that a report asks for."""
+    """Estimate in the gauge, with all quantities of the report."""
     solution, problem = result.solution.state, result.info.problem
     shared, u = result.covariance[0], problem.unknowns
     if measurements.imputation_covariance:
@@ -559,7 +565,7 @@ def _estimate(
     weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
     value = result.info.by_kind.value
     closures = value[..., problem.closure_rows]
-    joints = np.zeros(measurements.joints.shape)  # where no pose was fitted
+    joints = np.zeros(measurements.joints.shape)  # zero where no pose was estimated
     joints[assembled.observed] = problem.joint_rows(closures, solution)[0]
     return Estimate(
         machine=identified,
@@ -589,7 +595,9 @@ def _estimate(
 def _with_unseen_poses(
     machine: Machine, measurements: Measurements, assembled: Assembled, state: State
 ) -> State:
-    """Poses of the configurations that no image shows: by the readings alone."""
+    """State with the poses of configurations without measurements, by forward kinematics of the
+    readings.
+    """
     unseen = ~assembled.observed
     if not unseen.any():
         return state
@@ -602,7 +610,7 @@ def _with_unseen_poses(
 def _statistics(
     result: BatchResult, assembled: Assembled, value: Array, imputation_covariance: float
 ) -> Statistics:
-    """What the residuals (1, K, r) and their number say of the fit."""
+    """Statistics of the fit from the residuals (1, K, r)."""
     problem, state = result.info.problem, result.info.state
     kinds = np.array(assembled.priors)
     rows = [kind.rows for kind in problem.kinds]
@@ -615,7 +623,7 @@ def _statistics(
     n_edges, n_poses, n_links = (float(number[0]) for number in counts(problem, result.weight))
     n_joints = value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
-    # what is known beforehand of mounts is no measurement: unknowns that nothing else tells count
+    # the prior of mounts is no measurement: unknowns that nothing else determines count
     # as little as it does
     prior_rows = problem.prior[~np.isin(kinds, ("gauge", "mount"))]
     normal = result.info.by_kind.every[0] + prior_rows.T @ prior_rows
@@ -655,6 +663,8 @@ def _statistics(
 
 
 def _range(shares: NoiseShares, scale: Array) -> tuple[float, float | None]:
-    """Factors on a stated noise that the data allow, where ``scale`` (1,) is in use."""
+    """Interval of the factor on a stated noise, where ``scale`` (1,) is in use; None for no upper
+    end.
+    """
     low, high = (float((scale * end)[0]) for end in shares.interval())
     return low, high if np.isfinite(high) else None

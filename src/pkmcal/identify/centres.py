@@ -68,9 +68,9 @@ def joint_centres(nominal: Machine, calibrated: Machine, covariance: Array) -> t
     results: list[Centres] = []
     for side, old, new, by, index in sides:
         over = laid_over(np.array(old), np.array(new))
-        reference_values = _spread(by, index, covariance)
+        centre_covariance = _spread(by, index, covariance)
         results.append(
-            Centres(side, np.array(new), apply(over, np.array(old)), over, reference_values)
+            Centres(side, np.array(new), apply(over, np.array(old)), over, centre_covariance)
         )
     return tuple(results)
 

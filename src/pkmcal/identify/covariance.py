@@ -1,8 +1,8 @@
-"""How sure the estimate is: covariance, noise scale, rank. All from exact derivatives.
+"""Covariance, noise scale and rank of the estimate, from exact derivatives.
 
-The covariance is the inverse of the reduced information at the solution, told in a gauge. It
-covers the noise of edges and readings and the nominal model's tolerances; it does not cover errors
-of the model (joint clearance, bending, a wrong lens).
+The covariance is the inverse of the reduced information at the solution, expressed in a gauge. It
+covers the noise of edges and readings and the nominal model's prior sigmas; it does not cover
+errors of the model (joint clearance, bending, a wrong lens).
 """
 
 from __future__ import annotations
@@ -57,11 +57,10 @@ direction counts as unknown."""
 
 @dataclass(frozen=True)
 class Information:
-    """What a problem says at a state: its rows, and what the shared unknowns' covariance is.
+    """Linearized rows of a problem at a state, and the covariance of the shared unknowns.
 
-    normal : (B, na, na) the reduced normal matrix, where it is known already. The rows of two
-    thousand configurations take a gigabyte, so what passes through all of them takes them in
-    ``pieces``.
+    normal : (B, na, na) the reduced normal matrix, if it is already computed. The rows of two
+        thousand configurations take a gigabyte, so computations over all of them use ``pieces``.
     """
 
     problem: Problem
@@ -75,12 +74,13 @@ class Information:
 
     @cached_property
     def reduced(self) -> Reduced:
-        """The same with the configurations' own unknowns eliminated."""
+        """The linearized rows with the configurations' own unknowns eliminated."""
         return eliminate(self.linear)
 
     def pieces(self) -> Iterator[Information]:
-        """What some configurations say after the other, so many as the solver works on at once; the
-        rows on shared unknowns only are in each. One piece is this itself.
+        """Parts of the problem, each of as many configurations as the solver processes at once.
+
+        Rows on shared unknowns only are in every part. A small problem is its own single part.
         """
         cuts = divisions(self.state.T_base_platform.shape[1], self.problem.n_rows)
         if len(cuts) < 2:
@@ -91,8 +91,10 @@ class Information:
 
     @cached_property
     def rows(self) -> tuple[Array, Array]:
-        """All rows on the shared unknowns, the own ones eliminated: Jacobian (B, n, na) and
-        residuals (B, n), those on shared unknowns only last; each piece's condensed.
+        """Rows on the shared unknowns with the own ones eliminated: Jacobian (B, n, na) and
+        residuals (B, n).
+
+        Rows on shared unknowns only are last; those of each piece are condensed.
         """
         parts: list[tuple[Array, Array]] = []
         for piece in self.pieces():
@@ -106,13 +108,13 @@ class Information:
 
     @cached_property
     def by_kind(self) -> KindSums:
-        """What the rows of each kind say, summed over the configurations."""
+        """Sums over the configurations of each kind's normal matrix and squares."""
         return kind_sums(self.problem, self.state)
 
     @cached_property
     def root(self) -> Array:
-        """F (B, na, na) with F F^T the covariance of the shared unknowns, where nothing is said of
-        a direction that is not known.
+        """F (B, na, na) with F F^T the covariance of the shared unknowns; unidentifiable directions
+        are left out.
         """
         normal, prior = self.normal, self.problem.prior
         if normal is None:
@@ -125,15 +127,16 @@ class Information:
 
     @cached_property
     def _inverse(self) -> tuple[Array, Booleans]:
-        """The normal matrix's inverse, and where that holds half of the digits."""
+        """Inverse of the normal matrix, and the runs in which it has half of the digits."""
         return normal_inverse(cast(Array, self.normal))
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (B, na, na) of the shared unknowns before any gauge is applied; a direction
-        that nothing fixes has a huge variance.
+        """Covariance (B, na, na) of the shared unknowns before any gauge; an unidentifiable
+        direction has a huge variance.
 
-        By the normal matrix where it leaves half of the digits, else by the rows, which leave all.
+        Computed from the normal matrix where that leaves half of the digits, otherwise from the
+        rows, which leave all.
         """
         if self.normal is not None:
             inverse, sure = self._inverse
@@ -150,8 +153,8 @@ class Information:
 
 
 def covariance_by_noise(info: Information) -> Array:
-    """The part of the shared unknowns' covariance (B, na, na) that the noise of what was measured
-    makes; the rest is how little is known beforehand.
+    """Part of the shared unknowns' covariance (B, na, na) that is due to measurement noise; the
+    rest is due to the priors.
     """
     in_prior = info.problem.prior @ info.covariance
     return info.covariance - in_prior.mT @ in_prior
@@ -160,20 +163,22 @@ def covariance_by_noise(info: Information) -> Array:
 def reduced_rows(
     info: Information, keep: tuple[str, ...], silent: tuple[str, ...] | None = None
 ) -> tuple[Array, Array]:
-    """What the data say of some unknowns whatever the others are: rows A (n, m) by the named ones,
-    in the order of their columns, and residuals y (n,); the problem's first run. They are few, with
-    the same normal matrix, gradient and sum of squares as all.
+    """Information of the data on the named unknowns with all others marginalized, of the problem's
+    first run.
 
-    Each configuration's own unknowns are eliminated and what all other shared unknowns can take up
-    is projected out, so ``y + A x`` is left of the residuals where the kept ones move by x (their
-    best value is least squares on it). Rows that are known beforehand count too, but for those on
-    the ``silent`` unknowns, by default the kept ones: what is asked is not to be known already.
+    Returns rows A (n, m), in the order of the named unknowns' columns, and residuals y (n,). They
+    are few, with the same normal matrix, gradient and sum of squares as all rows.
+
+    Each configuration's own unknowns are eliminated, and the span of all other shared unknowns is
+    projected out: ``y + A x`` are the residuals that remain when the named unknowns change by x,
+    and their optimum is its least-squares solution. Prior rows count too, except those on the
+    ``silent`` unknowns, by default the named ones, so that A is the information of the data alone.
 
     For parameters that the problem holds, open it first, as drift tests do::
 
-        rows, left = reduced_rows(Information(*problem.opened(state)), ("machine",))
+        rows, residuals = reduced_rows(Information(*problem.opened(state)), ("machine",))
 
-    Frames stay in: their rows are zero along :func:`~pkmcal.identify.gauge.move_generators`.
+    Gauge freedoms remain: the rows are zero along :func:`~pkmcal.identify.gauge.move_generators`.
     """
     problem, (rows, value) = info.problem, (part[0] for part in info.rows)
     retained = problem.unknowns.columns(*keep)
@@ -192,10 +197,11 @@ def reduced_rows(
 def machine_covariance(
     problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
 ) -> Array:
-    """Covariance (n, n) of parameters, stations and mounts, told in the gauge; n = P + 6 S + 6 M,
-    in the order of :func:`~pkmcal.identify.state.estimated_unknowns`.
+    """Covariance (n, n) of parameters, stations and mounts in the gauge; n = P + 6 S + 6 M, in the
+    order of :func:`~pkmcal.identify.state.estimated_unknowns`.
 
-    before : the solution as the solver left it. shared : (na, na) covariance there.
+    before : the solution as the solver left it.
+    shared : (na, na) covariance of the shared unknowns there.
     """
     solved, estimated = problem.unknowns, estimated_unknowns(before)
     spread = np.zeros((estimated.count, solved.count))
@@ -208,10 +214,10 @@ def machine_covariance(
 def prior_in_gauge(
     machine: Machine, before: State, spread: Array, shared: Array, gauge: Gauge
 ) -> Array:
-    """The covariance ``spread shared spread^T`` (n, n) of parameters, stations and mounts in the
-    frames of ``before``, told in the gauge.
+    """Covariance ``spread shared spread^T`` (n, n) of parameters, stations and mounts, transformed
+    from the frames of ``before`` into the gauge.
 
-    spread : (n, m) how they change with what has the covariance shared (m, m).
+    spread : (n, m) derivative by the quantities whose covariance is ``shared`` (m, m).
     """
     estimated = estimated_unknowns(before)
     e, f = alignment(machine, before, gauge)
@@ -235,18 +241,19 @@ def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) 
     change = projector(machine, theta, gauge)
     spread = free - generators(machine.layout, theta) @ (change @ free)
     nominal = np.sum((spread * table.tolerances_free()) ** 2, axis=1)
-    above_limit = nominal > 1e-12 * table.tolerance**2
-    share = 1 - np.diag(covariance)[: len(table)] / np.where(above_limit, nominal, 1.0)
-    return np.where(above_limit, share, 0.0)
+    has_prior = nominal > 1e-12 * table.tolerance**2
+    share = 1 - np.diag(covariance)[: len(table)] / np.where(has_prior, nominal, 1.0)
+    return np.where(has_prior, share, 0.0)
 
 
 @dataclass(frozen=True)
 class ParameterDirection:
-    """A combination of parameters: names with weights, largest first, and how well known.
+    """Combination of parameters, with the information that the data have on it.
 
-    information : singular value of the data in units of the nominal model's tolerance; 1 means that
-    the data know it as well as the nominal model does. vector : (P,) the change of all parameters,
-    m and rad, with the largest entry one tolerance.
+    names, weights : of its largest components, largest first.
+    information : singular value of the data in units of the prior sigmas; 1 means that the data
+        determine it as well as the nominal model does.
+    vector : (P,) change of all parameters, m and rad, with the largest entry one prior sigma.
     """
 
     names: tuple[str, ...]
@@ -257,11 +264,13 @@ class ParameterDirection:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data alone can tell of the machine, frames aside.
+    """Directions of the machine that the data alone determine, apart from frames.
 
-    n_parameters : free ones. n_frames : freedoms of the frames, and of hinges' beginnings.
-    rank : directions the data fix. unidentified : directions that no amount of such data fixes.
-    weak : directions that the nominal model knows better than the data.
+    n_parameters : free ones.
+    n_frames : freedoms of the frames, and of the zeros of hinges.
+    rank : number of directions that the data determine.
+    unidentified : directions that no amount of such data determines.
+    weak : directions that the nominal model determines better than the data.
     """
 
     n_parameters: int
@@ -275,23 +284,23 @@ class Identifiability:
 
     @property
     def basis(self) -> Array:
-        """Changes (n, P) of all parameters that the data cannot see, m and rad."""
+        """Changes (n, P) of all parameters that do not affect the data, m and rad."""
         vectors = [d.vector for d in self.unidentified]
         size = next((d.vector.size for d in (*self.unidentified, *self.weak)), self.n_parameters)
         return np.array(vectors).reshape(-1, size)
 
 
 def identifiability(info: Information, machine: Machine) -> Identifiability:
-    """Which combinations of parameters the data fix, nominal model left out; the problem's first
-    run.
+    """Combinations of parameters that the data determine, without the nominal model, of the
+    problem's first run.
 
-    Poses, stations, edge shifts and shading are eliminated, frames taken out, and the columns are
-    scaled by the nominal model's tolerances.
+    Poses, stations, edge shifts and shading are eliminated, frames projected out, and the columns
+    are scaled by the nominal model's prior sigmas.
     """
     problem, state = info.problem, info.state
     table, nz = machine.parameters, problem.unknowns.n_free
     tolerance = table.tolerances_free()
-    # what is known beforehand of cameras and shading is not left out: without it, a shift of
+    # priors of cameras and shading are used: without them, a shift of
     # every line by itself would hide the tubes' radii
     remainder = reduced_rows(info, ("machine",), silent=("machine", "mounts"))[0] * tolerance
     theta, moves = problem.theta(state)[0], conventions(machine)

@@ -138,7 +138,7 @@ def _student(
         return np.einsum("vbn,bn->vb", each, times)
 
     def scored(a: Array, b: Array) -> tuple[Array, Array]:
-        """One step of Fisher's scoring of both variances."""
+        """Step of Fisher's scoring of both variances."""
         s, t = a[..., None] + b[..., None] * size, a[..., None]
         # weights of Student's distribution
         irls_weight = (tails + NUMBERS_AN_EDGE) / (tails + along / s + rest / t)

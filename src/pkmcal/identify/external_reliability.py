@@ -91,9 +91,9 @@ def covariance_of_undetected(info: Information, weight: Array) -> Array:
                 mine = kind == number
                 size, each = (irls_weight * share)[:, mine], (irls_weight * remainder)[:, mine]
                 wrong = taken[..., mine] * np.sqrt(size * square[:, mine])[:, None]
-                reference_values = taken[..., mine] * np.sqrt(size)[:, None]
+                effect = taken[..., mine] * np.sqrt(size)[:, None]
                 by_wrong += wrong @ wrong.mT
-                by_any[number] += reference_values @ reference_values.mT
+                by_any[number] += effect @ effect.mT
                 in_residuals[number] += np.sum(each * square[:, mine], axis=1)
                 redundancy[number] += np.sum(each, axis=1)
     # probability p, and J^T D J

@@ -329,7 +329,7 @@ def _slide(s: Situation, leg: int) -> Array:
 
 
 def _sliding(_s: Situation, coefficients: Array) -> str:
-    """Which end slides: base, platform, both independently, or the leg as a whole."""
+    """End that slides: base, platform, both independently, or the leg as a whole."""
     if len(coefficients) > 1:
         return "can grow and shift along itself, its two joints and its length together"
     base, platform = np.abs(coefficients[0])
@@ -432,12 +432,12 @@ def sizes(s: Situation) -> tuple[Size, ...]:
 
 def _sizes(s: Situation) -> Iterator[NamedChanges]:
     """Combinations of few sizes first: of all legs together, then of single legs."""
-    reference_values = sizes(s)
-    numbers = [*range(1, min(MOST_SIZES, len(reference_values)) + 1)]
-    numbers += [len(reference_values)] if len(reference_values) > MOST_SIZES else []
+    all_sizes = sizes(s)
+    numbers = [*range(1, min(MOST_SIZES, len(all_sizes)) + 1)]
+    numbers += [len(all_sizes)] if len(all_sizes) > MOST_SIZES else []
     apart = "cannot be told apart" + (" by heights" if s.heights else "") + "{better}"
     single: list[NamedChanges] = []
-    for group in (group for n in numbers for group in combinations(reference_values, n)):
+    for group in (group for n in numbers for group in combinations(all_sizes, n)):
         columns = np.stack([g.columns for g in group], axis=2)  # (P, L, sizes)
         labels = tuple((f"the {g.label}", g.unit) for g in group)
         having = np.any(columns, axis=0)  # (L, sizes)

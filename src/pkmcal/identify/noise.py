@@ -361,8 +361,6 @@ def _independent(
     of_own, turn = np.linalg.eigh(unit.T @ by_own @ unit)
     unit = unit @ turn
     of_own = np.clip(of_own, 0.0, 1.0)
-    reference_values = s.T @ unit
-    of_fixed = np.clip(
-        np.sum(reference_values * (fixed @ reference_values), axis=0), 0.0, 1.0 - of_own
-    )
+    projected = s.T @ unit
+    of_fixed = np.clip(np.sum(projected * (fixed @ projected), axis=0), 0.0, 1.0 - of_own)
     return unit.T @ r, of_own, 1.0 - of_own - of_fixed, of_fixed

@@ -28,9 +28,10 @@ Decider = Literal["data", "drawing", "frame", "fixed"]
 
 
 def decided_by(table: ParameterTable, covariance: Array, data_share: Array) -> tuple[Decider, ...]:
-    """What decides each parameter: data, drawing (the nominal model), frame or fixed.
+    """Source of each parameter's value: data, drawing (the nominal model), frame or fixed.
 
-    frame : the value only defines the result's frames. fixed : the mechanism file fixes it.
+    frame : the value only defines the result's frames.
+    fixed : the mechanism file fixes it.
 
     covariance : (P, P).
     data_share : (P,) share of the information that comes from the data.

@@ -1,6 +1,6 @@
-"""What edges scatter by: a scale, a shading and how heavy the tails are, of each of a leg's tubes.
+"""Noise of edges: scale, shading and degrees of freedom for each of a leg's tubes.
 
-How these are found is told in :mod:`pkmcal.identify.edge_noise`.
+Estimated in :mod:`pkmcal.identify.edge_noise`.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ NUMBERS_AN_EDGE = 2
 """Numbers that an edge measures."""
 EDGE_SCATTER_FLOOR = 1e-12
 LEAST_OWN_SHADING = OWN_SHADING / 3
-"""px; what a session of few edges can tell to be less."""
+"""px; lower bound, because a session of few edges cannot determine less."""
 
 
 @dataclass(frozen=True)
 class EdgeScatter:
-    """The noise of the edges of a leg's T tubes (first, second, ... of all legs) in B runs.
+    """Noise of the edges of a leg's T tubes (first, second, ... of all legs) in B runs.
 
-    scale : (B, T) factor on the stated standard deviations. shading : (B, T) px, of each edge
-    beside its line's; it counts where something is shaded. dof : (B, T) degrees of freedom of
-    their distribution. The standard deviations are such that normal errors with them would be worth
-    as much as these are. An estimate holds those of its one run, (T,) each (:meth:`of_run`).
+    scale : (B, T) factor on the stated standard deviations.
+    shading : (B, T) px, of each edge beside its line's; used where edges are shaded.
+    dof : (B, T) degrees of freedom of Student's distribution.
+
+    The standard deviations are those of normal errors with the same information. An estimate holds
+    those of its one run, (T,) each (:meth:`of_run`).
     """
 
     scale: Array
@@ -38,12 +40,12 @@ class EdgeScatter:
 
     @classmethod
     def stated(cls, n_runs: int, n_tubes: int) -> EdgeScatter:
-        """What edges are given with."""
+        """Noise as stated: scale one, usual shading, normal."""
         full = (n_runs, n_tubes)
         return cls(np.ones(full), np.full(full, OWN_SHADING), np.full(full, np.inf))
 
     def of_run(self, run: int) -> EdgeScatter:
-        """One run's alone."""
+        """Noise of one run, (T,) each."""
         return EdgeScatter(self.scale[run], self.shading[run], self.dof[run])
 
     def batch(self) -> EdgeScatter:
@@ -51,22 +53,23 @@ class EdgeScatter:
         return EdgeScatter(self.scale[None], self.shading[None], self.dof[None])
 
     def irls_weight(self, blocks: EdgeBlocks, square: Array) -> Array:
-        """By how much more or less each edge counts than on average, (B, K, G), where the squares
-        of its whitened residuals are (B, K, G).
+        """IRLS weight (B, K, G) of each edge, one on average.
+
+        square : (B, K, G) squares of the whitened residuals.
         """
-        tails = self.dof[:, blocks.tube]  # infinite of normal ones
+        tails = self.dof[:, blocks.tube]  # infinite for normal errors
         return (1 + NUMBERS_AN_EDGE / tails) / (1 + square * t_variance(tails) / tails)
 
     def squares(self, blocks: EdgeBlocks, rows: Array) -> Array:
-        """Squares (B, K, G) of the edges' rows (B, K, r) in use, trust included, as large as those
-        of normal errors.
+        """Squares (B, K, G) of the edges' rows (B, K, r) in use, with their weight, as large as
+        those of normal errors.
         """
         pairs = rows.reshape(*rows.shape[:2], -1, NUMBERS_AN_EDGE)
         return np.sum(pairs**2, axis=-1) * t_variance(self.dof)[:, blocks.tube]
 
     def factor(self, blocks: EdgeBlocks, data: EdgeData, weight: Array) -> Array:
-        """What edges with weights (B, K, G) scatter by on average, in times of what they are stated
-        with, (B,); 1 of none.
+        """Scatter (B,) of edges with weights (B, K, G) relative to their stated noise, root mean
+        square; 1 for no edges.
         """
         size = shift_squares(blocks, data)
         scale, shading = (part[:, blocks.tube] for part in (self.scale, self.shading))
@@ -76,8 +79,8 @@ class EdgeScatter:
         return np.sqrt(np.where(count > 0, square / np.maximum(count, EDGE_SCATTER_FLOOR), 1.0))
 
     def close_to(self, other: EdgeScatter, share: float) -> bool:
-        """Whether its deviations are another's up to a share, those of shading up to one of what is
-        usual, and its tails the same.
+        """Whether the deviations agree with another's up to a share, those of shading up to a share
+        of the usual, and the degrees of freedom are equal.
         """
         scale = np.abs(self.scale / other.scale - 1).max(initial=0.0)
         usual = np.maximum(other.shading, OWN_SHADING)
@@ -85,26 +88,28 @@ class EdgeScatter:
         return max(scale, shading) < share and bool(np.all(self.dof == other.dof))
 
     def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
-        """Deviations as many times as far from another's, with these tails."""
+        """Extrapolation of the deviations from another's by a factor, with these degrees of
+        freedom.
+        """
         scale = before.scale * (self.scale / before.scale) ** pace
         shading = before.shading * (self.shading / before.shading) ** pace
         return replace(self, scale=scale, shading=np.maximum(shading, LEAST_OWN_SHADING))
 
     def applied(self, blocks: EdgeBlocks, data: EdgeData) -> EdgeData:
-        """The edges with this noise."""
+        """Edge data with this noise."""
         own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.n_effective), blocks.alone)
         return replace(data, scale=self.scale[:, blocks.tube], own=own)
 
 
 def shift_squares(blocks: EdgeBlocks, data: EdgeData) -> Array:
-    """Squares of what a pixel outward does to the edges, in the noise as it was stated, (B or 1,
-    K, G); none where nothing is shaded.
+    """Squares of the effect of a shift by one pixel outward on the edges, in stated noise, (B or 1,
+    K, G); zero where nothing is shaded.
     """
     return np.where(blocks.n_effective > 0, np.sum(data.by_shift**2, axis=-1), 0.0)
 
 
 def t_variance(tails: Array) -> Array:
-    """The variance of normal errors that tell as much as those of Student's distribution of pairs,
-    over the square of its scale.
+    """Variance of normal errors with the information of Student's distribution of pairs, over the
+    square of its scale.
     """
     return 1 + 2 / (tails + NUMBERS_AN_EDGE)

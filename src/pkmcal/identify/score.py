@@ -429,7 +429,7 @@ def _products(
     begins = sorted({0, *(part.since for part in parts)})
     width = n + basis.shape[1] + 1
     sums: dict[int, Array] = {begin: np.zeros((n, width)) for begin in begins}
-    single, among, reference_values = (
+    single, among, gradient = (
         [np.zeros((0, motors, width))],
         [np.zeros((0, motors, motors))],
         0.0,
@@ -443,14 +443,14 @@ def _products(
         rows, value = eliminate_beside(linear, np.concatenate(further, axis=-1))
         count = problem.unknowns.count
         if not cut.start:
-            reference_values = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
+            gradient = (linear.shared_by @ basis[:count]).T @ linear.shared_value[0]
         first, split = count + root.shape[1], rows.shape[-1] - motors
         own = [rows[..., stations], rows[..., first:split], rows[..., :first] @ basis]
         wide = np.concatenate([*own, value[..., None]], axis=-1)
         for begin in begins:
             flat = wide[max(begin - cut.start, 0) :].reshape(-1, width)
             sums[begin] += flat[:, :n].T @ flat
-        reference_values = reference_values + np.einsum("kri,kr->i", own[-1], value)
+        gradient = gradient + np.einsum("kri,kr->i", own[-1], value)
         if singles:
             by_single = rows[..., split:]
             single.append(by_single.mT @ wide)
@@ -461,7 +461,7 @@ def _products(
         sums,
         np.concatenate(single),
         np.concatenate(among),
-        np.asarray(reference_values),
+        np.asarray(gradient),
     )
 
 

@@ -97,17 +97,17 @@ def sentence(
     rows = order[: int(np.sum(size > NAMED_SHARE * size.max()))]
     names = tuple(table.names[k] for k in rows)
     several = len(open_motion.legs) > 1
-    reference_values, n = (
+    statement, n = (
         "known from the nominal model only" if weak else "free",
         len(open_motion.numbers),
     )
-    open_ = f"{'is' if n == 1 else 'are'} {reference_values}"
+    open_ = f"{'is' if n == 1 else 'are'} {statement}"
     # fields of the motion's template
     places = {
         "legs": named(open_motion.legs),
         "each": "each of " if several else "",
-        "is": f"is {reference_values}",
-        "are": f"are {reference_values}",
+        "is": f"is {statement}",
+        "are": f"are {statement}",
         "open": "to the nominal model" if weak else "free",
         "better": " better than the nominal model does" if weak else "",
         "limited": ", which only the nominal model limits" if weak else "",

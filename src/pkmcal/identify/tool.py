@@ -93,8 +93,8 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     # constant legs and joints with axes restrict the poses: samples are projected onto these
     value = on_manifold(layout, machine.values, start)
     own = on_manifold(layout, machine.values, T_base_platform).singularity
-    retained_rows = value.converged & (value.singularity >= AS_REGULAR * float(np.median(own)))
-    poses = np.concatenate([T_base_platform, value.T_base_platform[retained_rows]])
+    regular = value.converged & (value.singularity >= AS_REGULAR * float(np.median(own)))
+    poses = np.concatenate([T_base_platform, value.T_base_platform[regular]])
     return machine.inverse(poses), poses
 
 

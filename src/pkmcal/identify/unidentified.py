@@ -64,18 +64,18 @@ class Condition:
 
 @dataclass(frozen=True)
 class Findings:
-    """What the data determine of the machine, and what they leave unidentified.
+    """Directions of the machine that the data determine, and those that they leave unidentified.
 
     identifiability : rank and spectrum of the information.
     unidentified : sentences on directions without information, or with less than
-    ``UnidentifiedOptions.weak``.
+        ``UnidentifiedOptions.weak``.
     weak : sentences on directions of which the nominal model contains more information.
-    by_drawing : displacement of the platform by the prior sigmas of all parameters, m, as
-    ``Sentence.moves_platform``.
+    by_nominal : displacement of the platform by the prior sigmas of all parameters, m, as
+        ``Sentence.moves_platform``.
     conditions : [A]'s conditions.
     conventional : fixed parameters for which any value would do.
     also_conventional : number of combinations of other fixed parameters for which any value would
-    do.
+        do.
     bed : predicted flatness, where nothing but heights was measured.
     """
 
@@ -147,11 +147,11 @@ def only_heights(estimate: Estimate) -> bool:
 
 
 def identified(machine: Machine, covariance: Array) -> Booleans:
-    """Which of the six numbers of poses the data determine, (..., 6). The others are conventions,
-    or the start of the search, and are not reported as numbers.
+    """Whether the data determine each of the six numbers of poses, (..., 6). The others are
+    conventions, or starting values, and are not reported as numbers.
 
     The prior of a target's position is the machine's size, and that of its rotation one radian; a
-    number of whose information the data hold less than the prior is not determined by the data.
+    number on which the data have less information than the prior is not determined by them.
 
     covariance : (..., 6, 6), rad and m.
     """
@@ -284,10 +284,10 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
     parts: list[OpenMotion] = []
     options = around.options
     done = np.zeros((0, space.rows.shape[1]))
-    reference_values, whole = list(candidates(around)), space
+    all_motions, whole = list(candidates(around)), space
     for motion, inside in [
-        *((m, share) for share in options.inside for m in reference_values[:-1]),
-        (reference_values[-1], 0.0),
+        *((m, share) for share in options.inside for m in all_motions[:-1]),
+        (all_motions[-1], 0.0),
     ]:
         if len(done) == len(whole.rows):
             break
@@ -296,7 +296,7 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
         new = _directions(names - (names @ done.T) @ done, options)
         if len(new) == 0:
             continue
-        if motion is reference_values[-1]:
+        if motion is all_motions[-1]:
             names = new
         done = _orthonormal(np.concatenate([done, new]))
         numbers = _coefficients(motion, space, names, options)
@@ -309,11 +309,11 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
 
 def _without(space: _Open, directions: Array) -> _Open:
     """Open space without changes (k, P) in it, which are treated as frame changes."""
-    retained_rows = np.linalg.svd(space.rows @ directions.T)[0][:, len(directions) :].T
+    complement = np.linalg.svd(space.rows @ directions.T)[0][:, len(directions) :].T
     frames = np.concatenate([space.frames, directions.T], axis=1)
     return _Open(
-        retained_rows @ space.rows,
-        retained_rows @ space.covariance @ retained_rows.T,
+        complement @ space.rows,
+        complement @ space.covariance @ complement.T,
         frames,
         space.unit,
     )

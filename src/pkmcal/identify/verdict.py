@@ -298,9 +298,9 @@ def _base_alone(estimate: Estimate) -> Finding:
     )
     # principal axes of the prior
     values, vectors = np.linalg.eigh(before)
-    above_limit = values > ROUNDING * values[-1]
-    unit = vectors[:, above_limit] * np.sqrt(values[above_limit])
-    inverse = vectors[:, above_limit] / np.sqrt(values[above_limit])
+    above_rounding = values > ROUNDING * values[-1]
+    unit = vectors[:, above_rounding] * np.sqrt(values[above_rounding])
+    inverse = vectors[:, above_rounding] / np.sqrt(values[above_rounding])
     v, axes = np.linalg.eigh(inverse.T @ together @ inverse)
     # e, and back to metres
     by_edges = v / np.maximum(1 - v, ROUNDING)

@@ -1,17 +1,18 @@
-"""What differs between two estimates of one machine, and how much of that chance explains.
+"""Difference between two estimates of one machine, and the part of it that chance explains.
 
-Frames are conventions, so the two are told in those in which they differ least: by least squares
-over all free parameters, each in its tolerance. What is then left, y, has no frames in it.
+Frames are conventions, so both are expressed in the frames in which they differ least: by least
+squares over all free parameters, each in its prior sigma. The remaining difference y does not
+depend on frames.
 
-Both estimates lean on the same nominal model where they have the same one, and on the same
-images as far as they share them. With the nominal model's covariance 1 (in tolerances), and
-what the data of each add to it, I_a and I_b, their covariances are C = (1 + I)^-1, and
+Both estimates use the same nominal model where they have the same one, and the same images as far
+as they share them. With the nominal model's covariance 1 (in prior sigmas), and the information I_a
+and I_b that the data of each add, their covariances are C = (1 + I)^-1, and
 
     cov(y_b - y_a) = C_a + C_b - C_a J C_b - C_b J C_a,    J = 1 + I_shared,
 
-without the 1 where the nominal models differ. Of data that tell unequally much of a direction, the
-shared part is no more than the lesser: an estimate by the same data, but not as good, differs by
-C_a - C_b (Hausman, 1978).
+without the 1 where the nominal models differ. Where the data of one determine a direction better,
+the shared part is no more than the lesser: an estimate by the same data, but not as good, differs
+by C_a - C_b (Hausman, 1978).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from pkmcal.solver.ranks import numerical_rank
 
 @dataclass(frozen=True)
 class MachineChange:
-    """Machine b less machine a, told in a's frames, in which they differ least.
+    """Machine b less machine a, in a's frames aligned so that they differ least.
 
     machine : a with b's values in these frames. change : (P,) of the parameters, m and rad.
     covariance : (P, P) of that by chance alone; zeros between nominal models. chi2, dof : of all
@@ -67,10 +68,11 @@ def machine_change(
     same_nominal: bool = True,
     shared: float = 0.0,
 ) -> MachineChange:
-    """What differs between two machines of the same parameters.
+    """Difference between two machines with the same parameters.
 
-    covariances : (P, P) of either's parameters in any frames; None for a nominal model, which is
-    taken at its word. same_nominal : whether both calibrations have the same nominal model.
+    covariances : (P, P) of either's parameters in any frames; None for a nominal model, whose
+        values are taken as exact.
+    same_nominal : whether both calibrations have the same nominal model.
     shared : share of the smaller data set that the other calibration has as well.
     """
     held = replace(a, parameters=replace(a.parameters, nominal=a.values))
@@ -112,15 +114,15 @@ def _spread(
     spreads: Sequence[Array | None], size: int, same_nominal: bool, shared: float
 ) -> tuple[Array, Array]:
     """Covariance (r, r) of the difference by chance, and the directions (r, k) that data tell."""
-    reference_values = [c for c in spreads if c is not None]
-    if not reference_values:
+    covariances = [c for c in spreads if c is not None]
+    if not covariances:
         return np.zeros((size, size)), np.zeros((size, 0))
-    values, vectors = np.linalg.eigh(np.mean(reference_values, axis=0))
+    values, vectors = np.linalg.eigh(np.mean(covariances, axis=0))
     # directions of which data leave nearly all of the nominal model's variance are undetermined
     null_vectors = vectors[:, values < 1 - NEGLIGIBLE]
-    if len(reference_values) == 1:
-        return reference_values[0], null_vectors
-    one, other = (_firm(c) for c in reference_values)
+    if len(covariances) == 1:
+        return covariances[0], null_vectors
+    one, other = (_firm(c) for c in covariances)
     inverse_one, inverse_other = np.linalg.inv(one), np.linalg.inv(other)
     lesser = _lesser(inverse_one, inverse_other)
     unit = np.eye(len(one))

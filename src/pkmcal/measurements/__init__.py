@@ -1,4 +1,4 @@
-"""What was measured: one contract, one file a kind of measurement; sets of measurements."""
+"""Measurements: the contract of their kinds, one kind a file; sets of measurements."""
 
 from pkmcal.measurements.columns import Column
 from pkmcal.measurements.edges import OWN_SHADING, SHADING_SIGMA, EdgeSet, Rejection

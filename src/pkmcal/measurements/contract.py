@@ -261,9 +261,7 @@ def configuration_rows(table: CsvTable, names: tuple[str, ...]) -> Integers:
     written = table.pairs if isinstance(table, PairTable) else tuple((n,) for n in table.names)
     for row, name in ((row, name) for row, each in enumerate(written) for name in each):
         if name not in number:
-            short = {
-                reference_values.lstrip("0"): reference_values for reference_values in names
-            }.get(name.lstrip("0"))
+            short = {reading.lstrip("0"): reading for reading in names}.get(name.lstrip("0"))
             raise InputError(
                 "this configuration has no joint readings",
                 where=table.where(row),

@@ -145,15 +145,15 @@ def partners(
         if back[best.trainIdx] == best.queryIdx
     ]
     # best ratio first; a match near an accepted one, in either image, is the same point
-    retained_rows: list[tuple[int, int]] = []
+    pairs: list[tuple[int, int]] = []
     taken = np.zeros((0, 2, 2))
     for worth, j, k in sorted(mutual):
         at = np.stack([one.pixel[j], other.pixel[k]])
         away = np.abs(taken - at).max(axis=-1)
         if worth < options.distance_ratio and (away >= options.apart).all():
-            retained_rows.append((j, k))
+            pairs.append((j, k))
             taken = np.concatenate([taken, at[None]])
-    return np.array(retained_rows, dtype=int).reshape(-1, 2)
+    return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
 def beside_machine(
@@ -304,11 +304,11 @@ class Surroundings:
         # correspondences of the image's features and the landmarks
         rays: list[Array] = [np.zeros((0, 3))]
         points: list[Array] = [np.zeros((0, 3))]
-        for other, reference_values in landmarks.items():
+        for other, landmark in landmarks.items():
             j, k = self.shared(one, other)
-            at, where = np.nonzero(k[:, None] == reference_values.number)
+            at, where = np.nonzero(k[:, None] == landmark.number)
             rays.append(self.texture(one).ray[j[at]])
-            points.append(reference_values.point[where])
+            points.append(landmark.point[where])
         ray, point = np.concatenate(rays), np.concatenate(points)
         ahead = ray[:, 2] > self.options.least_cosine
         ray, point = ray[ahead], point[ahead]

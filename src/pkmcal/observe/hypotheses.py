@@ -107,9 +107,10 @@ StationPair = tuple[SuspectStation, SuspectStation]
 
 @dataclass(frozen=True)
 class ImageHypothesis(Hypothesis[StationView]):
-    """What the images of a station may show instead; its data are the station's view.
+    """Hypothesis about the images of a station; its data are the station's view.
 
-    error : that names the mistake. readings : (K, m) of the images, where nothing else differs.
+    error : that names the mistake.
+    readings : (K, m) of the images, where nothing else differs.
     """
 
     error: InputError = field(default_factory=lambda: InputError(""))

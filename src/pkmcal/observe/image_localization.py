@@ -210,9 +210,9 @@ def weighed_poses(
 
 def distinct(view: StationView, values: Array) -> Integers:
     """Indices of the poses (H, 4, 4), best first, that are not the same as a better one."""
-    retained_rows = np.array(distinct_silhouettes(view, values, np.zeros(1, dtype=int)))
+    rows = np.array(distinct_silhouettes(view, values, np.zeros(1, dtype=int)))
     # poses near the first are the same pose, refined less well
-    return retained_rows[~same_pose(values[retained_rows], values[0]) | (retained_rows == 0)]
+    return rows[~same_pose(values[rows], values[0]) | (rows == 0)]
 
 
 def finest_view(

@@ -157,26 +157,24 @@ def _too_dark(label: str, highest: int) -> InputError:
 
 
 class LazyPictures(Sequence[Integers], ABC):
-    """Images as grey levels (height, width), none of which is looked at before it is asked
-    for.
-    """
+    """Images as grey levels (height, width), each made on first use."""
 
     @abstractmethod
     def image_of(self, number: int) -> Integers:
-        """One of them."""
+        """Image with a number."""
 
     @overload
     def __getitem__(self, index: int) -> Integers: ...
     @overload
     def __getitem__(self, index: slice) -> Sequence[Integers]: ...
     def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
-        """One image; of a slice, those that it picks."""
+        """Image with an index, or those of a slice."""
         numbers = range(len(self))[index]
         return self.image_of(numbers) if isinstance(numbers, int) else Selected(self, numbers)
 
 
 class Selected(LazyPictures):
-    """Some of a sequence of images."""
+    """Selection from a sequence of images."""
 
     def __init__(self, images: Sequence[Integers], numbers: Sequence[int] | Integers) -> None:
         self._images, self._numbers = images, [int(number) for number in numbers]
@@ -185,14 +183,15 @@ class Selected(LazyPictures):
         return len(self._numbers)
 
     def image_of(self, number: int) -> Integers:
-        """One of them."""
+        """Image with a number within the selection."""
         return self._images[self._numbers[number]]
 
 
 class Pictures(LazyPictures):
-    """Images of one camera, each decoded when it is looked at.
+    """Images of one camera, each decoded on first use.
 
-    paths, labels : of all of them. cache : those that stay decoded, by their number.
+    paths, labels : of all of them.
+    cache : those that stay decoded, by their number.
     """
 
     def __init__(
@@ -209,13 +208,14 @@ class Pictures(LazyPictures):
     def read(
         cls, paths: Sequence[Path], image_size: tuple[int, int], labels: Sequence[str], most: int
     ) -> Pictures:
-        """The images, each decoded once, of which the first ``most`` stay so; decoding runs
-        beside Python on a few threads. Raises InputError for the first that cannot be decoded.
+        """Decode each image once, on a few threads, and keep the first ``most``.
+
+        Raises InputError for the first that cannot be decoded.
         """
         out = cls(paths, image_size, labels)
 
         def measure(number: int) -> Integers | None:
-            image = out[number]  # a fault is told here, before any work
+            image = out[number]  # faults of the images are raised here, before any work
             return image if number < most else None
 
         with ThreadPoolExecutor(THREADS) as pool:
@@ -227,14 +227,14 @@ class Pictures(LazyPictures):
         return len(self._paths)
 
     def image_of(self, number: int) -> Integers:
-        """One of them. Raises InputError as :func:`decode`."""
+        """Image with a number. Raises InputError as :func:`decode`."""
         if number in self._cache:
             return self._cache[number]
         return decode(self._paths[number], self._size, self._labels[number])
 
 
 def fitting(image_size: tuple[int, int], room: int) -> int:
-    """How many decoded images fit into so many bytes."""
+    """Number of decoded images that fit into so many bytes."""
     return room // (image_size[0] * image_size[1])
 
 

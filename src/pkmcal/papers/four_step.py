@@ -165,8 +165,8 @@ def solve_from_centres(
     # passive legs ([A] 19) and joint axes
     if not legs.closing.all():
         rows = merged.visible & posed[:, None]
-        passive, reference_values = passive_centres(merged.u, base.centres, rows, T)
-        passive = np.where(reference_values[:, None], passive, np.nan)
+        passive, determined = passive_centres(merged.u, base.centres, rows, T)
+        passive = np.where(determined[:, None], passive, np.nan)
         platform = np.where(legs.closing[:, None], platform, passive)
     v, w = _axes(machine, legs, merged, posed, base, RegisteredBody(platform, T), form)
     return FourSteps(
@@ -223,13 +223,13 @@ def _axes(
     if legs.base_revolute.any():
         v[:, legs.base_revolute] = base.directions
         if form == "corrected":  # more accurate than one station
-            valid, reference_values = revolute_axes(
+            valid, determined = revolute_axes(
                 u, merged.visible, merged.station, 1, merged.information
             )
-            v = _where(reference_values[0] & legs.base_revolute, valid[:, 0], v)
+            v = _where(determined[0] & legs.base_revolute, valid[:, 0], v)
     if legs.platform_revolute.any():
-        valid, reference_values = platform_axes(u, visible, body.poses, merged.information)
-        w = _where(reference_values & legs.platform_revolute, valid, w)
+        valid, determined = platform_axes(u, visible, body.poses, merged.information)
+        w = _where(determined & legs.platform_revolute, valid, w)
     j = np.flatnonzero(legs.torsion)
     if j.size:
         tolerance = machine.parameters.tolerance[machine.layout.base_axis[j, 0]]

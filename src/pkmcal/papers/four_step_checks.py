@@ -124,10 +124,10 @@ def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, for
     posed = fixes_pose(legs.platform, at_once, motion=legs.motion)
     if not posed.any():
         _too_few_at_once(legs, at_once)
-    reference_values = (legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)])
-    free = loose(*reference_values, motion=legs.motion)
+    closing_data = (legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)])
+    free = loose(*closing_data, motion=legs.motion)
     if free.shape[-1]:
-        a, b = parts_of(*reference_values, free, motion=legs.motion)
+        a, b = parts_of(*closing_data, free, motion=legs.motion)
         names = np.flatnonzero(legs.closing)
         raise ResultError(
             what=f"the platform joints of {named(names[a])} can move against those of "

@@ -198,8 +198,8 @@ def _turns(body: Array, visibility: Array) -> list[tuple[Array, Array]]:
     along = u.mT @ laid[..., None]
     out: list[tuple[Array, Array]] = []
     for rank in HAND_EYE_RANKS:
-        retained_rows = along * (np.arange(4) < rank)[:, None]
-        camera, mount = u @ retained_rows, vt.mT @ retained_rows
+        coefficients = along * (np.arange(4) < rank)[:, None]
+        camera, mount = u @ coefficients, vt.mT @ coefficients
         out.append((from_quaternion(camera[..., 0]), from_quaternion(mount[..., 0])))
     return out
 
@@ -236,11 +236,11 @@ def _placed(body: Array, visibility: Array, camera: Array, mount: Array) -> Pair
 
 
 def start_from_poses(
-    machine: Machine, measurements: Measurements, reference_values: Array | None = None
+    machine: Machine, measurements: Measurements, T_camera_base: Array | None = None
 ) -> State:
     """Start of the joint estimate from measured poses, readings and the nominal model.
 
-    reference_values : (S, 4, 4) rough T_camera_base, NaN for stations without one; None without
+    T_camera_base : (S, 4, 4) rough T_camera_base, NaN for stations without one; None without
     any. Raises InputError for a station without any relation to the machine.
     """
     fk = machine.forward_result(measurements.joints)
@@ -249,8 +249,8 @@ def start_from_poses(
     poses = np.where(usable[:, None, None], fk.T_base_platform, np.nan)
     stations = (
         np.full((n_stations, 4, 4), np.nan)
-        if reference_values is None
-        else np.array(reference_values, float)
+        if T_camera_base is None
+        else np.array(T_camera_base, float)
     )
     stations, mounts = _carried_on(machine, measurements, poses, stations)
     lost = np.flatnonzero(np.isnan(stations[:, 0, 0]))

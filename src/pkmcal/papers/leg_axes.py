@@ -131,9 +131,9 @@ def revolute_axes(
     if information is not None:
         # covariances of the directions across themselves, up to a common factor
         size = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
-        above_limit = visible[..., None, None] & (size > 0)
+        determined = visible[..., None, None] & (size > 0)
         along = size * (u[..., :, None] * u[..., None, :])
-        covariance = np.linalg.inv(np.where(above_limit, information + along, np.eye(3)))
+        covariance = np.linalg.inv(np.where(determined, information + along, np.eye(3)))
         for _ in range(REVOLUTE_WEIGHT_ROUNDS):
             v = np.einsum("sc,bsli->bcli", of_group, vectors[..., 0])
             noise = dot(v, (covariance @ v[..., None])[..., 0])

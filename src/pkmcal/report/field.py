@@ -233,13 +233,13 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     # well-determined directions
     information = total(direction[:, :, None] * direction[:, None])
     strength, axes = np.linalg.eigh(information)
-    above_limit = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
+    strong = strength > LEAST_WEIGHT_ACROSS * strength.sum(axis=1, keepdims=True)
     along = np.einsum("cij,ci->cj", axes, total(direction * value[:, None]))
     shift = np.einsum(
-        "cij,cj->ci", axes, np.where(above_limit, along / np.maximum(strength, 1e-12), 0.0)
+        "cij,cj->ci", axes, np.where(strong, along / np.maximum(strength, 1e-12), 0.0)
     )
     explained = np.einsum("ci,cij,cj->c", shift, information, shift)
-    rank = above_limit.sum(axis=1)
+    rank = strong.sum(axis=1)
     freedom = np.maximum(n - rank, 1)
     residual = np.maximum(total(value**2) - explained, 1e-300)
     # F-test of the shift against the scatter about it

@@ -20,10 +20,11 @@ MOVEMENT_MOMENTS_TRIED = 12
 def movement_columns(
     station: int, name: str, used: Integers, configurations: Sequence[str], what: str = "camera"
 ) -> Iterator[Column]:
-    """That a station stands elsewhere from some configuration on.
+    """Columns of a station that moved after some configuration.
 
-    station, name : its number and name. used : configurations of which it measured something, in
-    their order. what : stands there.
+    station, name : its number and name.
+    used : configurations of which it measured something, in their order.
+    what : stands there.
     """
     few = FEWEST_BESIDE_MOVEMENT
     times = min(MOVEMENT_MOMENTS_TRIED, len(used) - 2 * few + 1)
@@ -51,7 +52,7 @@ def movement_columns(
 
 
 def how_far(change: Array) -> str:
-    """How far a pose moved, as the end of a sentence.
+    """Movement of a pose in words, as the end of a sentence.
 
     change : (omega, tau), rad and m; NaN where the data do not determine it.
     """

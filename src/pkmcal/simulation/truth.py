@@ -377,10 +377,10 @@ def load_truth(folder: Path | str, nominal: Machine | None = None) -> Truth:
     if data.get("pkmcal_truth") != 1:
         raise InputError("not the truth of a simulated session", where=str(path))
     nominal = nominal or load_session(folder).machine
-    reference_values = data["parameters"]
+    parameters = data["parameters"]
     # files from before readings had scales: the scale is one
     values = [
-        reference_values[name] if name in reference_values or not name.endswith(".scale") else 1.0
+        parameters[name] if name in parameters or not name.endswith(".scale") else 1.0
         for name in nominal.parameters.names
     ]
     stations, configurations = tuple(data["stations"]), tuple(data["configurations"])

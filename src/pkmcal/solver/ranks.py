@@ -19,7 +19,7 @@ NORMAL_RANK_TOLERANCE = 1e-13
 
 
 def nonzero(values: Array, tolerance: float = RANK_TOLERANCE) -> Booleans:
-    """Which singular values or eigenvalues (..., m) are above ``tolerance`` of the largest."""
+    """Whether singular values or eigenvalues (..., m) are above ``tolerance`` of the largest."""
     return values > tolerance * values.max(axis=-1, keepdims=True, initial=0.0)
 
 
@@ -96,8 +96,8 @@ def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
 
 def _safe_inverse(values: Array, limit: Array) -> Array:
     """1 / values where the values are above the limit, else 0."""
-    above_limit = values > limit
-    return np.where(above_limit, 1 / np.where(above_limit, values, 1.0), 0.0)
+    above_tolerance = values > limit
+    return np.where(above_tolerance, 1 / np.where(above_tolerance, values, 1.0), 0.0)
 
 
 def unit_diagonal(normal: Array) -> tuple[Array, Array]:

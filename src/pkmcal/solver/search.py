@@ -254,9 +254,9 @@ class _Divided(NamedTuple):
     def rows(self, state: Any, values: list[Values] | None) -> Iterator[Compact]:
         """Residuals and Jacobian of one part after another; values : residuals there, if known."""
         for k, (cut, part) in enumerate(self.parts):
-            reference_values = values[k].rows if values else None
-            if reference_values:
-                yield reference_values()
+            make_rows = values[k].rows if values else None
+            if make_rows:
+                yield make_rows()
             elif _is_divisible(part):
                 yield part.compact(part.state_among(state, cut))
             else:

@@ -185,9 +185,11 @@ class HexapodByLegs:
 
 @dataclass(frozen=True)
 class MeasuredHexapod:
-    """One run.
+    """Hexapod of one run, with its measurements.
 
-    view : the camera. centres : (L, 3) true base centres in its frame. machine : the assumed model.
+    view : the camera.
+    centres : (L, 3) true base centres in its frame.
+    machine : the assumed model.
     measurements : edges and readings.
     """
 

@@ -216,7 +216,7 @@ def answer_tasks(source: IO[bytes], target: IO[bytes]) -> None:
     while (message := _read_message(source)) is not None:
         try:
             answer: Any = work(pickle.loads(message))
-        except Exception as error:  # noqa: BLE001 - the study's own process tells it
+        except Exception as error:  # noqa: BLE001 - raised again by the study's own process
             answer = error
         _write_message(target, answer)
 
