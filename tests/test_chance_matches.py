@@ -115,7 +115,7 @@ def test_a_station_that_may_stand_elsewhere_is_told_with_why():
     assert number == 1
     (measured,) = {int(np.sum(turns.observation.edges.station == 1))}
     assert why.startswith(f"only {measured} of ")
-    assert why.endswith("it may stand elsewhere; a pose by hand would tell")
+    assert why.endswith("it may stand elsewhere; a pose by hand would decide")
     session, turns = two_stations(aside(taken(), 2.5 * IMAGE_OFFSET), T_camera_base=FRONT)
     assert by_chance(session, turns)[1].endswith("it may stand elsewhere")
 

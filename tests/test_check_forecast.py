@@ -130,7 +130,9 @@ def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
     legs.append(LegForecast("front", 6, seen, found, 0.2, 0.02, 0.4))
     values = Forecast(15, 2e-4, 1e-3, 0.0, 0.03, float("nan"), tuple(legs))
     part = words.forecast_part(values)
-    assert part.terminal_text[1] == f"Leg 6 tells little, 2% of what all edges tell: {why}."
+    assert (
+        part.terminal_text[1] == f"Leg 6 contributes little, 2% of the edges' information: {why}."
+    )
     marks = [row.mark for row in part.tables[0].rows]
     assert marks == ["good"] * 5 + [Level.NOTE]
 

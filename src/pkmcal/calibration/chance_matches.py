@@ -78,7 +78,7 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
         if station.handheld or k in boards:
             continue
         if (offered := _offered(turns, [k])) is not None:
-            advice = "" if station.T_camera_base is not None else "; a pose by hand would tell"
+            advice = "" if station.T_camera_base is not None else "; a pose by hand would decide"
             reasons[k] = (
                 f"only {offered.measured} of {offered.in_sight} edges in sight were measured where"
                 f" the machine has them, and chance offers as many {how_often(offered.chance)}: it"

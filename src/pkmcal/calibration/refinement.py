@@ -485,8 +485,8 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
     bad = [session.configurations[k] for k in np.flatnonzero(~fk.converged)]
     if bad:
         raise InputError(
-            "the machine cannot take these readings, neither as drawn nor as the other"
-            " configurations show it: its legs do not meet the platform",
+            "the machine does not close at these readings, neither by the nominal model nor by an"
+            " estimate from the other configurations",
             where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
             found=f"a gap of {float(fk.error.max()) * 1e3:.3g} mm",
             expected="readings at which all legs reach the platform",

@@ -31,13 +31,13 @@ INFORMATION_LOST_SHARE = 1 - 1 / ADVICE_WORTH_FACTOR**2
 POOR_LEG = 0.5
 """Information of a leg, relative to the mean of all legs, below which the leg is named."""
 EDGE_SHARES_LEGEND = (
-    "Shares of what all edges tell about the machine, by leg and station.",
+    "Shares of the edges' information about the machine, by leg and station.",
     "Variance: of the platform's position, what comes from the leg's edges: where",
     "it is large, a better view of that leg gains most.",
 )
 ONE_LEGEND = (
     "Seen: of its edges, what nothing hides. Found: of these, measured, agreeing",
-    "with the others. Sigma: of an edge, across. Tells: of what all edges tell",
+    "with the others. Sigma: of an edge, across. Share: of the edges' information",
     "about the machine. Variance: of the platform's position, what comes from its",
     "edges: where it is large, a better view of that leg gains most.",
 )
@@ -210,7 +210,7 @@ def forecast_part(forecast: Forecast) -> Part:
     total = {j: sum(by[s, j].tells for s in stations) for j in numbers}
     mean = sum(total.values()) / len(total)
     poor = [j for j in numbers if total[j] < POOR_LEG * mean]
-    columns = ("Seen", "Found", "Sigma", "Tells", "Variance")
+    columns = ("Seen", "Found", "Sigma", "Share", "Variance")
     details = Table(
         "By station and leg",
         ("Station, leg", *columns),
@@ -260,13 +260,13 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
     """Sentences on the forecast, and on the legs with the least information and their causes."""
     images = sum(len(edges.images) for edges in forecast.edges)
     out = [
-        f"{forecast.photographs} such images a station, over the joints' ranges, would tell the"
-        f" platform's position to {brief(forecast.position * 1e3)} mm and its orientation to"
+        f"{forecast.photographs} such images a station, over the joints' ranges, would determine"
+        f" the platform's position to {brief(forecast.position * 1e3)} mm and its orientation to"
         f" {brief(math.degrees(forecast.orientation))}° (standard deviations at given readings, by"
         f" the edges of {count(images, 'image')}). Of its variance"
         f" {sum(leg.variance for leg in forecast.legs):.0%} comes from the edges,"
-        f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from what is known"
-        " beforehand, of the nominal model and of shading."
+        f" {forecast.readings:.0%} from the readings, {forecast.drawing:.0%} from the priors"
+        " of the nominal model and of shading."
     ]
     for j in poor:
         mine = [leg for leg in forecast.legs if leg.leg == j]
@@ -278,7 +278,7 @@ def _forecast_lines(forecast: Forecast, poor: list[int]) -> tuple[str, ...]:
                 why.append(f"{1 - leg.found:.0%} of its edges lost at {leg.station}")
         because = f": {listed(why, 3)}" if why else ""
         share = f"{sum(leg.tells for leg in mine):.0%}"
-        out.append(f"Leg {j} tells little, {share} of what all edges tell{because}.")
+        out.append(f"Leg {j} contributes little, {share} of the edges' information{because}.")
     return tuple(out)
 
 

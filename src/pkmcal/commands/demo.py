@@ -75,7 +75,7 @@ def demo(
     n_images = sum(len(station.images) for station in calibration.session.stations)
     outcome = replace(
         outcome,
-        subject=f"A {calibration.machine.name}, not built quite as drawn, in {n_images}"
+        subject=f"A {calibration.machine.name} that deviates from its nominal model, in {n_images}"
         f" simulated images: {session}",
         summary={
             **(outcome.summary or {}),
