@@ -60,36 +60,35 @@ from pkmcal.solver.ranks import nonzero
 from pkmcal.wording import listed
 
 MOST_MEASUREMENT_PASSES = 3
-"""Looks at the edges, each from the estimate before, after which nothing but the machine itself is
-asked to have settled, and before which refined cameras are not."""
+"""Measurement passes, each from the estimate before, after which only the machine has to have
+converged; refined cameras do not converge in fewer."""
 MOST_BAD_PASSES = 9
-"""Most looks of one that does not."""
+"""Largest number of measurement passes of a machine that does not converge."""
 SETTLED_MACHINE_CHANGE = 2.0
-"""Standard deviations, root mean square over what the data tell, by which a look may move a machine
-that has settled: the second look moves it
-by one half or one, and looks that find other edges, of polished legs, by one again and again. Where
-a camera stands centimetres off and slides towards its place, edges lie where they are predicted,
-and each look moves the machine by four or more."""
+"""Change of a converged machine by a measurement pass, in standard deviations, root mean square
+over the determined directions. The second pass changes it by a half to one, and passes that measure
+other edges of polished legs by one again and again. While a camera that is centimetres off
+approaches its pose, edges lie where they are predicted, and each pass changes the machine by four
+or more."""
 SETTLED_AT_ONCE = SETTLED_MACHINE_CHANGE / 2
-"""The same of a second look that nothing follows: after one that moves the machine by more, another
-leaves a quarter of what the way there still makes of it."""
+"""The same for a pass that is the last one before MOST_MEASUREMENT_PASSES: after a larger change, a
+further pass reduces the remaining dependence on the starting point to a quarter."""
 SETTLED_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 10
-"""Median distance (px) of edges from their prediction below which another look changes nothing:
-the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
-far."""
+"""Median distance (px) of edges from their prediction below which a further pass changes nothing:
+the first pass corrects a pixel, the second what shading leaves; profiles reach ten times as far."""
 ASTRAY_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 3
-"""The same (px) of a first look that may have been elsewhere: what is found by chance lies evenly
-over the profiles' reach, so that the median of hundreds of places is half of it."""
+"""The same (px) for a first pass that may have measured other edges: chance matches are uniform
+over the profiles' reach, so the median of hundreds of them is half of it."""
 IMPUTATION_PASSES = 6
-"""Looks from machines as likely as the one that was found: with some thirty numbers told in each,
-the deviations that they make larger are known to a twentieth."""
+"""Measurement passes from machines drawn from the posterior: with some thirty determined numbers in
+each, the standard deviations that contain their scatter are known to a twentieth."""
 MOST_BINNING = 4
-"""Times that images are binned as at first, at most: to pictures of 256 pixels, in which a
-machine is still recognised."""
+"""Largest ratio of the binning to the first one: images then have 256 pixels, in which a machine is
+still localized."""
 IMAGES_FOR_WIDTH = 4
-"""StationImages of a station that are asked about that: a lens blurs all alike."""
+"""Images of a station from which the width of its edges is measured: a lens blurs all equally."""
 FEWEST_EDGES_TO_IDENTIFY = 24
-"""Edges without which there is nothing to identify: one image of a hexapod shows as many."""
+"""Fewest edges for an estimate: as many as one image of a hexapod shows."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
 _OFF = (
     "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"

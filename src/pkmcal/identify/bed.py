@@ -26,13 +26,13 @@ from pkmcal.solver.elimination import divisions, rows_on_shared
 from pkmcal.solver.ranks import column_space
 
 POINTS_OVER_BED = 60
-"""Places all over the bed: where nobody probed counts as well."""
+"""Points over the whole bed at which its height is predicted, probed or not."""
 NOTICED_TOUCH_DEVIATIONS = 4.13
-"""Standard deviations by which a touch has to be off what all others tell of it to be noticed: one
-right touch in a thousand seems to be, and four wrong ones in five are found (W. Baarda, A testing
-procedure for use in geodetic networks, 1968)."""
+"""Deviation of a height from its prediction by all others, in standard deviations, that is detected
+with a probability of 0.8 at a false-alarm rate of 0.001 (W. Baarda, A testing procedure for use in
+geodetic networks, 1968)."""
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-"""Turn from one place to the next on a spiral that covers a disc evenly."""
+"""Angle between successive points of a spiral that covers a disc evenly, rad."""
 
 
 @dataclass(frozen=True)
