@@ -73,7 +73,7 @@ def test_a_session_gives_a_false_alarm_at_most_at_its_level():
 
 
 def test_tests_of_one_search_share_its_level():
-    level = FalseAlarm(0.01, ("violations", "poses"))
+    level = FalseAlarm(0.01, searches=2)
     assert level.of_test(5) == 0.001
     assert level.of_test(0) == 0.005
     np.testing.assert_allclose(level.adjusted(np.array([1e-3, 0.5]), np.array([5, 5])), [0.01, 1.0])

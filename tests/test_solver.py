@@ -14,7 +14,7 @@ from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
 from pkmcal.solver.kernels import final_weights, geman_mcclure_weights
 from pkmcal.solver.marquardt import Damping
 from pkmcal.solver.ranks import column_space, inverse_root, normal_root
-from pkmcal.solver.search import Stop, minimise, of_runs, put, take
+from pkmcal.solver.search import SearchOptions, Stop, minimise, of_runs, put, take
 from pkmcal.solver.strips import Compact, StripLayout, Strips, compact, normal_equations
 from test_identify_scene import guess, make_scene
 
@@ -212,6 +212,18 @@ def test_step_limit_is_told():
     limited = minimise(Dense(rosenbrock, np.arange(1)), np.array([[-1.2, 1.0]]), max_steps=2)
     assert limited.stop == (Stop.STEPS,)
     assert "step limit" in limited.stop[0].value
+
+
+def test_damped_steps_are_smaller_and_lead_to_the_same_minimum():
+    def line(x, runs):
+        return 3 * x - 2, np.full((len(x), 1, 1), 3.0)
+
+    problem, start = Dense(line, np.arange(1)), np.array([[5.0]])
+    usual = minimise(problem, start)
+    damped = minimise(problem, start, options=SearchOptions(least_damping=1e-3))
+    assert damped.stop == usual.stop == (Stop.CONVERGED,)
+    assert damped.steps[0] > usual.steps[0]
+    np.testing.assert_allclose([damped.state, usual.state], 2 / 3, atol=1e-7)
 
 
 def test_nothing_predictable_is_told():

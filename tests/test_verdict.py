@@ -14,7 +14,7 @@ from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, explain, observed_legs
-from pkmcal.identify.verdict import VERDICT, assess, no_gain
+from pkmcal.identify.verdict import VERDICT, VerdictOptions, assess, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.conditions import conditions
@@ -59,6 +59,20 @@ def test_a_whole_session_may_be_used(whole):
     assert verdict.usable
     assert findings.identifiability.unidentified == ()
     assert verdict.warnings == ()
+
+
+def test_the_limits_of_a_verdict_are_its_options(whole):
+    observation, estimate, findings, _ = whole
+    used = int(estimate.configurations.sum())
+
+    def codes(**limits):
+        return assess(observation, estimate, findings, options=VerdictOptions(**limits)).codes
+
+    assert "configurations.few" not in codes(few_configurations=used)
+    assert "configurations.few" in codes(few_configurations=used + 1)
+    scale = estimate.statistics.noise_scale
+    assert "edges.misfit" not in codes(too_noisy=scale)
+    assert "edges.misfit" in codes(too_noisy=np.nextafter(scale, 0))
 
 
 def test_light_that_moves_single_edges_is_warned_of(whole):

@@ -9,29 +9,26 @@ holds however the tests depend on each other.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 
-Search = Literal["violations", "outlines", "discrepancy", "poses"]
-
 
 @dataclass(frozen=True)
 class FalseAlarm:
-    """Level of a session, and the searches that share it."""
+    """Level of a session, and the number of searches that share it."""
 
     # chance that a session that agrees with its model shows any named violation, any discrepancy,
     # or any measured pose that disagrees with all others: one session of two hundred
     level: float = 0.005
-    # score tests of model violations (score.py), tubes' outlines, components of the discrepancy,
-    # and measured poses that disagree with the others
-    searches: tuple[Search, ...] = ("violations", "outlines", "discrepancy", "poses")
+    # searches that share it: score tests of model violations (score.py), tubes' outlines,
+    # components of the discrepancy, and measured poses that disagree with the others
+    searches: int = 4
 
     def of_test(self, tests: int) -> float:
         """Level of each of the tests of one search."""
-        return self.level / (len(self.searches) * max(tests, 1))
+        return self.level / (self.searches * max(tests, 1))
 
     def scale(self, dof: float) -> float:
         """Root mean square of normal errors, in their standard deviations, that one search exceeds
@@ -46,7 +43,7 @@ class FalseAlarm:
         """P-values among all tests of a session, from the p-values of tests and the number of tests
         that share the level of their search.
         """
-        return np.minimum(len(self.searches) * np.asarray(tests) * chance, 1.0)
+        return np.minimum(self.searches * np.asarray(tests) * chance, 1.0)
 
 
 SESSION_FALSE_ALARM = FalseAlarm()
