@@ -16,7 +16,7 @@ in the readings at once.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -580,9 +580,8 @@ def poses_disagree(estimate: Estimate) -> bool:
     )
 
 
-def check_closure(session: Session, boards: Boards) -> None:
-    """Raise `InputError` where readings and measured poses contradict each other, and a reading
-    never changes or mistakes in the readings explain it.
+def explain_closure(session: Session, boards: Boards) -> Explanation:
+    """The mistake in the readings that explains why measured poses contradict them, if any.
 
     Asked before any estimate: one from such readings takes a thousand steps and ends nowhere.
     """
@@ -590,17 +589,14 @@ def check_closure(session: Session, boards: Boards) -> None:
     poses = measurements.poses
     positions = (poses.rows >= 3) & measurements.on_platform[poses.mount]
     if np.count_nonzero(positions) < 2 * FEWEST_BESIDE_MOVEMENT:
-        return  # a frame and mount of their own explain few
+        return Explanation()  # a frame and mount of their own explain few
     machine, few = session.machine, spread_over(measurements, CLOSURE_CONFIGURATIONS)
     (misfit,) = closure_misfits(machine, [few]).tolist()
     limit = closure_limit(machine, few, np.random.default_rng(0), enough=misfit)
     if misfit <= limit:
-        return
-    if error := frozen_in(session):
-        raise error
-    diagnosis = diagnose_by_closure(machine, measurements, misfit, limit)
-    if error := _error_of(session, diagnosis, misfit):
-        raise error
+        return Explanation()
+    diagnosis = partial(diagnose_by_closure, machine, measurements, misfit, limit)
+    return _explanation(session, diagnosis, misfit)
 
 
 def explain_poses(
@@ -613,32 +609,32 @@ def explain_poses(
 
     richer : the model of the mechanism file that explains the poses; where they agree with it, no
     mistake is looked for.
-    Raises InputError where poses disagree and a reading never changes.
     """
     if not poses_disagree(estimate) or (richer is not None and richer.scale < SUSPECT_SCALE):
         return Explanation()
-    if error := frozen_in(session):
-        raise error
-    diagnosis = diagnose(session.machine, measurements, estimate)
-    untested: tuple[Finding, ...] = ()
-    if diagnosis.untested:
-        codes = [code for code, _ in diagnosis.untested]
-        why = diagnosis.untested[0][1]
-        untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
-    error = _error_of(session, diagnosis, pose_misfit(estimate))
-    return Explanation(error, diagnosis.log_odds, untested)
+    diagnosis = partial(diagnose, session.machine, measurements, estimate)
+    return _explanation(session, diagnosis, pose_misfit(estimate))
 
 
-def _error_of(session: Session, diagnosis: Diagnosis, misfit: float) -> InputError | None:
-    """The error that names a diagnosis's mistakes, and those that it does not exclude; None where
-    it has none. misfit : of the poses as stated, in stated sigmas.
+def _explanation(session: Session, diagnose: Callable[[], Diagnosis], misfit: float) -> Explanation:
+    """The error that names a diagnosis's mistakes, and those that it does not exclude.
+
+    A reading that never changes is named before all others, for its effect may be like any of
+    theirs. misfit : of the poses as stated, in stated sigmas.
     """
+    if error := frozen_in(session):
+        return Explanation(error, np.inf)
+    diagnosis, untested = diagnose(), tuple[Finding, ...]()
+    if diagnosis.untested:
+        codes, (why, *_) = zip(*diagnosis.untested, strict=True)
+        untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
     if diagnosis.hypothesis is None:
-        return None
+        return Explanation(untested=untested)
     error = _error(session, diagnosis.hypothesis, diagnosis, misfit)
     others = [_error(session, one, diagnosis, misfit).what for one in diagnosis.rivals]
     also = f"; the poses fit as well if {' or '.join(others)}" if others else ""
-    return error.with_fields(found=f"{error.found}{also}")
+    error = error.with_fields(found=f"{error.found}{also}")
+    return Explanation(error, diagnosis.log_odds, untested)
 
 
 def _error(
