@@ -43,7 +43,7 @@ from pkmcal.calibration.localization import (
 )
 from pkmcal.calibration.model_violations import DetectedViolation, model_violations
 from pkmcal.calibration.outlier_explanations import outlier_explanations
-from pkmcal.calibration.pose_hypotheses import check_closure, explain_poses
+from pkmcal.calibration.pose_hypotheses import explain_closure, explain_poses
 from pkmcal.calibration.refinement import (
     RefinementResult,
     identify_poses,
@@ -316,7 +316,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
     repairs: list[Ranked[UpsideDown]] = []
     while True:
         # mistakes in the readings, without which no estimate means anything
-        check_closure(case.session, case.boards)
+        refuse(partial(explain_closure, case.session, case.boards))
         try:
             turns = _identify(case, refine_camera, clock)
         except ResultError:

@@ -1,11 +1,12 @@
 """Test of measured edges against chance matches.
 
-Some image edge is within reach of any predicted edge. A machine that is not the one in the images,
-localized all the same, gets a tenth of its edges by chance, and the joint estimate makes these
-agree, with large standard deviations. So where few of the edges in sight were measured, they are
-measured again with the images shifted, in several directions: there no leg is where it is
-predicted, so all matches are by chance. This is an absolute test; no likelihood ratio between
-explanations replaces it.
+Some image edge is within reach of any predicted edge. If another machine than that in the images
+is localized all the same, a tenth of its edges are matched by chance, and the joint estimate makes
+these agree, with large standard deviations. Where few of the edges in sight were measured, they are
+measured again with the images shifted, in several directions: no leg is then at its predicted
+place, so all matches are by chance. This is an absolute test, which no likelihood ratio between
+explanations replaces. Its level is that of the localization: the probability with which a wrong
+pose is accepted.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ OFFSET_DIRECTIONS = 8
 
 
 class _Offered(NamedTuple):
-    """Numbers of edges of some stations: in sight, measured, expected by chance, and the p-value
-    of as many by chance as were measured.
+    """Numbers of edges of some stations: in sight, measured, and expected by chance; and the
+    p-value of the number that was measured.
     """
 
     in_sight: int
@@ -45,8 +46,8 @@ class _Offered(NamedTuple):
 
 
 def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
-    """A reason against the result where its edges may be chance matches; tested only where less
-    than a third of the edges in sight were measured.
+    """Reason against a result whose edges may be chance matches; tested only where less than a
+    third of the edges in sight were measured.
     """
     offered = _offered(turns, [p.station for p in turns.images])
     if offered is None:
@@ -64,12 +65,12 @@ def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
 
 
 def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
-    """Reasons why stations on a tripod may have a wrong pose, by their numbers: as many edges by
-    chance as were measured. Empty where that holds for all stations.
+    """Reasons why stations on a tripod may have a wrong pose, by their numbers: their edges may be
+    chance matches. Empty if that holds for all stations.
 
-    One search of a thousand ends at a wrong pose although it seems sure, and where the machine
-    hardly shows, little is lost with the station. Stations that see a board on the base have their
-    pose from the board.
+    One search of a thousand is confirmed at a wrong pose, and little is lost with a station in
+    which the machine is hardly visible. Stations that observe a board on the base have their pose
+    from the board.
     """
     boards = set(turns.measurements.poses.station.tolist())
     reasons: dict[int, str] = {}
@@ -88,7 +89,7 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
 
 
 def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | None:
-    """Chance matches among the edges of some stations; None where they cannot explain these."""
+    """Chance matches among the edges of some stations; None if these are significantly more."""
     from scipy.special import stdtr
 
     in_view = turns.observation
@@ -106,7 +107,7 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     lateral = IMAGE_OFFSET * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     counts = np.array([_count(turns, stations, away) for away in lateral])
     mean = float(counts.mean())
-    # eight counts may lie nearer to each other by chance than counts do
+    # the scatter of eight counts may be smaller by chance than that of Poisson's distribution
     spread = max(float(counts.std(ddof=1)), np.sqrt(mean), 1.0)
     own = _count(turns, stations, np.zeros(2))
     apart = (own - mean) / (spread * np.sqrt(1 + 1 / len(counts)))

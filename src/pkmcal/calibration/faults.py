@@ -1,6 +1,6 @@
-"""Findings about an estimate: noise that contradicts what is stated, a poor model, scales, lenses.
+"""Findings about an estimate: contradicted noise, an insufficient model, scales, lenses.
 
-Mistakes in a session that explain disagreeing poses are in
+Hypotheses about poses that disagree with the machine are in
 :mod:`pkmcal.calibration.pose_hypotheses`.
 """
 
@@ -33,24 +33,25 @@ from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
 UNTOLD_BOARD_SIZE_SIGMA = 0.7
-"""Part of its prior sigma from which a board's size is determined by its file rather than by the
-data."""
+"""Share of the prior sigma of a board's size from which its sigma is due to the file rather than to
+the data."""
 BOARD_SIZE_DISAGREEMENT = 2.0
 """Standard deviations between a board's size by its file and by all other data from which a note
-names them: by chance one session of twenty."""
+reports both: by chance one session of twenty."""
 WRONG_SCALE_DEVIATIONS = 3.0
-"""Standard deviations from the nominal scale of a reading from which a note names it."""
+"""Standard deviations from the nominal scale of a reading from which a note reports it."""
 COMMON_FACTOR_CHI2 = 60.0
-"""Gain of the nominal model's chi2 by a common factor on all lengths from which it is named."""
+"""Reduction of the nominal model's chi2 by a common factor on all lengths from which the factor is
+reported."""
 WRONG_MODEL_READING_SCALE = 100.0
-"""Factor on the readings' stated noise from which the scatter is no noise: mounted encoders are
-ten or thirty times as noisy as their data sheets."""
+"""Factor on the readings' stated noise from which the scatter is a model error: mounted encoders
+are ten or thirty times as noisy as their data sheets."""
 FEWEST_POSES = 4
-"""Whole poses of one station from which the platform's turning is tested."""
+"""Whole poses of one station from which the platform's rotation is tested."""
 
 
 def wrong_scale(estimate: Estimate) -> float:
-    """Common factor of all estimated lengths to the nominal ones; 1 where no common factor explains
+    """Common factor of all estimated lengths to the nominal lengths; 1 if no common factor explains
     their difference. A board whose squares are larger than stated makes the whole machine larger.
     """
     machine = estimate.machine
@@ -69,8 +70,8 @@ def wrong_scale(estimate: Estimate) -> float:
 
 
 def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
-    """The estimate with the readings' noise as stated, for the comparison of hypotheses: otherwise
-    a wrong sign, or a model that is too poor, would be taken for noise.
+    """Estimate with the readings' noise as stated, for the comparison of hypotheses: otherwise the
+    noise scale would absorb a wrong sign, or an insufficient model.
     """
     if estimate.statistics.reading_scale <= 1 or not len(measurements.poses):
         return estimate
@@ -78,8 +79,8 @@ def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Es
 
 
 def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """A reason against the result where readings scatter by more than the nominal model's prior
-    sigma, so that they determine nothing, or by too much more than stated to be noise.
+    """Reason against a result whose readings scatter by more than the nominal model's prior sigma,
+    so that they determine nothing, or by too much more than stated to be noise.
     """
     s, tolerance = estimate.statistics, session.machine.document.tolerance
     units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
@@ -100,10 +101,10 @@ def noise_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
 def richer_model(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[RicherModel | None, tuple[Finding, ...]]:
-    """The richer model of the mechanism file that explains poses for which this one is too poor,
-    None where none does; and notes on models without an estimate.
+    """Richer model of the mechanism file that explains poses for which this model is insufficient,
+    None without such a model; and notes on models without an estimate.
 
-    Each of its parameters costs what noise gains by one (:func:`parameter_cost`).
+    Each additional parameter costs half a log n (:func:`parameter_cost`).
     """
     null, machine = estimate.statistics.pose_scale, session.machine
     if null < POOR_MODEL_POSE_SCALE:
@@ -138,7 +139,7 @@ def richer_model(
 
 
 def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """A reason against the result where all lengths have a common factor."""
+    """Reason against a result whose lengths all have a common factor."""
     scale = wrong_scale(estimate)
     if scale != 1.0 and estimate.pose_weights.size:
         cause = "board" if session.board else "table"
@@ -175,7 +176,7 @@ def noise_notes(
 
 
 def lens_notes(cameras: CameraRefinement) -> Iterator[Finding]:
-    """A warning for each camera that was refined and whose file states no covariance."""
+    """Warnings about refined cameras whose files state no covariance."""
     for file, camera in zip(cameras.files, cameras.calibrated, strict=True):
         if cameras.refined and camera.covariance is None:
             yield doubtful(
@@ -203,7 +204,7 @@ def size_notes(
         if sigma <= UNTOLD_BOARD_SIZE_SIGMA * tolerance:
             yield note("board.size_estimate", file, value=value, sigma=sigma)
             continue
-        # without the prior from the file, the estimate is that of all other data
+        # without the prior, which is the file's, the estimate is that of all other data
         other = max(1 - (sigma / tolerance) ** 2, np.finfo(float).eps)
         facts = {"tolerance": 100 * tolerance}
         if abs(value) / np.sqrt(other) > BOARD_SIZE_DISAGREEMENT * tolerance:
@@ -214,8 +215,8 @@ def size_notes(
 
 
 def scale_notes(session: Session, estimate: Estimate, named: tuple[str, ...]) -> Iterator[Finding]:
-    """A note on readings whose scale differs significantly from the nominal one, besides those
-    ``named`` already.
+    """Note on readings whose scale differs significantly from the nominal scale; named : columns
+    that another finding reports.
     """
     layout, table = session.machine.layout, session.machine.parameters
     results: dict[str, tuple[float, float]] = {}
@@ -249,7 +250,7 @@ def _within(value: float, limits: tuple[float, float | None]) -> bool:
 
 
 def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Finding]:
-    """Whether the platform turns as the mechanism file states, by each station's whole poses.
+    """Test of the platform's rotation against the mechanism file, by each station's whole poses.
 
     on_platform : (M,) of the mounts.
     """
@@ -277,7 +278,7 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Fin
             "chi2": axis.chi2,
             "dof": axis.dof,
         }
-        # Noise that is stated a little too small is no reason to doubt a mechanism.
+        # Noise that is stated a little too small does not contradict a mechanism.
         if axis.tenable:
             out.append(note("poses.turning", name, **facts))
         elif axis.chi2 > POOR_MODEL_POSE_SCALE**2 * axis.dof:

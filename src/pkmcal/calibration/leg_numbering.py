@@ -36,7 +36,7 @@ LAST_DIGIT = 1e-6
 
 def equal_numberings(machine: Machine, joints: Array) -> tuple[Integers, ...]:
     """Permutations of the readings' columns, (m,) each, under which the nominal model is the same
-    machine as far as its prior sigmas tell.
+    machine within its prior sigmas.
 
     Each starts the count at another leg, or counts backwards. Empty for machines with legs without
     a reading of their own.

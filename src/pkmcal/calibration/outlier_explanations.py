@@ -1,11 +1,11 @@
-"""Measured poses that the estimate rejects, and what explains them: a reading, or a wrong name.
+"""Explanations of rejected poses: a wrong reading, or a wrong name.
 
-A measured pose determines what all motors should have read. Where a configuration disagrees and all
-of its readings but one agree, that reading is wrong; where its pose agrees with the readings of
-another configuration, names were mixed up. Either is rejected because of the other configurations,
-so the result is right; but whoever took the images wants to know. Hypotheses are transformations of
-the readings (:mod:`pkmcal.outcome.hypotheses`), each with the absolute test that the configuration
-then disagrees no more.
+A measured pose determines the readings of all motors. Where a configuration is an outlier and all
+of its readings but one agree with its poses, that reading is wrong; where its poses agree with the
+readings of another configuration, names were exchanged. The estimate rejects either, so the result
+is right, and a warning names the cause. Hypotheses are transformations of the readings
+(:mod:`pkmcal.outcome.hypotheses`), each with the absolute test that the configuration is then no
+outlier.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ from pkmcal.wording import listed
 
 
 class MeasuredPlatforms(NamedTuple):
-    """Platform poses by n measured poses, T_base_platform (n, 4, 4), the configuration of each, and
-    the covariance (n, m, m) of the readings that follow from each.
+    """Platform poses by n measured poses.
+
+    configuration : (n,). T_base_platform : (n, 4, 4). noise : covariance (n, m, m) of the readings
+    that follow from each pose by inverse kinematics.
     """
 
     machine: Machine
@@ -50,17 +52,19 @@ class MeasuredPlatforms(NamedTuple):
     noise: Array
 
     def select(self, rows: Integers | Booleans) -> MeasuredPlatforms:
-        """Some poses: indices, or a mask."""
+        """Selected poses; rows : indices, or a mask."""
         return MeasuredPlatforms(
             self.machine, self.configuration[rows], self.T_base_platform[rows], self.noise[rows]
         )
 
     def differences(self, joints: Array) -> Array:
-        """Differences (n, m) of the readings that follow from those that were read, (K, m)."""
+        """Differences (n, m) of the readings by inverse kinematics from the table's, (K, m)."""
         return self.differences_of(joints[self.configuration])
 
     def differences_of(self, readings: Array) -> Array:
-        """Differences (..., n, m) from readings (..., n, m)."""
+        """Differences (..., n, m) of the readings by inverse kinematics from readings
+        (..., n, m).
+        """
         shape = readings.shape
         poses = np.broadcast_to(self.T_base_platform, (*shape[:-1], 4, 4)).reshape(-1, 4, 4)
         flat = readings.reshape(-1, shape[-1])
@@ -80,7 +84,7 @@ class MeasuredPlatforms(NamedTuple):
 def outlier_explanations(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> Iterator[Finding]:
-    """A warning for each configuration that stands against the others and is explained."""
+    """Warnings about configurations that are outliers and have an explanation."""
     whole = (measurements.poses.rows == 6) & measurements.on_platform[measurements.poses.mount]
     which = np.flatnonzero(whole)
     if not which.size:
@@ -96,9 +100,9 @@ def outlier_explanations(
     if len(which) < 2 * m:
         return
     squares = measured.squares(off)
-    usual = max(float(np.median(squares)) / m, 1.0)  # what the model leaves out, all poses have
+    usual = max(float(np.median(squares)) / m, 1.0)  # contains the model errors of all poses
     if usual > HOPELESS_POSE_SCALE**2:
-        return  # nothing fits, and no configuration stands out
+        return  # no pose fits, so there are no outliers
     measured = measured._replace(noise=usual * measured.noise)
     least = SESSION_FALSE_ALARM.of_test(len(which))
     rejected = estimate.pose_weights[which] < 0.5
@@ -121,9 +125,10 @@ def _explained(
     k: int,
     least: float,
 ) -> tuple[Finding | None, int]:
-    """The finding that explains configuration k, None where nothing does, and the configuration
-    with which it is exchanged, or else k. odd : configurations that disagree. least : chance below
-    which a configuration disagrees.
+    """Finding that explains configuration k, None without an explanation, and the configuration
+    with which k is exchanged, or else k.
+
+    odd : configurations that are outliers. least : p-value below which a configuration is one.
     """
     name, names = session.configurations[k], session.configurations
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
@@ -176,7 +181,8 @@ def _explained(
 def _wrong_readings(
     measured: MeasuredPlatforms, joints: Array, k: int
 ) -> Iterator[ReadingHypothesis]:
-    """Each reading of configuration k wrong, by what all of its poses make the likeliest.
+    """Hypotheses that one reading of configuration k is wrong, each with the reading's estimate
+    from all poses of the configuration.
 
     Facts: ``motor``, and ``value`` and ``sigma`` (1,), m or rad.
     """
@@ -197,7 +203,7 @@ def _wrong_readings(
 
 
 def _other_row(k: int, other: int) -> ReadingHypothesis:
-    """The readings of another configuration stand for those of k. Facts: ``like``, the other."""
+    """Hypothesis that k has the readings of another configuration. Facts: ``like``, the other."""
 
     def apply(joints: Array) -> Array:
         out = joints.copy()
@@ -208,7 +214,7 @@ def _other_row(k: int, other: int) -> ReadingHypothesis:
 
 
 def _exchanged(k: int, other: int) -> ReadingHypothesis:
-    """The readings of two configurations exchanged. Facts: ``partner``, the other."""
+    """Hypothesis that two configurations are exchanged. Facts: ``partner``, the other."""
 
     def apply(joints: Array) -> Array:
         out = joints.copy()
@@ -236,8 +242,8 @@ def _misnamed(session: Session, name: str, other: str, both: bool) -> Finding:
 def _platforms(
     measurements: Measurements, estimate: Estimate, which: Integers
 ) -> tuple[Array, Array]:
-    """Platform poses by the measured poses, T_base_platform (n, 4, 4), and the covariance (n, m, m)
-    of the readings that follow from them; NaN where the machine cannot reach one.
+    """Platform poses T_base_platform (n, 4, 4) by measured poses, and the covariance (n, m, m) of
+    the readings that follow; NaN where the machine cannot take a pose.
     """
     poses, state = measurements.poses.select(which), estimate.state
     T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]
@@ -247,7 +253,7 @@ def _platforms(
     T_station_target = poses.T_station_target.copy()
     T_station_target[:, :3, 3] *= (1 + size[poses.mount])[:, None]
     T_base_platform = inverse(T_camera_base) @ T_station_target @ inverse(T_mount)
-    # a turn and shift of the target, as one of the platform in the base's frame
+    # left perturbation of the target, as a perturbation of the platform in the base frame
     turn = T_camera_base[:, :3, :3].mT
     arm = T_base_platform[:, :3, :3] @ T_mount[:, :3, 3:]
     by = np.zeros((len(which), 6, 6))

@@ -1,22 +1,23 @@
-"""What may be wrong with a session whose measured poses disagree with the machine.
+"""Hypotheses about a session whose measured poses disagree with the machine.
 
-Hypotheses are all mistakes in the readings (:mod:`pkmcal.mechanisms.reading_hypotheses`), a board
-or a station that moved between two configurations, and a board of another size. Two levels of
+The hypotheses are all mistakes in the readings (:mod:`pkmcal.mechanisms.reading_hypotheses`), a
+board or a station that moved between two configurations, and a board of another size. Two levels of
 evidence compare them:
 
-- closure: platform poses by the nominal machine and the readings, laid on the measured ones by
-  robot-world/hand-eye in closed form. Milliseconds for each; nominal errors are in the residuals.
-- estimate: the joint estimate from the data as they would be without the mistake. Seconds for each,
-  so only hypotheses that closure leaves in the running are estimated.
+- closure: platform poses by the nominal machine and the readings, registered to the measured poses
+  by robot-world/hand-eye calibration in closed form. Milliseconds for each hypothesis; the
+  residuals contain nominal errors.
+- estimate: the joint estimate from the data without the mistake. Seconds for each hypothesis, so
+  only those that closure retains are estimated.
 
 Where poses and readings contradict each other by far more than nominal errors do, an estimate from
-the data as stated would take minutes and mean nothing: closure is asked first, for several mistakes
-in the readings at once.
+the data as stated takes minutes and is meaningless. Closure is then evaluated before any estimate,
+for two mistakes at once if one is not enough.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -59,11 +60,11 @@ from pkmcal.session.load import Session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
 
 SUSPECT_SCALE = 2.0
-"""Factor on the noise of poses, or of edges, from which mistakes are looked for."""
+"""Factor on the noise of poses, or of edges, from which hypotheses are compared."""
 SUSPECT_REJECTED_SHARE = 0.1
-"""Share of rejected poses from which they are."""
+"""Share of rejected poses from which hypotheses are compared."""
 EXPLAINED_POSES_SHARE = 0.85
-"""Share of the poses that a mistake put right has to explain; the rest may be outliers."""
+"""Share of the poses that a hypothesis has to explain; the rest may be outliers."""
 HOPELESS_POSE_SCALE = 50.0
 """Factor on the poses' noise at which an estimate under a hypothesis is given up after a first
 search: far beyond ``VerdictOptions.too_noisy``."""
@@ -71,8 +72,8 @@ NOMINAL_ERROR_FACTOR = 10.0
 """Factor by which the errors of a nominal model may exceed its prior sigmas. A motor that stands
 still while its readings move, or the reverse, is off by 20 to 50 times as much."""
 NOMINAL_DRAWS = 4
-"""Machines drawn from the prior sigmas to know how large closure residuals are by nominal errors:
-four draws of some thirty parameters each tell it to a tenth."""
+"""Machines drawn from the prior sigmas for the size of closure residuals by nominal errors: four
+draws of some thirty parameters each determine it to a tenth."""
 CLOSURE_CONFIGURATIONS = 48
 """Configurations, spread over all, by which poses and readings are tested for a contradiction, and
 in which pairs of mistakes are compared: a thousand pairs in seconds."""
@@ -89,13 +90,13 @@ PoseHypothesis = Hypothesis[PoseCase]
 
 
 class Diagnosis(NamedTuple):
-    """The mistake that explains measured poses.
+    """Decision between the hypotheses about measured poses.
 
-    hypothesis : None where none does. log_odds : of it, nats. misfit : rms residual of the poses
-    without the mistake, in stated standard deviations. movement : (6,) left perturbation (omega,
-    tau) of a board, or a station, that moved; NaN where the data do not determine it. untested :
-    codes and errors of hypotheses without an estimate. rivals : other mistakes that are not
-    excluded.
+    hypothesis : the mistake; None if no hypothesis explains the poses. log_odds : of the mistake,
+    nats. misfit : rms residual of the poses without the mistake, in stated standard deviations.
+    movement : (6,) left perturbation (omega, tau) of a board, or a station, that moved; NaN where
+    the data do not determine it. untested : codes and errors of hypotheses without an estimate.
+    rivals : other mistakes that are not excluded.
     """
 
     hypothesis: PoseHypothesis | None = None
@@ -192,7 +193,7 @@ class PoseEvidence:
         return second._replace(hypothesis=replace(first, facts={"parts": parts}), rivals=())
 
     def diagnosis(self, ranked: Sequence[Ranked[PoseHypothesis]]) -> Diagnosis:
-        """What to decide by hypotheses that were estimated."""
+        """Decision between hypotheses that were estimated."""
         found, untested = likely(ranked), tuple(self.untested)
         if not found:
             return Diagnosis(untested=untested)
@@ -200,7 +201,7 @@ class PoseEvidence:
         value = self.estimates[id(best.hypothesis)]
         movement = _movement(self.machine, best.hypothesis, value)
         hypothesis = self._with_constants(best.hypothesis, value)
-        # such as a camera that moved beside a board that did
+        # such as a movement of the camera, where the board may have moved
         rivals = tuple(one.hypothesis for one in others)
         return Diagnosis(hypothesis, best.log_odds, pose_misfit(value), movement, untested, rivals)
 
@@ -230,7 +231,7 @@ class PoseEvidence:
 
 
 def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -> Diagnosis:
-    """The mistake that explains why poses disagree with the machine.
+    """Mistake by which poses disagree with the machine, by closure and estimates.
 
     machine : nominal. estimate : of these measurements.
     """
@@ -248,12 +249,11 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
 def diagnose_by_closure(
     machine: Machine, measurements: Measurements, misfit: float, limit: float
 ) -> Diagnosis:
-    """The mistake in the readings that explains why poses contradict them, with another one of any
-    kind where one alone does not.
+    """Mistake in the readings by which poses contradict them, with a second mistake of any kind if
+    a single one does not explain the poses.
 
-    By closure mistakes in the readings have to leave nominal errors alone; those that do are
-    estimated. misfit : of the poses as stated, in stated standard deviations. limit : of
-    :func:`closure_limit`.
+    Only hypotheses whose closure residuals are as small as nominal errors are estimated. misfit :
+    of the poses as stated, in stated standard deviations. limit : of :func:`closure_limit`.
     """
     evidence = PoseEvidence(machine, measurements, misfit, limit)
     closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
@@ -309,19 +309,20 @@ def spread_over(measurements: Measurements, most: int | None) -> Measurements:
 
 
 def closure_misfits(machine: Machine, cases: Sequence[Measurements]) -> Array:
-    """Misfits (N,) of N cases of measurements where platform poses follow from the nominal machine
-    and the readings: as :func:`pose_misfit`.
+    """Misfits (N,), as of :func:`pose_misfit`, of N cases of measurements with platform poses by
+    the nominal machine and the readings.
 
-    Each pair of a station and a mount on the platform is laid by itself, by the best of the closed
-    forms. Cases may differ in their readings and in their poses' stations, mounts and values.
+    Each pair of a station and a mount on the platform is registered by itself, by the best of the
+    closed forms. Cases may differ in their readings and in their poses' stations, mounts and
+    values.
     """
     joints = np.stack([case.joints for case in cases])
     fk = machine.forward_result(joints.reshape(-1, joints.shape[-1])).T_base_platform
     body = fk.reshape(*joints.shape[:2], 4, 4)
-    # where legs do not meet, the nearest pose is off by as much as the readings are wrong
+    # where loops do not close, the nearest pose is off by as much as the readings are wrong
     body = np.where(np.isfinite(body).all(axis=(-1, -2), keepdims=True), body, np.eye(4))
     out = np.zeros(len(cases))
-    shared: dict[tuple[bytes, bytes], list[int]] = {}  # which are laid together
+    shared: dict[tuple[bytes, bytes], list[int]] = {}  # cases that are registered together
     for k, case in enumerate(cases):
         key = case.poses.station.tobytes(), case.poses.mount.tobytes()
         shared.setdefault(key, []).append(k)
@@ -433,9 +434,9 @@ def _pairs(
 def pose_hypotheses(
     machine: Machine, measurements: Measurements, estimate: Estimate
 ) -> list[PoseHypothesis]:
-    """All mistakes that measured poses can show."""
+    """Hypotheses about measured poses: readings, movements and sizes of boards."""
     n_effective = effective_sample_size(machine, measurements)
-    # heights do not determine where a tracker stands: score tests tell whether it moved
+    # heights do not determine a tracker's pose: score tests detect whether it moved
     whole = () if only_heights(estimate) else _movements(measurements, estimate)
     rest = [*whole, *_sizes(machine, measurements, estimate)]
     prior = -log(max(len({one.meaning for one in rest}), 1))
@@ -446,7 +447,7 @@ def pose_hypotheses(
 
 
 def _movements(measurements: Measurements, estimate: Estimate) -> Iterator[PoseHypothesis]:
-    """A board, or a camera, that stands elsewhere from some configuration on."""
+    """Movements of a board, or a camera, between two configurations."""
     poses = measurements.poses
     for m in np.flatnonzero(measurements.on_platform):
         for s in np.unique(poses.station[poses.mount == m]):
@@ -528,8 +529,8 @@ def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int
 
 
 def _movement(machine: Machine, hypothesis: PoseHypothesis, estimate: Estimate) -> Array:
-    """(omega, tau) (6,) of what moved, from its pose before to the one after; NaN where the data do
-    not determine it, zero where the hypothesis is another.
+    """Movement (omega, tau), (6,), of the board or station, from the pose before to the pose after;
+    NaN where the data do not determine it, zero for other hypotheses.
     """
     if hypothesis.code == "board.moved":
         pair = [hypothesis.facts["mount"], -1]
@@ -547,7 +548,7 @@ def _movement(machine: Machine, hypothesis: PoseHypothesis, estimate: Estimate) 
 def _sizes(
     machine: Machine, measurements: Measurements, estimate: Estimate
 ) -> Iterator[PoseHypothesis]:
-    """A board whose squares have another size: its distances are all wrong by one factor."""
+    """Another size of the board's squares: all of its distances are wrong by one factor."""
     poses = measurements.poses
     boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == "board"]
     rows = np.flatnonzero(np.isin(poses.mount, boards) & measurements.on_platform[poses.mount])
@@ -571,7 +572,7 @@ def _sizes(
 
 
 def poses_disagree(estimate: Estimate) -> bool:
-    """Whether the poses disagree with the machine so much that a mistake is likely."""
+    """Whether the poses disagree with the machine so much that hypotheses are compared."""
     rejected = estimate.pose_weights < 0.5
     return bool(rejected.size) and (
         estimate.statistics.pose_scale > SUSPECT_SCALE
@@ -580,27 +581,24 @@ def poses_disagree(estimate: Estimate) -> bool:
     )
 
 
-def check_closure(session: Session, boards: Boards) -> None:
-    """Raise `InputError` where readings and measured poses contradict each other, and a reading
-    never changes or mistakes in the readings explain it.
+def explain_closure(session: Session, boards: Boards) -> Explanation:
+    """Mistake in the readings by which measured poses contradict them, if any.
 
-    Asked before any estimate: one from such readings takes a thousand steps and ends nowhere.
+    Evaluated before any estimate: an estimate from such readings takes a thousand steps and does
+    not converge.
     """
     measurements = measurements_of(session, boards)
     poses = measurements.poses
     positions = (poses.rows >= 3) & measurements.on_platform[poses.mount]
     if np.count_nonzero(positions) < 2 * FEWEST_BESIDE_MOVEMENT:
-        return  # a frame and mount of their own explain few
+        return Explanation()  # a frame and mount of their own explain few
     machine, few = session.machine, spread_over(measurements, CLOSURE_CONFIGURATIONS)
     (misfit,) = closure_misfits(machine, [few]).tolist()
     limit = closure_limit(machine, few, np.random.default_rng(0), enough=misfit)
     if misfit <= limit:
-        return
-    if error := frozen_in(session):
-        raise error
-    diagnosis = diagnose_by_closure(machine, measurements, misfit, limit)
-    if error := _error_of(session, diagnosis, misfit):
-        raise error
+        return Explanation()
+    diagnosis = partial(diagnose_by_closure, machine, measurements, misfit, limit)
+    return _explanation(session, diagnosis, misfit)
 
 
 def explain_poses(
@@ -609,42 +607,42 @@ def explain_poses(
     estimate: Estimate,
     richer: RicherModel | None = None,
 ) -> Explanation:
-    """The mistake that explains why poses disagree with the machine, if any.
+    """Mistake by which poses disagree with the machine, if any.
 
-    richer : the model of the mechanism file that explains the poses; where they agree with it, no
-    mistake is looked for.
-    Raises InputError where poses disagree and a reading never changes.
+    richer : model of the mechanism file that explains the poses; where they agree with that model,
+    no hypothesis is compared.
     """
     if not poses_disagree(estimate) or (richer is not None and richer.scale < SUSPECT_SCALE):
         return Explanation()
-    if error := frozen_in(session):
-        raise error
-    diagnosis = diagnose(session.machine, measurements, estimate)
-    untested: tuple[Finding, ...] = ()
-    if diagnosis.untested:
-        codes = [code for code, _ in diagnosis.untested]
-        why = diagnosis.untested[0][1]
-        untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
-    error = _error_of(session, diagnosis, pose_misfit(estimate))
-    return Explanation(error, diagnosis.log_odds, untested)
+    diagnosis = partial(diagnose, session.machine, measurements, estimate)
+    return _explanation(session, diagnosis, pose_misfit(estimate))
 
 
-def _error_of(session: Session, diagnosis: Diagnosis, misfit: float) -> InputError | None:
-    """The error that names a diagnosis's mistakes, and those that it does not exclude; None where
-    it has none. misfit : of the poses as stated, in stated sigmas.
+def _explanation(session: Session, diagnose: Callable[[], Diagnosis], misfit: float) -> Explanation:
+    """Explanation with the error that names a diagnosis's mistakes and their rivals.
+
+    A reading that never changes precedes all other mistakes, because its effect may equal that of
+    any of them. misfit : of the poses as stated, in stated sigmas.
     """
+    if error := frozen_in(session):
+        return Explanation(error, np.inf)
+    diagnosis, untested = diagnose(), tuple[Finding, ...]()
+    if diagnosis.untested:
+        codes, (why, *_) = zip(*diagnosis.untested, strict=True)
+        untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)
     if diagnosis.hypothesis is None:
-        return None
+        return Explanation(untested=untested)
     error = _error(session, diagnosis.hypothesis, diagnosis, misfit)
     others = [_error(session, one, diagnosis, misfit).what for one in diagnosis.rivals]
     also = f"; the poses fit as well if {' or '.join(others)}" if others else ""
-    return error.with_fields(found=f"{error.found}{also}")
+    error = error.with_fields(found=f"{error.found}{also}")
+    return Explanation(error, diagnosis.log_odds, untested)
 
 
 def _error(
     session: Session, hypothesis: PoseHypothesis, diagnosis: Diagnosis, misfit_before: float
 ) -> InputError:
-    """The error that names the mistake, or two. misfit_before : of the poses with it, in stated
+    """Error that names one mistake, or two. misfit_before : of the poses as stated, in stated
     sigmas.
     """
     parts = [
@@ -666,7 +664,7 @@ def _error(
 def _error_of_part(
     session: Session, hypothesis: PoseHypothesis, movement: Array, misfit_before: float
 ) -> InputError:
-    """The error that names one mistake, without the residual of the poses."""
+    """Error that names one mistake, without the residual of the poses."""
     facts, joints = hypothesis.facts, session.document["joints"]
     if hypothesis.code in ("board.moved", "station.moved"):
         what = (

@@ -1,10 +1,10 @@
-"""The hypothesis that diameters were written for radii.
+"""Hypothesis that diameters were written for radii.
 
 Tubes modelled twice as thick are localized all the same: their edges match edges beside the right
-ones, with the camera at another distance. The likelihood of the images does not decide between the
-two, for the highlights of a tube, too, are edges at less than its width. The joint estimate does:
-with the stated radii few edges are measured, which disagree with the machine, sometimes by no more
-than is accepted of a result, or are chance matches; with half of the radii there are more edges,
+ones, with the camera at another distance. The likelihood of the images does not decide, because
+the highlights of a tube are edges, too, at less than its width. The joint estimate decides: with
+the stated radii few edges are measured, which are chance matches or disagree with the machine,
+sometimes by no more than is accepted of a result; with half of the radii more edges are measured,
 and they agree.
 """
 
@@ -41,10 +41,10 @@ RadiiHypothesis = Hypothesis[Session]
 def explain_radii(
     case: Case, turns: RefinementResult | None, refine_camera: bool, seed: int
 ) -> Explanation:
-    """Diameters for radii, where edges disagree with the machine and more of them agree with one of
-    half the radii.
+    """Diameters for radii, where edges disagree with the machine and more edges agree with half of
+    the radii.
 
-    turns : with the stated radii, None where they give no estimate. refine_camera : whether the
+    turns : refinement with the stated radii, None without an estimate. refine_camera : whether the
     cameras are estimated. seed : for the localization of the stations.
     """
     null = _edge_misfit(turns)
@@ -74,8 +74,8 @@ def explain_radii(
 
 
 def _edge_misfit(turns: RefinementResult | None) -> float:
-    """Scatter of the edges, in what they state; no less than is untenable where there is no
-    estimate or its edges may be chance matches, which agree with anything.
+    """Noise scale of the edges; at least the untenable scale without an estimate, or if the edges
+    may be chance matches, which agree with any machine.
     """
     if turns is None:
         return VERDICT.too_noisy

@@ -1,8 +1,9 @@
 """Mistakes in a table of joint readings, as transformations of the readings.
 
-One list for images, boards and trackers: a motor that counts the other way, two columns exchanged,
-columns counted from another leg or backwards, rows shifted by one configuration. Boards and
-trackers weigh these hypotheses by how platform poses close, images by the likelihood of edges.
+One list serves images, boards and trackers: a motor that counts the other way, two columns
+exchanged, columns counted from another leg or backwards, rows shifted by one configuration. The
+evidence is the closure of platform poses for boards and trackers, and the likelihood of edges for
+images. A second list (units, signs, zeros) is decided by the ranges of the readings alone.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ value that it stands for, 0 for a wrong sign alone; ``order`` (m,), the column o
 
 
 def reading_hypotheses(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
-    """All mistakes in readings that are weighed, with equal prior odds for each explanation.
+    """Mistakes in readings that measurements can show, with equal prior odds of each explanation.
 
-    joints : (K, m). ranges : (m, 2) smallest and largest reading, NaN where not known.
+    joints : (K, m). ranges : (m, 2) smallest and largest reading, NaN where unknown.
     """
     hypotheses = [
         *reversed_motors(joints, ranges),
@@ -201,7 +202,7 @@ def renumbered_legs(count: int) -> list[ReadingHypothesis]:
 
 
 def reordered(code: str, subject: str, order: Integers, **facts: Any) -> ReadingHypothesis:
-    """Columns in another order, (m,): the column of each leg."""
+    """Columns in another order; order : (m,), the column of each leg."""
     return ReadingHypothesis(
         code, subject, lambda joints: joints[:, order], facts={"order": order, **facts}
     )
@@ -229,10 +230,10 @@ def reading_error(
     units: Sequence[str],
     without: str = "",
 ) -> InputError:
-    """The error that names a mistake in the readings, without what shows it.
+    """Error that names a mistake in the readings, without the value that was found.
 
-    file : of the readings, with ``columns``. units : ``m`` or ``rad`` of each. without : what the
-    data do where the readings are right, for the end of what is expected.
+    file, columns : of the readings. units : ``m`` or ``rad`` for each column. without : state of
+    the data without the mistake, which ends the error's ``expected``.
     """
     facts, where = hypothesis.facts, f"{file}, line 1"
     names = [columns[motor] for motor in facts.get("motors", ())]

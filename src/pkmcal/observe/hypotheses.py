@@ -1,13 +1,14 @@
-"""What may be wrong with a session whose images do not show what it states.
+"""Hypotheses about a session whose images disagree with it.
 
-Hypotheses are all mistakes in the readings (:mod:`pkmcal.mechanisms.reading_hypotheses`), images
-under other names, mirrored images and diameters taken for radii. Levels of evidence compare their
-log-likelihoods with that of the session as stated: a short search in few images, the same in all,
-and a full search of the likeliest, from whose poses all are compared. A machine that was localized
-is compared as well: with two columns exchanged, four legs of six still fit.
+The hypotheses are all mistakes in the readings (:mod:`pkmcal.mechanisms.reading_hypotheses`),
+exchanged stations, images under other names, mirrored images, and diameters in place of radii.
+Levels of evidence compare their log-likelihoods with that of the session as stated: a short search
+in few images, the same search in all images, and a full search for the likeliest hypotheses, from
+whose poses all are compared. Hypotheses are compared for localized machines as well: with two
+columns exchanged, four legs of six still fit.
 
-A search gives a lower bound of the likelihood, for it may end beside the best pose. So before the
-full search hypotheses are dropped by their order alone.
+A search gives a lower bound of the likelihood, because it may end beside the best pose. Before the
+full search, hypotheses are therefore dropped by their order alone.
 """
 
 from __future__ import annotations
@@ -50,34 +51,36 @@ OTHER_EXPLANATIONS = 4
 """Explanations of images beside those of the readings: shifted, under other names, mirrored,
 diameters for radii."""
 POSE_BY_HAND_LOG_ODDS = 1000.0
-"""Nats by which a pose by hand speaks against readings by which the camera stands on another side
-of the machine: more than any images."""
+"""Log-likelihood ratio (nats) of a pose by hand against readings that place the camera on another
+side of the machine: more than that of any images."""
 NEAR_SEARCH_TURN = np.radians(15.0)
 """Turn from the pose by hand beyond which hypotheses are searched about that pose, too."""
 OTHER_POSE_TURN = np.radians(45.0)
-"""Turn from the pose by hand beyond which the machine was localized where the user does not see it:
-a machine of three or six equal parts looks the same from there."""
+"""Turn from the pose by hand beyond which the localized pose contradicts it: a machine of three or
+six equal parts looks the same from there."""
 RIGHT_NAME_SHARE = 0.1
 """Share of the mean log-likelihood ratio of a localized machine's images by which another name has
-to be likelier: of two configurations that are nearly equal, errors of the nominal model decide. Of
-simulated machines exchanged ones had 0.2 to 2 times as much, right ones up to 0.03."""
+to be likelier: between two nearly equal configurations, errors of the nominal model decide. On
+simulated machines, exchanged names had 0.2 to 2 times as much, right names up to 0.03."""
 NAMING_ROUNDS = 3
 """Rounds of names for images, and of the pose by these names."""
 FEW_CONFIGURATIONS = 4
-"""Images in which all hypotheses about the readings are compared."""
+"""Images in which all hypotheses about the readings are compared first."""
 ENOUGH_IMAGES_ALONE, USUAL_IMAGES = 4, 15
-"""Images below which there are no two halves, one to search and one to confirm, and one of little
-evidence leaves it open whether the machine is there; and how many are usual."""
+"""Images below which a message names their number as the reason, because they have no two halves,
+for search and confirmation; and the usual number of images."""
 NUMBERING = "readings.numbering_"
-"""Codes of legs that are numbered from another one, or backwards."""
+"""Prefix of the codes of legs that are numbered from another leg, or backwards."""
 STATION_PAIRS_SEARCHED = 15
-"""Pairs of stations that are searched for the other's pose: of six stations, all."""
+"""Pairs of stations at most that are searched for each other's pose: all pairs of six stations."""
 
 
 class SuspectStation(NamedTuple):
-    """A station: its name, the files of its images, the names of the session's configurations, the
-    file of the readings and its columns, its view, its pose by hand (4, 4) if there is one, and its
-    localization.
+    """Station whose images are compared with hypotheses.
+
+    name, files : of the station and its images. configurations : names in the session. table,
+    columns : file of the readings and its columns. by_hand : T_camera_base (4, 4), None without a
+    pose by hand.
     """
 
     name: str
@@ -91,7 +94,7 @@ class SuspectStation(NamedTuple):
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the machine was localized far from where the user says, or not at all."""
+        """Whether the machine was localized far from the pose by hand, or not at all."""
         return not self.localization.good or self.turned > OTHER_POSE_TURN
 
     @property
@@ -109,8 +112,7 @@ StationPair = tuple[SuspectStation, SuspectStation]
 class ImageHypothesis(Hypothesis[StationView]):
     """Hypothesis about the images of a station; its data are the station's view.
 
-    error : that names the mistake.
-    readings : (K, m) of the images, where nothing else differs.
+    error : names the mistake. readings : (K, m) of the images, where nothing else differs.
     """
 
     error: InputError = field(default_factory=lambda: InputError(""))
@@ -118,7 +120,7 @@ class ImageHypothesis(Hypothesis[StationView]):
 
 
 def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputError | None:
-    """The error about stations whose images show something else than the session states."""
+    """Error about stations whose images disagree with the session, None if all agree."""
     error = _swapped_stations([s for s in stations if s.elsewhere], rng)
     if error is not None or not stations:
         return error
@@ -126,7 +128,7 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
     worst = max(
         stations, key=lambda s: (not s.localization.good, s.elsewhere, s.localization.by_chance)
     )
-    # one station that is where the user says shows that its readings are in order
+    # a station that is localized near its pose by hand shows that the readings are in order
     in_order = any(s.by_hand is not None and not s.elsewhere for s in stations)
     error = _mixed_up(worst, in_order, rng)
     if error is not None:
@@ -158,7 +160,7 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
 
 
 def _little(station: SuspectStation) -> str:
-    """The evidence that is too weak, in words."""
+    """Description of the evidence, which is too weak."""
     localization = station.localization
     if localization.by_chance < localization.limit:
         return "legs that fit nearly as well at another place"
@@ -173,10 +175,10 @@ def _little(station: SuspectStation) -> str:
 def _swapped_stations(
     stations: list[SuspectStation], rng: np.random.Generator
 ) -> InputError | None:
-    """The error about two stations whose images are exchanged, rather than mirrored: a symmetric
-    machine's mirror image looks much as the machine does from the other side.
+    """Error about two stations whose images are exchanged, rather than mirrored: the mirror image
+    of a symmetric machine resembles the machine from the other side.
 
-    stations : localized far from where the user says, or not at all.
+    stations : localized far from their poses by hand, or not at all.
     """
     placed = [station for station in stations if station.by_hand is not None]
 
@@ -223,7 +225,7 @@ def _swapped_stations(
 def _mixed_up(
     station: SuspectStation, in_order: bool, rng: np.random.Generator
 ) -> InputError | None:
-    """The error of the hypothesis that explains a station's images better than the session, if any.
+    """Error of the hypothesis that explains a station's images better than the session, if any.
 
     in_order : whether another station shows that the readings are in order.
     """
@@ -251,7 +253,7 @@ def _mixed_up(
                 joints = other.joints[None]
                 values[k] = likelihood_nearby(other, joints, begin, wide, images, rng)[0]
             values = (values - own) / localization.correlation_length
-            # where the machine is as the user says, another explanation has to be better at once
+            # at a confirmed pose another explanation has to be better at once
             return values if station.elsewhere else np.where(values > 0, values, -np.inf)
 
         return EvidenceLevel(
@@ -275,11 +277,11 @@ def _likelier(
     rng: np.random.Generator,
     count: int | None = None,
 ) -> InputError | None:
-    """The error of the likeliest hypothesis, by a full search, that explains a station better than
-    the session, if any; it names those that it does not exclude.
+    """Error of the likeliest hypothesis, by a full search, that explains a station better than the
+    session, if any, with the rivals that it does not exclude.
 
-    count : of hypotheses of which these are the likeliest; all, if None. By chance one of so many
-    is confirmed, so each has to be recognised more surely by as much.
+    count : number of hypotheses of which these are the likeliest; of these, if None. Chance may
+    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni).
     """
     if not hypotheses:
         return None
@@ -298,8 +300,8 @@ def _likelier(
             if not at.good or station._replace(localization=at).elsewhere:
                 continue
             ratio = (likelihood_from(other, poses) - stated) / localization.correlation_length
-            # by its own readings the camera stands where the user does not see it, and no other
-            # station shows that they are in order
+            # the stated readings contradict the pose by hand, and no other station shows that they
+            # are in order
             if station.elsewhere and localization.good and not in_order and h.readings is not None:
                 out[k] = ratio + POSE_BY_HAND_LOG_ODDS
             elif at.by_chance * count < at.limit:
@@ -331,11 +333,11 @@ def log_prior_of_each(machine: Machine, joints: Array) -> float:
 
 
 def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
-    """All mistakes in the readings, and images under their neighbours' names; of a station that was
-    not localized, diameters taken for radii.
+    """Hypotheses about the readings and about images under their neighbours' names; of a station
+    that was not localized, also diameters in place of radii.
     """
     view, prior = station.view, log_prior_of_each(station.view.machine, station.view.all_joints)
-    # of a machine with equal thirds, any of its equal numberings would do
+    # a machine of equal thirds is localized by any of its equal numberings
     any_numbering = station.localization.good and station.by_hand is None
     for h in reading_hypotheses(view.all_joints, view.machine.joint_ranges):
         if h.code == "readings.shifted" or (any_numbering and h.code.startswith(NUMBERING)):
@@ -380,7 +382,7 @@ def _with_half_radii(view: StationView) -> StationView:
 
 def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
     """Images under the names that fit each of them best; mirrored images where the machine was not
-    localized, or elsewhere than the user says, as its mirror image is.
+    localized near its pose by hand.
     """
     view, T_camera_base = station.view, station.localization.T_camera_base
     names, prior = view.configuration, log_prior_of_each(view.machine, view.all_joints)
@@ -395,14 +397,14 @@ def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
     if not 2 < len(names) == len(np.unique(names)):
         return
     columns = np.arange(len(names))
-    # any name could be on each image, and the fewest that bear wrong ones are two; without this,
-    # images of equal configurations would change names for nothing
+    # each image could have any name, and at least two images have wrong names; without this prior,
+    # images of equal configurations would exchange their names
     choices, own = math.log(len(names)), station.localization
     keep_evidence = (
         own.log_likelihood_ratio / (own.correlation_length * len(names)) if own.good else 0.0
     )
     keeps = np.eye(len(names)) * own.correlation_length * (OPTIONS.act / 2 + choices)
-    for _ in range(NAMING_ROUNDS):  # the wrong names have moved the pose, and it the names
+    for _ in range(NAMING_ROUNDS):  # names determine the pose, and the pose the names
         fits = log_likelihood_by_name(
             replace(view, configuration=names[columns]), T_camera_base, names
         )
@@ -423,11 +425,11 @@ def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
 
 
 def _best_names(score: Array) -> Integers:
-    """The name (n,) of each image, each used once, with the largest sum of scores (n, n)."""
+    """Assignment (n,) of names to images, each used once, with the largest sum of scores (n, n)."""
     others = np.where(np.eye(len(score), dtype=bool), -np.inf, score).max(axis=1)
     gain = np.sort(others - np.diag(score))
-    # two images at least have to leave their own names for others; where that loses, as a
-    # rule, all keep theirs, and SciPy's, which takes a while to import, is not asked
+    # at least two images have to change their names; where that loses, as it usually does, SciPy's
+    # assignment, which is slow to import, is not needed
     if gain[-2:].sum() < 0:
         return np.arange(len(score))
     from scipy.optimize import linear_sum_assignment
@@ -448,7 +450,7 @@ def _shifted(step: int) -> InputError:
 
 
 def _misnamed(station: SuspectStation, images: Integers, fitting: Integers) -> InputError:
-    """The error about images, by index, that fit other rows of the readings."""
+    """Error about images, by index, that fit other rows of the readings."""
     files = [station.files[k] for k in images]
     fit = [station.configurations[k] for k in fitting]
     return InputError(
@@ -480,7 +482,7 @@ def _mirrored(station: SuspectStation) -> InputError:
 
 
 def diameters(mechanism: str) -> InputError:
-    """The error about radii that are twice too large; mechanism : the nominal model's file."""
+    """Error about radii that are twice too large; mechanism : the nominal model's file."""
     return InputError(
         "the tubes' radii look like diameters",
         where=f"{mechanism}, tubes",

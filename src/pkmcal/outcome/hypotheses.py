@@ -5,13 +5,13 @@ board that moved. The null hypothesis is the data as stated. The log-odds of a h
 
     log O(h) = log L(data | h) - log L(data | null) + log prior odds of h
 
-in nats. Levels of evidence, cheap ones first, each give the log-likelihood ratios of all hypotheses
-that are still in the running; the first level that decides ends the comparison. Each level has the
-effective sample size inside: correlated residuals count once.
+in nats. Levels of evidence, the cheapest first, compute the log-likelihood ratios of all remaining
+hypotheses; the first level that decides ends the comparison. Each level uses the effective sample
+size: correlated residuals count once.
 
-A likelihood ratio compares explanations. It does not tell whether any of them is tenable: that the
-machine is in the images at all, or that the residuals of the best hypothesis are as small as their
-noise, are absolute tests, which a level makes by returning minus infinity.
+A likelihood ratio compares explanations; none of them may be tenable. Whether the machine is in the
+images at all, and whether the residuals of a hypothesis are as small as their noise, are absolute
+tests: a level returns minus infinity for hypotheses that fail them.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ Subject = TypeVar("Subject", bound="Hypothesis[Any]")
 class HypothesisOptions:
     """Thresholds of all decisions between hypotheses, in nats.
 
-    act : log-odds from which data are used otherwise than stated (a repair), which the user learns
-    only afterwards; also the log-odds by which a hypothesis excludes another.
-    report : log-odds from which the user hears of a hypothesis: as the reason of a refusal, or as a
-    warning. She can look for herself, so one false report in twenty is acceptable.
+    act : log-odds from which data are repaired, of which the user learns only afterwards; also the
+    log-odds by which a hypothesis excludes another.
+    report : log-odds from which a hypothesis is reported, as the reason of a refusal or as a
+    warning. The user can verify a report, so one false report in twenty is acceptable.
     beam : log-likelihood ratio to the best explanation below which a hypothesis is dropped before
     the next level of evidence: e^-12 = 6e-6, far less than a finer level changes.
     most : hypotheses at most that go on to a level that costs seconds for each.
@@ -58,7 +58,7 @@ NO_ESTIMATE = (PkmcalError, np.linalg.LinAlgError)
 
 @dataclass(frozen=True)
 class Hypothesis(Generic[Data]):
-    """What may be wrong with a session.
+    """Possible mistake in a session, as a transformation of its data.
 
     code : of its finding, such as readings.exchanged. subject : the motor, station, file or image
     concerned; hypotheses with one code and one subject are variants of one explanation. apply : the
@@ -77,12 +77,12 @@ class Hypothesis(Generic[Data]):
 
     @property
     def meaning(self) -> tuple[str, str]:
-        """What variants of one explanation have in common."""
+        """Code and subject, which all variants of one explanation share."""
         return self.code, self.subject
 
 
 class EvidenceLevel(NamedTuple, Generic[Subject]):
-    """One way to compare hypotheses with the data.
+    """Evidence by which hypotheses are compared.
 
     log_likelihood_ratios : (N,) nats, of N hypotheses against the null; minus infinity for those
     that are untenable. decides : whether the comparison may end here. most : hypotheses that go on
@@ -131,10 +131,10 @@ class Ranked(NamedTuple, Generic[Subject]):
 
 
 class Explanation(NamedTuple):
-    """What hypotheses about one kind of data explain.
+    """Decision between the hypotheses about one kind of data.
 
-    error : that names the mistake, None where none is decided for. log_odds : of it, nats.
-    untested : notes on hypotheses that could not be tested.
+    error : names the mistake; None if no hypothesis is likely enough. log_odds : of the mistake,
+    nats. untested : notes on hypotheses that could not be tested.
     """
 
     error: InputError | None = None
@@ -147,7 +147,7 @@ def posterior(
     levels: Sequence[EvidenceLevel[Subject]],
     options: HypothesisOptions = OPTIONS,
 ) -> list[Ranked[Subject]]:
-    """Hypotheses that no level of evidence has dropped, the likeliest first.
+    """Hypotheses that all levels of evidence retain, the likeliest first.
 
     levels : cheapest first. Later levels are skipped once one that may decide has found a
     hypothesis with odds of ``act`` against the null and against each other explanation.
