@@ -175,30 +175,8 @@ def refine_alternating(
         scatter *= _scatter_of(measurements.edges.coarse, estimate)
         lap("identify")
         if turn == 0:
-            progress("Asking how the images code light", share + 0.1)
-
-            def measured(
-                some: list[StationImages],
-                blur: BlurByStation,
-                before: Estimate = before,
-                refine: bool = cameras.active,
-            ) -> EdgeSet:
-                lap("identify")
-                station_edges = partial(_measure, estimate=before, blur=blur, refine=refine)
-                edges = concatenate([one.edges for one in _search_pass(some, station_edges)])
-                lap("observe")
-                return edges
-
-            responses = responses_by_edges(
-                session,
-                images,
-                measurements,
-                estimate,
-                partial(measured, blur=blur),  # nearly the same by the other response
-                partial(measured, blur={}),
-                lambda edges, cameras=cameras: measurements_of(session, boards, edges, cameras),
-            )
-            lap("identify")
+            progress("Comparing the responses of images", share + 0.1)
+            responses = _responses(case, images, measurements, before, estimate, cameras, blur, lap)
             if results := overruled(responses):
                 images = [
                     replace(p, response=results.get(session.stations[p.station].entry, p.response))
@@ -222,6 +200,42 @@ def refine_alternating(
         observation, measurements, estimate, cameras, responses, images, blur, scatter, start,
         change,
     )  # fmt: skip
+
+
+def _responses(
+    case: Case,
+    images: Sequence[StationImages],
+    measurements: Measurements,
+    before: Estimate,
+    estimate: Estimate,
+    cameras: CameraRefinement,
+    blur: BlurByStation,
+    lap: Callable[[str], None],
+) -> tuple[ResponseEstimate, ...]:
+    """Response of each camera's images to light, by the edges of the first pass.
+
+    before : predicted the edges of ``measurements``; estimate : from these edges.
+    """
+
+    def measured(some: list[StationImages], blur: BlurByStation) -> EdgeSet:
+        """Edges of some images by another response, measured where ``before`` predicts them."""
+        lap("identify")
+        measure = partial(_measure, estimate=before, blur=blur, refine=cameras.active)
+        edges = concatenate([one.edges for one in _search_pass(some, measure)])
+        lap("observe")
+        return edges
+
+    responses = responses_by_edges(
+        case.session,
+        list(images),
+        measurements,
+        estimate,
+        partial(measured, blur=blur),  # nearly the same by the other response
+        partial(measured, blur={}),
+        lambda edges: measurements_of(case.session, case.boards, edges, cameras),
+    )
+    lap("identify")
+    return responses
 
 
 def imputation_variance(
