@@ -32,16 +32,14 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for, load_truth
 from pkmcal.simulation.board import BASE_BOARD_DIAGONAL, board_from_fields
 from pkmcal.simulation.scene import discs_of
-from rendered import by_command
+from rendered import BOARD_SESSION, by_command
 from test_bad_input import only
 
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     """Two stations of four configurations each, by the command; tests must not write into it."""
-    folder = tmp_path_factory.mktemp("board") / "session"
-    words = ("--board", "--stations", "2", "--configurations", "4", "--size", "640x480")
-    return by_command(folder, *words)
+    return by_command(tmp_path_factory.mktemp("board") / "session", *BOARD_SESSION)
 
 
 @pytest.fixture
