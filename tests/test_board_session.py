@@ -266,15 +266,16 @@ def test_another_board_than_described(folder):
     assert "markers of DICT_4X4_50" in caught.value.found
 
 
-@pytest.mark.slow
-def test_a_board_that_is_nowhere(found):
-    session, station_images, _ = found
-    # one of it: if no board is found, one of every other kind is searched as well
-    one = replace(session.stations[0], images=session.stations[0].images[:1])
+def test_a_board_that_is_nowhere(folder):
+    session, image = load_session(folder), np.full((60, 80), 90, np.uint8)
+    assert cv2.imwrite(str(folder / "images" / "station1" / "0000.png"), image)
+    # one small image: if no board is found, one of every other kind is searched as well
+    one = session.stations[0]
+    camera = replace(one.camera, image_size=(80, 60))
+    one = replace(one, camera=camera, images=one.images[:1])
     session = replace(session, stations=(one, *session.stations[1:]))
-    images = {0: [np.full_like(station_images[0].images[0], 90)]}
     with pytest.raises(InputError, match="in none of the images of station station1") as caught:
-        find_boards(session, images)
+        find_boards(session, {0: [image]})
     assert caught.value.where == "images/station1/0000.png"
 
 
