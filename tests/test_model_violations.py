@@ -231,7 +231,7 @@ def false_alarms(seeds):
 
 
 def test_right_sessions_have_chances_like_dice():
-    chances = false_alarms(range(100, 112))
+    chances = false_alarms(range(100, 108))
     assert chances.min() > SESSION_FALSE_ALARM.level / chances.shape[1] / 10
     assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
 
@@ -241,7 +241,7 @@ def test_errors_of_whole_configurations_are_no_departure():
     scatter over configurations in the test, a scale would be reported.
     """
     named = np.zeros(2, dtype=int)
-    for seed in range(6):
+    for seed in range(4):
         nominal, data, where = measured(40 + seed, count=20)
         wrong = data.joints.copy()
         off = np.random.default_rng(seed).normal(0, 5e-3, len(wrong))
@@ -253,7 +253,7 @@ def test_errors_of_whole_configurations_are_no_departure():
             len(tests.significant()),
         )
         assert tests.fitted([0])[0].sigma[0] > 3e-4  # 5e-3 of twenty, as far as edges see it
-    assert named[0] >= 3
+    assert named[0] >= 2
     assert named[1] == 0
 
 
