@@ -236,6 +236,7 @@ def shifted(folder, station, first):
 
 
 def test_a_camera_that_moved(folder):
+    only(folder, "station1")
     shifted(folder, "station1", 2)
     checked = check_session(folder)
     assert checked.exit_code == 2
@@ -248,6 +249,7 @@ def test_a_camera_that_moved(folder):
 
 
 def test_an_image_that_disagrees_is_told(folder):
+    only(folder, "station1")
     shifted(folder, "station1", 3)
     session = load_session(folder)
     boards = boards_of(session, read_images(session))
@@ -257,6 +259,7 @@ def test_an_image_that_disagrees_is_told(folder):
 
 
 def test_another_board_than_described(folder):
+    only(folder, "station1")
     path = folder / "board.yaml"
     path.write_text(path.read_text().replace("DICT_4X4_50", "DICT_5X5_50"))
     session = load_session(folder)
