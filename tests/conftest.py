@@ -15,11 +15,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pytest
+from hypothesis import settings
 
 from pkmcal.calibration.refinement import IMPUTATION_PASSES as ALL_LOOKS
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from rendered import once, rendered
+
+# Examples of a property, unless its test says how many.
+settings.register_profile("quick", max_examples=40)
+settings.load_profile("quick")
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
