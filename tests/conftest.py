@@ -56,14 +56,14 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_pose_sessions",
-    "test_calibrate_board", "test_study_workers", "test_boards", "test_camera_calibration",
-    "test_validate", "test_repeats", "test_silhouettes", "test_watch_command", "test_handheld",
-    "test_bundle", "test_heights", "test_servo", "test_observe_search", "test_model_violations",
-    "test_export_c", "test_plan", "test_simulate", "test_hostile", "test_view", "test_diagnose",
-    "test_docs", "test_python", "test_export_mujoco", "test_export_trees", "test_examples",
-    "test_reproduce_b", "test_paper_a", "test_calibration", "test_h4", "test_catalogue",
-    "test_response", "test_accepted_inputs", "test_legible", "test_paper_c", "test_writing",
+    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_camera_calibration",
+    "test_calibrate_board", "test_validate", "test_boards", "test_pose_sessions",
+    "test_silhouettes", "test_watch_command", "test_handheld", "test_study_workers", "test_servo",
+    "test_observe_search", "test_heights", "test_plan", "test_model_violations", "test_export_c",
+    "test_bundle", "test_view", "test_hostile", "test_diagnose", "test_export_mujoco",
+    "test_export_trees", "test_simulate", "test_calibration", "test_reproduce_b", "test_paper_c",
+    "test_python", "test_response", "test_profiles", "test_h4", "test_discrepancy", "test_writing",
+    "test_kinematics", "test_repeats", "test_cli_camera", "test_paper_a", "test_site",
 )  # fmt: skip
 
 
