@@ -11,16 +11,20 @@ import shutil
 from collections.abc import Callable, Collection, Iterable
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pytest
+from hypothesis import settings
 
 from pkmcal.calibration.refinement import IMPUTATION_PASSES as ALL_LOOKS
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
-from rendered import once
+from rendered import once, rendered
+
+# Examples of a property, unless its test says how many.
+settings.register_profile("quick", max_examples=40)
+settings.load_profile("quick")
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -52,14 +56,14 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_pose_sessions",
-    "test_calibrate_board", "test_study_workers", "test_boards", "test_camera_calibration",
-    "test_validate", "test_repeats", "test_silhouettes", "test_watch_command", "test_handheld",
-    "test_bundle", "test_heights", "test_servo", "test_observe_search", "test_model_violations",
-    "test_export_c", "test_plan", "test_simulate", "test_hostile", "test_view", "test_diagnose",
-    "test_docs", "test_python", "test_export_mujoco", "test_export_trees", "test_examples",
-    "test_reproduce_b", "test_paper_a", "test_calibration", "test_h4", "test_catalogue",
-    "test_response", "test_accepted_inputs", "test_legible", "test_paper_c", "test_writing",
+    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_camera_calibration",
+    "test_calibrate_board", "test_validate", "test_boards", "test_pose_sessions",
+    "test_silhouettes", "test_watch_command", "test_handheld", "test_study_workers", "test_servo",
+    "test_observe_search", "test_heights", "test_plan", "test_model_violations", "test_export_c",
+    "test_bundle", "test_view", "test_hostile", "test_diagnose", "test_export_mujoco",
+    "test_export_trees", "test_simulate", "test_calibration", "test_reproduce_b", "test_paper_c",
+    "test_python", "test_response", "test_profiles", "test_h4", "test_discrepancy", "test_writing",
+    "test_kinematics", "test_repeats", "test_cli_camera", "test_paper_a", "test_site",
 )  # fmt: skip
 
 
@@ -150,44 +154,62 @@ def made_once(folder: Path, make: Callable[[], Any]) -> Any:
     return pickle.loads((once(folder, write) / "made.pickle").read_bytes())
 
 
-@pytest.fixture(scope="session")
-def demo(common) -> Demo:
-    """One demonstration for a run of the tests."""
-    out = common / "demo"
-    words = ("demo", "-o", out, "--fast", "--no-open", "--json")
-    return Demo(out, made_once(common / "said", lambda: run(*words)))
-
-
 @dataclass(frozen=True)
 class Told(Generic[Found]):
-    """Localization of the demonstration's session, and its progress messages."""
+    """Result of a function for the demonstration's session, and its progress messages."""
 
     found: Found
     told: list[tuple[str, float]]
 
 
-def told_once(folder: Path, find: Callable[..., Found]) -> Told[Found]:
-    """Result and messages of ``find``, computed by the first worker that needs them."""
+@pytest.fixture(scope="session")
+def demonstrated(common) -> tuple[Run, Told[Calibration]]:
+    """One demonstration for a run of the tests: the command's output and its calibration."""
+    from pkmcal import simulation
+    from pkmcal.calibration import calibrate
 
-    def make() -> Told[Found]:
-        progress: list[tuple[str, float]] = []
-        item = find(progress=lambda text, share: progress.append((text, share)))
-        return Told(item, progress)
+    def rendered_once(folder: Path, *words: Any, progress: object, **more: Any) -> None:
+        rendered(folder, *words, **more)
 
-    return made_once(folder, make)
+    calibrations: list[Told[Calibration]] = []
+    calibrate_session = calibrate.calibrate_session
+
+    def recorded(session: Path, progress: Callable[[str, float], None]) -> Calibration:
+        told: list[tuple[str, float]] = []
+
+        def both(text: str, share: float) -> None:
+            told.append((text, share))
+            progress(text, share)
+
+        calibrations.append(Told(calibrate_session(session, progress=both), told))
+        return calibrations[-1].found
+
+    def make() -> tuple[Run, Told[Calibration]]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(simulation, "simulate_session", rendered_once)
+            patch.setattr(calibrate, "calibrate_session", recorded)
+            done = run("demo", "-o", common / "demo", "--fast", "--no-open", "--json")
+        (calibration,) = calibrations
+        return done, calibration
+
+    return made_once(common / "demonstrated", make)
 
 
 @pytest.fixture(scope="session")
-def calibrating(demo, common) -> Told[Calibration]:
-    """The demonstration's session, calibrated from Python."""
-    from pkmcal.calibration.calibrate import calibrate_session
+def demo(demonstrated, common) -> Demo:
+    """The demonstration's folders and output."""
+    return Demo(common / "demo", demonstrated[0])
 
-    return told_once(common / "calibrated", partial(calibrate_session, demo.session))
+
+@pytest.fixture(scope="session")
+def calibrating(demonstrated) -> Told[Calibration]:
+    """The demonstration's calibration, with its progress messages."""
+    return demonstrated[1]
 
 
 @pytest.fixture(scope="session")
 def calibrated(calibrating) -> Calibration:
-    """The localization without its messages."""
+    """The demonstration's calibration without its messages."""
     return calibrating.found
 
 
@@ -196,7 +218,14 @@ def checked(demo, common) -> Told[SessionCheck]:
     """The demonstration's session, checked from Python."""
     from pkmcal.check.check import check_session
 
-    return told_once(common / "checked", partial(check_session, demo.session))
+    def make() -> Told[SessionCheck]:
+        progress: list[tuple[str, float]] = []
+        check = check_session(
+            demo.session, progress=lambda text, share: progress.append((text, share))
+        )
+        return Told(check, progress)
+
+    return made_once(common / "checked", make)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -20,6 +20,8 @@ from pkmcal.mechanisms import mechanism_text
 from pkmcal.simulation import Settings, simulate_session
 
 KEPT = Path(__file__).parents[1] / ".pytest_cache" / "rendered"
+BOARD_SESSION = ("--board", "--stations", "2", "--configurations", "4", "--size", "640x480")
+"""Options of a session whose two stations observe a board on the base."""
 RENDERING = ("simulation", "mechanisms", "geometry", "cameras", "boards")
 """Packages whose code determines the content of an image."""
 

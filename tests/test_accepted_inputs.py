@@ -79,13 +79,15 @@ def test_nothing_is_left_to_be_calibrated(copy, but_radii):
         assert "nothing to calibrate" in " ".join(refused(command, copy).split())
 
 
-@pytest.mark.parametrize("value", ["2", "0.2", "1e6", "1e12", "1e15", "0", "-1", "1e-20", ".inf"])
-@pytest.mark.parametrize("name", ["center", "offset", "radius", "arm", "axis", "angle", "scale"])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("center", value) for value in ("2", "0.2", "1e15", "0", "-1", "1e-20", ".inf")),
+        *((name, "2") for name in ("offset", "radius", "arm", "axis", "angle", "scale")),
+        *((name, "0") for name in ("axis", "angle")),  # a scale may be exact
+    ],
+)
 def test_tolerances_that_tell_nothing(copy, name, value):
-    if name == "scale" and value in ("0", "1e-20"):
-        return  # an exact one
-    if name in ("axis", "angle") and value == "0.2":
-        return  # eleven degrees
     old = (copy / "mechanism.yaml").read_text()
     at = old.index("tolerance: {")
     line = old[at : old.index("\n", at)]

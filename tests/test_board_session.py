@@ -32,16 +32,14 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for, load_truth
 from pkmcal.simulation.board import BASE_BOARD_DIAGONAL, board_from_fields
 from pkmcal.simulation.scene import discs_of
-from rendered import by_command
+from rendered import BOARD_SESSION, by_command
 from test_bad_input import only
 
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     """Two stations of four configurations each, by the command; tests must not write into it."""
-    folder = tmp_path_factory.mktemp("board") / "session"
-    words = ("--board", "--stations", "2", "--configurations", "4", "--size", "640x480")
-    return by_command(folder, *words)
+    return by_command(tmp_path_factory.mktemp("board") / "session", *BOARD_SESSION)
 
 
 @pytest.fixture
@@ -238,6 +236,7 @@ def shifted(folder, station, first):
 
 
 def test_a_camera_that_moved(folder):
+    only(folder, "station1")
     shifted(folder, "station1", 2)
     checked = check_session(folder)
     assert checked.exit_code == 2
@@ -250,6 +249,7 @@ def test_a_camera_that_moved(folder):
 
 
 def test_an_image_that_disagrees_is_told(folder):
+    only(folder, "station1")
     shifted(folder, "station1", 3)
     session = load_session(folder)
     boards = boards_of(session, read_images(session))
@@ -259,6 +259,7 @@ def test_an_image_that_disagrees_is_told(folder):
 
 
 def test_another_board_than_described(folder):
+    only(folder, "station1")
     path = folder / "board.yaml"
     path.write_text(path.read_text().replace("DICT_4X4_50", "DICT_5X5_50"))
     session = load_session(folder)
@@ -268,15 +269,16 @@ def test_another_board_than_described(folder):
     assert "markers of DICT_4X4_50" in caught.value.found
 
 
-@pytest.mark.slow
-def test_a_board_that_is_nowhere(found):
-    session, station_images, _ = found
-    # one of it: if no board is found, one of every other kind is searched as well
-    one = replace(session.stations[0], images=session.stations[0].images[:1])
+def test_a_board_that_is_nowhere(folder):
+    session, image = load_session(folder), np.full((60, 80), 90, np.uint8)
+    assert cv2.imwrite(str(folder / "images" / "station1" / "0000.png"), image)
+    # one small image: if no board is found, one of every other kind is searched as well
+    one = session.stations[0]
+    camera = replace(one.camera, image_size=(80, 60))
+    one = replace(one, camera=camera, images=one.images[:1])
     session = replace(session, stations=(one, *session.stations[1:]))
-    images = {0: [np.full_like(station_images[0].images[0], 90)]}
     with pytest.raises(InputError, match="in none of the images of station station1") as caught:
-        find_boards(session, images)
+        find_boards(session, {0: [image]})
     assert caught.value.where == "images/station1/0000.png"
 
 

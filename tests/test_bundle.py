@@ -87,10 +87,10 @@ def test_truth_is_recovered_to_rounding(robust):
 
 
 def test_uncertainty_is_what_repeats_show():
-    """Two hundred runs: errors divided by their covariance are standard normal, all of them
+    """One hundred runs: errors divided by their covariance are standard normal, all of them
     together; so are chi2 and the estimated noise scale."""
     rng = np.random.default_rng(1)
-    runs = 200
+    runs = 100
     scene = make_scene(rng, runs=runs, configurations=8, n_stations=2, in_view=0.6)
     assembled, truth = scene.batch(rng)
     start = replace(truth, z=0 * truth.z, columns=0 * truth.columns)
@@ -196,24 +196,22 @@ def test_stated_noise_is_kept_when_asked():
 @pytest.mark.parametrize("share", [pytest.param(0.05, marks=pytest.mark.slow), 0.2])
 def test_wrong_edges_change_nothing_that_matters(share):
     """Edges replaced by another leg's: the same answer within 1.5 of its standard deviations."""
-    for seed in range(2):
-        scene = make_scene(np.random.default_rng(10 + seed), configurations=20)
-        rng = np.random.default_rng(seed)
-        clean = estimate(scene, scene.measurements(np.random.default_rng(100 + seed)), rng)
-        dirty_data = scene.measurements(np.random.default_rng(100 + seed), wrong=share)
-        dirty = estimate(scene, dirty_data, rng)
-        sigma = np.sqrt(np.diag(dirty.covariance))
-        above_limit = sigma > 1e-9
-        change = (dirty.state.theta - clean.state.theta)[above_limit] / sigma[above_limit]
-        assert np.abs(change).max() < 1.5
-        wrong = np.any(
-            dirty_data.edges.normal
-            != scene.measurements(np.random.default_rng(100 + seed)).edges.normal,
-            axis=1,
-        )
-        far = np.linalg.norm(dirty_data.edges.normal - scene.normal[0], axis=1) > 0.005
-        assert np.all(dirty.edge_weights[wrong & far] < 0.05)
-        assert np.mean(dirty.edge_weights[~wrong] > 0.9) > 0.995
+    scene = make_scene(np.random.default_rng(10), configurations=20)
+    rng = np.random.default_rng(0)
+    clean = estimate(scene, scene.measurements(np.random.default_rng(100)), rng)
+    dirty_data = scene.measurements(np.random.default_rng(100), wrong=share)
+    dirty = estimate(scene, dirty_data, rng)
+    sigma = np.sqrt(np.diag(dirty.covariance))
+    above_limit = sigma > 1e-9
+    change = (dirty.state.theta - clean.state.theta)[above_limit] / sigma[above_limit]
+    assert np.abs(change).max() < 1.5
+    wrong = np.any(
+        dirty_data.edges.normal != scene.measurements(np.random.default_rng(100)).edges.normal,
+        axis=1,
+    )
+    far = np.linalg.norm(dirty_data.edges.normal - scene.normal[0], axis=1) > 0.005
+    assert np.all(dirty.edge_weights[wrong & far] < 0.05)
+    assert np.mean(dirty.edge_weights[~wrong] > 0.9) > 0.995
 
 
 def test_robustness_costs_nothing_on_clean_edges():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from conftest import run
+from conftest import run, two_looks
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.localization import boards_of, read_images
 from pkmcal.errors import InputError
@@ -40,6 +40,16 @@ def folder(rendered, tmp_path):
     (tmp_path / "session" / "truth.json").unlink()
     change(tmp_path / "session", lambda station: station.pop("pose"))
     return tmp_path / "session"
+
+
+@pytest.fixture(scope="module")
+def by_legs_and_board(rendered, tmp_path_factory):
+    """Calibration by legs and board, without a pose by hand."""
+    folder = shutil.copytree(rendered, tmp_path_factory.mktemp("both") / "session")
+    (folder / "truth.json").unlink()
+    change(folder, lambda station: station.pop("pose"))
+    with two_looks():
+        return calibrate_session(folder)
 
 
 def change(folder, what):
@@ -75,8 +85,8 @@ def test_boards_are_where_they_are(rendered):
     assert np.all(z2 < 30)  # six squares each; one in twenty thousand
 
 
-def test_corners_are_expected_where_the_calibrated_machine_has_them(rendered):
-    calibration = calibrate_session(rendered)
+def test_corners_are_expected_where_the_calibrated_machine_has_them(by_legs_and_board):
+    calibration = by_legs_and_board
     corners = board_corners(calibration.session, calibration.boards, calibration.estimate)
     assert len(corners) > 50
     # what the corners' own noise leaves, a few hundredths of a pixel
@@ -91,8 +101,8 @@ def test_corners_are_expected_where_the_calibrated_machine_has_them(rendered):
     np.testing.assert_allclose(change[:, 0], -focal * turn, rtol=0.3)
 
 
-def test_legs_and_board_together_need_no_pose_by_hand(rendered, folder):
-    result = calibrate_session(folder)
+def test_legs_and_board_together_need_no_pose_by_hand(rendered, by_legs_and_board):
+    result = by_legs_and_board
     truth = load_truth(rendered, result.session.machine)
     s = result.estimate.statistics
     assert s.n_edges > 100

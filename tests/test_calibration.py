@@ -225,7 +225,7 @@ def test_a_camera_without_covariance_is_refined_from_what_is_usual(demo):
     camera = session.stations[0].camera
     off = 0.006 * np.where(np.arange(len(camera.parameters)) < 2, camera.parameters, 0.0)
     wrong = replace(camera, parameters=camera.parameters + off, covariance=None)
-    stations = tuple(replace(s, camera=wrong) for s in session.stations)
+    stations = tuple(replace(s, camera=wrong) for s in session.stations[:2])
     value = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
     refined = value.cameras.result(value.estimate, session.stations[0].camera_file)
     remainder, sigma = refined.parameters - camera.parameters, np.sqrt(np.diag(refined.covariance))

@@ -95,8 +95,13 @@ def test_shares_are_parts_of_a_whole(found):
     assert "look" not in found.as_dict()
 
 
-def test_three_images_of_one_station(alone):
-    check = check_session(alone)
+@pytest.fixture(scope="module")
+def alone_checked(alone):
+    return check_session(alone)
+
+
+def test_three_images_of_one_station(alone_checked):
+    check = alone_checked
     assert not [f for f in check.findings if f.level is Level.WRONG]
     rows = check.forecast
     assert [leg.leg for leg in rows.legs] == [1, 2, 3, 4, 5, 6]
@@ -300,15 +305,13 @@ def test_a_page_with_pictures(found):
     assert "best pose found, not recognised" in html
 
 
-def test_the_command_writes_page_and_pictures(alone, tmp_path, monkeypatch):
-    """The second and third time of what was found the first time."""
-    retained = []
+@pytest.fixture
+def check_once(alone_checked, monkeypatch):
+    """The command has the session checked already."""
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: alone_checked)
 
-    def once(*words, **more):
-        retained[:] = retained or [check_session(*words, **more)]
-        return retained[0]
 
-    monkeypatch.setattr("pkmcal.check.check.check_session", once)
+def test_the_command_writes_page_and_pictures(alone, check_once, tmp_path):
     done = run("check", alone, "-o", tmp_path / "out", "--pictures", tmp_path / "drawn", "--json")
     assert done.json["exit_code"] == done.code
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
@@ -328,7 +331,7 @@ def test_the_command_writes_page_and_pictures(alone, tmp_path, monkeypatch):
     assert "something other than pictures of a check" in refused.err
 
 
-def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
+def test_without_these_options_nothing_is_drawn(alone, check_once, monkeypatch):
     def never(*_):
         raise AssertionError
 

@@ -28,7 +28,7 @@ from test_identify_scene import make_scene
 
 # ------------------------------------------------------------------ what chance does
 
-PAIRS = 8
+PAIRS = 5
 
 
 def of_configurations(measurements, keep):
@@ -66,7 +66,7 @@ def changes(pairs):
 
 @pytest.mark.parametrize("kind", ["new data", "half of the data", "all data of the smaller"])
 def test_the_stated_spread_is_that_of_unchanged_machines(pairs, kind):
-    """Over 8 pairs with 47 degrees of freedom the mean of chi-square has a deviation of 0.07."""
+    """Over 5 pairs with 47 degrees of freedom the mean of chi-square has a deviation of 0.09."""
     value = changes(pairs[kind])
     dof = sum(c.dof for c in value)
     assert sum(c.chi2 for c in value) / dof == pytest.approx(1, abs=0.2)

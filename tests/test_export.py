@@ -98,7 +98,7 @@ def test_numbers_have_the_fewest_digits_that_read_back(name, tmp_path):
     hexapod = source_of(load_mechanism("gough-stewart"))
     for one in (source, hexapod):
         try:
-            files = make_export(one, name).files
+            files = exporters()[name].files(one)
         except InputError:  # another machine's format
             continue
         for text in files.values():

@@ -17,7 +17,7 @@ from export_sources import built, calibration, source_of
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
 from pkmcal.export.c import C_SOURCE_FOLDER, MACHINE_NUMBERS_END, CSource
-from pkmcal.export.contract import make_export
+from pkmcal.export.contract import exporters, make_export
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
@@ -26,7 +26,7 @@ COMPILER = shutil.which("gcc") or shutil.which("cc")
 CPP_COMPILER = shutil.which("g++") or shutil.which("c++")
 AVR_COMPILER, ARM_COMPILER = shutil.which("avr-gcc"), shutil.which("arm-none-eabi-gcc")
 WARNINGS = ["-Wall", "-Wextra", "-pedantic-errors", "-Wconversion", "-Wfloat-conversion", "-Werror"]
-FLAGS = ["-std=c99", "-O2", *WARNINGS, "-shared", "-fPIC"]
+FLAGS = ["-std=c99", "-O1", *WARNINGS, "-shared", "-fPIC"]
 REALS = {"double": ctypes.c_double, "float": ctypes.c_float}
 EPSILON = {"double": np.finfo(np.float64).eps, "float": np.finfo(np.float32).eps}
 SOURCES = ("pkmcal_kinematics.c", "pkmcal_selftest.c")
@@ -45,8 +45,7 @@ def structures(real):
 
 def compiled(machine, folder, *flags, real="double"):
     """A machine's source as a library, its functions on NumPy arrays."""
-    made = make_export(source_of(machine), "c")
-    for name, text in made.files.items():
+    for name, text in exporters()["c"].files(source_of(machine)).items():
         (folder / name).write_text(text)
     sources = [str(folder / name) for name in SOURCES]
     path = folder / f"{real}.so"

@@ -205,7 +205,7 @@ RESULTS = (
 
 
 @pytest.mark.parametrize("prepare", HOSTILE)
-def test_no_command_changes_anything_outside_its_output(home, tmp_path, prepare):
+def test_no_command_changes_anything_outside_its_output(home, tmp_path, quick_plans, prepare):
     prepare(home)
     root = home.parent
     # what commands may write: results inside a session, by their own names, where no link stands

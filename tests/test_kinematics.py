@@ -25,7 +25,7 @@ from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR, NEAR_SINGULAR
 
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=8, deadline=None)
+few = settings(max_examples=4, deadline=None)
 
 
 def machine_of(motion, legs, more=""):

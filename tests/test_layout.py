@@ -31,10 +31,16 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+@cache
+def import_nodes(path: Path) -> list[ast.Import | ast.ImportFrom]:
+    """All import statements of a file, at its top or inside its functions."""
+    return [n for n in ast.walk(parsed(path)) if isinstance(n, ast.Import | ast.ImportFrom)]
+
+
 def imports(path: Path) -> set[Path]:
     """Files of the package that a file imports, at its top or inside its functions."""
     actual_names: set[Path | None] = set()
-    for node in ast.walk(parsed(path)):
+    for node in import_nodes(path):
         if isinstance(node, ast.Import):
             actual_names |= {file_of(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
@@ -96,7 +102,7 @@ def test_private_names_are_used_in_their_own_file_and_nowhere_else():
         names = (node.name for node in made if not node.decorator_list and is_private(node.name))
         alone = (name for name in names if len(re.findall(rf"\b{name}\b", text)) == 1)
         wrong += (f"{where}: nobody uses {name}" for name in alone)
-        taken = (n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom))
+        taken = (n for n in import_nodes(path) if isinstance(n, ast.ImportFrom))
         names = (alias.name for node in taken for alias in node.names)
         wrong += (f"{where} imports {name}" for name in names if is_private(name))
     assert wrong == []

@@ -19,7 +19,7 @@ from export_sources import built, calibration, source_of
 from fuzz import bases
 from pkmcal.commands import console
 from pkmcal.errors import InputError, legible
-from pkmcal.export.contract import make_export
+from pkmcal.export.contract import exporters
 from pkmcal.files import json_text, read_json, read_yaml
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
@@ -108,14 +108,13 @@ def test_no_name_becomes_a_line_of_an_export(name):
     """All that differs from the export of a plain name are comments and names."""
     machine = built(FORMATS[name])
     plain, odd = (
-        make_export(
+        exporters()[name].files(
             source_of(
                 named(machine, text), origin=text, headline=text, session=text, frames=text,
                 calibrated=True, T_base_camera={text: np.eye(4)},
                 sigma_camera={text: np.full(6, 1e-3)},
-            ),
-            name,
-        ).files
+            )
+        )
         for text in ("plain", HOSTILE)
     )  # fmt: skip
     assert len(plain) == len(odd)
@@ -149,7 +148,7 @@ FOLDERS = ("a\x1b[31mb", "a\nname: b", "a\u202eb", "a\udcffb", "a\udcff\x1b\nnam
     [*(pytest.param(x, marks=pytest.mark.slow) for x in FOLDERS[:-1]), FOLDERS[-1]],
     ids=ascii,
 )
-def test_a_session_in_a_folder_of_any_name(tmp_path, name):
+def test_a_session_in_a_folder_of_any_name(tmp_path, quick_plans, name):
     folder = tmp_path / name
     try:
         bases.measured(folder, seed=1, count=14)

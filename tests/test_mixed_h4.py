@@ -26,8 +26,11 @@ def machine():
     return with_forearms(load_mechanism("h4"))
 
 
-def estimates(machine, seed):
-    """From the forearms, from the board, from both; of one true machine."""
+FOREARMS, BOARD, BOTH = (True, False), (False, True), (True, True)
+
+
+def estimates(machine, seed, *kinds):
+    """Estimates of one true machine from the forearms, from the board or from both."""
     rng = np.random.default_rng(seed)
     home, n = machine.home(), 30
     step = np.zeros((n, 6))
@@ -43,22 +46,24 @@ def estimates(machine, seed):
     whiten = np.broadcast_to(np.diag(1 / POSE), (n, 6, 6))
     board = PoseSet(np.zeros(n, int), np.arange(n), np.zeros(n, int), in_view, whiten)
     rough = perturb(T, 0.01 * rng.normal(size=(1, 6)))
-    for legs, targets in ((edges, None), (EdgeSet.empty(), board), (edges, board)):
+    for by_forearms, by_board in kinds:
         measurements = Measurements(
-            legs,
+            edges if by_forearms else EdgeSet.empty(),
             joints,
             READING,
             1,
             np.zeros(1, int),
-            poses=PoseSet.empty() if targets is None else targets,
-            mounts=() if targets is None else (Mount("board", "platform"),),
+            poses=board if by_board else PoseSet.empty(),
+            mounts=(Mount("board", "platform"),) if by_board else (),
         )
         yield bundle(machine, measurements, start_state(machine, measurements, rough))
 
 
 def test_forearms_and_board_together_know_more_than_each(machine):
     motor = np.flatnonzero(np.array(machine.parameters.kinds) == "angle")
-    legs, board, both = (np.diag(e.covariance)[motor] for e in estimates(machine, 0))
+    legs, board, both = (
+        np.diag(e.covariance)[motor] for e in estimates(machine, 0, FOREARMS, BOARD, BOTH)
+    )
     assert np.all(both < legs)
     assert np.all(both < board)
     # as much as two independent sources: what is worth less than 0.8 of that would be lost
@@ -66,5 +71,5 @@ def test_forearms_and_board_together_know_more_than_each(machine):
 
 
 def test_what_both_see_agrees(machine):
-    chi2 = [list(estimates(machine, seed))[2].statistics for seed in range(3)]
-    assert 0.8 < np.mean([s.chi2 / s.dof for s in chi2]) < 1.2
+    statistics = [e.statistics for seed in range(3) for e in estimates(machine, seed, BOTH)]
+    assert 0.8 < np.mean([s.chi2 / s.dof for s in statistics]) < 1.2

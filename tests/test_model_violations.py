@@ -37,6 +37,7 @@ from pkmcal.simulation.edges import EdgeNoise
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver import elimination
 from pkmcal.wording import ratio_in_per_cent
+from test_bad_input import only
 from test_identify_scene import exact
 
 NOISE = EdgeNoise(0.1, 0.1)
@@ -231,7 +232,7 @@ def false_alarms(seeds):
 
 
 def test_right_sessions_have_chances_like_dice():
-    chances = false_alarms(range(100, 112))
+    chances = false_alarms(range(100, 108))
     assert chances.min() > SESSION_FALSE_ALARM.level / chances.shape[1] / 10
     assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
 
@@ -241,7 +242,7 @@ def test_errors_of_whole_configurations_are_no_departure():
     scatter over configurations in the test, a scale would be reported.
     """
     named = np.zeros(2, dtype=int)
-    for seed in range(6):
+    for seed in range(4):
         nominal, data, where = measured(40 + seed, count=20)
         wrong = data.joints.copy()
         off = np.random.default_rng(seed).normal(0, 5e-3, len(wrong))
@@ -253,7 +254,7 @@ def test_errors_of_whole_configurations_are_no_departure():
             len(tests.significant()),
         )
         assert tests.fitted([0])[0].sigma[0] > 3e-4  # 5e-3 of twenty, as far as edges see it
-    assert named[0] >= 3
+    assert named[0] >= 2
     assert named[1] == 0
 
 
@@ -430,6 +431,7 @@ def test_another_camera_is_named(session):
 
 
 def test_one_wrong_reading_is_named_with_its_configuration(session):
+    only(session, "station1", "station2")
     path = session / "joints.csv"
     lines = path.read_text().splitlines()
     cells = lines[6].split(",")

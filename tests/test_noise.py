@@ -116,7 +116,7 @@ def test_noise_of_edges_that_poses_take_up_is_not_that_of_readings():
         assert not np.any(shares.contradicts())
 
 
-@pytest.mark.parametrize(("true", "stated"), [(3e-6, 3e-3), (3e-4, 3e-6), (3e-4, 3e-2)])
+@pytest.mark.parametrize(("true", "stated"), [(3e-6, 3e-3), (3e-4, 3e-6)])
 def test_a_noise_that_is_stated_wrong_is_found(true, stated):
     """Stated noise wrong by a hundred or a thousand, either way: estimates are as accurate and as
     honest as with the right one, and edges are not reported.

@@ -228,10 +228,9 @@ def test_turned_images_are_found_from_nothing(turn):
 
 def test_one_image_says_where_but_not_that_it_is_the_machine():
     """From one image the pose is right; no other image confirms it."""
-    for seed in range(2):
-        localization = find_station(view_of(images()[:1]), None, np.random.default_rng(seed))
-        assert inconsistent_poses(localization.T_camera_base) < 5
-        assert not localization.good
+    localization = find_station(view_of(images()[:1]), None, np.random.default_rng(0))
+    assert inconsistent_poses(localization.T_camera_base) < 5
+    assert not localization.good
 
 
 @pytest.mark.parametrize("seed", [2, *(often(seed) for seed in (0, 1, 3))])
@@ -333,7 +332,7 @@ def sticks(rng):
 def test_images_of_something_else_are_not_recognised(scene, count):
     rng = np.random.default_rng(1)
     view = view_of([scene(rng) for _ in range(count)])
-    for start in (rough_pose(0), rough_pose(1), None):
+    for start in (rough_pose(0), None):
         assert not find_station(view, start, np.random.default_rng(0)).good
 
 

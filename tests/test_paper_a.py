@@ -133,19 +133,6 @@ def test_standard_errors_are_the_scatter_of_studies():
     assert np.all((ratio > 0.29) & (ratio < 1.87)), ratio
 
 
-def test_the_result_does_not_depend_on_workers(monkeypatch):
-    results, rows = [], []
-    for count in (1, 3):
-        monkeypatch.setattr("pkmcal.studies.workers.cores", lambda count=count: count)
-        setting = HexapodByAxes(batch=4)
-        results.append(engine.run(setting, 10, 3, progress=lambda _text, share: rows.append(share)))
-    assert [r.workers for r in results] == [1, 3]
-    assert rows == pytest.approx(2 * [1 / 3, 2 / 3, 1])
-    for name in PAPER_A_METHODS:
-        assert results[0].of(name) == results[1].of(name)
-        assert len(results[0].values("parameters", name)) == 10
-
-
 def test_a_batch_depends_on_its_own_seed_alone():
     """Any batch can be done again, anywhere, and gives the study's very runs."""
     import pickle

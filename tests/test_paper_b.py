@@ -68,7 +68,7 @@ def edges_around_a_mirror(rng):
     return normal.reshape(LEGS, -1, 3), spread.reshape(LEGS, -1, 3, 3), centres
 
 
-def errors(method, share, runs=12):
+def errors(method, share, runs=8):
     """Root mean square error (m) of the base centres with a share of another leg's edges."""
     squares = []
     for run in range(runs):

@@ -31,7 +31,7 @@ def options():
 
 OPTIONS = [(command, name, flag) for command, name, flag, kinds, *_ in options()
            if kinds & {int, float}]  # fmt: skip
-BAD = ("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", str(10**9), str(10**30), "x", "")
+BAD = ("nan", "-inf", "0", "1e308", "x")
 
 
 def arguments(command):

@@ -99,14 +99,14 @@ def whitened(value, truth):
     ids=["four-belt", "4-rpr", "7 legs"],
 )
 def test_the_truth_is_within_the_stated_deviations(make, noise, n):
-    """Twenty-one machines with errors as large as the prior sigmas; the noise is stated three times
+    """Twelve machines with errors as large as the prior sigmas; the noise is stated three times
     too large, three times too small, and right, and is estimated.
     """
     nominal, rng = make(), np.random.default_rng(3)
     assert nominal.redundancy == nominal.n_joints - nominal.layout.own_motion.shape[1] > 0
     errors, scales = [], []
     poses = draw_configurations(nominal, n, 0.0, rng)[0][:n]
-    for run in range(21):
+    for run in range(12):
         truth = true_machine(nominal, 1.0, rng)
         joints = truth.inverse(poses)
         joints = joints + noise * rng.standard_normal(joints.shape)

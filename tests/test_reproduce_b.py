@@ -43,7 +43,7 @@ from pkmcal.studies.paper_b_control import (
 )
 from pkmcal.studies.paper_b_report import paper_b_outcome
 
-RUNS = 10
+RUNS = 8
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from pkmcal.calibration.faults import scale_notes
 from pkmcal.calibration.machine_identity import _check_machine
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
-from pkmcal.export.contract import make_export
+from pkmcal.export.contract import exporters
 from pkmcal.judge.causes import single_causes
 from pkmcal.mechanisms import catalogue, load_mechanism, machine_from_document, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense
@@ -176,12 +176,12 @@ def test_a_firmware_without_scales_is_told_what_to_set(name, to, words):
         off, machine = machine, with_scales(load_mechanism(name), 1e-3)
         own = np.array([entry.endswith(".scale") for entry in machine.parameters.names])
         machine = machine.with_values(np.where(own, off.values, machine.values))
-    text = " ".join("".join(make_export(source_of(machine), to).files.values()).split())
+    text = " ".join("".join(exporters()[to].files(source_of(machine)).values()).split())
     assert words in text
     factors = [f"{s:.9g}" for s in scales(machine)]
     assert all(f"goes {factor} times as far as its reading says." in text for factor in factors)
     exact = with_scales(load_mechanism(name), 0.0)
-    assert words not in "".join(make_export(source_of(exact), to).files.values())
+    assert words not in "".join(exporters()[to].files(source_of(exact)).values())
 
 
 # Words, and files of earlier versions

@@ -93,8 +93,15 @@ def test_frames_are_conventions(scenes, case, calibrated):
     assert max(first.station) < 5e-3  # coarse images, but the camera is localized
 
 
-@pytest.mark.slow
-def test_a_whole_session_is_scored_and_its_truth_not_shown(scenes, demo, tmp_path, capsys):
+def test_a_whole_session_is_scored_and_its_truth_not_shown(
+    scenes, demo, calibrated, capsys, monkeypatch
+):
+    def calibrate(session, **_options):
+        assert session.folder != demo.session
+        assert not list(session.folder.rglob("truth.json"))
+        return calibrated
+
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", calibrate)
     scenes.main([str(demo.session), "--json"])
     value = json.loads(capsys.readouterr().out)
     (row,) = value["sessions"]

@@ -379,20 +379,20 @@ def test_what_chance_does_is_no_gain():
 
 def test_the_command_tells_and_writes(tmp_path, one_process):
     out = tmp_path / "study"
-    done = run("study", "3-rpr", *SMALL, "--runs", 12, "-o", out)
+    done = run("study", "3-rpr", *SMALL, "--runs", 8, "-o", out)
     assert done.code == 0, done.err
     assert "The stated deviations hold" in done.out
     assert "stations 1" in done.out
     with (out / "study.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 24
-    assert [row["run"] for row in rows[:12]] == [str(k) for k in range(12)]
+    assert len(rows) == 16
+    assert [row["run"] for row in rows[:8]] == [str(k) for k in range(8)]
     assert {row["stations"] for row in rows} == {"1", "2"}
     assert all(float(row["position"]) > 0 for row in rows)
     assert all(row["worst_parameter"].startswith("legs[") for row in rows)
     page = (out / "study.html").read_text()
     assert "By stations" in page
-    again = run("study", "3-rpr", *SMALL, "--runs", 12, "-o", out, "--json").json
+    again = run("study", "3-rpr", *SMALL, "--runs", 8, "-o", out, "--json").json
     assert again["exit_code"] == 0
     assert len(again["combinations"]) == 2
     assert again["combinations"][0]["covered"]["value"] > 0.85

@@ -43,7 +43,7 @@ def small():
     return SimpleNamespace(nominal=nominal, machine=machine, poses=poses, covariance=known(machine))
 
 
-def drawn_poses(case, draws=1500):
+def drawn_poses(case, draws=600):
     """Poses at the same readings of machines drawn by the covariance, as changes (draws, n, 6),
     each laid over the calibrated one by its joint centres.
     """
@@ -70,8 +70,8 @@ def test_sigma_is_the_scatter_of_machines_drawn_by_the_covariance(small):
     scatter = np.einsum("dni,dnj->nij", count, count) / len(count)
     scale = np.sqrt(np.einsum("nii->ni", values.covariance)) + 1e-15
     off = (scatter - values.covariance) / (scale[:, :, None] * scale[:, None])
-    # 1500 draws leave 3.7 % on a variance; four and a half of them, for 432 numbers
-    assert np.abs(off).max() < 0.165
+    # 600 draws leave 5.8 % on a variance; four and a half of them, for 432 numbers
+    assert np.abs(off).max() < 0.26
     drawn = np.sqrt(np.trace(scatter[:, 3:, 3:], axis1=1, axis2=2))
     np.testing.assert_allclose(values.position, drawn, rtol=0.06)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -49,6 +50,7 @@ from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
+from test_bad_input import images, only
 from test_identify_scene import exact
 from test_report_page import Found
 
@@ -455,13 +457,26 @@ def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
 # the commands
 
 
+def of_two_stations(session):
+    """The session without its third station and the configurations that it alone observes."""
+    only(session, "station1", "station2")
+    visible = {path.stem for name in ("station1", "station2") for path in images(session, name)}
+    head, *rows = (session / "joints.csv").read_text().splitlines()
+    rows = [row for row in rows if row.partition(",")[0] in visible]
+    (session / "joints.csv").write_text("\n".join([head, *rows]) + "\n")
+    return session
+
+
 @pytest.fixture(scope="module")
 def kept(demo, tmp_path_factory):
-    """The demonstration's session calibrated without three configurations, and validated."""
+    """Two of the demonstration's stations calibrated without three configurations, and
+    validated.
+    """
     folder = tmp_path_factory.mktemp("validate")
+    session = of_two_stations(shutil.copytree(demo.session, folder / "session"))
     with two_looks():
-        made = run("calibrate", demo.session, "--holdout", 3, "-o", folder / "c", "--json")
-    value = run("validate", folder / "c", demo.session, "-o", folder / "v", "--json")
+        made = run("calibrate", session, "--holdout", 3, "-o", folder / "c", "--json")
+    value = run("validate", folder / "c", session, "-o", folder / "v", "--json")
     return SimpleNamespace(folder=folder, made=made, found=value)
 
 
@@ -503,6 +518,7 @@ def test_validate_on_what_was_held_out(kept, demo):
 
 
 def test_validate_in_words(kept, session):
+    of_two_stations(session)
     path = "\npaths: {ruler: ['0000', '0001', '0002']}\n"
     (session / "session.yaml").write_text((session / "session.yaml").read_text() + path)
     done = run("validate", kept.folder / "c", session, "--regions", 2)

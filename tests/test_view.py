@@ -23,14 +23,13 @@ from conftest import run
 from pkmcal.cameras.files import camera_text
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb, pose, pose_difference, rotation
-from pkmcal.mechanisms import load_mechanism
 from pkmcal.session.load import load_session
-from pkmcal.simulation import Settings, board_for, load_truth
+from pkmcal.simulation import load_truth
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.view import server
 from pkmcal.view.content import Viewed
 from pkmcal.view.pose_file import PoseFile
-from rendered import rendered
+from rendered import BOARD_SESSION, by_command
 from test_report_page import CHROMIUM, Found
 
 PORT, TOKEN = 4711, "the-token"
@@ -362,11 +361,9 @@ def test_reasons_of_what_was_left_out_are_told(page, monkeypatch):
 
 
 def test_a_boards_corners_are_shown(tmp_path):
-    machine = load_mechanism("gough-stewart")
-    settings = Settings(stations=1, configurations=2, board=board_for(machine), observe=("board",))
-    folder = rendered(tmp_path / "session", machine, camera_of_size((640, 480)), settings)
-    text = (folder / "session.yaml").read_text()
-    (folder / "session.yaml").write_text(text.replace("fixed_to: base", "fixed_to: platform"))
+    folder = by_command(tmp_path / "session", *BOARD_SESSION)
+    text = (folder / "session.yaml").read_text().replace("fixed_to: base", "fixed_to: platform")
+    (folder / "session.yaml").write_text(re.sub(r"observe: .*", "observe: board", text))
     opened = Page(folder)
     visible = opened.ask("found")
     assert len(visible["corners"]) > 5
