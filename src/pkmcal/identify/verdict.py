@@ -49,6 +49,8 @@ class VerdictOptions:
 
     # noise scale beyond which the model does not explain the images, or the poses
     too_noisy: float = 4.0
+    # ratio to the least noise scale up to which a simpler one of the richer models fits as well
+    equal_fit: float = 1.1
     # share of rejected edges beyond which the remaining ones may be the outliers
     too_many_rejected: float = 0.4
     # share of the platform's error by the nominal model that may remain undetermined. A calibration
@@ -315,7 +317,7 @@ def _poses_misfit(
     """
     s = estimate.statistics
     best = min((model.scale for model in richer), default=np.inf)
-    fits = next((model for model in richer if model.scale < 1.1 * best), None)
+    fits = next((model for model in richer if model.scale < options.equal_fit * best), None)
     better = {"model": fits and fits.name, "model_scale": fits and fits.scale}
     if s.pose_scale > options.too_noisy:
         yield wrong("poses.misfit", scale=s.pose_scale, **better)
