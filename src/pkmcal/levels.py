@@ -34,6 +34,8 @@ CONTRADICTION_SIGMAS = 5.0
 NOISE_EXCESS = 1.5
 """Ratio of errors to their standard deviations that is no reason for a report: standard deviations
 contain noise, and shading and lenses add a few tenths in any images."""
+RELEVANT_FACTOR = 1.2
+"""Factor on a standard deviation that matters: that of half as many images in addition."""
 ALIGNED_ANGLE = radians(10.0)
 """Angle (rad) to an axis or a plane within which a direction has its name."""
 TRANSLATION_TURN = radians(3.0)

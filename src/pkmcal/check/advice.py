@@ -14,6 +14,7 @@ import numpy as np
 from pkmcal.check.forecast import Forecast, LegForecast
 from pkmcal.check.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
+from pkmcal.levels import RELEVANT_FACTOR
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_OPTIONS
 from pkmcal.outcome import Figure, Level, Part, Row, Table
@@ -22,11 +23,7 @@ from pkmcal.planning.first import EdgesOf
 from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.wording import brief, count, listed, named
 
-ADVICE_WORTH_FACTOR = 1.2
-"""Minimum gain of a standard deviation, as a factor, that is worth advice: that of half as many
-images in addition.
-"""
-INFORMATION_LOST_SHARE = 1 - 1 / ADVICE_WORTH_FACTOR**2
+INFORMATION_LOST_SHARE = 1 - 1 / RELEVANT_FACTOR**2
 """Share of the information that is lost with that factor."""
 POOR_LEG = 0.5
 """Information of a leg, relative to the mean of all legs, below which the leg is named."""
@@ -59,7 +56,7 @@ def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, 
 
 def _second_station(forecast: Forecast | None) -> list[Finding]:
     """Advice to use a second station, if it gains more than further images at the only one."""
-    if forecast is None or not forecast.second * ADVICE_WORTH_FACTOR < forecast.position:
+    if forecast is None or not forecast.second * RELEVANT_FACTOR < forecast.position:
         return []
     return [
         note(
@@ -87,7 +84,7 @@ def _from_one_side(inspection: Inspection) -> list[Finding]:
     sine = np.linalg.norm(np.cross(direction[:, None], direction), axis=-1)
     if (
         not all(station.recognised for station in inspection.stations)
-        or sine.max() * ADVICE_WORTH_FACTOR > 1
+        or sine.max() * RELEVANT_FACTOR > 1
     ):
         return []
     angle = math.degrees(math.asin(float(sine.max())))

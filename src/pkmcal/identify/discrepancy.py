@@ -58,6 +58,7 @@ from pkmcal.identify.score import (
     eliminate_beside,
     shared_basis,
 )
+from pkmcal.levels import RELEVANT_FACTOR
 from pkmcal.measurements import Column
 from pkmcal.solver.elimination import divisions
 
@@ -75,7 +76,7 @@ class DiscrepancyOptions:
     # level of the session, of which the components share that of their search
     false_alarm: FalseAlarm = SESSION_FALSE_ALARM
     # factor on a stated noise from which the discrepancy may be what enlarged it
-    enlarged: float = 1.2
+    enlarged: float = RELEVANT_FACTOR
     # factors tried then, from what was stated to what is in use
     noise_factors: int = 5
     # smallest part of a probe's stated noise that is tried, and how many factors: new sessions

@@ -48,8 +48,12 @@ class RobustOptions:
     # times sharper they allow short steps only at first, and after a single refused step the scales
     # would seem settled
     pose_steps: int = 10
-    # largest number of stages of the annealing, each of which divides the scale by up to four
+    # largest number of stages of the annealing
     most_stages: int = 30
+    # factor of the first scale on the last one, and the largest by which a stage divides the scale
+    stage_factor: float = 4.0
+    # share of the scale before from which on a stage has changed nothing, and the annealing ends
+    settled_stage: float = 0.8
     # Geman-McClure scale in units of the residuals' robust scale: an inlier at two of these keeps
     # two thirds of its weight
     geman_mcclure_scale: float = FULL_WEIGHT_DISTANCE
@@ -261,14 +265,18 @@ def anneal(problem: Problem, start: BatchState, options: RobustOptions = ROBUST)
     most = options.pose_steps if problem.kinds.poses.present.size else 1
     d = norms(problem, problem.unweighted(state))
     cut = [
-        4 * options.geman_mcclure_scale * scale for scale in noise_scales(problem, d, LEAST_SCALE)
+        options.stage_factor * options.geman_mcclure_scale * scale
+        for scale in noise_scales(problem, d, LEAST_SCALE)
     ]
     for _ in range(options.most_stages):
         aim = [
             options.geman_mcclure_scale * scale for scale in noise_scales(problem, d, LEAST_SCALE)
         ]
-        new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
-        settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
+        new = [
+            np.minimum(c, np.maximum(a, c / options.stage_factor))
+            for c, a in zip(cut, aim, strict=True)
+        ]
+        settled = all(np.all(n > options.settled_stage * c) for n, c in zip(new, cut, strict=True))
         cut = new
         weight = Kinds(
             *(geman_mcclure_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True))

@@ -24,6 +24,8 @@ from pkmcal.wording import split_name
 
 JointSide = Literal["base", "platform"]
 JOINT_SIDES: tuple[JointSide, JointSide] = ("base", "platform")
+COMMON_MOUNT_RATIO = 0.7
+"""Distance of two joints on a common mount, relative to that of the next joint, at most."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +189,7 @@ def _neighbours(machine: Machine, side: JointSide) -> list[tuple[int, int]]:
     nearest = np.argmin(apart, axis=1)
     own = {pair for arm in arms(machine) for pair in [(i, j) for i in arm for j in arm]}
     pairs = {(min(i, j), max(i, j)) for i, j in enumerate(nearest.tolist()) if nearest[j] == i}
-    # a common mount is shorter than the distance to the next joint
-    close = [p for p in pairs if apart[p] < 0.7 * np.sort(apart[p[0]])[1]]
+    close = [p for p in pairs if apart[p] < COMMON_MOUNT_RATIO * np.sort(apart[p[0]])[1]]
     return sorted(set(close) - own)
 
 
