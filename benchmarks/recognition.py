@@ -262,7 +262,7 @@ MISTAKES: dict[str, Mistake] = {
     "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), "image.mirrored"),
     "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1])),
     "diameters": Mistake(_radii, "tube.diameter"),
-    "millimetres": Mistake(_millimetres, "readings.units"),
+    "millimetres": Mistake(_millimetres, "mechanism.units"),
     "another machine": Mistake(_another, "station.not_recognised"),
     "stations exchanged": Mistake(_stations, "station.exchanged"),
 }

@@ -118,11 +118,11 @@ def test_a_drawing_in_millimetres_without_a_unit_is_told(tmp_path):
     text = yaml.safe_dump(scaled(content, lambda path: only.get(unit_of(path, "m"), "")))
     path = tmp_path / "m.yaml"
     path.write_text(text.replace(" mm", ""))
-    values = fault(load_mechanism, path)
-    assert values.startswith(
-        "m.yaml: the nominal model's lengths look like millimetres; found legs["
-    )
-    assert "Write each length with its unit, such as 269.3 mm" in values
+    with pytest.raises(InputError) as caught:
+        load_mechanism(path)
+    assert caught.value.code == "mechanism.units"
+    assert caught.value.found.startswith("legs[")
+    assert "Write each length with its unit, such as 269.3 mm" in caught.value.next_step
     path.write_text(text.replace(" mm", " m"))  # a machine of some hundred metres, in so many words
     assert np.abs(load_mechanism(path).values).max() > 100
 

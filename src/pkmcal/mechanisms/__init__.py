@@ -136,6 +136,7 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
             expected=f"metres, at most {LARGEST_UNITLESS_LENGTH:g} where no value has a unit",
             next_step="Write each length with its unit, such as 269.3 mm, or divide them by 1000;"
             " in a session also the camera's pose, and head the columns of joints.csv leg1 [mm]",
+            code="mechanism.units",
         )
     for name in ("center", "offset", "radius", "arm"):
         value = getattr(checked.tolerance, name)

@@ -196,4 +196,5 @@ def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
         found=f"positions that vary by {spread:.4g}",
         expected=f"metres; the platform itself moves by {motion:.3g} by its readings",
         next_step="Divide x, y and z by 1000, or head them x [mm], y [mm], z [mm]",
+        code="poses.units",
     )
