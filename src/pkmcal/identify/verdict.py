@@ -50,7 +50,6 @@ class VerdictOptions:
 
     # noise scale beyond which the model does not explain the images, or the poses
     too_noisy: float = 4.0
-    # ratio to the least noise scale up to which a simpler one of the richer models fits as well
     # share of rejected edges beyond which the remaining ones may be the outliers
     too_many_rejected: float = 0.4
     # share of the platform's error by the nominal model that may remain undetermined. A calibration
