@@ -82,7 +82,7 @@ def test_the_file_holds_everything(folder, calibrated):
     assert {"pkmcal", "python", "numpy", "opencv-contrib-python-headless"} <= set(data["versions"])
     assert set(data["timings"]) == {"load", "decode", "observe", "identify"}
     assert data["session"]["joints"]["columns"] == [f"leg{n}" for n in range(1, 7)]
-    assert "not of what the model leaves out" in data["conventions"]
+    assert "as far as residuals show them" in data["conventions"]
 
 
 def test_numbers_that_are_none_become_null(calibrated):

@@ -26,6 +26,7 @@ from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.outcome.finding import Finding, wrong
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import how_often
 
 IMAGE_OFFSET = 2 * legs.LEG_SEARCH_OPTIONS.reach
@@ -99,7 +100,8 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
         r.side >= 0 and r.code != "edges.out_of_sight" and r.station in stations
         for r in in_view.rejected
     )
-    given_up = int(np.sum(mine & (turns.estimate.edge_weights < 0.5)))  # which are among both
+    # these are among both
+    given_up = int(np.sum(mine & (turns.estimate.edge_weights < INLIER_WEIGHT)))
     in_sight = int(np.sum(mine)) + missed - given_up
     if not turns.images or measured >= FEW * in_sight:
         return None

@@ -36,6 +36,7 @@ from pkmcal.outcome.hypotheses import (
 )
 from pkmcal.session.load import Session
 from pkmcal.session.readings import wrong_reading
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import listed
 
 
@@ -105,7 +106,7 @@ def outlier_explanations(
         return  # no pose fits, so there are no outliers
     measured = measured._replace(noise=usual * measured.noise)
     least = SESSION_FALSE_ALARM.of_test(len(which))
-    rejected = estimate.pose_weights[which] < 0.5
+    rejected = estimate.pose_weights[which] < INLIER_WEIGHT
     odd = np.unique(measured.configuration[rejected & (_chance(m, squares / usual) < least)])
     named: set[int] = set()
     for k in odd.tolist():

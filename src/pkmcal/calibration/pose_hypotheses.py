@@ -58,6 +58,7 @@ from pkmcal.outcome.hypotheses import (
 from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
+from pkmcal.solver.kernels import INLIER_WEIGHT
 
 SUSPECT_SCALE = 2.0
 """Factor on the noise of poses, or of edges, from which hypotheses are compared."""
@@ -573,7 +574,7 @@ def _sizes(
 
 def poses_disagree(estimate: Estimate) -> bool:
     """Whether the poses disagree with the machine so much that hypotheses are compared."""
-    rejected = estimate.pose_weights < 0.5
+    rejected = estimate.pose_weights < INLIER_WEIGHT
     return bool(rejected.size) and (
         estimate.statistics.pose_scale > SUSPECT_SCALE
         or rejected.mean() > SUSPECT_REJECTED_SHARE

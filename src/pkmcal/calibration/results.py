@@ -51,10 +51,10 @@ FORMAT_KEY, CALIBRATION_FORMAT = "pkmcal_calibration", 1
 PACKAGES_WITH_VERSION = ("numpy", "scipy", "opencv-contrib-python-headless")
 CALIBRATION_CONVENTIONS = (
     "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading +"
-    " offset. Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, not"
-    " of what the model leaves out. Rotations of a pose are perturbed from the left, about the axes"
-    " of its outer frame. Where sigma is null, the data do not determine the value: it is a"
-    " convention."
+    " offset. Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, and"
+    " of model errors as far as residuals show them. Rotations of a pose are perturbed from the"
+    " left, about the axes of its outer frame. Where sigma is null, the data do not determine the"
+    " value: it is a convention."
 )
 EDGE_COLUMNS = (
     "station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt", "coarse",

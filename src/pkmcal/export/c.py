@@ -78,8 +78,8 @@ class CSource(Exporter):
         about = source.header(*CONVENTIONS)
         sigmas = (
             "",
-            "Parameters (sigma: standard deviation of sampling, not of what the model leaves out;"
-            " held: by the choice of frames, or by the mechanism file):",
+            "Parameters (sigma: standard deviation of sampling, and of model errors as far as"
+            " residuals show them; held: by the choice of frames, or by the mechanism file):",
             *source.sigma_lines(),
         )
         test = (

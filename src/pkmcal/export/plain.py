@@ -20,8 +20,8 @@ CONVENTIONS = (
     "Units: m and rad; axes are unit vectors.",
     "T_a_b maps coordinates of frame b to frame a. length = scale * reading + offset, and so of"
     " what else a reading moves; a scale that does not stand here is 1. Legs count from 1.",
-    "sigma is a standard deviation: of sampling, not of what the model leaves out. 0 (held): by the"
-    " choice of frames, or by the mechanism file.",
+    "sigma is a standard deviation: of sampling, and of model errors as far as residuals show them."
+    " 0 (held): by the choice of frames, or by the mechanism file.",
 )
 
 

@@ -1,8 +1,9 @@
 """Covariance, noise scale and rank of the estimate, from exact derivatives.
 
 The covariance is the inverse of the reduced information at the solution, expressed in a gauge. It
-covers the noise of edges and readings and the nominal model's prior sigmas; it does not cover
-errors of the model (joint clearance, bending, a wrong lens).
+covers the noise of edges and readings and the nominal model's prior sigmas. Errors of the model
+(joint clearance, bending, a wrong lens) are added elsewhere, as far as residuals show them
+(:mod:`pkmcal.identify.discrepancy`).
 """
 
 from __future__ import annotations

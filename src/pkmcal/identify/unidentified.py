@@ -150,7 +150,7 @@ def identified(machine: Machine, covariance: Array) -> Booleans:
     """Whether the data determine each of the six numbers of poses, (..., 6). The others are
     conventions, or starting values, and are not reported as numbers.
 
-    The prior of a target's position is the machine's size, and that of its rotation one radian; a
+    Positions are compared with the machine's size, their prior, and rotations with one radian: a
     number on which the data have less information than the prior is not determined by them.
 
     covariance : (..., 6, 6), rad and m.

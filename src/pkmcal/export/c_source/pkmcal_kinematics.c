@@ -12,8 +12,8 @@
  * C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all
  * functions can run at once in several threads. Do not compile with -ffast-math.
  *
- * Parameters (sigma: standard deviation of sampling, not of what the model leaves out; held: by
- * the choice of frames, or by the mechanism file):
+ * Parameters (sigma: standard deviation of sampling, and of model errors as far as residuals show
+ * them; held: by the choice of frames, or by the mechanism file):
  * legs[1].base.center.x = 0.2693 m
  * legs[1].base.center.y = 0.02 m
  * legs[1].base.center.z = 0 m
