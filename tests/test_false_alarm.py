@@ -81,7 +81,7 @@ def test_tests_of_one_search_share_its_level():
 
 @pytest.mark.parametrize("dof", [5, 60])
 def test_noise_exceeds_its_scale_as_often_as_the_level_says(dof):
-    level, runs = FalseAlarm(0.02, ("violations", "poses")), 20000
+    level, runs = FalseAlarm(0.02, searches=2), 20000
     rng = np.random.default_rng(0)
     rms = np.sqrt(np.mean(rng.normal(size=(runs, dof)) ** 2, axis=1))
     assert np.mean(rms > level.scale(dof)) == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / runs))
