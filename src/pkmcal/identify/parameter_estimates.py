@@ -162,7 +162,7 @@ class ParameterEstimates(Sequence[ParameterEstimate]):
                     number(row.value, places),
                     number(row.sigma, places) if row.sigma else "",
                     row.unit,
-                    row.decided_by,
+                    "nominal model" if row.decided_by == "drawing" else row.decided_by,
                 )
             )
         return out
