@@ -64,12 +64,10 @@ class UnidentifiedOptions:
     sparse_steps: int = 20
     frame_weight: float = 10.0
 
-    @property
-    def new_sine(self) -> float:
-        """Sine of the angle to the motions so far below which a motion describes nothing new: it
-        nearly lies in their space.
-        """
-        return float(np.sqrt(1 - self.inside[1]))
+    # sine of the angle to the motions so far below which a motion describes nothing new. Larger
+    # angles must count: what no motion describes is reported as one undetermined direction, with
+    # the effect of all of them, and refuses results whose single motions are harmless
+    new_sine: float = 0.1
 
 
 UNIDENTIFIED = UnidentifiedOptions()

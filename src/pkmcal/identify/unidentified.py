@@ -151,12 +151,12 @@ def identified(machine: Machine, covariance: Array) -> Booleans:
     conventions, or starting values, and are not reported as numbers.
 
     Positions are compared with the machine's size, their prior, and rotations with one radian: a
-    number on which the data have less information than the prior is not determined by them.
+    number whose standard deviation is not below half of that is not determined by the data.
 
     covariance : (..., 6, 6), rad and m.
     """
-    variance = np.einsum("...ii->...i", covariance)
-    return variance < MAJORITY * np.repeat([1.0, machine_size(machine)], 3) ** 2
+    sigma = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 0.0))
+    return sigma < MAJORITY * np.repeat([1.0, machine_size(machine)], 3)
 
 
 def direction_vectors(directions: tuple[ParameterDirection, ...], machine: Machine) -> Array:
