@@ -20,7 +20,7 @@ from hypothesis import settings
 from pkmcal.calibration.refinement import IMPUTATION_PASSES as ALL_LOOKS
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
-from rendered import once, rendered
+from rendered import once
 
 # Examples of a property, unless its test says how many.
 settings.register_profile("quick", max_examples=40)
@@ -163,53 +163,30 @@ class Told(Generic[Found]):
 
 
 @pytest.fixture(scope="session")
-def demonstrated(common) -> tuple[Run, Told[Calibration]]:
-    """One demonstration for a run of the tests: the command's output and its calibration."""
-    from pkmcal import simulation
-    from pkmcal.calibration import calibrate
-
-    def rendered_once(folder: Path, *words: Any, progress: object, **more: Any) -> None:
-        rendered(folder, *words, **more)
-
-    calibrations: list[Told[Calibration]] = []
-    calibrate_session = calibrate.calibrate_session
-
-    def recorded(session: Path, progress: Callable[[str, float], None]) -> Calibration:
-        told: list[tuple[str, float]] = []
-
-        def both(text: str, share: float) -> None:
-            told.append((text, share))
-            progress(text, share)
-
-        calibrations.append(Told(calibrate_session(session, progress=both), told))
-        return calibrations[-1].found
-
-    def make() -> tuple[Run, Told[Calibration]]:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(simulation, "simulate_session", rendered_once)
-            patch.setattr(calibrate, "calibrate_session", recorded)
-            done = run("demo", "-o", common / "demo", "--fast", "--no-open", "--json")
-        (calibration,) = calibrations
-        return done, calibration
-
-    return made_once(common / "demonstrated", make)
+def demo(common) -> Demo:
+    """One demonstration for a run of the tests: its folders and output."""
+    words = ("demo", "-o", common / "demo", "--fast", "--no-open", "--json")
+    return Demo(common / "demo", made_once(common / "demonstrated", lambda: run(*words)))
 
 
 @pytest.fixture(scope="session")
-def demo(demonstrated, common) -> Demo:
-    """The demonstration's folders and output."""
-    return Demo(common / "demo", demonstrated[0])
+def calibrating(demo, common) -> Told[Calibration]:
+    """The demonstration's session, calibrated from Python, with the progress messages."""
+    from pkmcal.calibration.calibrate import calibrate_session
 
+    def make() -> Told[Calibration]:
+        progress: list[tuple[str, float]] = []
+        calibration = calibrate_session(
+            demo.session, progress=lambda text, share: progress.append((text, share))
+        )
+        return Told(calibration, progress)
 
-@pytest.fixture(scope="session")
-def calibrating(demonstrated) -> Told[Calibration]:
-    """The demonstration's calibration, with its progress messages."""
-    return demonstrated[1]
+    return made_once(common / "calibrated", make)
 
 
 @pytest.fixture(scope="session")
 def calibrated(calibrating) -> Calibration:
-    """The demonstration's calibration without its messages."""
+    """That calibration without its messages."""
     return calibrating.found
 
 

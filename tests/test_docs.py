@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-import pkmcal
 from conftest import run
 from document_keys import assert_keys
 from pkmcal.cameras import camera_models
@@ -100,17 +99,10 @@ def workplace(demo, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def calibrate_once():
-    """``pkmcal.calibrate``, which calibrates a session once for all pages."""
-    return cache(pkmcal.calibrate)
-
-
 @pytest.mark.parametrize("name", [n for n in NAMES if blocks(text_of(n), "python runnable")])
-def test_examples_run(name, workplace, monkeypatch, calibrate_once):
+def test_examples_run(name, workplace, monkeypatch):
     """Blocks of one page share their names, as a reader who types them in would have it."""
     monkeypatch.chdir(workplace)
-    monkeypatch.setattr(pkmcal, "calibrate", calibrate_once)
     namespace: dict[str, object] = {}
     for body in blocks(text_of(name), "python runnable"):
         exec(compile(body, name, "exec"), namespace)

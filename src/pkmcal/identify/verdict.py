@@ -197,22 +197,22 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     )
 
 
-def no_gain(sigma: float, by_drawing: float, options: VerdictOptions = VERDICT) -> bool:
+def no_gain(sigma: float, nominal_sigma: float, options: VerdictOptions = VERDICT) -> bool:
     """Whether a result is no better than the nominal model, for data of any kind.
 
     sigma : standard deviation of the purpose of the result (the platform at given readings, or the
     tool's height above the bed).
-    by_drawing : the same by the prior sigmas alone, in the same unit.
+    nominal_sigma : the same by the prior sigmas alone, in the same unit.
     """
-    return not sigma <= options.nominal_error_share * by_drawing
+    return not sigma <= options.nominal_error_share * nominal_sigma
 
 
 def _no_gain(
-    subject: str, sigma: float, by_drawing: float, options: VerdictOptions
+    subject: str, sigma: float, nominal_sigma: float, options: VerdictOptions
 ) -> Iterator[Finding]:
     """Wrong if the measurements do not improve on the nominal model; see :func:`no_gain`."""
-    if no_gain(sigma, by_drawing, options):
-        yield wrong(f"{subject}.no_gain", sigma=sigma, nominal_sigma=by_drawing)
+    if no_gain(sigma, nominal_sigma, options):
+        yield wrong(f"{subject}.no_gain", sigma=sigma, nominal_sigma=nominal_sigma)
 
 
 def _touch_unnoticed(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:

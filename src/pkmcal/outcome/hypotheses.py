@@ -182,15 +182,13 @@ def decide(
     return ranked[0] if ranked[0].log_odds > limit else None
 
 
-def likely(
-    ranked: Sequence[Ranked[Subject]], options: HypothesisOptions = OPTIONS
-) -> list[Ranked[Subject]]:
+def likely(ranked: Sequence[Ranked[Subject]]) -> list[Ranked[Subject]]:
     """The hypothesis to follow, then the others to be reported that it does not exclude; empty
     where none is likely enough.
     """
-    first = decide(ranked, options)
-    rivals = rivals_of(ranked, options) if first else []
-    return [one for one in (first, *rivals) if one and one.log_odds > options.report]
+    first = decide(ranked)
+    rivals = rivals_of(ranked) if first else []
+    return [one for one in (first, *rivals) if one and one.log_odds > OPTIONS.report]
 
 
 def rivals_of(
@@ -205,9 +203,7 @@ def rivals_of(
     return list(out.values())
 
 
-def refuse(
-    *explanations: Callable[[], Explanation], options: HypothesisOptions = OPTIONS
-) -> tuple[Finding, ...]:
+def refuse(*explanations: Callable[[], Explanation]) -> tuple[Finding, ...]:
     """Raise the error of the likeliest explanation; notes on what could not be tested where none
     has an error.
 
@@ -217,7 +213,7 @@ def refuse(
     for explain in explanations:
         likeliest = max(likeliest, one := explain(), key=lambda one: one.log_odds)
         untested += one.untested
-        if likeliest.log_odds > options.act:
+        if likeliest.log_odds > OPTIONS.act:
             break
     if likeliest.error is not None:
         raise likeliest.error

@@ -19,7 +19,7 @@ from pkmcal.identify.parameter_estimates import (
     ParameterEstimates,
     parameter_estimates,
 )
-from pkmcal.identify.unidentified import Findings, only_heights
+from pkmcal.identify.unidentified import Findings
 from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part, Plot
@@ -57,12 +57,12 @@ LATEX_SIGNS = {
 }  # fmt: skip
 """Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
-    "data": ("", "the images decide"),
-    "drawing": ("nominal", "the nominal model decides more than the images"),
+    "data": ("data", "the data decide"),
+    "drawing": ("nominal", "the nominal model decides more than the data"),
     "frame": ("frame", "defines the frame"),
     "fixed": ("fixed", "kept at the nominal model's value"),
 }
-"""Mark in the table, empty for the name of what was measured, and sentence."""
+"""Mark in the table, and sentence, by the source's key."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class ParameterRow:
 
     @property
     def mark_text(self) -> str:
-        """Mark of the source; empty for the data, which the page calls by their kind."""
+        """Mark of the source in the table."""
         return PARAMETER_SOURCES[self.source][0]
 
     @property
@@ -114,7 +114,6 @@ class ParameterGroup:
 
 def section(nominal: Machine, estimate: Estimate) -> Part:
     """Section with the table of parameters."""
-    visible = estimate.edge_weights.size or estimate.pose_weights.size
     estimates = parameter_estimates(
         nominal.values, estimate.machine, estimate.covariance, estimate.data_share
     )
@@ -130,7 +129,6 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
             ),
         },
         gauge=estimate.gauge,
-        measured_by="heights" if only_heights(estimate) else "images" if visible else "readings",
     )
     return Part("parameters", "Parameters", html=html)
 

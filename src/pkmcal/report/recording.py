@@ -82,7 +82,7 @@ def _result(c: Calibration) -> Iterator[Logged]:
     ]
     rows += [
         f"| {p.name} | {p.unit} | {p.drawing:.7g} | {p.value:.7g} | {p.sigma:.2g}"
-        f" | {PARAMETER_SOURCES[p.decided_by][0] or 'data'} |"
+        f" | {PARAMETER_SOURCES[p.decided_by][0]} |"
         for p in c.parameters
     ]
     yield Logged(("result", "parameters"), "text", {"text": "\n".join(rows)})
