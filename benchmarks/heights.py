@@ -56,7 +56,7 @@ NAMES: tuple[str, ...] = ("radius", "angle_a", "angle_b", "endstop_a", "endstop_
 class Truth:
     """A printer: its firmware's values, the right values, and the machine."""
 
-    says: printers.Settings
+    firmware_settings: printers.Settings
     right: printers.Settings
     machine: Machine
 
@@ -186,7 +186,7 @@ def moved(
     r, a = radius * np.sqrt((k + 0.5) / len(k)), k * np.pi * (3 - np.sqrt(5)) + 0.3
     values = np.column_stack([r * np.cos(a), r * np.sin(a), 0 * r])
     travel = pasted.homed - pasted.carriages(values)
-    there = 1e3 * truth.machine.forward(1e-3 * (truth.says.homed - travel))[:, :3, 3]
+    there = 1e3 * truth.machine.forward(1e-3 * (truth.firmware_settings.homed - travel))[:, :3, 3]
     plane = np.column_stack([values[:, :2], np.ones(len(k))])
     flat = there[:, 2] - plane @ np.linalg.lstsq(plane, there[:, 2], rcond=None)[0]
     slopes = np.linalg.lstsq(plane, there[:, :2], rcond=None)[0][:2]
@@ -236,16 +236,16 @@ def _row(count: int, of_a_kit: bool, noise: float, n: int, wrong: float) -> None
         truth = drawn(rng, of_a_kit)
         readings = printers.felt(truth.machine, printers.bed(n, RADIUS), noise, rng)
         readings[n // 2] += wrong
-        readings = truth.says.homed - printers.STEP * np.round(
-            (truth.says.homed - readings) / printers.STEP
+        readings = truth.firmware_settings.homed - printers.STEP * np.round(
+            (truth.firmware_settings.homed - readings) / printers.STEP
         )
-        told_tolerance = KIT if of_a_kit else IDEAL
-        calibration = calibrated(truth.says, readings, noise, told_tolerance)
+        stated_tolerance = KIT if of_a_kit else IDEAL
+        calibration = calibrated(truth.firmware_settings, readings, noise, stated_tolerance)
         ours, usable = exported(calibration), calibration.verdict.usable
         bed = calibration.findings.bed
         pasted = {
-            "before": truth.says,
-            "Klipper": by_klipper(truth.says, readings),
+            "before": truth.firmware_settings,
+            "Klipper": by_klipper(truth.firmware_settings, readings),
             "pkmcal": ours,
         }
         for name, settings in pasted.items():

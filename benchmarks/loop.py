@@ -57,7 +57,7 @@ def allocated(call: Callable[[], object]) -> tuple[float, float]:
     return peak / 1024, remainder / 1024
 
 
-def shown(name: str, call: Callable[[], object], calls: int) -> None:
+def print_time(name: str, call: Callable[[], object], calls: int) -> None:
     begin = time.thread_time()
     call()
     first = 1e3 * (time.thread_time() - begin)
@@ -88,16 +88,20 @@ def main() -> None:
     for law in ("edges", "directions"):
         servo = VisualServo(machine, camera, T, goal, law=law, start=pose)
         edges = true_edges(servo.view, pose)
-        shown(f"{law}: from edges", partial(servo.step_edges, edges, readings), calls)
+        print_time(f"{law}: from edges", partial(servo.step_edges, edges, readings), calls)
         less = edges.copy()
         less[1] = np.nan
-        shown(f"{law}: from edges, a leg lost", partial(servo.step_edges, less, readings), calls)
+        print_time(
+            f"{law}: from edges, a leg lost", partial(servo.step_edges, less, readings), calls
+        )
         servo.reset(pose)
-        shown(f"{law}: from an image", partial(servo.step_image, image, readings), calls)
+        print_time(f"{law}: from an image", partial(servo.step_image, image, readings), calls)
     covered = np.full_like(image, 90)
     servo.reset(pose)
     pictures = cycle([image, covered])
-    shown("every other image covered", lambda: servo.step_image(next(pictures), readings), calls)
+    print_time(
+        "every other image covered", lambda: servo.step_image(next(pictures), readings), calls
+    )
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ class Outcome(NamedTuple):
     """
 
     what: str
-    said: str
+    message: str
     seconds: float
     code: str = ""
 

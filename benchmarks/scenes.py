@@ -420,7 +420,7 @@ def cells(row: Row) -> list[str]:
     return [*start, usable, *stations, *sizes, *rows, f"{e.worst:.1f}", *times]
 
 
-def tell(rows: list[Row]) -> None:
+def print_rows(rows: list[Row]) -> None:
     """The table, refusals in words, and the whitened error of all."""
     from rich.console import Console
     from rich.table import Table
@@ -494,7 +494,7 @@ def main(words: list[str] | None = None) -> None:
     if options.json:
         print(json_text(document(rows)), end="")
     else:
-        tell(rows)
+        print_rows(rows)
 
 
 if __name__ == "__main__":

@@ -215,10 +215,10 @@ def against_ceres(program: Path, count: int) -> bool:
         for _ in range(REPEATS):
             for name, *options in CERES:
                 words = [str(program), str(path), *options, str(REPEATS if count < MANY else 1)]
-                _kept(results, name, words, {})
+                _keep_best(results, name, words, {})
             for name, what in OURS:
                 words = [sys.executable, __file__, "--one", what, str(count)]
-                _kept(results, name, words, {})
+                _keep_best(results, name, words, {})
     ours, best = results["pkmcal"], min(results[name]["cpu"] for name, *_ in CERES)
     same = True
     for name, m in results.items():
@@ -231,7 +231,7 @@ def against_ceres(program: Path, count: int) -> bool:
     return same
 
 
-def _kept(
+def _keep_best(
     results: dict[str, dict[str, float]], name: str, words: list[str], environment: dict[str, str]
 ) -> None:
     """The best of what a command measured so far, kept under a name."""
@@ -298,7 +298,7 @@ def in_turns(what: str, count: int, sources: list[Path]) -> list[dict[str, float
     words = [sys.executable, __file__, "--one", what, str(count)]
     for _ in range(REPEATS):
         for source in sources:
-            _kept(best, str(source), words, {"PYTHONPATH": str(source)})
+            _keep_best(best, str(source), words, {"PYTHONPATH": str(source)})
     return list(best.values())
 
 

@@ -44,7 +44,7 @@ class Fact(NamedTuple):
 
     make: Callable[[Path, np.random.Generator], None]
     codes: tuple[str, ...]
-    seen: tuple[str, ...] = ("legs", "board")
+    targets: tuple[str, ...] = ("legs", "board")
 
 
 class Outcome(NamedTuple):
@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
 
     what: str
     z: float
-    said: str
+    message: str
 
 
 def edited(path: Path, change: Callable[[Any], None]) -> None:
@@ -299,8 +299,8 @@ def ingredients(in_view: str, seed: int) -> tuple[Any, Any, Any, Any]:
     lens = replace(lens, parameters=values)
     settings = Settings(stations=stations, configurations=count)
     if in_view == "board":
-        seen_board = board_for(nominal, "platform")
-        settings = replace(settings, board=seen_board, board_on="platform", observe=("board",))
+        platform_board = board_for(nominal, "platform")
+        settings = replace(settings, board=platform_board, board_on="platform", observe=("board",))
     cameras = one_a_station(lens, stations)
     return draw_truth(nominal, cameras, settings, seed), cameras, settings, nominal
 
@@ -387,14 +387,14 @@ def main() -> None:
             for in_view in [kind for kind in what.seen if kind in kinds]:
                 jobs = [(fact, in_view, seed, keep) for seed in seeds]
                 value = list(pool.map(outcome, *zip(*jobs, strict=True)))
-                tell(f"{fact}, {in_view}", value)
-                if options.tell:
+                print_outcomes(f"{fact}, {in_view}", value)
+                if options.print_outcomes:
                     for seed, one in zip(seeds, value, strict=True):
                         print(f"    {seed}: {one.what} {one.z:.2f} {one.said}")
     print(f"{time.perf_counter() - begin:.0f} s")
 
 
-def tell(name: str, results: list[Outcome]) -> None:
+def print_outcomes(name: str, results: list[Outcome]) -> None:
     """One line."""
     counts = [sum(one.what == word for one in results) for word in
               ("named", "refused", "warned", "silent")]  # fmt: skip

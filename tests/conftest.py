@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.check.results import SessionCheck
 
-Found = TypeVar("Found")
+Result = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -155,11 +155,11 @@ def made_once(folder: Path, make: Callable[[], Any]) -> Any:
 
 
 @dataclass(frozen=True)
-class Told(Generic[Found]):
+class WithProgress(Generic[Result]):
     """Result of a function for the demonstration's session, and its progress messages."""
 
-    found: Found
-    told: list[tuple[str, float]]
+    result: Result
+    steps: list[tuple[str, float]]
 
 
 @pytest.fixture(scope="session")
@@ -170,16 +170,16 @@ def demo(common) -> Demo:
 
 
 @pytest.fixture(scope="session")
-def calibrating(demo, common) -> Told[Calibration]:
+def calibrating(demo, common) -> WithProgress[Calibration]:
     """The demonstration's session, calibrated from Python, with the progress messages."""
     from pkmcal.calibration.calibrate import calibrate_session
 
-    def make() -> Told[Calibration]:
+    def make() -> WithProgress[Calibration]:
         progress: list[tuple[str, float]] = []
         calibration = calibrate_session(
             demo.session, progress=lambda text, share: progress.append((text, share))
         )
-        return Told(calibration, progress)
+        return WithProgress(calibration, progress)
 
     return made_once(common / "calibrated", make)
 
@@ -187,20 +187,20 @@ def calibrating(demo, common) -> Told[Calibration]:
 @pytest.fixture(scope="session")
 def calibrated(calibrating) -> Calibration:
     """That calibration without its messages."""
-    return calibrating.found
+    return calibrating.result
 
 
 @pytest.fixture(scope="session")
-def checked(demo, common) -> Told[SessionCheck]:
+def checked(demo, common) -> WithProgress[SessionCheck]:
     """The demonstration's session, checked from Python."""
     from pkmcal.check.check import check_session
 
-    def make() -> Told[SessionCheck]:
+    def make() -> WithProgress[SessionCheck]:
         progress: list[tuple[str, float]] = []
         check = check_session(
             demo.session, progress=lambda text, share: progress.append((text, share))
         )
-        return Told(check, progress)
+        return WithProgress(check, progress)
 
     return made_once(common / "checked", make)
 

@@ -19,7 +19,7 @@ from pkmcal.cameras.files import camera_text
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.simulation import Settings, simulate_session
 
-KEPT = Path(__file__).parents[1] / ".pytest_cache" / "rendered"
+CACHE = Path(__file__).parents[1] / ".pytest_cache" / "rendered"
 BOARD_SESSION = ("--board", "--stations", "2", "--configurations", "4", "--size", "640x480")
 """Options of a session whose two stations observe a board on the base."""
 RENDERING = ("simulation", "mechanisms", "geometry", "cameras", "boards")
@@ -45,7 +45,7 @@ def rendered(folder: Path, machine, camera, settings: Settings, seed: int = 0) -
     parts = [mechanism_text(machine), *map(camera_text, cameras), repr(settings), str(seed)]
     key = hashlib.sha256("\n".join([_code(), *parts]).encode()).hexdigest()[:24]
     retained = once(
-        KEPT / _code() / key,
+        CACHE / _code() / key,
         lambda part: simulate_session(part, machine, camera, settings, seed=seed),
     )
     shutil.copytree(retained, folder)
@@ -64,7 +64,7 @@ def by_command(folder: Path, *words: str) -> Path:
         done = run("simulate", part, *words)
         assert done.code == 0, done.err
 
-    shutil.copytree(once(KEPT / _code() / key, make), folder)
+    shutil.copytree(once(CACHE / _code() / key, make), folder)
     return folder
 
 
@@ -74,8 +74,8 @@ def _code() -> str:
     package = Path(pkmcal.__file__).parent
     files = sorted(path for name in RENDERING for path in (package / name).rglob("*.py"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
-    if KEPT.is_dir():
-        for old in KEPT.iterdir():
+    if CACHE.is_dir():
+        for old in CACHE.iterdir():
             if old.is_dir() and old.name != digest:
                 shutil.rmtree(old, ignore_errors=True)
     return digest

@@ -87,7 +87,7 @@ def test_nothing_is_left_to_be_calibrated(copy, but_radii):
         *((name, "0") for name in ("axis", "angle")),  # a scale may be exact
     ],
 )
-def test_tolerances_that_tell_nothing(copy, name, value):
+def test_tolerances_without_information(copy, name, value):
     old = (copy / "mechanism.yaml").read_text()
     at = old.index("tolerance: {")
     line = old[at : old.index("\n", at)]
@@ -96,7 +96,7 @@ def test_tolerances_that_tell_nothing(copy, name, value):
         assert f"tolerance.{name}" in refused(command, copy)
 
 
-def test_a_tolerance_in_the_wrong_unit_is_told_to_be_one(copy):
+def test_a_tolerance_in_the_wrong_unit_is_reported_to_be_one(copy):
     replaced(copy / "mechanism.yaml", "{center: 0.002,", "{center: 2,")
     assert "2 mm" in refused("check", copy)
 

@@ -104,7 +104,7 @@ def test_what_may_be_the_machine_is_left_out():
 
 
 @pytest.mark.parametrize("apart", [10, 20, 30])
-def test_the_room_tells_a_place_from_its_look_alikes(apart):
+def test_the_room_distinguishes_similar_poses(apart):
     scene = Scene([0, apart], seed=apart)
     pairs = scene.room.shared(0, 1)
     rays = [scene.textures[k].ray[numbers] for k, numbers in enumerate(pairs)]
@@ -129,7 +129,7 @@ def test_chance_is_not_taken_for_agreement():
         assert np.mean(gains > g) <= np.exp(-g)
 
 
-def test_few_pairs_tell_nothing():
+def test_few_pairs_decide_nothing():
     ray = np.tile([0.0, 0.0, 1.0], (BACKGROUND_OPTIONS.fewest_pairs - 1, 1))
     assert agreement(ray, ray, looking(0) @ inverse(looking(20))) == 0.0
 
@@ -157,7 +157,7 @@ def test_an_image_of_another_part_of_the_room_is_not_placed():
     assert not len(scene.room.place(3, scene.room.landmarks(scene.placed(0, 1, 2))))
 
 
-def test_the_right_place_is_named_though_legs_prefer_its_look_alike():
+def test_the_right_pose_is_chosen_though_legs_prefer_a_similar_one():
     scene = Scene([0, 20], seed=8)
     T = scene.T[0]
     places = np.stack([T @ turned(120), T, T @ turned(240)])

@@ -137,7 +137,7 @@ LONG = "n" * 5000
 
 
 @pytest.mark.parametrize(
-    ("name", "old", "new", "said"),
+    ("name", "old", "new", "message"),
     [
         ("session.yaml", "mechanism: ", f"mechanism: {LONG} # ", "mechanism: the file"),
         ("session.yaml", "mechanism: ", f"mechanism: {LONG}.yaml # ", "mechanism: the file"),
@@ -149,9 +149,9 @@ LONG = "n" * 5000
         ("mechanism.yaml", "name: ", f"name: {LONG} # ", "expected text of 255 characters at most"),
     ],
 )  # fmt: skip
-def test_names_of_five_thousand_letters(session, name, old, new, said):
+def test_names_of_five_thousand_letters(session, name, old, new, message):
     replaced(session / name, old, new, 1)
-    assert len(refused(session, said)) < 1000
+    assert len(refused(session, message)) < 1000
 
 
 def test_a_path_through_what_was_not_measured(session):
@@ -177,7 +177,7 @@ def test_a_zero_in_a_pattern(session):
     refused(session, "session.yaml, line ", "images: this text holds a character")
 
 
-def test_a_damaged_image_is_told_by_pkmcal_alone(session, capfd):
+def test_a_damaged_image_is_reported_by_pkmcal_alone(session, capfd):
     path = images(session, "station2")[1]
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 255

@@ -20,8 +20,8 @@ from pkmcal.observe.image_batches import StationImages
 from pkmcal.observe.images import binned
 from pkmcal.observe.legs import first_binning, measure, sharp_binning
 from pkmcal.observe.profiles import PROFILE_OPTIONS
-from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
+from test_observe_rendered_legs import FRONT, machine, poses
 
 TIMES = 2
 
@@ -50,7 +50,7 @@ def test_pixels_are_averaged():
     ("size", "count"),
     [((640, 480), 1), ((1280, 720), 1), ((1920, 1080), 2), ((3000, 4000), 4), ((20, 10), 1)],
 )
-def test_the_longer_side_says_how_many(size, count):
+def test_the_longer_side_determines_the_number(size, count):
     assert first_binning(size) == count
 
 

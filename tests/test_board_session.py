@@ -51,7 +51,7 @@ def folder(rendered, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def found(rendered):
+def observed(rendered):
     """A session, its images and the boards in them."""
     session = load_session(rendered)
     images = read_images(session)
@@ -71,8 +71,8 @@ def without_pose(folder, station):
 # the renderer's boards
 
 
-def test_rendered_corners_are_true_to_two_hundredths_of_a_pixel(rendered, found):
-    session, _, boards = found
+def test_rendered_corners_are_true_to_two_hundredths_of_a_pixel(rendered, observed):
+    session, _, boards = observed
     truth = load_truth(rendered, session.machine)
     for number, station in boards.stations.items():
         T_camera_board = truth.T_camera_base[number] @ truth.T_base_board
@@ -84,8 +84,8 @@ def test_rendered_corners_are_true_to_two_hundredths_of_a_pixel(rendered, found)
         assert np.all(np.abs(off.mean(axis=0)) < 0.005)
 
 
-def test_poses_from_rendered_images(rendered, found):
-    session, _, boards = found
+def test_poses_from_rendered_images(rendered, observed):
+    session, _, boards = observed
     truth = load_truth(rendered, session.machine)
     poses = boards.poses
     assert poses.station.tolist() == [0, 1]
@@ -161,9 +161,9 @@ def test_stations_without_a_pose_are_found_through_the_board(rendered, folder, w
     assert np.all(np.linalg.norm(error[:, :3], axis=1) < np.deg2rad(3))
 
 
-def test_poses_joined_are_exact(found):
+def test_poses_joined_are_exact(observed):
     """T_camera_base = T_camera_board T_board_other T_other_base."""
-    _, _, boards = found
+    _, _, boards = observed
     rng = np.random.default_rng(1)
     T_base_board = pose(rotation(rng.normal(size=3)), rng.normal(size=3))
     T = [s.stood.T_camera_board @ inverse(T_base_board) for s in boards.stations.values()]
@@ -248,7 +248,7 @@ def test_a_camera_that_moved(folder):
     assert run("calibrate", folder).err == f"Error: {text}\n"
 
 
-def test_an_image_that_disagrees_is_told(folder):
+def test_an_image_that_disagrees_is_reported(folder):
     only(folder, "station1")
     shifted(folder, "station1", 3)
     session = load_session(folder)
@@ -282,10 +282,10 @@ def test_a_board_that_is_nowhere(folder):
     assert caught.value.where == "images/station1/0000.png"
 
 
-def test_one_image_of_a_board_is_noted(folder, found):
+def test_one_image_of_a_board_is_noted(folder, observed):
     """Three of four images are grey at the board's place; one station is enough to detect it."""
     only(folder, "station1")
-    board = found[2].stations[0]
+    board = observed[2].stations[0]
     corners = np.nanmean(board.views.views.pixels[0], axis=0)
     for path in sorted((folder / "images" / "station1").iterdir())[1:]:
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -303,9 +303,9 @@ def test_a_board_on_the_platform_needs_no_rough_pose(folder):
     check_observable(load_session(folder))
 
 
-def test_a_board_on_the_platform_gives_a_measurement_a_image(found):
+def test_a_board_on_the_platform_gives_a_measurement_a_image(observed):
     """Quantities that a session with such a board uses; here it is at rest, which is not tested."""
-    session, images, _ = found
+    session, images, _ = observed
     moving = replace(session, board_body="platform")
     boards = find_boards(moving, {p.station: p.images for p in images})
     assert len(boards.poses) == 8

@@ -31,7 +31,7 @@ NOISE = np.array([3e-4, 3e-4, 3e-4, 3e-5, 3e-5, 6e-5])
 TOLERANCE = 2e-3
 
 
-def seen_by(nominal, rng, size, tolerance, count=20):
+def observed_boards(nominal, rng, size, tolerance, count=20):
     """Machine within its tolerances, and a camera's measurements of a board that is larger than its
     file states by the share ``size``.
     """
@@ -64,7 +64,7 @@ def estimated(nominal, data):
 def test_derivatives_by_the_size_are_those_of_the_residuals():
     nominal = load_mechanism("linear-delta")
     rng = np.random.default_rng(0)
-    _, data = seen_by(nominal, rng, 0.001, TOLERANCE)
+    _, data = observed_boards(nominal, rng, 0.001, TOLERANCE)
     both = replace(
         data,
         mounts=(Mount("tool", "platform"), Mount("board", "platform", TOLERANCE)),
@@ -90,9 +90,9 @@ def test_derivatives_by_the_size_are_those_of_the_residuals():
     assert np.all(by[::2] == 0)  # what a tracker measures has no size
 
 
-def test_readings_of_carriages_tell_how_large_the_board_is():
+def test_readings_of_carriages_determine_the_size_of_the_board():
     nominal = load_mechanism("linear-delta")
-    _, data = seen_by(nominal, np.random.default_rng(1), 0.003, TOLERANCE)
+    _, data = observed_boards(nominal, np.random.default_rng(1), 0.003, TOLERANCE)
     result = estimated(nominal, data)
     value, sigma = result.state.columns[BOARD_SIZE][0], result.column_sigma(BOARD_SIZE)[0]
     assert sigma < 0.3 * TOLERANCE
@@ -108,7 +108,7 @@ def errors_at_the_tool(name, runs, tolerance, assumed):
     out = []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        true, data = seen_by(nominal, rng, tolerance * rng.standard_normal(), tolerance)
+        true, data = observed_boards(nominal, rng, tolerance * rng.standard_normal(), tolerance)
         z = []
         for one in assumed:
             value = estimated(nominal, replace(data, mounts=(Mount("board", "platform", one),)))
@@ -120,7 +120,7 @@ def errors_at_the_tool(name, runs, tolerance, assumed):
 
 
 @pytest.mark.parametrize("runs", [12, pytest.param(48, marks=pytest.mark.slow)])
-def test_sigma_contains_the_size_where_nothing_tells_it(runs):
+def test_sigma_contains_the_size_where_nothing_determines_it(runs):
     errors = errors_at_the_tool("delta", runs, TOLERANCE, (TOLERANCE, 0.0))
     z, blind = np.mean(errors**2, axis=0)
     # the size is one direction, and most of the tool's error: squares scatter as of one normal
@@ -129,9 +129,9 @@ def test_sigma_contains_the_size_where_nothing_tells_it(runs):
 
 
 @pytest.mark.parametrize("size", [0.0, 0.01])
-def test_a_hint_says_what_size_all_else_would_have(size):
+def test_a_hint_states_the_size_of_everything_else(size):
     nominal = load_mechanism("h4")
-    _, data = seen_by(nominal, np.random.default_rng(1), size, TOLERANCE)
+    _, data = observed_boards(nominal, np.random.default_rng(1), size, TOLERANCE)
     session = SimpleNamespace(document={"board": {"file": "board.yaml"}})
     (information,) = size_notes(session, data, estimated(nominal, data))
     code = "board.size_disagrees" if size else "board.size_by_file"

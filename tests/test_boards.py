@@ -188,7 +188,7 @@ def test_a_board_out_of_sight_has_a_reason(tmp_path):
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi])
-def test_colours_tell_which_way_up_a_chessboard_is(tmp_path, turn):
+def test_colours_determine_which_way_up_a_chessboard_is(tmp_path, turn):
     board = board_of(tmp_path, FILES["chessboard"])
     assert not board.turnable
     assert chessboard((7, 5), 0.03).turnable
@@ -202,7 +202,7 @@ def test_colours_tell_which_way_up_a_chessboard_is(tmp_path, turn):
     assert np.abs(value.pixels - truth[value.ids]).max() < 0.3
 
 
-def test_mirror_images_are_told(tmp_path):
+def test_mirror_images_are_reported(tmp_path):
     board, camera = board_of(tmp_path, FILES["charuco"]), CAMERAS["pinhole"]
     T_camera_board = view(board, (0.2, -0.2, 0.0), (0.0, 0.0), 0.42)
     image = np.ascontiguousarray(render(camera, T_camera_board, board)[:, ::-1])
@@ -250,7 +250,7 @@ def test_every_image_has_a_result(pictures):
 
 
 @pytest.mark.parametrize(
-    ("kind", "pairs", "shows", "says"),
+    ("kind", "pairs", "shows", "message"),
     [
         ("chessboard", (("[8, 5]", "[7, 5]"),), "8x5 inner", "7x5 inner"),
         pytest.param("chessboard", (("[8, 5]", "[9, 6]"),), "8x5 inner", "9x6 inner",
@@ -266,13 +266,13 @@ def test_every_image_has_a_result(pictures):
         ("aruco_grid", (("[5, 4]", "[5, 4]\nfirst_id: 5"),), "first_id: 0", "first_id: 5"),
     ],
 )  # fmt: skip
-def test_a_wrong_board_file_says_what_fits(pictures, tmp_path, kind, pairs, shows, says):
+def test_a_wrong_board_file_states_what_fits(pictures, tmp_path, kind, pairs, shows, message):
     board = described(tmp_path, kind, *pairs)
     with pytest.raises(InputError) as caught:
         detect_boards(pictures[kind][1], board)
     assert "another board than the one described" in str(caught.value)
     assert shows in caught.value.found
-    assert says in caught.value.expected
+    assert message in caught.value.expected
 
 
 @pytest.mark.parametrize(("gap", "advice"), [("0.3", "gap: 0.012;"), ("0.024", "a ruler")])

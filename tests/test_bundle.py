@@ -50,7 +50,7 @@ def without_noise(rng, scene):
     return replace(clean, edges=replace(clean.edges, covariance=scene.covariance))
 
 
-def known_radii(scene):
+def stated_radii(scene):
     """Scene with true radii in the nominal model and no edge shift, so that nothing biases the
     estimate.
     """
@@ -68,7 +68,7 @@ def test_truth_is_recovered_to_rounding(robust):
     # without the nominal model the readings' scales cannot be separated from the size of everything
     scene = make_scene(rng, machine=exact("gough-stewart"))
     scene = replace(scene, edge_shift=np.zeros(1))
-    scene = known_radii(scene)
+    scene = stated_radii(scene)
     # edges drawn without shift, since the scene's own shift is now zero
     value = estimate(
         scene,
@@ -306,7 +306,7 @@ def test_result_statistics_add_up():
     assert np.median(value.data_share) > 0.9
 
 
-def test_chi2_of_the_noise_as_stated_tells_that_it_was_stated_seven_times_too_small():
+def test_chi2_shows_noise_that_was_stated_seven_times_too_small():
     """The noise as found makes chi2 one whatever was stated."""
     rng = np.random.default_rng(8)
     scene = make_scene(rng)
@@ -319,7 +319,7 @@ def test_chi2_of_the_noise_as_stated_tells_that_it_was_stated_seven_times_too_sm
     assert s.chi2_as_stated == pytest.approx(s.chi2_edges * 49 / s.dof, rel=0.2)
 
 
-def test_what_is_told_of_a_machine_stands_for_what_told_it():
+def test_constraints_on_a_machine_replace_the_data_behind_them():
     """One station's edges with a marginal prior of the machine from the other's, against both
     jointly.
     """
@@ -453,7 +453,7 @@ def test_two_cameras_have_their_own_edge_shift():
     )
 
 
-def test_wrong_inputs_are_told():
+def test_wrong_inputs_are_reported():
     rng = np.random.default_rng(25)
     scene = make_scene(rng)
     good = scene.measurements(rng)

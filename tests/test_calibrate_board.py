@@ -180,7 +180,7 @@ def test_a_missing_board_file_and_another_camera(folder):
         load_session(folder)
 
 
-def test_the_method_of_paper_c_says_nothing_of_the_size(folder, tmp_path, monkeypatch):
+def test_the_method_of_paper_c_does_not_estimate_the_size(folder, tmp_path, monkeypatch):
     """Without an estimate of the size none is reported, though the tolerance in board.yaml adds to
     sigma.
     """
@@ -192,7 +192,7 @@ def test_the_method_of_paper_c_says_nothing_of_the_size(folder, tmp_path, monkey
     assert "size" not in target
 
 
-def test_inverse_of_a_known_station_is_told(rendered):
+def test_inverse_of_a_known_station_is_reported(rendered):
     """The truth's own frames: a check on the simulator."""
     session = load_session(rendered)
     truth = load_truth(rendered, session.machine)

@@ -44,7 +44,7 @@ def errors_in_sigmas(calibration, folder):
     return (estimate.machine.values - true)[free] / sigma[free]
 
 
-def check_found(value, folder, centre):
+def check_calibration(value, folder, centre):
     """The joint centres' errors decrease from millimetres to ``centre``, and match their standard
     deviations.
     """
@@ -60,18 +60,18 @@ def check_found(value, folder, centre):
 
 def test_the_machine_is_found(demo, calibrated):
     """Twelve images, 480x360: as below, times sqrt(18/12) and 640/480."""
-    check_found(calibrated, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
+    check_calibration(calibrated, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
 
 
 @pytest.mark.slow
 def test_the_machine_is_found_in_more_and_larger_images(tmp_path):
     """Eighteen, 640x480: deviations of 0.1 mm, so errors of 0.2 mm would be wrong."""
     folder = imaged(tmp_path / "session", seed=11)
-    check_found(pkmcal.calibrate(folder), folder, 0.2e-3)
+    check_calibration(pkmcal.calibrate(folder), folder, 0.2e-3)
 
 
 @pytest.mark.slow
-def test_slim_bare_rods_are_told_honestly(tmp_path):
+def test_slim_bare_rods_are_reported_honestly(tmp_path):
     """Bare rods nine pixels wide: their edges are measured 0.1 px inwards, all of them, which
     neither the profiles' sigmas nor one edge shift for a camera model; each line's own shading
     does. Without it errors are 1.25 standard deviations here, with it 0.87.
@@ -104,7 +104,7 @@ def test_start_ten_centimetres_and_ten_degrees_off(demo, calibrated, seed):
 
 
 @pytest.mark.slow
-def test_start_from_a_bad_drawing(demo, calibrated):
+def test_start_from_a_bad_nominal_model(demo, calibrated):
     """A nominal model with errors of 5 mm on every coordinate, and a tolerance to match: the same
     machine.
     """
@@ -133,7 +133,7 @@ def of_twice_the_radii(machine):
 
 
 @pytest.mark.parametrize("stations", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_diameters_for_radii_are_named_where_the_machine_was_recognised(demo, stations):
+def test_diameters_for_radii_are_named_where_the_machine_was_localized(demo, stations):
     """Stations with too thick legs are localized at another distance; the estimate detects the
     radii, or the message says that one station alone does not.
     """
@@ -171,7 +171,7 @@ def test_one_station_alone(demo, calibrated):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["four-step", "linear"])
-def test_papers_methods_are_told_apart_from_the_joint_one(demo, calibrated, method):
+def test_papers_methods_are_distinguished_from_the_joint_one(demo, calibrated, method):
     """The papers' methods run on the same edges and are far less accurate; the verdict names the
     better method.
 

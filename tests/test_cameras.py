@@ -145,7 +145,7 @@ def picture_pixels(camera, count=60):
     return np.stack([x, y], axis=-1)
 
 
-def seen_points(camera, seed, count=400):
+def visible_points(camera, seed, count=400):
     """Points of the camera frame that project into the image, at all depths."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(40 * count, 3)) * np.exp(rng.normal(size=(40 * count, 1)))
@@ -184,7 +184,7 @@ def test_round_trips(case):
 def test_points_come_back_as_their_directions(case):
     """No imaged point is lost or found in another place, whatever its depth."""
     _, camera = case
-    points = seen_points(camera, 0)
+    points = visible_points(camera, 0)
     assert len(points) > 100
     pixels = camera.project(points)
     np.testing.assert_allclose(camera.project(7.0 * points), pixels, atol=1e-9, rtol=0)
@@ -343,7 +343,7 @@ def test_derivatives_of_ray_undo_those_of_project(case, place):
 
 def test_a_binned_camera_sees_the_same_in_larger_pixels(case):
     _, camera = case
-    points, small = seen_points(camera, 0), camera.binned(3)
+    points, small = visible_points(camera, 0), camera.binned(3)
     assert small.image_size == tuple(n // 3 for n in camera.image_size)
     pixels = (camera.project(points) + 0.5) / 3 - 0.5
     np.testing.assert_allclose(small.project(points), pixels, atol=1e-9, rtol=0)
@@ -356,7 +356,7 @@ def test_a_binned_camera_sees_the_same_in_larger_pixels(case):
 
 def test_a_shifted_camera_sees_the_same_at_shifted_pixels(case):
     _, camera = case
-    points, offset = seen_points(camera, 0), np.array([3.0, -7.5])
+    points, offset = visible_points(camera, 0), np.array([3.0, -7.5])
     shifted = camera.shifted(offset)
     np.testing.assert_allclose(shifted.center, camera.center + offset)
     np.testing.assert_allclose(shifted.project(points), camera.project(points) + offset, atol=1e-9)
@@ -367,7 +367,7 @@ def test_a_camera_turned_by_half_takes_the_same_picture_upside_down(case):
     """With its whole covariance; turned twice the camera is itself."""
     _, camera = case
     camera = replace(camera, covariance=np.diag(np.arange(1.0, len(camera.parameters) + 1)) + 0.1)
-    points, turned = seen_points(camera, 0), camera.turned_by_half()
+    points, turned = visible_points(camera, 0), camera.turned_by_half()
     upside_down = np.array(camera.image_size) - 1 - camera.project(points * [-1, -1, 1])
     np.testing.assert_allclose(turned.project(points), upside_down, atol=1e-9, rtol=0)
     again = turned.turned_by_half()
@@ -386,7 +386,7 @@ def test_a_camera_turned_by_half_takes_the_same_picture_upside_down(case):
 def test_opencv_agrees(model, name):
     example, camera = made(model, name)
     project, undistort = OPENCV[model]
-    points = np.concatenate([seen_points(camera, 2), near_border(camera, 0.9)])
+    points = np.concatenate([visible_points(camera, 2), near_border(camera, 0.9)])
     pixels = camera.project(points)
     np.testing.assert_allclose(project(example.fields, points), pixels, atol=1e-9, rtol=0)
     # cv2's fixed-point iteration only converges in the middle of a strong lens

@@ -15,8 +15,8 @@ from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
 from pkmcal.observe.legs import measure
 from pkmcal.observe.profiles import PROFILE_OPTIONS
-from test_observe_drawing import FRONT, machine, poses
 from test_observe_measure import taken
+from test_observe_rendered_legs import FRONT, machine, poses
 
 
 def turns_of(images, keep=1.0):
@@ -41,7 +41,7 @@ def turns_of(images, keep=1.0):
     return RefinementResult(visible, None, estimate, None, images=[images], blur={})
 
 
-def aside(images, px):
+def displaced(images, px):
     """Edges as if the machine were elsewhere in the image."""
     parameters = images.camera.parameters.copy()
     parameters[2] += px
@@ -53,9 +53,9 @@ def test_few_edges_of_the_right_machine_are_no_chance():
 
 
 def test_edges_of_a_machine_that_is_elsewhere_are():
-    (why,) = chance_match_reason(turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)))
+    (why,) = chance_match_reason(turns_of(displaced(taken(), 2.5 * IMAGE_OFFSET)))
     assert "may not be the machine in the images" in why.text
-    in_view = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET)).observation
+    in_view = turns_of(displaced(taken(), 2.5 * IMAGE_OFFSET)).observation
     hidden = sum(r.code == "edges.out_of_sight" for r in in_view.rejected)
     in_sight = len(in_view.edges) + len(in_view.rejected) - hidden
     assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why.text
@@ -73,15 +73,15 @@ def test_repeats_count_once():
     """As many matches in shifted images as at the machine; the edges count after repeats were
     averaged.
     """
-    once = aside(taken(), 2.5 * IMAGE_OFFSET)
+    once = displaced(taken(), 2.5 * IMAGE_OFFSET)
     twice = once.select(np.repeat(np.arange(len(once.images)), 2))
     turns = turns_of(once)._replace(blur={0: PROFILE_OPTIONS.usual_blur})
     assert chance_match_reason(turns._replace(images=[twice])) == chance_match_reason(turns) != ()
 
 
-def test_chance_that_offers_more_is_told_in_words(monkeypatch):
+def test_chance_that_offers_more_is_reported_in_words(monkeypatch):
     """A chance of a half or more is not "once in 1 times"."""
-    few = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET))
+    few = turns_of(displaced(taken(), 2.5 * IMAGE_OFFSET))
     counts = iter([9, 8, 10, 9, 9, 8, 10, 9, 9])
     monkeypatch.setattr(chance_matches, "_count", lambda *_: next(counts))
     (why,) = chance_match_reason(few)
@@ -109,34 +109,34 @@ def two_stations(second, **values):
     return SimpleNamespace(stations=(station, station)), turns
 
 
-def test_a_station_that_may_stand_elsewhere_is_told_with_why():
-    session, turns = two_stations(aside(taken(), 2.5 * IMAGE_OFFSET))
+def test_a_station_that_may_stand_elsewhere_is_reported_with_why():
+    session, turns = two_stations(displaced(taken(), 2.5 * IMAGE_OFFSET))
     ((number, why),) = by_chance(session, turns).items()
     assert number == 1
     (measured,) = {int(np.sum(turns.observation.edges.station == 1))}
     assert why.startswith(f"only {measured} of ")
     assert why.endswith("it may stand elsewhere; a pose by hand would decide")
-    session, turns = two_stations(aside(taken(), 2.5 * IMAGE_OFFSET), T_camera_base=FRONT)
+    session, turns = two_stations(displaced(taken(), 2.5 * IMAGE_OFFSET), T_camera_base=FRONT)
     assert by_chance(session, turns)[1].endswith("it may stand elsewhere")
 
 
-def test_a_station_is_kept_that_shows_the_machine_or_whose_place_is_told_otherwise():
-    wrong = aside(taken(), 2.5 * IMAGE_OFFSET)
+def test_a_station_is_kept_that_shows_the_machine_or_whose_pose_is_determined_otherwise():
+    wrong = displaced(taken(), 2.5 * IMAGE_OFFSET)
     assert by_chance(*two_stations(taken())) == {}
     assert by_chance(*two_stations(wrong, boards=[1])) == {}
     assert by_chance(*two_stations(wrong, handheld=True)) == {}
 
 
-def test_the_only_station_is_not_left_out_but_doubted():
+def test_the_only_station_is_not_left_out_but_reported_as_unsure():
     session, turns = two_stations(taken())
-    alone = turns_of(aside(taken(), 2.5 * IMAGE_OFFSET))
+    alone = turns_of(displaced(taken(), 2.5 * IMAGE_OFFSET))
     alone = alone._replace(measurements=turns.measurements)
     assert by_chance(session, alone) == {}
     assert chance_match_reason(alone)
 
 
 @pytest.mark.slow
-def test_the_machine_is_told_by_the_other_stations(demo, monkeypatch):
+def test_the_machine_is_identified_by_the_other_stations(demo, monkeypatch):
     """A station that may stand elsewhere is left out with its reason, and the rest identified."""
     item = iter([{1: "it may stand elsewhere"}])
     monkeypatch.setattr(calibrate, "by_chance", lambda *_: next(item, {}))

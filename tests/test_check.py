@@ -38,7 +38,7 @@ def texts(value, level):
 
 
 def test_a_good_session(checked):
-    count = checked.found
+    count = checked.result
     assert count.exit_code == 0
     assert texts(count, Level.WRONG) == texts(count, Level.DOUBTFUL) == []
     assert (count.n_legs, count.configurations) == (6, 12)
@@ -57,8 +57,8 @@ def test_a_good_session(checked):
     assert all(0.6 < joint.used < 1 for joint in count.joints)
 
 
-def test_progress_is_told_in_order(checked):
-    text, shares = zip(*checked.told, strict=True)
+def test_progress_is_reported_in_order(checked):
+    text, shares = zip(*checked.steps, strict=True)
     assert list(shares) == sorted(shares)
     assert text[-1] == "What such images will give"
 
@@ -137,7 +137,7 @@ def test_a_station_without_a_pose_is_found_anywhere(session):
     assert check.stations[0].by_chance < 1e-3
 
 
-def test_what_cannot_be_observed_is_told(session):
+def test_what_cannot_be_observed_is_reported(session):
     text = (session / "mechanism.yaml").read_text()
     lines = [line for line in text.splitlines() if "tubes:" not in line and "radius:" not in line]
     (session / "mechanism.yaml").write_text("\n".join(lines) + "\n")
@@ -147,20 +147,20 @@ def test_what_cannot_be_observed_is_told(session):
 
 
 @pytest.mark.parametrize(
-    ("x", "where", "said"),
+    ("x", "where", "message"),
     [
         ("0.55", "joints.csv, configuration ", "its legs do not meet the platform"),
         ("1.27", "mechanism.yaml: ", "cannot be assembled with its legs at mid-range"),
     ],
 )
-def test_readings_that_the_drawing_cannot_take(session, x, where, said):
+def test_readings_that_the_nominal_model_cannot_take(session, x, where, message):
     path = session / "mechanism.yaml"
     path.write_text(path.read_text().replace("[0.2693, 0.02,", f"[{x}, 0.02,"))
     check = check_session(session)
     assert check.exit_code == 2
     text = texts(check, Level.WRONG)[0]
     assert text.startswith(where)
-    assert said in text
+    assert message in text
     assert run("calibrate", session).err == f"Error: {text}\n"
 
 
@@ -168,7 +168,7 @@ def test_readings_that_the_drawing_cannot_take(session, x, where, said):
 
 
 @pytest.mark.parametrize(
-    ("station", "said"),
+    ("station", "message"),
     [
         (GOOD, None),
         (replace(GOOD, saturated=0.3), "30% of the legs are overexposed"),
@@ -179,9 +179,9 @@ def test_readings_that_the_drawing_cannot_take(session, x, where, said):
         (replace(GOOD, legs=2.5), "Only 2.5 of 6 legs"),
     ],
 )
-def test_a_stations_findings(station, said):
+def test_a_stations_findings(station, message):
     count = station_findings(station, 6)
-    assert (said is None and not count) or (len(count) == 1 and said in count[0].text)
+    assert (message is None and not count) or (len(count) == 1 and message in count[0].text)
 
 
 def test_crowded_and_few_configurations(demo):
@@ -196,7 +196,7 @@ def test_crowded_and_few_configurations(demo):
     assert results[1].text.startswith("There are only 2 configurations")
 
 
-def test_a_pose_under_several_names_is_told(demo):
+def test_a_pose_under_several_names_is_reported(demo):
     """0001 and 0002 at one station, or each at a station of its own, with the readings of 0000."""
     session = load_session(demo.session)
     joints = session.joints.copy()
@@ -229,7 +229,7 @@ def test_a_pose_under_several_names_is_told(demo):
     )
 
 
-def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
+def test_the_first_leg_is_open_where_no_pose_decides(demo):
     session = load_session(demo.session)
     assert [*numbering_note(session)] == []
     stations = tuple(replace(s, T_camera_base=None) for s in session.stations)
@@ -247,7 +247,7 @@ def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
     [("gough-stewart", [2, 4]), ("3-rps", [1, 2]), ("delta", [1, 2]), ("hexaglide", []),
      ("four-belt", [1, 2, 3])],
 )  # fmt: skip
-def test_numberings_that_nothing_tells_apart(name, firsts):
+def test_numberings_that_nothing_distinguishes(name, firsts):
     """The machines of the two configurations differ by one rotation of everything, except for tubes
     and unequal joints. A plane machine's may turn it over: its legs are then counted backwards.
     """

@@ -36,8 +36,8 @@ from pkmcal.planning.first import EdgesOf
 
 
 @pytest.fixture
-def found(checked):
-    return checked.found
+def checked_session(checked):
+    return checked.result
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +61,10 @@ def alone(demo, tmp_path_factory):
 # ------------------------------------------------------------------ the forecast
 
 
-def test_the_forecast_is_what_calibrate_then_states(found, calibrated):
+def test_the_forecast_is_what_calibrate_then_states(checked_session, calibrated):
     """From two images of each of three stations, for the four of each that exist."""
     each = len(calibrated.session.stations[0].images)
-    values = forecast(found.look, each)
+    values = forecast(checked_session.look, each)
     _, tool = centres_and_tool(
         calibrated.session.machine, calibrated.estimate, calibrated.session.joints
     )
@@ -73,14 +73,14 @@ def test_the_forecast_is_what_calibrate_then_states(found, calibrated):
     assert values.orientation == pytest.approx(tool.orientation.mean(), rel=0.5)
 
 
-def test_more_images_tell_more(found):
-    few, many = forecast(found.look, 8), forecast(found.look, 32)
+def test_more_images_reduce_the_forecast(checked_session):
+    few, many = forecast(checked_session.look, 8), forecast(checked_session.look, 32)
     # independent errors would halve; what shading does to a side stays
     assert 0.4 < many.position / few.position < 0.85
 
 
-def test_shares_are_parts_of_a_whole(found):
-    values = found.forecast
+def test_shares_are_parts_of_a_whole(checked_session):
+    values = checked_session.forecast
     assert sum(leg.tells for leg in values.legs) == pytest.approx(1)
     legs = sum(leg.variance for leg in values.legs)
     assert legs + values.readings + values.drawing == pytest.approx(1)
@@ -91,8 +91,8 @@ def test_shares_are_parts_of_a_whole(found):
         assert 0 <= leg.tells < 1
         assert 0 <= leg.seen <= 1
     assert np.isnan(values.second)
-    assert "edges" not in found.as_dict()["forecast"]
-    assert "look" not in found.as_dict()
+    assert "edges" not in checked_session.as_dict()["forecast"]
+    assert "look" not in checked_session.as_dict()
 
 
 @pytest.fixture(scope="module")
@@ -111,14 +111,14 @@ def test_three_images_of_one_station(alone_checked):
     assert "by the edges of 3 images" in text[0]
 
 
-def test_no_forecast_where_a_station_is_not_recognised(found):
-    edges = found.look
+def test_no_forecast_where_a_station_is_not_localized(checked_session):
+    edges = checked_session.look
     lost = replace(edges, stations=(*edges.stations[:2], replace(edges.stations[2], quality=None)))
     assert forecast(lost) is None
 
 
-def test_no_forecast_of_images_without_edges(found):
-    edges = found.look
+def test_no_forecast_of_images_without_edges(checked_session):
+    edges = checked_session.look
     grey = [replace(s.images, images=[np.full_like(i, 90) for i in s.images.images])
             for s in edges.stations]  # fmt: skip
     stations = [replace(s, images=p) for s, p in zip(edges.stations, grey, strict=True)]
@@ -127,12 +127,12 @@ def test_no_forecast_of_images_without_edges(found):
 
 
 @pytest.mark.parametrize(
-    ("seen", "found", "why"),
+    ("visible", "checked_session", "why"),
     [(0.3, 0.9, "70% hidden from front"), (0.9, 0.4, "60% of its edges lost at front")],
 )
-def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
+def test_an_uninformative_leg_is_named_with_its_reason(visible, checked_session, why):
     legs = [LegForecast("front", j, 0.9, 0.95, 0.1, 0.19, 0.1) for j in range(1, 6)]
-    legs.append(LegForecast("front", 6, seen, found, 0.2, 0.02, 0.4))
+    legs.append(LegForecast("front", 6, visible, checked_session, 0.2, 0.02, 0.4))
     values = Forecast(15, 2e-4, 1e-3, 0.0, 0.03, float("nan"), tuple(legs))
     part = words.forecast_part(values)
     assert (
@@ -145,8 +145,8 @@ def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
 # ------------------------------------------------------------------ advice
 
 
-def test_a_second_place_is_advised_where_it_is_worth_it(found):
-    values = replace(found.forecast, position=2e-4, second=1e-4)
+def test_a_second_place_is_advised_where_it_is_worth_it(checked_session):
+    values = replace(checked_session.forecast, position=2e-4, second=1e-4)
     (text,) = words._second_station(values)
     assert text.code == "images.second_place"
     assert (text.facts["tool_sigma"], text.facts["tool_sigma_before"]) == (1e-4, 2e-4)
@@ -155,40 +155,44 @@ def test_a_second_place_is_advised_where_it_is_worth_it(found):
     assert words._second_station(replace(values, second=float("nan"))) == []
 
 
-def test_stations_on_one_side_are_told(found):
-    first = found.look.stations[0]
-    middle = found.look.poses[:, :3, 3].mean(axis=0)
+def test_stations_on_one_side_are_reported(checked_session):
+    first = checked_session.look.stations[0]
+    middle = checked_session.look.poses[:, :3, 3].mean(axis=0)
     turn = rotation(np.array([0, 0, np.deg2rad(25)]))
     beside = first.T_camera_base @ inverse(pose(turn, middle - turn @ middle))
-    near = replace(found.look, stations=(first, replace(first, name="b", T_camera_base=beside)))
+    near = replace(
+        checked_session.look, stations=(first, replace(first, name="b", T_camera_base=beside))
+    )
     (text,) = words._from_one_side(near)
     assert text.code == "images.one_side"
     assert 20 < text.facts["degrees"] < 25.5
-    assert words._from_one_side(found.look) == []
+    assert words._from_one_side(checked_session.look) == []
 
 
-def test_slim_tubes_are_told(found):
+def test_slim_tubes_are_reported(checked_session):
     """Advice by the nominal width in the images; wide tubes need none."""
-    assert words._slim_tubes(found.look) == []
-    first, *others = found.look.stations
-    half_width = np.where(tubes_of(found.look.session.machine).tube == 1, 2.25, 9.0)
+    assert words._slim_tubes(checked_session.look) == []
+    first, *others = checked_session.look.stations
+    half_width = np.where(tubes_of(checked_session.look.session.machine).tube == 1, 2.25, 9.0)
     every = np.broadcast_to(half_width, first.quality.half_width.shape)
     slim = replace(first, quality=replace(first.quality, half_width=every))
-    (text,) = words._slim_tubes(replace(found.look, stations=(slim, *others)))
+    (text,) = words._slim_tubes(replace(checked_session.look, stations=(slim, *others)))
     assert (text.code, text.station) == ("images.slim", first.name)
     assert text.facts["tubes"] == ["tube 2 4.5 px"]
 
 
-def test_hidden_legs_are_told_where_no_station_sees_them(found):
+def test_hidden_legs_are_reported_where_no_station_sees_them(checked_session):
     def hiding(station, leg, share):
         hidden = np.full(station.quality.hidden.shape, 0.1)
         hidden[:, leg] = share
         return replace(station, quality=replace(station.quality, hidden=hidden))
 
-    stations = found.look.stations
-    one = replace(found.look, stations=(hiding(stations[0], 3, 0.8), hiding(stations[1], 0, 0.8)))
+    stations = checked_session.look.stations
+    one = replace(
+        checked_session.look, stations=(hiding(stations[0], 3, 0.8), hiding(stations[1], 0, 0.8))
+    )
     assert words._hidden_legs(one) == []
-    every = replace(found.look, stations=tuple(hiding(s, 3, 0.8) for s in stations))
+    every = replace(checked_session.look, stations=tuple(hiding(s, 3, 0.8) for s in stations))
     (text,) = words._hidden_legs(every)
     assert (text.code, text.subject, text.station) == ("images.hidden", "leg 4", "station1")
     assert text.facts["share"] == pytest.approx(0.8)
@@ -203,9 +207,9 @@ def test_hidden_legs_are_told_where_no_station_sees_them(found):
         (200.0, 90.0, "images.lost_clear"),
     ],
 )
-def test_why_edges_are_lost(found, level, behind, code):
+def test_why_edges_are_lost(checked_session, level, behind, code):
     """Half of all edges lost for this reason; the other legs are white in front of a grey wall."""
-    station = found.look.stations[0]
+    station = checked_session.look.stations[0]
     shape = station.quality.level.shape
     lost = np.zeros((1, shape[1]), dtype=bool)
     lost[:, ::2] = True
@@ -213,22 +217,25 @@ def test_why_edges_are_lost(found, level, behind, code):
     own[:, ::2], other[:, ::2] = level, behind
     station = replace(station, quality=replace(station.quality, level=own, behind=other))
     edges = EdgesOf(np.array([0]), np.ones_like(lost), ~lost)
-    (one,) = words._lost_edges(found.look, station, edges)
+    (one,) = words._lost_edges(checked_session.look, station, edges)
     assert (one.code, one.station) == (code, "station1")
     assert one.facts["share"] == pytest.approx(0.5)
     assert one.facts.get("sheet", "dark") == "dark"
-    assert words._lost_edges(found.look, station, replace(edges, valid=np.ones_like(lost))) == []
+    assert (
+        words._lost_edges(checked_session.look, station, replace(edges, valid=np.ones_like(lost)))
+        == []
+    )
 
 
 # ------------------------------------------------------------------ pictures
 
 
-def test_pictures_of_all_images(found, tmp_path):
-    write_pictures(found.look, tmp_path / "pictures")
+def test_pictures_of_all_images(checked_session, tmp_path):
+    write_pictures(checked_session.look, tmp_path / "pictures")
     names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
-    assert names == sorted(picture_names(found.look).values())
-    assert len(names) == sum(station.photographs for station in found.stations)
-    station = found.look.stations[0]
+    assert names == sorted(picture_names(checked_session.look).values())
+    assert len(names) == sum(station.photographs for station in checked_session.stations)
+    station = checked_session.look.stations[0]
     width, height = station.images.camera.image_size
     drawn = cv2.imread(str(tmp_path / "pictures" / names[0]))
     assert drawn.shape == (height + CAPTION_BAR_HEIGHT, 2 * width + PANE_GAP, 3)
@@ -240,8 +247,8 @@ def test_pictures_of_all_images(found, tmp_path):
         assert np.abs(after.astype(int) - colour).max(axis=-1).min() < 60
 
 
-def test_pictures_of_large_images_are_binned(found):
-    station = found.look.stations[0]
+def test_pictures_of_large_images_are_binned(checked_session):
+    station = checked_session.look.stations[0]
     large = replace(station, images=replace(station.images, binning=2))
     width, height = station.images.camera.image_size
     size = width // 2, height // 2
@@ -250,7 +257,7 @@ def test_pictures_of_large_images_are_binned(found):
         (station, photo := station.images.images[0]),
         (large, binned(photo, 2)),
     ):
-        pane = picture(found.look, edges, 0)[CAPTION_BAR_HEIGHT:, : grey.shape[1]]
+        pane = picture(checked_session.look, edges, 0)[CAPTION_BAR_HEIGHT:, : grey.shape[1]]
         changed = np.any(np.abs(pane.astype(int) - grey[..., None]) > 40, axis=-1)
         drawn.append(cv2.resize(changed.astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0)
     # what is drawn lies where it lay
@@ -258,7 +265,7 @@ def test_pictures_of_large_images_are_binned(found):
     assert np.mean(near[drawn[1]]) > 0.9
 
 
-def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
+def test_the_nominal_model_lies_on_the_legs_by_the_pose_found(checked_session, calibrated):
     """Under its lines the image changes; under those at the rough pose, which are off, less."""
     from pkmcal.check.pictures import nominal_over_image
 
@@ -268,21 +275,21 @@ def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
         slope = cv2.dilate(slope, np.ones((5, 5)))
         mask = np.zeros(image.shape, np.uint8)
         for edge in nominal_over_image(
-            found.look, station, station.images.camera, T_camera_base, k
+            checked_session.look, station, station.images.camera, T_camera_base, k
         )[0]:
             cv2.polylines(mask, [np.rint(edge.points).astype(np.int32)], False, 255)
         return float(np.median(slope[mask > 0]))
 
-    for station in found.look.stations:
+    for station in checked_session.look.stations:
         assert strength(station.T_camera_base, 0) > 1.15 * strength(station.by_hand, 0)
 
 
-def test_each_number_stands_once_and_apart(found):
+def test_each_number_stands_once_and_apart(checked_session):
     from pkmcal.check.pictures import nominal_over_image
 
-    station = found.look.stations[0]
+    station = checked_session.look.stations[0]
     eye = station.images.camera
-    _, spots = nominal_over_image(found.look, station, eye, station.T_camera_base, 0)
+    _, spots = nominal_over_image(checked_session.look, station, eye, station.T_camera_base, 0)
     numbered = [spot for spot in spots if spot.labelled]
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 
@@ -293,13 +300,13 @@ def test_colours_are_those_of_the_style_sheet():
     assert f"--leg1: #{red:02x}{green:02x}{blue:02x}" in style.read_text()
 
 
-def test_a_page_with_pictures(found):
-    part = with_pictures(found.look)
+def test_a_page_with_pictures(checked_session):
+    part = with_pictures(checked_session.look)
     assert part.html.count('<svg class="shot"') == 2 * 9
     assert part.html.count('plain">pose by hand') == part.html.count('plain">pose found') == 9
     assert "predicted edges" in part.html
-    lost = found.look.stations[0]
-    edges = replace(found.look, stations=(replace(lost, quality=None, by_hand=None),))
+    lost = checked_session.look.stations[0]
+    edges = replace(checked_session.look, stations=(replace(lost, quality=None, by_hand=None),))
     html = with_pictures(edges).html
     assert html.count('<svg class="shot"') == 3
     assert "best pose found, not recognised" in html
@@ -341,8 +348,8 @@ def test_without_these_options_nothing_is_drawn(alone, check_once, monkeypatch):
     assert sorted(alone.rglob("*")) == before
 
 
-def test_pictures_whole_or_not_at_all(found, tmp_path, monkeypatch):
+def test_pictures_whole_or_not_at_all(checked_session, tmp_path, monkeypatch):
     monkeypatch.setattr("pkmcal.check.pictures.CAPTION_BAR_HEIGHT", -1)  # fails in the first image
     with pytest.raises(ValueError, match="negative"):
-        write_pictures(found.look, tmp_path / "pictures")
+        write_pictures(checked_session.look, tmp_path / "pictures")
     assert list(tmp_path.iterdir()) == []

@@ -34,7 +34,7 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
 from pkmcal.starter import TO_FILL, session_texts, untouched_files
 from test_pose_sessions import make
-from test_report_page import Found
+from test_report_page import PageParts
 
 COMMANDS = (
     *("demo", "new", "check", "view", "board", "camera", "plan", "calibrate", "validate"),
@@ -69,11 +69,11 @@ def test_help_imports_nothing_heavy():
 
 
 def test_a_command_loads_no_other():
-    ask = "cli.main(['calibrate', '--help'])"
-    tell = (
+    script = "cli.main(['calibrate', '--help'])"
+    report = (
         "print([m[16:] for m in sys.modules if m[16:] in cli.COMMANDS_IN_ORDER], file=sys.stderr)"
     )
-    code = f"import sys; from pkmcal.commands import cli; {ask}; {tell}"
+    code = f"import sys; from pkmcal.commands import cli; {script}; {report}"
     assert python("-c", code).stderr == "['calibrate']\n"
 
 
@@ -93,7 +93,7 @@ def test_every_command_has_help_and_json(command):
     assert max(map(len, done.out.splitlines())) <= 80
 
 
-def test_the_documentation_tells_of_all_commands_and_options():
+def test_the_documentation_covers_all_commands_and_options():
     text = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
     options = {
         option
@@ -144,7 +144,7 @@ def test_a_reader_that_leaves_changes_nothing(unbuffered, monkeypatch):
         (["new", "NEW", "--json"], ">&-", "Bad file"),
     ],
 )
-def test_an_answer_that_cannot_be_given_is_told_once(words, end, reason, tmp_path):
+def test_an_answer_that_cannot_be_given_is_reported_once(words, end, reason, tmp_path):
     words = [str(tmp_path / "new") if word == "NEW" else word for word in words]
     done = shell(words, end)
     assert done.returncode == 2
@@ -154,7 +154,7 @@ def test_an_answer_that_cannot_be_given_is_told_once(words, end, reason, tmp_pat
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device here that is always full")
 @pytest.mark.parametrize(("end", "words"), [(">/dev/full", ["--json"]), (">&-", [])])
-def test_a_mistake_is_told_where_an_answer_cannot_be_given(end, words):
+def test_a_mistake_is_reported_where_an_answer_cannot_be_given(end, words):
     done = shell(["board", "nowhere", *words], end)
     assert done.returncode == 2
     assert done.stderr == "Error: nowhere: the file does not exist; expected a file nowhere.\n"
@@ -207,10 +207,10 @@ def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
 
 
 @pytest.mark.parametrize(
-    ("variables", "shown"),
+    ("variables", "opens"),
     [({"DISPLAY": ":0"}, True), ({"DISPLAY": ":0", "CI": "1"}, False), ({}, False)],
 )
-def test_a_browser_opens_for_people_only(variables, shown, monkeypatch):
+def test_a_browser_opens_for_people_only(variables, opens, monkeypatch):
     from pkmcal.commands.console import can_show
 
     for name in ("CI", "DISPLAY", "WAYLAND_DISPLAY"):
@@ -219,7 +219,7 @@ def test_a_browser_opens_for_people_only(variables, shown, monkeypatch):
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    assert can_show() is shown
+    assert can_show() is opens
 
 
 def test_demo_replaces_only_a_demo(tmp_path):
@@ -243,7 +243,7 @@ def test_an_earlier_demo_is_removed(tmp_path):
 # new
 
 
-def test_new_then_check_says_what_is_missing(tmp_path):
+def test_new_then_check_states_what_is_missing(tmp_path):
     done = run("new", tmp_path / "mine")
     assert done.code == 0
     assert all(name in done.out for name in session_texts())
@@ -270,7 +270,7 @@ def test_new_files_load(tmp_path):
 
 
 @pytest.mark.parametrize("options", [(), ("--machine", "3-rps", "--places", 2)])
-def test_a_new_session_says_nothing_of_where_its_camera_stands(tmp_path, options):
+def test_a_new_session_has_no_pose_of_its_camera(tmp_path, options):
     """The pose is optional; a rough one takes one uncommented line."""
     folder = tmp_path / "mine"
     assert run("new", folder, *options).code == 0
@@ -345,7 +345,7 @@ def test_new_in_a_folder_that_is_not_empty(demo):
 
 
 def test_check_of_a_good_session(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
     done = run("check", session)
     assert done.code == 0
     assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
@@ -360,13 +360,13 @@ def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path
     monkeypatch.chdir(session)
     (session / "joints.csv").unlink()  # refused at once
     assert run("check", ".", "-o", tmp_path / "c").code == 2
-    title = Found((tmp_path / "c" / "check.html").read_text()).text
+    title = PageParts((tmp_path / "c" / "check.html").read_text()).text
     assert f"Check of {session.name}" in title
     assert "Check of ." not in title
 
 
 def test_check_as_json(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
     count = run("check", session, "--json").json
     assert count["exit_code"] == 0
     assert_keys("check --json", count)
@@ -376,7 +376,7 @@ def test_check_as_json(session, checked, monkeypatch):
     assert len(count["joints"]) == 6
 
 
-def test_check_tells_errors_as_every_command_does(session, tmp_path):
+def test_check_reports_errors_as_every_command_does(session, tmp_path):
     shape = {"error", "exit_code", "message", "what", "where", "found", "expected", "next_step"}
     nowhere = run("check", tmp_path / "none", "--json").json
     assert run("calibrate", tmp_path / "none", "--json").json.items() <= nowhere.items()
@@ -465,7 +465,7 @@ def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
         assert "[A] 3.3" in done.json["expected"]
 
 
-def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
+def test_an_unusable_result_is_reported_and_written(session, calibrated, monkeypatch):
     value = calibrated
     others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
     verdict = assess(value.observation, value.estimate, value.findings, others=others)
@@ -518,7 +518,7 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "said"),
+    ("option", "value", "message"),
     [
         ("--size", "3x4", "no size of an image; found 3x4, expected width x height"),
         ("--size", "large", "found large, expected width x height"),
@@ -534,10 +534,10 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
         ("--stations", "0", "--stations: this number cannot be used"),
     ],
 )
-def test_simulate_refuses(tmp_path, option, value, said):
+def test_simulate_refuses(tmp_path, option, value, message):
     done = run("simulate", tmp_path / "s", option, value)
     assert done.code == 2
-    assert said in done.err
+    assert message in done.err
     assert not (tmp_path / "s").exists()
 
 
@@ -545,7 +545,7 @@ def test_simulate_refuses(tmp_path, option, value, said):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["chek"], "No such command 'chek', did you mean check. See pkmcal --help."),
         (["chek", "--json"], "No such command 'chek', did you mean check. See pkmcal --help."),
@@ -562,10 +562,10 @@ def test_simulate_refuses(tmp_path, option, value, said):
         (["reproduce", "d"], "'d' is not one of 'a', 'b', 'c'. See pkmcal reproduce --help."),
     ],
 )
-def test_usage_errors(words, said):
+def test_usage_errors(words, message):
     done = run(*[word for word in words if word != "--json"])
     assert (done.code, done.out) == (2, "")
-    assert said in done.err
+    assert message in done.err
     assert done.err.startswith("Error: ")
     assert not re.search("Value error|Input should|Possible options", done.err)
     values = run(*words, "--json").json
@@ -574,7 +574,7 @@ def test_usage_errors(words, said):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["servo", "gough"], "expected gough-stewart."),
         (["study", "stewart"], "expected gough-stewart."),
@@ -583,14 +583,14 @@ def test_usage_errors(words, said):
         (["calibrate", "DIR/nothing-like-it"], "there is no such session folder.\n"),
     ],
 )
-def test_what_was_meant_is_said_where_it_is_likely(words, said, tmp_path):
+def test_what_was_meant_is_stated_where_it_is_likely(words, message, tmp_path):
     (tmp_path / "session").mkdir()
     (tmp_path / "session" / "session.yaml").touch()
     (tmp_path / "letters").mkdir()  # like it, but no session
     there = [word.replace("DIR", str(tmp_path)) for word in words]
     done = run(*there)
     assert done.code == 2
-    assert said.replace("DIR", str(tmp_path)) in done.err
+    assert message.replace("DIR", str(tmp_path)) in done.err
 
 
 def test_completion_knows_commands_and_options():
@@ -602,7 +602,7 @@ def test_completion_knows_commands_and_options():
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "said"),
+    ("error", "code", "message"),
     [
         (MemoryError(), 2, "there is not enough memory. Close other programs"),
         (OSError(errno.ENOSPC, "No space left on device", "x.png"), 2,
@@ -614,7 +614,7 @@ def test_completion_knows_commands_and_options():
          " Set PKMCAL_DEBUG=1, run the command again, and report what it then prints."),
     ],
 )  # fmt: skip
-def test_no_traceback_whatever_happens(error, code, said, tmp_path, monkeypatch):
+def test_no_traceback_whatever_happens(error, code, message, tmp_path, monkeypatch):
     def fail(*_words):
         raise error
 
@@ -622,7 +622,7 @@ def test_no_traceback_whatever_happens(error, code, said, tmp_path, monkeypatch)
     monkeypatch.delenv("PKMCAL_DEBUG", raising=False)
     done = run("new", tmp_path)
     assert (done.code, done.out) == (code, "")
-    assert said in done.err
+    assert message in done.err
     assert "Traceback" not in done.err
     assert run("new", tmp_path, "--json").json["exit_code"] == code
     monkeypatch.setenv("PKMCAL_DEBUG", "1")

@@ -24,7 +24,7 @@ WRONG = 3
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def example(tmp_path_factory):
     """The calibration of a printer from ten heights, one of which is rejected."""
     folder = tmp_path_factory.mktemp("printer")
     true = printers.machine(replace(SAYS, radius=118.3))
@@ -35,9 +35,9 @@ def found(tmp_path_factory):
     return calibrate_session(folder / "kit")
 
 
-def test_hypotheses_weigh_as_their_solutions_do(found):
+def test_hypotheses_weigh_as_their_solutions_do(example):
     """Solutions of each hypothesis, not to first order, with prior sigmas five times as wide."""
-    measurements, estimate = found.measurements, found.estimate
+    measurements, estimate = example.measurements, example.estimate
     assert np.flatnonzero(estimate.pose_weights < 0.5).tolist() == [WRONG]
     assembled, info = estimate.linearized
     drawn = np.array(assembled.priors) == "nominal"
@@ -84,8 +84,8 @@ def normal_beyond(share):
     return -ndtri(share / 2)
 
 
-def test_nothing_rejected_is_nothing_to_confirm(found):
-    estimate = replace(found.estimate, pose_weights=np.ones(10))
-    result = rejections_of(found.measurements, estimate, bed_by_parameters(estimate))
+def test_nothing_rejected_is_nothing_to_confirm(example):
+    estimate = replace(example.estimate, pose_weights=np.ones(10))
+    result = rejections_of(example.measurements, estimate, bed_by_parameters(estimate))
     assert result.units == ()
     assert result.shift == 0

@@ -30,7 +30,7 @@ class Heard:
         return False
 
 
-def test_a_long_step_is_told_in_plain_lines(monkeypatch, capsys):
+def test_a_long_step_is_reported_in_plain_lines(monkeypatch, capsys):
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     with redirect_stderr(Heard()) as heard, console.progress() as progress:
         progress("Finding the legs: 3 of 9 images", 0.35)
@@ -49,33 +49,33 @@ def test_nobody_speaks_where_nothing_is_wanted(monkeypatch):
     assert heard.text == ""
 
 
-def test_a_short_run_says_nothing():
+def test_a_short_run_prints_nothing():
     with redirect_stderr(Heard()) as heard, console.progress() as progress:
         progress("Finding the legs", 0.35)
     assert heard.text == ""
 
 
-def test_nothing_is_said_before_there_is_anything_to_say(monkeypatch):
+def test_nothing_is_printed_before_there_is_a_message(monkeypatch):
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     with redirect_stderr(Heard()) as heard, console.progress():
         assert not heard.written.wait(0.2)
 
 
-def test_a_calibration_tells_what_it_does(demo, calibrating, tmp_path, monkeypatch):
+def test_a_calibration_reports_its_steps(demo, calibrating, tmp_path, monkeypatch):
     def again(*_, progress, **_more):
-        for text, share in dict(calibrating.told).items():
+        for text, share in dict(calibrating.steps).items():
             progress(text, share)
             deadline = time.monotonic() + 60
             while text not in sys.stderr.getvalue() and time.monotonic() < deadline:
                 time.sleep(0.005)
-        return calibrating.found
+        return calibrating.result
 
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
     monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", again)
     text = run("calibrate", demo.session, "-o", tmp_path / "told")
     assert text.code == 0
     steps = dict.fromkeys(re.sub(r" \(\d+%, \d+ s\)", "", x) for x in text.err.splitlines())
-    for step in ("Recognising", "Finding the legs", "Measuring edges", "Identifying"):
+    for step in ("Localizing", "Finding the legs", "Measuring edges", "Identifying"):
         assert any(x.startswith(step) for x in steps)
     assert not any(step in text.out for step in steps)
 

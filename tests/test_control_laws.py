@@ -209,7 +209,7 @@ def test_image_and_readings_give_the_limbs(name):
     np.testing.assert_allclose(value.rows, there.rows, atol=1e-9)
 
 
-def test_three_seen_legs_tell_the_unseen_ones():
+def test_three_visible_legs_determine_the_hidden_ones():
     in_view = before("gough-stewart", legs=[4, 0, 2])
     assert not in_view.by_image_alone
     poses, joints = poses_of(in_view, 6)

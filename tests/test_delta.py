@@ -76,7 +76,7 @@ def test_readings_in_and_out(name):
 
 
 @pytest.mark.parametrize("name", ["delta", "6-rus"])
-def test_home_is_found_without_being_told(name):
+def test_home_is_derived_without_being_stated(name):
     """Mid-range readings close a machine with cranks on the side to which they reach; for guides
     the side of the platform is undetermined.
     """

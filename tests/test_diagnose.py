@@ -24,7 +24,15 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.wording import listed
-from test_observe_drawing import camera_of, draw, machine, poses, redrawn, rendered_images, tubes_at
+from test_observe_rendered_legs import (
+    camera_of,
+    draw,
+    machine,
+    poses,
+    redrawn,
+    rendered_images,
+    tubes_at,
+)
 from test_observe_search import clouds, rough_pose
 
 NAMES = tuple("abcdefghi")
@@ -39,13 +47,13 @@ def pictures(count=6):
     ]
 
 
-def said(*words, seed=0, **more):
+def refusal(*words, seed=0, **more):
     """Findings on one station; see :func:`looked_for`."""
     rng = np.random.default_rng(seed)
-    return mistake([looked_for(rng, *words, **more)], rng)
+    return mistake([search(rng, *words, **more)], rng)
 
 
-def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None, by_hand=None):
+def search(rng, pictures, readings=None, configuration=None, mechanism=None, by_hand=None):
     """A station's localization; the nominal model is 1 mm wrong, as usual."""
     mechanism = mechanism or redrawn(3, 0.001)
     readings = machine().inverse(poses()) if readings is None else readings
@@ -91,13 +99,13 @@ def given(by_hand):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("by_hand", [True, False])
-def test_nothing_is_said_of_what_is_right(by_hand):
+def test_right_sessions_have_no_finding(by_hand):
     """With a nominal model that is 2 mm wrong.
 
     Whole right sessions are calibrated in many tests, one without a rough pose in test_check.py.
     """
     rng = np.random.default_rng(0)
-    station = looked_for(rng, pictures(), by_hand=given(by_hand), mechanism=redrawn(1, 0.002))
+    station = search(rng, pictures(), by_hand=given(by_hand), mechanism=redrawn(1, 0.002))
     assert station.localization.sure
     assert mistake([station], rng) is None
 
@@ -113,7 +121,7 @@ def test_two_columns_exchanged(pair, by_hand, seed):
     """
     order, count = np.arange(6), 6 if by_hand else 9
     order[list(pair)] = order[list(pair)[::-1]]
-    error = said(pictures(count), readings_with(order, count), by_hand=given(by_hand), seed=seed)
+    error = refusal(pictures(count), readings_with(order, count), by_hand=given(by_hand), seed=seed)
     assert error.code == "readings.exchanged"
     a, b = (COLUMNS[k] for k in pair)
     assert error.what == f"the readings of {a} and {b} are exchanged"
@@ -126,7 +134,7 @@ def test_a_motor_that_counts_the_other_way(motor):
     readings = machine().inverse(poses())
     constant = readings[:, motor].min() + readings[:, motor].max() + 0.004
     readings[:, motor] = constant - readings[:, motor]
-    error = said(pictures(), readings, by_hand=given(True))
+    error = refusal(pictures(), readings, by_hand=given(True))
     assert error.code == "readings.reversed"
     assert error.what == f"the readings of {COLUMNS[motor]} count the other way"
     named = float(re.match(r"(\d+) mm, or nearly so", error.expected)[1])
@@ -137,7 +145,7 @@ def test_a_motor_that_counts_the_other_way(motor):
 def test_columns_turned_round(turn, another_side):
     """A hexapod turned by a third looks the same, and only the rough pose decides."""
     order = np.roll(np.arange(6), turn)
-    error = said(pictures(), readings_with(order), by_hand=given(True))
+    error = refusal(pictures(), readings_with(order), by_hand=given(True))
     assert error.code == "readings.numbering_turned"
     right = listed([COLUMNS[k] for k in np.argsort(order)], 6)
     assert error.expected.startswith(f"the columns in the order {right}")
@@ -147,7 +155,7 @@ def test_columns_turned_round(turn, another_side):
 
 @pytest.mark.slow
 def test_columns_in_reverse():
-    error = said(pictures(), readings_with(np.arange(6)[::-1]), by_hand=given(True))
+    error = refusal(pictures(), readings_with(np.arange(6)[::-1]), by_hand=given(True))
     assert error.code == "readings.numbering_reversed"
     assert error.expected.startswith(f"the columns in the order {listed(COLUMNS[::-1], 6)}")
 
@@ -156,14 +164,14 @@ def test_columns_in_reverse():
     ("step", "words", "by_hand"), [also(-1, "before", True), also(1, "after", False)]
 )
 def test_images_shifted_by_one(step, words, by_hand):
-    error = said(pictures(), configuration=np.roll(np.arange(6), step), by_hand=given(by_hand))
+    error = refusal(pictures(), configuration=np.roll(np.arange(6), step), by_hand=given(by_hand))
     assert "the images are shifted against the readings" in str(error)
     assert f"the configuration {words} its own" in str(error)
 
 
 @pytest.mark.parametrize("by_hand", [True, also(False)])
 def test_two_images_exchanged(by_hand):
-    error = said(pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(by_hand))
+    error = refusal(pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(by_hand))
     assert "images of front bear each other's names" in str(error)
     assert "images/front/b.png fits configuration b" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
@@ -173,7 +181,7 @@ def test_images_of_one_configuration_are_not_taken_for_exchanged():
     """Another search may end where images fit better: as here, under any names."""
     rng = np.random.default_rng(1)
     images, readings = b_again()
-    station = looked_for(rng, images, readings, by_hand=given(True))
+    station = search(rng, images, readings, by_hand=given(True))
     short = station.localization.log_likelihood_ratio - 50 * station.localization.correlation_length
     station = station._replace(
         localization=replace(station.localization, log_likelihood_ratio=short)
@@ -184,7 +192,7 @@ def test_images_of_one_configuration_are_not_taken_for_exchanged():
 def test_two_images_exchanged_beside_two_of_one_configuration():
     images, readings = b_again()
     order = [0, 1, 3, 2, 4, 5, 6]
-    error = said(images, readings, configuration=order, by_hand=given(True))
+    error = refusal(images, readings, configuration=order, by_hand=given(True))
     assert error is not None
     assert error.found == (
         "images/front/c.png fits configuration c; images/front/d.png fits configuration d"
@@ -192,11 +200,11 @@ def test_two_images_exchanged_beside_two_of_one_configuration():
 
 
 @pytest.mark.slow
-def test_two_images_exchanged_at_the_station_that_is_recognised_most_surely():
+def test_two_images_exchanged_at_the_station_that_is_localized_most_surely():
     """The right name has a slightly lower likelihood, as may happen with many images."""
     rng = np.random.default_rng(0)
-    wrong = looked_for(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
-    right = looked_for(rng, pictures(), by_hand=given(True))
+    wrong = search(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
+    right = search(rng, pictures(), by_hand=given(True))
     stations = [
         station._replace(name=name, localization=replace(station.localization, by_chance=by_chance))
         for station, name, by_chance in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
@@ -219,7 +227,7 @@ def test_mirrored_images(by_hand):
     reported.
     """
     mirrored = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures()]
-    assert "the images of front are mirrored" in str(said(mirrored, by_hand=given(by_hand)))
+    assert "the images of front are mirrored" in str(refusal(mirrored, by_hand=given(by_hand)))
 
 
 def test_tables_of_mirrored_images_are_mirrored_tables():
@@ -255,7 +263,7 @@ def test_diameters_for_radii():
     values = mechanism.values.copy()
     values[radii] *= 2
     rng, nominal = np.random.default_rng(0), mechanism.with_values(values)
-    station = looked_for(rng, pictures(), mechanism=nominal, by_hand=given(True))
+    station = search(rng, pictures(), mechanism=nominal, by_hand=given(True))
     unsure = station._replace(localization=replace(station.localization, by_chance=1.0))
     error = mistake([unsure], rng)
     assert "the tubes' radii look like diameters" in str(error)
@@ -265,32 +273,30 @@ def test_diameters_for_radii():
 def test_images_of_nothing_are_refused():
     """From Python; by both commands in test_bad_input.py and test_check.py."""
     rng = np.random.default_rng(0)
-    error = said([clouds(rng) for _ in range(6)], by_hand=given(True))
+    error = refusal([clouds(rng) for _ in range(6)], by_hand=given(True))
     assert "not recognised in the images of front" in str(error)
 
 
 @pytest.mark.slow
-def test_another_machine_is_not_surely_recognised_and_nothing_is_renamed():
+def test_another_machine_is_not_surely_localized_and_nothing_is_renamed():
     """Each leg ends in its neighbour's joint: no hypothesis of the session explains that."""
     values = machine().values.copy()
     rows = [k for k, name in enumerate(machine().parameters.names) if ".platform." in name]
     values[rows] = np.roll(values[rows].reshape(6, 3), 1, axis=0).ravel()
     other = machine().with_values(values)
     rng, readings = np.random.default_rng(0), other.inverse(poses())
-    station = looked_for(rng, pictures(), readings, mechanism=other, by_hand=given(True))
+    station = search(rng, pictures(), readings, mechanism=other, by_hand=given(True))
     assert not station.localization.sure
     error = mistake([station], rng)
     assert error is None or "not recognised" in str(error)
 
 
 @pytest.mark.parametrize(("by_chance", "named"), [(5e-3, False), (1e-5, True)])
-def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
-    monkeypatch, by_chance, named
-):
+def test_log_odds_of_an_exchange_grow_with_the_other_stations(monkeypatch, by_chance, named):
     """From two images without localization, chance confirms one hypothesis of thirty."""
     rng, readings = np.random.default_rng(0), machine().inverse(poses())
     localization = LocalizedPose(rough_pose(4), 0.5, 1.0, 0.02, has_prior=True)
-    two = looked_for(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(
+    two = search(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(
         localization=localization
     )
 

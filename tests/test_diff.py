@@ -125,7 +125,7 @@ def test_what_changed_is_found_where_it_changed(pairs, name, times):
     assert hits >= PAIRS - 1
 
 
-def test_a_drawing_is_taken_at_its_word(pairs):
+def test_a_nominal_model_is_taken_at_its_word(pairs):
     a = pairs["new data"][0][0]
     nominal = a.machine.with_values(a.machine.parameters.nominal)
     value = machine_change(nominal, a.machine, (None, a.covariance))
@@ -216,7 +216,7 @@ def test_another_machine_is_refused(saved):
         difference(saved, "delta")
 
 
-def test_two_drawings():
+def test_two_nominal_models():
     nominal = load_mechanism("gough-stewart")
     values = nominal.values.copy()
     k = nominal.parameters.index("legs[2].length.offset")
@@ -232,7 +232,7 @@ def test_two_drawings():
     assert document["parameters"][k]["change"] == pytest.approx(1e-3, rel=0.2)
 
 
-def test_a_fixed_number_that_differs_is_told():
+def test_a_fixed_number_that_differs_is_reported():
     """It has no standard deviation, and no frame can absorb it."""
     nominal = load_mechanism("gough-stewart")
     name = "legs[2].length.offset"
@@ -274,18 +274,18 @@ def test_the_command(demo, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("gough-stewart", "h5"), "there is no such calibration and no such machine"),
         (("gough-stewart", "delta"), "delta: these are two different machines"),
         (("gough-stewart", "."), "there is no calibration here"),
     ],
 )
-def test_what_cannot_be_compared(words, said, tmp_path, monkeypatch):
+def test_what_cannot_be_compared(words, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = run("diff", *words)
     assert done.code == 2
-    assert said in done.err
+    assert message in done.err
     assert not (tmp_path / "diff").exists()
 
 

@@ -171,7 +171,7 @@ def test_legs_that_give_way_are_found_and_contained():
     assert after < 3
 
 
-def test_readings_that_lag_are_told_by_their_steps():
+def test_readings_that_lag_are_reported_by_their_steps():
     lag = 0.02
 
     def change(q):

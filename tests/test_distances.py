@@ -42,7 +42,7 @@ def kit(true, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(kit):
+def measured(kit):
     return calibrate_session(kit)
 
 
@@ -57,26 +57,28 @@ def stretch_sigma(estimate):
     return float(np.sqrt(row @ estimate.covariance @ row))
 
 
-def test_heights_alone_leave_the_size_open_and_distances_determine_it(kit, found, true, tmp_path):
+def test_heights_alone_leave_the_size_open_and_distances_determine_it(
+    kit, measured, true, tmp_path
+):
     for name in ("session.yaml", "mechanism.yaml", "joints.csv", "poses.csv"):
         (tmp_path / name).write_text((kit / name).read_text())
     text = (kit / "session.yaml").read_text()
     (tmp_path / "session.yaml").write_text(text[: text.index("\ndistances:")])
     alone = calibrate_session(tmp_path)
     assert alone.session.heights_alone
-    assert not found.session.heights_alone
-    assert found.verdict.usable
+    assert not measured.session.heights_alone
+    assert measured.verdict.usable
     # in words: what heights leave to the nominal model, and with distances nothing of it
     assert alone.verdict.of("bed.sideways")
-    assert not found.verdict.of("bed")
-    assert found.findings.bed is None
+    assert not measured.verdict.of("bed")
+    assert measured.findings.bed is None
     # a radius 0.6 mm off makes a bed 0.6 % too small
-    before = distance_sessions.stretch(true, found.session.machine)
-    after = distance_sessions.stretch(true, found.machine)
+    before = distance_sessions.stretch(true, measured.session.machine)
+    after = distance_sessions.stretch(true, measured.machine)
     assert abs(before) > 5e-3
     assert stretch_sigma(alone.estimate) > 5e-4
-    assert abs(after) < 4 * stretch_sigma(found.estimate) < 4e-4
-    assert stretch_sigma(found.estimate) < stretch_sigma(alone.estimate) / 8
+    assert abs(after) < 4 * stretch_sigma(measured.estimate) < 4e-4
+    assert stretch_sigma(measured.estimate) < stretch_sigma(alone.estimate) / 8
 
 
 @pytest.mark.slow
@@ -164,7 +166,7 @@ def test_commands_say_what_was_measured(kit, calibrated_kit):
     assert 'id="distances"' in page
 
 
-def test_too_few_distances_to_show_a_wrong_one(true, tmp_path, found):
+def test_too_few_distances_to_show_a_wrong_one(true, tmp_path, measured):
     """Three determine the size and leave nothing over; eighteen check each other."""
     pairs = [(7, 10), (8, 11), (9, 12)]
     kit = distance_sessions.write(tmp_path, true, np.random.default_rng(3), pairs=pairs)
@@ -172,7 +174,7 @@ def test_too_few_distances_to_show_a_wrong_one(true, tmp_path, found):
     assert few.estimate.statistics.dof_links < 0.3
     assert few.verdict.usable
     assert any("one of the distances is wrong" in text for text in few.verdict.warnings)
-    assert not any("one of the distances is wrong" in text for text in found.verdict.warnings)
+    assert not any("one of the distances is wrong" in text for text in measured.verdict.warnings)
 
 
 @pytest.mark.usefixtures("calibrated_kit")

@@ -169,17 +169,17 @@ def test_functions_named_exist(name):
         first, *rest = span.removeprefix("pkmcal.").split(".")
         if not rest or first not in modules or span.endswith(FILES):
             continue
-        assert _found(f"pkmcal.{first}", rest), f"{name}: {span}"
+        assert _exists(f"pkmcal.{first}", rest), f"{name}: {span}"
 
 
-def _found(module: str, names: list[str]) -> bool:
+def _exists(module: str, names: list[str]) -> bool:
     try:
         here = importlib.import_module(module)
     except ImportError:
         return False
     if not names or reduce(lambda o, n: getattr(o, n, None), names, here) is not None:
         return True
-    return _found(f"{module}.{names[0]}", names[1:])
+    return _exists(f"{module}.{names[0]}", names[1:])
 
 
 def schema_keys(schema: dict) -> set[str]:

@@ -30,7 +30,7 @@ LINE = 0.05
 """px, of what all edges of a line have in common."""
 
 
-def alike(rng, line, normal):
+def correlated_errors(rng, line, normal):
     """Correlated draws of unit variance (B, n) for edges with normals (B, n, 3) of a line, by the
     distance of their normals.
     """
@@ -50,13 +50,13 @@ def shaded(rng, own, runs=8, configurations=8, n_stations=2, tilt=0.0, reach=1.0
     scene = make_scene(rng, runs, configurations, n_stations, reach=reach)
     line = np.unique(scene.index[[0, 2, 3, 4]], axis=1, return_inverse=True)[1].ravel()
     shift = (LINE * rng.normal(size=(runs, line.max() + 1)))[:, line]
-    shift = shift + own * alike(rng, line, scene.normal)
+    shift = shift + own * correlated_errors(rng, line, scene.normal)
     turned = 0.0
     if tilt:
         root = np.linalg.cholesky(scene.covariance)
         v = np.linalg.solve(root, scene.shift[..., None])[..., 0]
         across = np.stack([-v[:, 1], v[:, 0]], axis=-1) / np.linalg.norm(v, axis=-1)[:, None]
-        drawn = tilt * alike(rng, line, scene.normal)
+        drawn = tilt * correlated_errors(rng, line, scene.normal)
         turned = (root @ across[..., None])[..., 0] * drawn[..., None]
     return replace(scene, shading=shift, turned=turned)
 
@@ -107,7 +107,7 @@ def test_heavy_tails_are_found_and_deviations_hold():
     assert off(result, truth) == pytest.approx(1, abs=0.2)
 
 
-def test_the_same_edge_many_times_tells_its_shading_once():
+def test_the_same_edge_many_times_determines_its_shading_once():
     """Eight copies of each edge, each with eight times the variance of its shading."""
     rng = np.random.default_rng(10)
     scene = shaded(rng, 0.1, runs=1)
@@ -131,20 +131,20 @@ def test_what_nothing_shades_keeps_the_least():
     assert off(result, truth) < 1.15
 
 
-@pytest.mark.parametrize(("seen", "other"), [(0, 1), (1, 0)])
-def test_a_tube_that_nobody_saw_keeps_what_is_stated(seen, other):
+@pytest.mark.parametrize(("visible", "other"), [(0, 1), (1, 0)])
+def test_a_tube_that_nobody_saw_keeps_what_is_stated(visible, other):
     rng = np.random.default_rng(11)
     scene = shaded(rng, 0.1, runs=1)
     measurements = scene.measurements(rng)
-    there = measurements.edges.tube == seen
+    there = measurements.edges.tube == visible
     alone = replace(measurements, edges=measurements.edges.select(there))
     noise = bundle(scene.machine, alone, scene.state()).edge_noise
-    assert noise.scale[seen] != 1
+    assert noise.scale[visible] != 1
     assert (noise.scale[other], noise.shading[other]) == (1, OWN_SHADING)
     assert noise.dof[other] == np.inf
 
 
-def test_a_crowd_is_the_sum_over_its_line():
+def test_the_variance_of_a_mean_is_the_sum_over_its_line():
     rng = np.random.default_rng(8)
     measurements = shaded(rng, 0.1, runs=1).measurements(rng)
     edges, (keys, number) = measurements.edges, lines(measurements)
@@ -184,12 +184,12 @@ def test_what_edges_have_in_common_is_in_the_covariance():
     angle = np.arccos(np.clip(edges.normal @ edges.normal.T, -1, 1))
     together = np.all([k[:, None] == k for k in (edges.station, edges.leg, edges.side)], axis=0)
     near = np.exp(-angle / SHADING_CORRELATION_ANGLE) * together
-    shaded_alike = near * np.where(edges.tube[:, None] == edges.tube, 1.0, TUBE_CORRELATION)
+    shading_covariance = near * np.where(edges.tube[:, None] == edges.tube, 1.0, TUBE_CORRELATION)
     near = near * (number[:, None] == number)
     noise = at.taken(data.scale[0]) ** 2
     own = result.edges.shading[0][edges.tube] * size
     counted = noise + at.taken(data.own[0]) ** 2 * size**2
-    shift = np.diag(noise / counted) + shaded_alike * np.outer(own, own) / np.sqrt(
+    shift = np.diag(noise / counted) + shading_covariance * np.outer(own, own) / np.sqrt(
         np.outer(counted, counted)
     )
     inverse, n = info.covariance[0], len(edges)
@@ -209,7 +209,7 @@ def test_what_edges_have_in_common_is_in_the_covariance():
 
 
 @pytest.mark.parametrize("tilt", [pytest.param(0.0, marks=pytest.mark.slow), 2.0])
-def test_deviations_hold_where_edges_err_alike(tilt):
+def test_deviations_hold_where_errors_of_edges_are_correlated(tilt):
     """With correlated tilts the inverse of the normal matrix alone is too small; with correlated
     shading only it is not, as in the tests above.
     """
@@ -243,21 +243,21 @@ def integrated(shift, covariance, sigma, least):
     return np.sqrt(np.trapezoid(share * tried**2, tried) / np.trapezoid(share, tried))
 
 
-@pytest.mark.parametrize(("told", "n"), [(0.01, 60), (0.3, 5)])
-def test_the_lines_deviation_is_its_mean(told, n):
+@pytest.mark.parametrize(("line_sigma", "n"), [(0.01, 60), (0.3, 5)])
+def test_the_lines_deviation_is_its_mean(line_sigma, n):
     """Near the true value if the data determine it; if hardly, well above the least."""
     normal = LineShadingOptions(freedom=1e9)
     rng = np.random.default_rng(14)
     true = rng.normal(0, 0.1, n)
     root = rng.normal(size=(n, n)) / np.sqrt(n)
-    noise = told**2 * (root @ root.T + np.eye(n))
+    noise = line_sigma**2 * (root @ root.T + np.eye(n))
     measured = true + np.linalg.cholesky(noise) @ rng.normal(size=n)
     sigma = np.full(n, 0.2)
     covariance = np.linalg.inv(np.linalg.inv(noise) + np.diag(1 / sigma**2))
     shift = covariance @ np.linalg.solve(noise, measured)
     values = common_shading(shift[None], covariance[None], np.eye(n), sigma[None], 0.03, normal)[0]
     np.testing.assert_allclose(values, integrated(shift, covariance, sigma, 0.03), rtol=0.02)
-    if told < 0.1:
+    if line_sigma < 0.1:
         np.testing.assert_allclose(values, 0.1, rtol=0.2)
     else:
         assert np.all(values > 0.1)

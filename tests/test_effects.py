@@ -70,8 +70,8 @@ def test_an_effect_with_a_prior_is_estimated(scene, effect, number):
     measurements = scene.measurements(np.random.default_rng(3))
     measurements = wrong_by(measurements, effect(None), number)
     start = start_state(scene.machine, measurements, scene.T_camera_base)
-    known = replace(measurements, effects=(effect(np.full((1, 1), PRIOR)),))
-    estimate = bundle(scene.machine, known, start)
+    with_prior = replace(measurements, effects=(effect(np.full((1, 1), PRIOR)),))
+    estimate = bundle(scene.machine, with_prior, start)
     (code,) = estimate.state.columns.keys() - {EDGE_SHIFT}
     (value,), (sigma,) = estimate.state.columns[code], estimate.column_sigma(code)
     assert sigma < 0.3 * PRIOR
@@ -84,14 +84,14 @@ def test_an_effect_with_a_prior_is_estimated(scene, effect, number):
 def test_an_effect_without_a_prior_is_detected(scene, effect, number):
     measurements = scene.measurements(np.random.default_rng(3))
     tested = replace(measurements, effects=(effect(None),))
-    for data, found in ((tested, []), (wrong_by(tested, effect(None), number), [0])):
+    for data, detected in ((tested, []), (wrong_by(tested, effect(None), number), [0])):
         start = start_state(scene.machine, data, scene.T_camera_base)
         estimate = bundle(scene.machine, data, start, scale_noise=False, robust=False)
         listed = [one for one in columns_of_effects(data) if one.prior is None]
         tests = ScoreTests(*estimate.linearized, listed)
-        assert [k for k, _ in tests.significant()] == found
-        if found:
-            fit = tests.fitted(found)[0]
+        assert [k for k, _ in tests.significant()] == detected
+        if detected:
+            fit = tests.fitted(detected)[0]
             assert abs(fit.value[0] - number) < 4 * fit.sigma[0]
 
 

@@ -75,7 +75,7 @@ def test_a_calibration_is_held_beside_its_truth(demo):
     assert "Traceback" not in done.stderr
 
 
-def test_a_drawing_that_cannot_take_the_readings_has_no_figures(demo, tmp_path):
+def test_a_nominal_model_that_cannot_take_the_readings_has_no_figures(demo, tmp_path):
     """Outside the machine's pose; NaN for programs."""
     session = shutil.copytree(demo.session, tmp_path / "session")
     path = session / "mechanism.yaml"
@@ -100,7 +100,7 @@ def test_numbered_pictures_stand_in_for_a_camera(demo):
     assert "no controller to send velocities to" in done.stderr
 
 
-def test_without_a_camera_one_sentence_says_so(demo):
+def test_without_a_camera_one_sentence_states_so(demo):
     words = (demo.calibration, "station1", "--goal", "0000", "--source", "nothing.mp4")
     done = run_example("servo_live.py", *words)
     assert done.returncode == 2

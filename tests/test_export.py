@@ -56,7 +56,7 @@ def test_every_format_of_the_folder_is_found():
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_a_format_expresses_a_machine_or_says_that_it_does_not(name):
+def test_a_format_expresses_a_machine_or_states_that_it_does_not(name):
     for machine in MACHINES:
         source = source_of(load_mechanism(machine))
         if machine not in EXPRESSED[name]:
@@ -249,7 +249,7 @@ def test_the_command(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("h4", "--to", "stl"), "expected c, "),
         (("h4", "--to", "jsn"), "expected json, or another of c, "),
@@ -259,11 +259,11 @@ def test_the_command(tmp_path, monkeypatch):
         (("nothing.yaml", "--to", "c"), "does not exist"),
     ],
 )
-def test_wrong_words(words, told, tmp_path, monkeypatch):
+def test_wrong_words(words, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = run("export", *words)
     assert done.code == 2
-    assert told in done.err
+    assert message in done.err
     assert list(tmp_path.iterdir()) == []
 
 

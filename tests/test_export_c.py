@@ -379,7 +379,7 @@ def test_cranks_and_sliders_out_of_reach(library):
 
 
 @needs_compiler
-def test_a_singular_pose_is_told(tmp_path):
+def test_a_singular_pose_is_reported(tmp_path):
     """A 3-RPR at a pose where the lines of its three legs meet in a point, so that its plate can
     turn.
     """

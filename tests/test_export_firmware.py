@@ -109,7 +109,7 @@ def test_an_ideal_rotary_delta_is_recovered():
 
 @pytest.mark.parametrize("name", ["delta", "linear-delta"])
 @pytest.mark.parametrize("to", FIRMWARES)
-def test_a_machine_off_its_drawing_is_followed_as_far_as_said(name, to):
+def test_a_machine_off_its_nominal_model_is_followed_as_far_as_stated(name, to):
     machine = built(name, seed=4)
     made = make_export(source_of(machine), to)
     difference = made.differences[0]

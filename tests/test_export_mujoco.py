@@ -210,7 +210,7 @@ def test_what_is_read_again_closes_from_beside(name):
 # ------------------------------------------------------------------ words and refusals
 
 
-def test_the_header_says_what_it_is():
+def test_the_header_states_what_it_is():
     nominal = machine_of("delta")
     _, text = exported(nominal)
     assert "Nominal model only" in text

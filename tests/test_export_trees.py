@@ -337,7 +337,7 @@ def test_a_bar_that_turns_another_way_is_found(to, old, new):
 
 
 @pytest.mark.parametrize("to", READERS)
-def test_what_is_not_known_is_said(to):
+def test_what_is_not_known_is_stated(to):
     source, files, _ = exported("delta", to)
     text = next(iter(files.values()))
     flat = " ".join(text.split())

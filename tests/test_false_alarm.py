@@ -57,13 +57,13 @@ def test_a_session_gives_a_false_alarm_at_most_at_its_level():
         problem = LinearProblem.of(info.problem, rows, rng)
         here = replace(assembled, problem=problem), Information(problem, info.state)
         tests = ScoreTests(*here, listed, families, singles=True, false_alarm=level)
-        found = discrepancy_of(
+        estimated = discrepancy_of(
             *here, components, options=DiscrepancyOptions(false_alarm=level, scales=31)
         )
         tubes, poses = rng.uniform(size=(2, 15))
         alarms[k] = (
             bool(tests.significant()),
-            bool(found.scales),
+            bool(estimated.scales),
             tubes.min() < level.of_test(15),
             level.adjusted(poses.min(), 15) < LEVEL,
         )
@@ -80,7 +80,7 @@ def test_tests_of_one_search_share_its_level():
 
 
 @pytest.mark.parametrize("dof", [5, 60])
-def test_noise_exceeds_its_scale_as_often_as_the_level_says(dof):
+def test_noise_exceeds_its_scale_as_often_as_the_level_states(dof):
     level, runs = FalseAlarm(0.02, searches=2), 20000
     rng = np.random.default_rng(0)
     rms = np.sqrt(np.mean(rng.normal(size=(runs, dof)) ** 2, axis=1))

@@ -298,7 +298,7 @@ def test_schema_faults(tmp_path, text, parts):
         assert part in message
 
 
-def test_all_faults_are_told_in_the_order_of_the_file(tmp_path):
+def test_all_faults_are_reported_in_the_order_of_the_file(tmp_path):
     message = fault(check, tmp_path, "count: x\nkind: c\nlimit: 3\nname: m\n")
     assert message.startswith("a.yaml, line 1, count")
     assert message.endswith("Then look at line 2, kind and line 3, limit.")

@@ -32,7 +32,7 @@ FIELDS = {
     for code, entry in ENTRIES.items()
 }
 MAKERS = {"finding", "wrong", "doubtful", "note"}
-DEPARTURE_FACTS = ("calibration/model_violations.py", "cameras/contract.py", "session/readings.py")
+VIOLATION_FACTS = ("calibration/model_violations.py", "cameras/contract.py", "session/readings.py")
 
 
 VIOLATIONS = {code for code in ENTRIES if "tool_shift_sigmas" in FIELDS[code]}
@@ -64,7 +64,7 @@ def codes_of(code: ast.expr, facts: set[str]) -> set[str]:
     return set()
 
 
-def tells(call: ast.Call) -> bool:
+def makes_finding(call: ast.Call) -> bool:
     """Whether it makes a column whose facts are those of a finding."""
     return getattr(call.func, "id", "") == "Column" and any(k.arg == "facts" for k in call.keywords)
 
@@ -77,16 +77,16 @@ def calls() -> list[tuple[str, set[str], set[str]]]:
         p: ast.parse(text) for p, text in texts.items() if re.search(r"finding|\bColumn\(", text)
     }
     del trees[SOURCE / "outcome" / "finding.py"]
-    detections = set[str]().union(*(keys(trees[SOURCE / name]) for name in DEPARTURE_FACTS))
+    detections = set[str]().union(*(keys(trees[SOURCE / name]) for name in VIOLATION_FACTS))
     out: list[tuple[str, set[str], set[str]]] = []
     for path, tree in trees.items():
         nodes = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
-        made = [n for n in nodes if getattr(n.func, "id", "") in MAKERS or tells(n)]
+        made = [n for n in nodes if getattr(n.func, "id", "") in MAKERS or makes_finding(n)]
         inside = keys(tree) if made else set[str]()
         for node in made:
             facts = {k.arg for k in node.keywords if k.arg} | {"subject"}
             others = any(k.arg is None for k in node.keywords)
-            if others or tells(node):
+            if others or makes_finding(node):
                 facts |= inside | detections
             where = f"{path.relative_to(SOURCE)}:{node.lineno}"
             out.append((where, codes_of(node.args[0], facts), facts))
@@ -150,7 +150,7 @@ def test_violations_have_kinds_for_files():
     for path in SOURCE.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         for node in ast.walk(ast.parse(text)) if "Column(" in text else ():
-            if isinstance(node, ast.Call) and tells(node):
+            if isinstance(node, ast.Call) and makes_finding(node):
                 assert len(node.args) == 3, f"{path}:{node.lineno}: a column without its kind"
                 codes |= codes_of(node.args[0], FACTS_OF_VIOLATIONS)
     assert codes >= VIOLATIONS

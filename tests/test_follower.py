@@ -75,7 +75,7 @@ def test_a_leap_is_searched():
     np.testing.assert_allclose(follow(far), machine.forward(far, before), atol=1e-10)
 
 
-def test_readings_out_of_reach_are_told_and_forgotten():
+def test_readings_out_of_reach_are_reported_and_forgotten():
     machine = load_mechanism("gough-stewart")
     follow = machine.follower()
     home = machine.inverse(machine.home())

@@ -340,7 +340,7 @@ THREE_BY_TWO = np.array([[0, 1], [2, 3], [4, 5]])
 THREE_BY_THREE = np.array([[0, 1, 2], [2, 3, 4], [4, 5, 0]])
 
 
-def seen_by(scene: Scene, legs) -> np.ndarray:
+def visible_legs(scene: Scene, legs) -> np.ndarray:
     edges = scene.measurements.edges
     return (edges.leg[:, None] == legs[edges.station]).any(axis=1)
 
@@ -353,7 +353,7 @@ def test_a_board_on_the_base_joins_stations_that_share_no_legs():
     sees = [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1)]
     measurements = with_boards(scene, boards, ("base", "platform"), sees)
     for legs in (THREE_BY_TWO, THREE_BY_THREE):
-        edges = measurements.edges.select(seen_by(scene, legs))
+        edges = measurements.edges.select(visible_legs(scene, legs))
         without = replace(scene.measurements, edges=edges)
         with pytest.raises(ResultError, match="too few legs"):
             four_step(scene.nominal, without)
@@ -370,7 +370,7 @@ def test_two_boards_in_a_chain():
     sees = [(0, 0), (1, 0), (1, 1), (2, 1)]
     measurements = with_boards(scene, boards, ("base", "base"), sees)
     legs = np.array([[0, 1, 6], [2, 3, 3], [4, 5, 5]])
-    part = replace(measurements, edges=measurements.edges.select(seen_by(scene, legs)))
+    part = replace(measurements, edges=measurements.edges.select(visible_legs(scene, legs)))
     value = four_step(scene.nominal, part)
     assert_same(value, scene.truth)
     np.testing.assert_allclose(value.T_mount, boards, atol=1e-7)
@@ -378,7 +378,7 @@ def test_two_boards_in_a_chain():
 
 def test_given_poses_join_stations_that_share_no_legs():
     scene = make_scene("gough-stewart", np.random.default_rng(12), 24)
-    part = scene.select(seen_by(scene, THREE_BY_THREE))
+    part = scene.select(visible_legs(scene, THREE_BY_THREE))
     value = four_step(scene.nominal, part, T_camera_base_guess=scene.truth.T_camera_base)
     assert_same(value, scene.truth)
 

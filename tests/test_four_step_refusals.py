@@ -20,7 +20,7 @@ from test_four_step_machines import (
     THREE_BY_TWO,
     make_scene,
     noisy,
-    seen_by,
+    visible_legs,
 )
 from test_identify_scene import exact
 
@@ -67,13 +67,13 @@ def test_a_station_that_sees_two_legs(hexapod):
 def test_stations_that_share_no_or_two_legs(hexapod):
     """Three cameras with three legs each: all of them fixed by their legs, none by the others."""
     three = np.array([[0, 1, 2], [3, 4, 5], [3, 4, 5]])
-    error = refused(hexapod, hexapod.select(seen_by(hexapod, three)), "share too few legs")
+    error = refused(hexapod, hexapod.select(visible_legs(hexapod, three)), "share too few legs")
     assert "legs 1 to 3 can move against those of legs 4 to 6" in str(error)
     assert "station 2 sees legs 4 to 6" in str(error)
     assert "calibration board" in str(error)
-    refused(hexapod, hexapod.select(seen_by(hexapod, THREE_BY_THREE)), "share too few legs")
+    refused(hexapod, hexapod.select(visible_legs(hexapod, THREE_BY_THREE)), "share too few legs")
     two = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [0, 1, 4, 5]])
-    refused(hexapod, hexapod.select(seen_by(hexapod, two)), "legs 3 and 4", "legs 5 and 6")
+    refused(hexapod, hexapod.select(visible_legs(hexapod, two)), "legs 3 and 4", "legs 5 and 6")
 
 
 def test_one_station_that_sees_four_legs_of_six(hexapod):
@@ -129,7 +129,7 @@ def test_images_of_one_configuration_by_several_stations_are_at_once(hexapod):
     """The printed form, which uses each image alone, refuses what the corrected form accepts."""
     rng = np.random.default_rng(3)
     scene = make_scene("gough-stewart", rng, 24)
-    keep = seen_by(scene, THREE_BY_TWO)
+    keep = visible_legs(scene, THREE_BY_TWO)
     part = scene.select(keep)
     guess = scene.truth.T_camera_base
     values = four_step(scene.nominal, part, T_camera_base_guess=guess)
@@ -156,7 +156,7 @@ def test_a_passive_leg_that_does_not_turn():
     refused(scene, noisy(scene.measurements, rng), "leg 7 of 7 does not change its direction")
 
 
-def test_lengths_that_the_distances_do_not_tell():
+def test_lengths_that_the_distances_do_not_determine():
     """A platform that only shifts with parallel legs: a common length is free (errata)."""
     scene = make_scene("constant-legs", np.random.default_rng(6), 12)
     legs = legs_as_drawn(scene.nominal)
@@ -180,7 +180,7 @@ def test_lengths_that_the_distances_do_not_tell():
         )
 
 
-def test_a_length_that_collapsed_is_told():
+def test_a_length_that_collapsed_is_reported():
     nominal = exact("constant-legs")
     legs = legs_as_drawn(nominal)
     q0 = np.where(np.arange(6) == 2, 0.001, legs.rod)[None]
@@ -246,4 +246,4 @@ def test_counts_are_necessary_at_most(hexapod):
     visible = np.zeros((3, 6), dtype=bool)
     visible[np.arange(3)[:, None], two] = True
     assert all(c.met for c in conditions(hexapod.nominal, visible))
-    refused(hexapod, hexapod.select(seen_by(hexapod, two)), "share too few legs")
+    refused(hexapod, hexapod.select(visible_legs(hexapod, two)), "share too few legs")

@@ -137,10 +137,10 @@ def base_views(rng, in_view, directions_visible, noise=0.0):
     return items, T, base, directions
 
 
-def laid_on(value, truth, T_found, T_true):
+def laid_on(value, truth, T_estimate, T_true):
     """Both forms determine the base up to its frame: compare after fitting one to the other."""
     e = poses_laying_items(value, truth, np.ones(value.shape[:2]))
-    np.testing.assert_allclose(T_true @ e[:, None], T_found, atol=1e-8)
+    np.testing.assert_allclose(T_true @ e[:, None], T_estimate, atol=1e-8)
     return e, apply(e[:, None], value)
 
 
@@ -498,7 +498,7 @@ def test_universal_axes_of_a_platform_that_does_not_turn():
     assert np.abs(valid[0] - v).max() > 2e-3
 
 
-def test_noise_leaves_weak_directions_to_the_drawing():
+def test_noise_leaves_weak_directions_to_the_prior():
     """A platform that turns by 5 mrad only: the common turn would cost 0.1 rad from data alone."""
     rng = np.random.default_rng(22)
     v, w, rot, u = universal_legs(rng, 0.005, runs=20)

@@ -58,7 +58,7 @@ def test_a_proper_refusal_has_no_faults():
 
 
 @pytest.mark.parametrize(
-    ("told", "fault"),
+    ("case", "fault"),
     [
         ({"code": 70}, "exit code 70"),
         ({"code": -9, "err": ""}, "exit code -9"),
@@ -76,5 +76,5 @@ def test_a_proper_refusal_has_no_faults():
         ({"code": 0, "err": "", "after": {"out/.a.part": (1,)}}, "left over"),
     ],
 )
-def test_the_judge_sees(told, fault):
-    assert any(value.startswith(fault) for value in faults(**told)), faults(**told)
+def test_the_judge_sees(case, fault):
+    assert any(value.startswith(fault) for value in faults(**case)), faults(**case)

@@ -158,7 +158,7 @@ def complex_normal(a, b, radius, side):
     return (cos if side == 0 else -cos) * m / distance - sin * np.cross(u, m / distance)
 
 
-def test_a_camera_inside_a_leg_is_told():
+def test_a_camera_inside_a_leg_is_reported():
     a, b, radius = leg(1, 0.8)
     assert not cylinders.has_silhouette(cylinders.line_through(a, b)[1], np.array(radius))
     inside = cylinders.edge_normal_jacobians(a, b, np.array(radius), np.array(0))

@@ -39,7 +39,7 @@ def points():
 T = look_at(np.array([0.6, -0.8, 0.5]), np.array([0.02, 0.01, 0.2]), np.array([0.1, 0.0, 1.0]))
 
 
-def seen(camera, T_camera_base, points):
+def projected(camera, T_camera_base, points):
     return camera.project(apply(T_camera_base, points))
 
 
@@ -47,7 +47,7 @@ def test_what_is_pulled_stays_under_the_mouse(camera):
     for away in (0.3, 2.0):
         point = apply(inverse(T), away * camera.ray(START))
         np.testing.assert_allclose(
-            seen(camera, aimed(camera, T, START, END), point), END, atol=1e-5
+            projected(camera, aimed(camera, T, START, END), point), END, atol=1e-5
         )
 
 
@@ -56,13 +56,13 @@ def test_a_turn_follows_the_mouse_and_leaves_the_middle(camera, points):
     np.testing.assert_allclose(apply(done, middle), apply(T, middle), atol=1e-12)
     ray = apply(T, middle) / np.linalg.norm(apply(T, middle))
     near = apply(inverse(T), apply(T, middle) - 0.1 * ray)  # on the side of the camera
-    assert (seen(camera, done, near) - seen(camera, T, near)) @ (END - START) > 0
+    assert (projected(camera, done, near) - projected(camera, T, near)) @ (END - START) > 0
 
 
 def test_a_roll_is_about_the_middle(camera, points):
     middle, done = points.mean(axis=0), rolled(camera, T, points, START, END)
-    at = seen(camera, T, middle)
-    np.testing.assert_allclose(seen(camera, done, middle), at, atol=1e-6)
+    at = projected(camera, T, middle)
+    np.testing.assert_allclose(projected(camera, done, middle), at, atol=1e-6)
     turn = pose_difference(done, T)[:3]
     sight = apply(T, middle) / np.linalg.norm(apply(T, middle))
     np.testing.assert_allclose(np.cross(turn, sight), 0, atol=1e-12)
@@ -72,7 +72,7 @@ def test_a_roll_is_about_the_middle(camera, points):
 
 def test_the_distance_grows_along_the_ray(camera, points):
     middle = points.mean(axis=0)
-    at = seen(camera, T, middle)
+    at = projected(camera, T, middle)
     done = farther(camera, T, points, at, 1.5)
     np.testing.assert_allclose(apply(done, middle), 1.5 * apply(T, middle), atol=1e-6)
 
@@ -81,11 +81,11 @@ def test_the_distance_grows_along_the_ray(camera, points):
 def test_joints_come_to_their_places(camera, points, count):
     truth = perturb(T, np.array([0.05, -0.08, 0.1, 0.05, -0.04, 0.08]))
     pins = points[[0, 9, 4, 7, 2][:count]]
-    places = seen(camera, truth, pins)
+    places = projected(camera, truth, pins)
     done = pinned(camera, T, points, pins, places)
     # exactly; where all freedoms move, the pose by hand weighs in, within what a hand can do
     near = 1e-4 if count < 3 else PINNED_JOINT_SIGMA
-    np.testing.assert_allclose(seen(camera, done, pins), places, atol=near)
+    np.testing.assert_allclose(projected(camera, done, pins), places, atol=near)
     if count == 5:  # fewer joints fit from several places
         error = pose_difference(inverse(done), inverse(truth))
         assert np.linalg.norm(error[:3]) < 1e-3

@@ -136,7 +136,9 @@ def test_a_delta_kit_with_a_board(workplace):
     ("rod", "radius", "endstop"),
     [(218.0, 97.3, 300.0), (270.0, 105.4, 400.0), (300.0, 146.0, 400.0), (397.0, 200.0, 540.0)],
 )
-def test_a_printers_drawing_is_what_its_firmware_holds(tmp_path, monkeypatch, rod, radius, endstop):
+def test_a_printers_nominal_model_is_what_its_firmware_holds(
+    tmp_path, monkeypatch, rod, radius, endstop
+):
     """Exported as it was read it comes back, also where home is above the lowest carriage, which
     is below the tool there.
     """

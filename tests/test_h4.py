@@ -265,7 +265,7 @@ def ranks(machine, poses):
     return rank(joint.reshape(-1, joint.shape[-1])), rank(full.reshape(-1, full.shape[-1]))
 
 
-def test_what_71_poses_can_tell():
+def test_what_71_poses_determine():
     """Errata: Model 12, 24 unknowns, rank 21 and 23; Model 31, 43 unknowns, 38 and 40."""
     rng = np.random.default_rng(5)
     poses = papers_poses()[rng.permutation(81)[:71]]
@@ -278,7 +278,7 @@ def test_what_71_poses_can_tell():
     assert ranks(thirty_one, poses) == (38, 40)
 
 
-def test_what_the_rods_can_tell():
+def test_what_the_rods_determine():
     """78 unknowns, without the origins of hinges; frames aside, the data determine 66."""
     rng = np.random.default_rng(6)
     machine = load_mechanism("h4-rods")

@@ -57,7 +57,7 @@ def anywhere(rng, reach):
     return pose(rotation(rng.normal(size=3) * 1.5), reach * rng.normal(size=3))
 
 
-def seen_from(camera, body, mount, rng, station=0, number=0):
+def simulated_poses(camera, body, mount, rng, station=0, number=0):
     n = len(body)
     noise = NOISE * rng.normal(size=(n, 6))
     return PoseSet(
@@ -86,14 +86,14 @@ def off(state, poses):
 
 @pytest.mark.parametrize("name", MACHINES)
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
-def test_every_machine_with_a_drawing_2_mm_and_2_degrees_off(name, seed):
+def test_every_machine_with_a_nominal_model_2_mm_and_2_degrees_off(name, seed):
     """Prediction as good as the nominal model allows; a wrong branch would be off by a radian."""
     rng = np.random.default_rng(seed)
     nominal = exact(name)
     truth = true_machine(nominal, rng)
     body, joints = platform_poses(truth, rng)
     camera, mount = anywhere(rng, 1.0), anywhere(rng, 0.05)
-    data = measured(seen_from(camera, body, mount, rng), joints)
+    data = measured(simulated_poses(camera, body, mount, rng), joints)
     state = start_from_poses(nominal, data)
     turn, shift = off(state, data.poses)
     assert turn < np.radians(6)
@@ -102,12 +102,12 @@ def test_every_machine_with_a_drawing_2_mm_and_2_degrees_off(name, seed):
 
 
 @pytest.mark.parametrize("name", MACHINES)
-def test_the_right_drawing_leaves_the_noise(name):
+def test_the_right_nominal_model_leaves_the_noise(name):
     rng = np.random.default_rng(1)
     machine = load_mechanism(name)
     body, joints = platform_poses(machine, rng)
     camera, mount = anywhere(rng, 1.0), anywhere(rng, 0.05)
-    data = measured(seen_from(camera, body, mount, rng), joints)
+    data = measured(simulated_poses(camera, body, mount, rng), joints)
     state = start_from_poses(machine, data)
     turn, shift = off(state, data.poses)
     assert turn < 2 * np.radians(0.03)
@@ -116,7 +116,7 @@ def test_the_right_drawing_leaves_the_noise(name):
     assert np.linalg.norm(values[:3]) < 0.02
 
 
-def test_what_the_motion_does_not_tell_stays_zero():
+def test_what_the_motion_does_not_determine_stays_zero():
     """[C] III.C: a board's place on a platform that does not turn, and along the only axis."""
     rng = np.random.default_rng(0)
     body = np.broadcast_to(np.eye(4), (12, 4, 4)).copy()
@@ -138,7 +138,7 @@ def test_boards_that_slipped_do_not_lead_astray():
     machine = load_mechanism("gough-stewart")
     body, joints = platform_poses(machine, rng)
     camera, mount = anywhere(rng, 1.0), anywhere(rng, 0.05)
-    poses = seen_from(camera, body, mount, rng)
+    poses = simulated_poses(camera, body, mount, rng)
     wrong = poses.T_station_target.copy()
     wrong[:6] = wrong[:6] @ anywhere(rng, 0.1)
     state = start_from_poses(machine, measured(replace(poses, T_station_target=wrong), joints))
@@ -159,10 +159,10 @@ def test_several_stations_and_mounts_are_chained():
     still = np.broadcast_to(np.eye(4), body.shape)
     poses = concatenate(
         [
-            seen_from(cameras[0], body, mounts[0], rng),
-            seen_from(cameras[0], still, mounts[1], rng, 0, 1),
-            seen_from(cameras[1], still, mounts[1], rng, 1, 1),
-            seen_from(cameras[2], body, mounts[2], rng, 2, 2),
+            simulated_poses(cameras[0], body, mounts[0], rng),
+            simulated_poses(cameras[0], still, mounts[1], rng, 0, 1),
+            simulated_poses(cameras[1], still, mounts[1], rng, 1, 1),
+            simulated_poses(cameras[2], body, mounts[2], rng, 2, 2),
         ]
     )
     kinds = (Mount("a", "platform"), Mount("b", "base"), Mount("c", "platform"))
@@ -175,18 +175,18 @@ def test_several_stations_and_mounts_are_chained():
     assert np.abs(pose_difference(state.T_mount, np.stack(mounts))).max() < 5e-3
 
 
-def test_a_station_that_nothing_ties_is_told():
+def test_a_station_that_nothing_ties_is_reported():
     rng = np.random.default_rng(7)
     machine = load_mechanism("gough-stewart")
     body, joints = platform_poses(machine, rng)
-    poses = seen_from(anywhere(rng, 1.0), body, anywhere(rng, 0.05), rng)
+    poses = simulated_poses(anywhere(rng, 1.0), body, anywhere(rng, 0.05), rng)
     with pytest.raises(InputError, match="ties station 2 of 2"):
         start_from_poses(machine, measured(poses, joints, 2))
     with pytest.raises(InputError, match="ties station 1 of 1"):
         start_from_poses(machine, measured(poses.select(np.arange(2)), joints))
 
 
-def test_configurations_along_a_line_are_told():
+def test_configurations_along_a_line_are_reported():
     rng = np.random.default_rng(7)
     body = np.broadcast_to(np.eye(4), (12, 4, 4)).copy()
     body[:, 0, 3] = np.linspace(-0.1, 0.1, 12)

@@ -242,7 +242,7 @@ def test_a_turned_image_is_turned_back(tmp_path, orientation, quarters):
     np.testing.assert_array_equal(decode(path, (8, 6), "a.jpg"), np.rot90(stored, quarters))
 
 
-def test_a_turned_image_is_told(folder):
+def test_a_turned_image_is_reported(folder):
     jpeg(folder / "images/phone/0000-2.jpg", Exif(1, 26.0), np.rot90(PICTURE))
     (warning,) = load_session(folder).warnings
     assert warning.startswith("images/phone/0000-2.jpg: turned by a quarter against its camera")
@@ -305,7 +305,7 @@ def at_truth(monkeypatch, folder, off=2e-3):
     """Let hand-held images be localized nearly where they were taken."""
     rng = np.random.default_rng(1)
 
-    def place(session, images, boards, _rng, _told):
+    def place(session, images, boards, _rng, _progress):
         truth = load_truth(folder, session.machine).T_camera_base
         near = perturb(truth, off * rng.normal(size=(len(truth), 6)))
         scene = PriorScene.as_drawn(session, near)
@@ -418,9 +418,9 @@ def test_focal_lengths_are_found_within_their_deviations(breathed):
     assert np.all(np.abs(values - truth.focal_scale) < 3.5 * sigma)
 
 
-def test_normals_turn_with_the_focal_length_as_stated(looked):
+def test_normals_turn_with_the_focal_length_as_stated(searched):
     """The same image measured with a camera whose focal lengths are larger by a thousandth."""
-    session, images, _, truth = looked
+    session, images, _, truth = searched
     p, excess = images[EASIEST], 1e-3
     T, pose = truth.T_camera_base[EASIEST], truth.T_base_platform[[EASIEST]]
     wider = replace(p.camera, parameters=p.camera.parameters + excess * p.camera.focal_part)
@@ -447,7 +447,7 @@ def test_normals_turn_with_the_focal_length_as_stated(looked):
     assert slopes[order][np.searchsorted(share, share[-1] / 2)] == pytest.approx(1.0, abs=0.1)
 
 
-def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
+def test_edges_determine_focal_lengths_as_the_derivative_predicts(breathed):
     """Derivatives of the rows by an image's focal length, against differences of the rows."""
     calibration, _ = breathed
     assembled = assemble(
@@ -492,7 +492,7 @@ def test_a_images_edges_are_no_lines_of_their_own(breathed):
 
 
 @pytest.fixture(scope="module")
-def looked(simulated):
+def searched(simulated):
     """The session, its images, the platform's poses and the truth."""
     session = load_session(simulated)
     truth = load_truth(simulated, session.machine)
@@ -505,12 +505,12 @@ def view_of(session, p, poses):
     return StationView(session.machine, p.camera, p.configuration, session.joints, poses, tables)
 
 
-def found_with(monkeypatch, truth, faults, textured=False):
+def localized_with(monkeypatch, truth, faults, textured=False):
     """Images are localized where they were taken, with uncertainty; textured : with a
     background.
     """
 
-    def measure(_session, image, _before, _found, _others, _asked):
+    def measure(_session, image, _before, _poses, _others, _configurations):
         T, fault = truth.T_camera_base[image.station], faults[image.station]
         lead = np.log(1 / fault - 1)
         places = PoseHypotheses(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
@@ -528,14 +528,14 @@ def found_with(monkeypatch, truth, faults, textured=False):
 def placed(remeasured, monkeypatch, faults, textured=False):
     """Poses of images that are localized right, with uncertainty; none : localized elsewhere."""
     session, images, _, truth = remeasured
-    found_with(monkeypatch, truth, faults, textured)
+    localized_with(monkeypatch, truth, faults, textured)
     return handheld.localize_case(session, images, Boards(), np.random.default_rng(0))
 
 
 @pytest.mark.slow
-def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
+def test_the_room_may_decide_what_legs_do_not(searched, monkeypatch):
     """All images show some of the same points about the machine."""
-    _, images, _, truth = looked
+    _, images, _, truth = searched
     rng = np.random.default_rng(2)
     world = rng.uniform(-1.2, 1.2, (6000, 3))
     names = rng.standard_normal((len(world), 128)).astype(np.float32)
@@ -549,8 +549,8 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
         return Texture(camera.ray(pixel[inside]), pixel[inside], names[inside])
 
     monkeypatch.setattr(background, "texture_of", texture)
-    results = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4], textured=True)
-    assert [s.name for s in results.session.stations] == [s.name for s in looked[0].stations]
+    results = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4], textured=True)
+    assert [s.name for s in results.session.stations] == [s.name for s in searched[0].stations]
 
 
 def test_a_board_on_the_base_serves_images_by_hand(folder):
@@ -562,11 +562,11 @@ def test_a_board_on_the_base_serves_images_by_hand(folder):
     assert not any("board" in values for values in load_session(folder).warnings)
 
 
-def test_unsure_images_are_left_out_and_told(looked, monkeypatch):
-    results = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4])
+def test_unsure_images_are_left_out_and_reported(searched, monkeypatch):
+    results = placed(searched, monkeypatch, [1e-4, 0.3, 1e-4])
     assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert [p.station for p in results.images] == [0, 1]
-    off = pose_difference(results.scene.T_camera_base, looked[3].T_camera_base[[0, 2]])
+    off = pose_difference(results.scene.T_camera_base, searched[3].T_camera_base[[0, 2]])
     # as in the joint estimate: two images hardly determine a machine
     assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
@@ -589,7 +589,7 @@ def test_places_are_believed_while_all_together_leave_little_doubt():
 
 
 @pytest.mark.slow
-def test_an_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatch):
+def test_an_image_in_which_no_leg_can_be_measured_is_left_out(searched, monkeypatch):
     """However well its silhouettes match something: it determines no machine."""
     rows = []
 
@@ -598,7 +598,7 @@ def test_an_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatc
         return image.station == 1
 
     monkeypatch.setattr(handheld, "_too_few_edges", bare)
-    results = placed(looked, monkeypatch, [1e-4, 1e-4, 1e-4])
+    results = placed(searched, monkeypatch, [1e-4, 1e-4, 1e-4])
     assert [s.name for s in results.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert sorted(results.scene.edges) == [0, 1]
     (warning,) = results.session.warnings
@@ -606,8 +606,8 @@ def test_an_image_in_which_no_leg_can_be_measured_is_left_out(looked, monkeypatc
     assert len(rows) < 12  # the scoring ends
 
 
-def test_legs_are_measured_where_an_image_is_and_not_elsewhere(looked):
-    session, images, poses, truth = looked
+def test_legs_are_measured_where_an_image_is_and_not_elsewhere(searched):
+    session, images, poses, truth = searched
     p = images[EASIEST]
     there = PriorScene(session.machine, truth.T_camera_base, poses)
     assert not handheld._too_few_edges(there, p)
@@ -616,8 +616,8 @@ def test_legs_are_measured_where_an_image_is_and_not_elsewhere(looked):
     assert handheld._too_few_edges(elsewhere, p)
 
 
-def test_check_tells_which_images_are_sure(simulated, looked, monkeypatch):
-    found_with(monkeypatch, looked[3], [1e-4, 0.3, 1e-4])
+def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
+    localized_with(monkeypatch, searched[3], [1e-4, 0.3, 1e-4])
     check = check_session(simulated)
     assert [station.recognised for station in check.stations] == [True, False, True]
     assert check.stations[0].legs > 2
@@ -629,14 +629,14 @@ def test_check_tells_which_images_are_sure(simulated, looked, monkeypatch):
     assert check.forecast is None
 
 
-def test_no_image_by_hand_is_recognised(looked, monkeypatch):
+def test_no_image_by_hand_is_localized(searched, monkeypatch):
     with pytest.raises(InputError, match="recognised in none of the images by hand"):
-        placed(looked, monkeypatch, [0.3, 0.3, 0.3])
+        placed(searched, monkeypatch, [0.3, 0.3, 0.3])
 
 
-def test_images_of_one_configuration_are_recognised(looked, monkeypatch):
+def test_images_of_one_configuration_are_localized(searched, monkeypatch):
     with pytest.raises(InputError, match="are recognised show one configuration only"):
-        placed(looked, monkeypatch, [0.3, 1e-4, 0.3])
+        placed(searched, monkeypatch, [0.3, 1e-4, 0.3])
 
 
 def test_an_image_in_a_wrong_place_is_found_out(breathed):
@@ -697,9 +697,9 @@ def test_tubes_stand_out_of_a_chart():
 
 
 @pytest.mark.slow
-def test_one_image_is_found_from_nothing(looked):
+def test_one_image_is_found_from_nothing(searched):
     """Ten seconds: all poses about the machine, for the easiest of the three images."""
-    session, images, poses, truth = looked
+    session, images, poses, truth = searched
     k = EASIEST
     p = images[k]
     view = view_of(session, p, poses)
@@ -710,9 +710,9 @@ def test_one_image_is_found_from_nothing(looked):
     assert np.linalg.norm(off[3:]) < 0.1
 
 
-def test_turns_of_a_machine_onto_itself(looked):
+def test_turns_of_a_machine_onto_itself(searched):
     """A hexapod has equal thirds: two other poses with the same appearance."""
-    session, images, poses, truth = looked
+    session, images, poses, truth = searched
     p = images[0]
     view = view_of(session, p, poses)
     same = symmetric_poses(view, truth.T_camera_base[:1])
@@ -726,9 +726,9 @@ def test_turns_of_a_machine_onto_itself(looked):
         assert np.all(apart.argmin(axis=1) != np.arange(6))
 
 
-def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
+def test_a_similar_pose_is_distinguished_by_the_machine_there(searched):
     """A search holds the place and those from which the machine is turned onto itself for equal."""
-    session, images, poses, truth = looked
+    session, images, poses, truth = searched
     p = images[1]
     view = view_of(session, p, poses)
     true = truth.T_camera_base[1]
@@ -764,11 +764,11 @@ def evidence_there(reference_values, view):
     ).sum()
 
 
-def test_images_join_what_is_known(looked):
+def test_images_join_what_is_known(searched):
     """A board of the same machine costs the other images little; with another's readings it does
     not fit.
     """
-    session, images, poses, truth = looked
+    session, images, poses, truth = searched
     at = {p.station: p for p in images}
     places = dict(enumerate(truth.T_camera_base[:2]))
     drawn = PriorScene(session.machine, np.full((3, 4, 4), np.nan), poses)
@@ -790,9 +790,9 @@ def test_images_join_what_is_known(looked):
 
 
 @pytest.mark.slow
-def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
+def test_a_question_costs_the_same_however_many_are_placed(searched, monkeypatch):
     """Scoring is an estimate of one image, and no pose is scored twice."""
-    session, images, poses, truth = looked
+    session, images, poses, truth = searched
     at = {p.station: p for p in images}
     estimated = []
 
@@ -815,11 +815,11 @@ def test_a_question_costs_the_same_however_many_are_placed(looked, monkeypatch):
     np.testing.assert_array_equal(again.T_camera_base, one.T_camera_base)
 
 
-def test_a_board_on_the_base_weighs_places_together(looked):
+def test_a_board_on_the_base_weighs_places_together(searched):
     """Two images prefer poses with the same appearance, each another one; the board is in one place
     only.
     """
-    truth = looked[3].T_camera_base
+    truth = searched[3].T_camera_base
     turns = [
         pose(rotation(np.radians(a) * np.array([0.0, 0.0, 1.0])), np.zeros(3)) for a in (120, 240)
     ]

@@ -74,7 +74,7 @@ def pasted(text):
     return printers.Settings(float(config["printer"]["delta_radius"][0]), *each)
 
 
-def test_the_session_says_what_the_printer_felt(kit, true):
+def test_the_session_states_what_the_printer_felt(kit, true):
     printer = read_printer(kit.parent / "printer.cfg")
     np.testing.assert_allclose(printer.homed, SAYS.homed, atol=1e-9)
     assert printer.touches is not None
@@ -85,7 +85,7 @@ def test_the_session_says_what_the_printer_felt(kit, true):
     assert calibrate_session(kit).session.heights_alone
 
 
-def test_it_is_accepted_for_the_bed_and_says_what_it_is_not_good_for(kit):
+def test_it_is_accepted_for_the_bed_and_states_what_it_is_not_good_for(kit):
     saved = load(kit / "calibration")
     assert saved.verdict.usable
     bed = saved.document["bed"]
@@ -242,9 +242,9 @@ def test_what_one_parameter_explains_is_not_rejected(tmp_path, centre):
     """Seven heights, the radius 1.9 mm wrong: where the ring fits, the centre is 26 standard
     deviations off, and with the radius all fit.
     """
-    said(tmp_path, printers.printer_cfg(SMALL), "printer.cfg")
+    text_file(tmp_path, printers.printer_cfg(SMALL), "printer.cfg")
     write_printer_session(
-        tmp_path / "kit", tmp_path / "printer.cfg", said(tmp_path, BOWL, "probed.csv")
+        tmp_path / "kit", tmp_path / "printer.cfg", text_file(tmp_path, BOWL, "probed.csv")
     )
     if centre:
         with_tolerance(tmp_path / "kit", centre)
@@ -334,7 +334,7 @@ def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
 # ------------------------------------------------------------------ output of printers
 
 
-def said(folder, text, name="console.txt"):
+def text_file(folder, text, name="console.txt"):
     (folder / name).write_text(text)
     return folder / name
 
@@ -343,7 +343,7 @@ def said(folder, text, name="console.txt"):
 def cfg(tmp_path):
     """A printer.cfg without heights, whose probe is aside of the nozzle."""
     text = "[probe]\nx_offset: 12\ny_offset: -5.5\nz_offset: 1.25\n" + printers.printer_cfg(SAYS)
-    return said(tmp_path, text, "printer.cfg")
+    return text_file(tmp_path, text, "printer.cfg")
 
 
 PLACES = printers.bed(8)
@@ -360,8 +360,8 @@ def test_points_of_klippers_console(cfg):
     new = [f"// probe: at {x + 12:.3f},{y - 5.5:.3f} bed will contact at z={z:.6f}"
            for (x, y), z in zip(PLACES, Z, strict=True)]  # fmt: skip
     want = SAYS.carriages(np.column_stack([PLACES, Z]))
-    one = read_touches(said(folder, "Send: PROBE\n" + "\n".join(old)), printer)
-    other = read_touches(said(folder, "\n".join(new)), printer)
+    one = read_touches(text_file(folder, "Send: PROBE\n" + "\n".join(old)), printer)
+    other = read_touches(text_file(folder, "\n".join(new)), printer)
     np.testing.assert_allclose(one.carriages - 1.25, want, atol=1e-3)
     np.testing.assert_allclose(one.heights, 1.25)
     np.testing.assert_allclose(other.carriages, want, atol=1e-3)
@@ -372,7 +372,7 @@ END_A = "#*# position_endstop = 300.0\n"
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         (END_A, "position_endstop = 299.1\n", "found 'position_endstop = 299.1',"),
         (END_A, "#*#position_endstop = 299.1\n", "found '#*#position_endstop = 299.1',"),
@@ -380,13 +380,13 @@ END_A = "#*# position_endstop = 300.0\n"
         ("#*# <--", "# <--", "Put the header back"),
     ],
 )
-def test_saved_lines_that_klipper_would_drop_are_told(tmp_path, old, new, told):
+def test_saved_lines_that_klipper_would_drop_are_reported(tmp_path, old, new, message):
     text = printers.printer_cfg(SAYS)
     spoilt = text.replace(old, new, 1)
     assert spoilt != text
     with pytest.raises(InputError, match="Klipper drops all that SAVE_CONFIG wrote") as error:
-        read_printer(said(tmp_path, spoilt, "printer.cfg"))
-    assert told in str(error.value)
+        read_printer(text_file(tmp_path, spoilt, "printer.cfg"))
+    assert message in str(error.value)
     # for a missing header the following line is reported
     above = spoilt[: spoilt.index(new)].count("\n") + new.startswith("# <")
     assert f"line {above + 1}:" in str(error.value)
@@ -416,7 +416,7 @@ def test_a_board_on_a_printer(cfg):
     assert "board.yaml is still the example" in untouched
 
 
-def test_the_drawing_of_a_printer_is_simulated(cfg):
+def test_the_nominal_model_of_a_printer_is_simulated(cfg):
     """Its rods meet in one point, all that a firmware has of the platform."""
     run("new", cfg.parent / "kit", "--printer", cfg, "--board")
     nominal = load_mechanism(cfg.parent / "kit" / "mechanism.yaml")
@@ -439,7 +439,7 @@ def reprap_settings():
 
 
 def test_points_of_reprapfirmware(tmp_path):
-    printer = read_printer(said(tmp_path, REPRAP, "config.g"))
+    printer = read_printer(text_file(tmp_path, REPRAP, "config.g"))
     settings = reprap_settings()
     np.testing.assert_allclose(printer.homed, settings.homed, atol=1e-9)
     tilt = (0.1 * PLACES[:, 0] - 0.2 * PLACES[:, 1]) / 100
@@ -448,20 +448,20 @@ def test_points_of_reprapfirmware(tmp_path):
     lines[-1] += " S-1"
     heights = " ".join(f"{z:.3f}" for z in Z)
     text = "\n".join([*lines, f"G32 bed probe heights: {heights}, mean 0.05, deviation 0.2"])
-    values = read_touches(said(tmp_path, text), printer)
+    values = read_touches(text_file(tmp_path, text), printer)
     np.testing.assert_allclose(values.carriages, want, atol=2e-3)
 
 
 def test_points_of_a_height_map(tmp_path):
     """Rows go along y, a plain 0 was not probed, a height of 0.000 was."""
-    printer = read_printer(said(tmp_path, REPRAP.replace(" A0.1 B-0.2", ""), "config.g"))
+    printer = read_printer(text_file(tmp_path, REPRAP.replace(" A0.1 B-0.2", ""), "config.g"))
     text = (
         "RepRapFirmware height map file v2 generated at 2026-11-23 10:00, min error -0.1\n"
         "axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1\n"
         "X,Y,-40.00,40.00,-30.00,30.00,50.00,40.00,30.00,3,3\n"
         "      0,  0.010,      0\n  0.020,  0.000, -0.030\n  0.040,  0.050,      0\n"
     )
-    results = read_touches(said(tmp_path, text, "heightmap.csv"), printer)
+    results = read_touches(text_file(tmp_path, text, "heightmap.csv"), printer)
     points = [(0, -30, 0.01), (-40, 0, 0.02), (0, 0, 0), (40, 0, -0.03), (-40, 30, 0.04),
               (0, 30, 0.05)]  # fmt: skip
     want = reprap_settings().carriages(np.array(points, dtype=float))
@@ -469,13 +469,13 @@ def test_points_of_a_height_map(tmp_path):
     old = text.replace("axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1",
                        "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum")  # fmt: skip
     old = old.replace("X,Y,-40", "-40")
-    same = read_touches(said(tmp_path, old, "heightmap.csv"), printer)
+    same = read_touches(text_file(tmp_path, old, "heightmap.csv"), printer)
     np.testing.assert_allclose(same.carriages, want, atol=1e-9)
 
 
 def test_a_table_of_points(cfg):
     rows = "\n".join(f"{k},{x:.4f},{y:.4f},{0.002 * x:.4f}" for k, (x, y) in enumerate(PLACES))
-    path = said(cfg.parent, "configuration,x [mm],y [mm],z [mm]\n" + rows, "points.csv")
+    path = text_file(cfg.parent, "configuration,x [mm],y [mm],z [mm]\n" + rows, "points.csv")
     done = run("new", cfg.parent / "kit", "--printer", cfg, "--probed", path, "--json")
     assert done.code == 0, done.err
     assert sorted(done.json["files"]) == [
@@ -493,14 +493,14 @@ def test_a_step_is_what_the_motor_makes_of_it(true, tmp_path):
     head, tail = text.split("[stepper_b]", 1)
     first = head + "[stepper_b]" + tail.replace("microsteps: 16\nrotation_distance: 40\n", "")
     for kind in (text, geared, fine, first):
-        printer = read_printer(said(tmp_path, kind, "printer.cfg"))
+        printer = read_printer(text_file(tmp_path, kind, "printer.cfg"))
         np.testing.assert_allclose(printer.touches.carriages, readings, atol=1e-5)
 
 
 def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
     """config.g and heightmap.csv to M665 and M666, which put Z 0 on the bed; no file of ours is
     read in between."""
-    config = said(tmp_path, "M665 L270 R105 H300 B90\nM666 X0 Y0 Z0\n", "config.g")
+    config = text_file(tmp_path, "M665 L270 R105 H300 B90\nM666 X0 Y0 Z0\n", "config.g")
     x, y = (v.ravel() for v in np.meshgrid(np.linspace(-60, 60, 5), np.linspace(-60, 60, 5)))
     z = np.zeros(25)
     for _ in range(8):  # lowered until it touches
@@ -513,7 +513,7 @@ def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
         "axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1\n"
         f"X,Y,-60.00,60.00,-60.00,60.00,90.00,30.00,30.00,5,5\n{rows}"
     )
-    probed = said(tmp_path, text, "heightmap.csv")
+    probed = text_file(tmp_path, text, "heightmap.csv")
     done = run("new", tmp_path / "kit", "--printer", config, "--probed", probed)
     assert done.code == 0, done.err
     assert "--to reprap" in (tmp_path / "kit" / "session.yaml").read_text()
@@ -576,8 +576,8 @@ WRONG_PRINTERS = {
 
 
 @pytest.mark.parametrize("text", WRONG_PRINTERS, ids=WRONG_PRINTERS.values())
-def test_a_printers_file_that_tells_too_little(text, tmp_path):
-    path = said(tmp_path, text, "printer.cfg")
+def test_a_printers_file_with_too_little_in_it(text, tmp_path):
+    path = text_file(tmp_path, text, "printer.cfg")
     done = run("new", tmp_path / "kit", "--printer", path)
     assert done.code == 2
     assert WRONG_PRINTERS[text] in " ".join(done.err.split())
@@ -596,7 +596,7 @@ def test_what_no_printer_has_is_refused_with_its_line(name, value, tmp_path):
     section = "[printer]" if key in ("delta_radius", "print_radius") else "[stepper_a]"
     at = lines.index(section) + 1
     spoilt = [*lines[:at], f"{key}: {right.replace('1', value, 1) if ':' in right else value}"]
-    path = said(tmp_path, "\n".join([*spoilt, *lines[at:]]), "printer.cfg")
+    path = text_file(tmp_path, "\n".join([*spoilt, *lines[at:]]), "printer.cfg")
     done = run("new", tmp_path / "kit", "--printer", path)
     assert done.code == 2
     assert f"printer.cfg, line {at + 1}, {section}" in " ".join(done.err.split())
@@ -608,7 +608,9 @@ def test_what_no_printer_has_is_refused_with_its_line(name, value, tmp_path):
 def test_what_no_reprapfirmware_printer_has_is_refused_with_its_line(letter, value, tmp_path):
     words = {"L": "270", "R": "105", "H": "300", "B": "90", letter: value}
     text = "G28\nM665 " + " ".join(f"{k}{v}" for k, v in words.items()) + "\n"
-    done = run("new", tmp_path / "kit", "--printer", said(tmp_path, text, "config.g"), "--board")
+    done = run(
+        "new", tmp_path / "kit", "--printer", text_file(tmp_path, text, "config.g"), "--board"
+    )
     assert done.code == 2
     assert letter in done.err
 
@@ -627,14 +629,14 @@ WRONG_POINTS = {
 
 @pytest.mark.parametrize("text", WRONG_POINTS, ids=WRONG_POINTS.values())
 def test_points_that_cannot_be_read(text, cfg):
-    path = said(cfg.parent, text)
+    path = text_file(cfg.parent, text)
     done = run("new", cfg.parent / "kit", "--printer", cfg, "--probed", path)
     assert done.code == 2
     assert WRONG_POINTS[text] in " ".join(done.err.split())
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("--probed", "x"), "read with the printer's own values"),
         (("--printer", "x"), "the file does not exist"),
@@ -642,10 +644,10 @@ def test_points_that_cannot_be_read(text, cfg):
         (("--printer", "x", "--board", "--probed", "y"), "--probed besides"),
     ],
 )
-def test_options_that_do_not_go_together(words, told, tmp_path):
+def test_options_that_do_not_go_together(words, message, tmp_path):
     done = run("new", tmp_path / "kit", *words)
     assert done.code == 2
-    assert told in " ".join(done.err.split())
+    assert message in " ".join(done.err.split())
 
 
 def test_only_a_bed_is_level(kit, tmp_path):
@@ -659,7 +661,7 @@ def test_only_a_bed_is_level(kit, tmp_path):
         calibrate_session(folder)
 
 
-def test_what_calibrate_tells_programs(kit):
+def test_the_document_of_calibrate(kit):
     document = json.loads((kit / "calibration" / "calibration.json").read_text())
     assert document["bed"].keys() == {
         "radius", "sigma", "by_drawing", "sideways", "size", "z", "touches", "unnoticed",

@@ -38,7 +38,7 @@ from pkmcal.outcome.hypotheses import (
     rivals_of,
 )
 from pkmcal.session.load import load_session
-from test_pose_sessions import make, seen_poses, write_joints, write_poses
+from test_pose_sessions import make, measured_poses, write_joints, write_poses
 
 
 def named(code, subject="", log_prior=0.0, action="refuse"):
@@ -86,7 +86,7 @@ def test_the_cheapest_level_that_decides_is_the_last():
 
 
 @pytest.mark.parametrize("other", [OPTIONS.act, 2.0])
-def test_a_level_does_not_decide_between_explanations_that_it_cannot_tell_apart(other):
+def test_a_level_does_not_decide_between_explanations_that_it_cannot_distinguish(other):
     cheap, _ = level("cheap", {"a": OPTIONS.act + 1, "b": other})
     costly, given = level("costly", {"a": 1.0, "b": 20.0})
     ranked = posterior([named("a"), named("b")], [cheap, costly])
@@ -149,7 +149,7 @@ def test_nothing_is_decided_of_no_hypotheses():
     assert decide(posterior([], [one])) is None
 
 
-def test_an_estimate_weighs_what_it_explains_and_says_what_it_could_not_test():
+def test_an_estimate_weighs_what_it_explains_and_lists_what_it_could_not_test():
     misfits, failures = {"right": 1.0, "worse": 9.0, "poor": 4.0}, []
 
     def misfit(one):
@@ -323,7 +323,7 @@ def test_two_mistakes_are_named_together(tmp_path):
 def test_a_mistake_in_the_readings_hides_none_of_another_kind(tmp_path, name):
     """Two columns exchanged, and a target that moved on the platform."""
     made = make(tmp_path / "session", name, n=16)
-    in_view = seen_poses(made)
+    in_view = measured_poses(made)
     in_view[9:] = in_view[9:] @ perturb(np.eye(4), np.array([0.01, 0, 0.02, 0.002, 0, 0]))
     write_poses(made.folder, in_view)
     write_joints(made.folder, made.joints[:, [1, 0, *range(2, made.joints.shape[1])]])

@@ -45,14 +45,14 @@ def without_radii(machine):
     return replace(machine, parameters=table.with_roles(fixed=radii))
 
 
-def seen_by(session, legs):
+def visible_to(session, legs):
     """The session's measurements where station s sees only legs[s]."""
     edges = session.measurements.edges
     keep = np.array([j in legs[s] for j, s in zip(edges.leg, edges.station, strict=True)])
     return replace(session.measurements, edges=edges.select(keep))
 
 
-def told(machine, measurements, state):
+def rank_test(machine, measurements, state):
     """The rank test at a state."""
     assembled = assemble(machine, measurements, default_gauge(machine))
     info = Information(assembled.problem, batch_of(machine, assembled, state))
@@ -92,7 +92,7 @@ def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():
     for radii, lost in ((False, 6), (True, 7)):
         drawn = machine if radii else without_radii(machine)
         session = Session(drawn, settings=Settings(stations=2, configurations=8, tolerance=0.0))
-        count = told(drawn, session.measurements, session.state())
+        count = rank_test(drawn, session.measurements, session.state())
         assert len(count.unidentified) == lost
         frames = generators(machine.layout, machine.values) @ freedoms(drawn)
         unknown = np.linalg.qr(np.concatenate([frames, count.basis.T], axis=1))[0]
@@ -119,8 +119,8 @@ def test_one_camera_sees_four_legs_of_six():
     """Readings of all six, and the pose from the four, determine the two without images."""
     machine = hexapod()
     session = Session(machine, stations=1, configurations=20)
-    measurements = seen_by(session, [[0, 1, 2, 3]])
-    value = told(machine, measurements, session.state())
+    measurements = visible_to(session, [[0, 1, 2, 3]])
+    value = rank_test(machine, measurements, session.state())
     # for the two legs without images only the tubes are unidentified, two parameters each
     names = {n for d in value.unidentified for n in d.names}
     assert len(value.unidentified) == 4
@@ -136,8 +136,8 @@ def test_three_cameras_that_share_no_leg(board):
     machine = hexapod()
     boards = ("base",) if board else ()
     session = Session(machine, stations=3, configurations=2, boards=boards)
-    measurements = seen_by(session, [[0, 1], [2, 3], [4, 5]])
-    count = told(machine, measurements, session.state())
+    measurements = visible_to(session, [[0, 1], [2, 3], [4, 5]])
+    count = rank_test(machine, measurements, session.state())
     assert len(count.unidentified) == (0 if board else 12)
     estimate = bundle(machine, measurements, session.guess(np.random.default_rng(0), measurements))
     if not board:
@@ -152,7 +152,7 @@ def test_three_cameras_that_share_no_leg_and_the_four_steps():
     for boards in ((), ("base",)):
         settings = Settings(stations=2, configurations=15, shared=True, joint_noise=JOINT_NOISE)
         session = Session(machine, stations=2, boards=boards, settings=settings)
-        measurements = seen_by(session, [[0, 2, 4], [1, 3, 5]])
+        measurements = visible_to(session, [[0, 2, 4], [1, 3, 5]])
         if boards:
             state = four_step(machine, measurements)
             error = normalised_steps(machine, state, session.state())

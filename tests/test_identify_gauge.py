@@ -54,7 +54,7 @@ def test_constraints_hold_and_nothing_measurable_changes(gauge):
     np.testing.assert_allclose(again.theta, values.theta, atol=1e-14)
 
 
-def test_three_centres_as_the_design_says():
+def test_three_centres_as_the_design_states():
     rng = np.random.default_rng(1)
     scene = make_scene(rng)
     base = centre_index(scene.machine.layout)[0]

@@ -196,7 +196,7 @@ def test_a_station_with_two_legs_needs_its_pose():
     assert four_step_error(scene, values) < 0.03
 
 
-def test_a_leg_that_no_station_sees_is_told():
+def test_a_leg_that_no_station_sees_is_reported():
     _, machine, _, m = setup(12)
     part = replace(m, edges=m.edges.select(m.edges.leg != 4))
     with pytest.raises(ResultError, match="leg 5"):

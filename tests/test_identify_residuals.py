@@ -269,19 +269,19 @@ def test_reduced_rows_are_the_least_squares_of_the_unknowns_kept():
     assert len(queries) == len(rows) - problem.prior[:, machine].any(axis=1).sum()
 
 
-@pytest.mark.parametrize("way", [0.02, 1e-5])
-def test_a_long_step_ends_where_the_readings_allow_it(way):
+@pytest.mark.parametrize("direction", [0.02, 1e-5])
+def test_a_long_step_ends_where_the_readings_allow_it(direction):
     """Legs become longer where their ends go across: there poses are moved back, and only there."""
     rng = np.random.default_rng(14)
     assembled, state = make_scene(rng, configurations=4).batch(rng)
     problem, noise = assembled.problem, assembled.problem.joint_noise.min()
-    own = way * rng.normal(size=(1, 4, 6))
+    own = direction * rng.normal(size=(1, 4, 6))
     before = problem.closure(state).rows
     meant = before.value + (before.by_pose @ own[..., None])[..., 0]
     straight = replace(state, T_base_platform=perturb(state.T_base_platform, own))
     shifted = problem.retract(state, np.zeros((1, problem.unknowns.count)), own)
     bent = np.abs(problem.closure(straight).rows.value - meant).max() > 100 * noise
-    assert bent == (way > 1e-3)
+    assert bent == (direction > 1e-3)
     assert np.abs(problem.closure(shifted).rows.value - meant).max() < noise
     assert np.array_equal(shifted.T_base_platform, straight.T_base_platform) == (not bent)
 

@@ -29,7 +29,7 @@ from pkmcal.identify.score import OneStepUpdate, ScoreTests
 from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.outcome.hypotheses import Ranked, decide
 from pkmcal.report.calibration import save
-from test_calibration import check_found
+from test_calibration import check_calibration
 
 CUT = (32, 20)
 """Columns and rows that are cut from the images, which puts the camera's centre beside the middle.
@@ -70,7 +70,7 @@ def test_upside_down_images_are_known_by_their_cameras_centre(turned):
     The required certainty is tested below.
     """
     values = pkmcal.calibrate(turned)
-    check_found(values, turned, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
+    check_calibration(values, turned, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480)
     (hint,) = values.verdict.of("image.upside_down")
     assert hint.subject == "cameras/camera.yaml"
     assert hint.facts["stations"] == ("station1", "station2", "station3")
@@ -105,7 +105,7 @@ def test_upright_images_are_left_as_they_are(calibrated):
 
 
 @pytest.mark.slow
-def test_where_it_is_likely_it_is_said(demo, monkeypatch):
+def test_where_it_is_likely_it_is_stated(demo, monkeypatch):
     """And the images are measured as they are."""
 
     def likely(session, turns):
@@ -124,7 +124,7 @@ def test_where_it_is_likely_it_is_said(demo, monkeypatch):
     np.testing.assert_array_equal(results.session.stations[0].camera.parameters, own.parameters)
 
 
-def test_odds_that_are_too_few_are_said_with_what_to_do(calibrated):
+def test_odds_that_are_too_few_are_stated_with_what_to_do(calibrated):
     camera = calibrated.session.stations[0].camera.turned_by_half()
     one = Ranked(upside_down_images("cameras/camera.yaml", ["station1"], camera), np.log(376.0))
     finding = rotation_finding(one)
@@ -142,7 +142,7 @@ def lens(session, centre, covariance=None):
 
 
 @pytest.mark.parametrize(
-    ("values", "sigma", "known"),
+    ("values", "sigma", "decided"),
     [((0.0, 0.1, -0.1), 0.04, None), ((0.9, 1.1, 0.8), 0.12, True), ((0.9, 1.1, 0.8), 0.8, None),
      ((2.0, 2.1, 2.0), 0.1, None), ((1.0, 1.0, 0.0), 0.1, None), ((1.0, 0.3, 1.0), 0.3, True),
      ((1.0, 0.0, 0.0), np.array([0.1, np.inf, np.inf]), True), ((0.0, 0.0, 0.0), np.inf, None),
@@ -150,7 +150,7 @@ def lens(session, centre, covariance=None):
     ids=["upright", "upside down", "not told", "another camera", "one station is upright",
          "one tells little", "one alone tells", "none tells", "not sure"],
 )  # fmt: skip
-def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigma, known):
+def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigma, decided):
     sigmas = np.broadcast_to(sigma, 3)
     information = zip(values, sigmas, strict=True)
     fits = [OneStepUpdate(np.array([v]), np.array([s]), np.zeros(1)) for v, s in information]
@@ -160,21 +160,21 @@ def test_what_fits_has_to_be_sure_and_near(calibrated, monkeypatch, values, sigm
     results = upside_down(session, calibrated)
     subjects = [(one.hypothesis.subject, one.hypothesis.facts["stations"]) for one in results]
     expected = ("cameras/camera.yaml", ("station1", "station2", "station3"))
-    assert subjects == [expected] * (known is not None)
+    assert subjects == [expected] * (decided is not None)
     for one in results:
-        assert (decide([one]) is not None) == known
+        assert (decide([one]) is not None) == decided
         turned = one.hypothesis.camera.parameters
         np.testing.assert_array_equal(turned, camera.turned_by_half().parameters)
 
 
 @pytest.mark.parametrize(
-    ("centre", "sigma", "known"),
+    ("centre", "sigma", "decided"),
     [((8.0, -5.0), None, True), ((0.5, -0.5), None, False), ((0.0, 0.0), None, False),
      ((0.5, -0.5), 0.05, True), ((0.5, -0.5), 0.0, True), ((8.0, -5.0), 8.0, False)],
     ids=["beside the middle", "half a pixel beside", "in the middle", "known to less", "exactly",
          "not known"],
 )  # fmt: skip
-def test_a_file_may_be_wrong_by_what_it_says(calibrated, monkeypatch, centre, sigma, known):
+def test_a_file_may_be_wrong_by_what_it_states(calibrated, monkeypatch, centre, sigma, decided):
     """A centre that is half a pixel from the middle may be on the other side without any turn."""
     fit = OneStepUpdate(np.array([0.9]), np.array([0.05]), np.zeros(1))
     monkeypatch.setattr(ScoreTests, "fitted", lambda _, freed: [fit] * len(freed))
@@ -182,10 +182,10 @@ def test_a_file_may_be_wrong_by_what_it_says(calibrated, monkeypatch, centre, si
     covariance = None
     if sigma is not None:
         covariance = np.diag([1.0, 1.0, sigma**2, sigma**2] + [0.0] * (n - 4))
-    assert len(upside_down(lens(calibrated.session, centre, covariance), calibrated)) == known
+    assert len(upside_down(lens(calibrated.session, centre, covariance), calibrated)) == decided
 
 
-def test_the_file_that_is_told_is_the_one_that_is_written(turned_calibration, tmp_path):
+def test_the_file_that_is_named_is_the_one_that_is_written(turned_calibration, tmp_path):
     """Beside the result, where every loader of a calibration finds it; and as a fact for
     programs.
     """

@@ -261,7 +261,7 @@ def test_a_quarter_turn_is_singular_at_any_height(degrees, height):
     assert machine.forward_result(machine.inverse(T), T).singularity < 1e-14
 
 
-def test_nearness_to_a_singular_pose_is_told():
+def test_nearness_to_a_singular_pose_is_reported():
     """The singular value falls as the cosine of the yaw, so a tenth of a degree has a tenth."""
     machine = hexapod()
     near = [

@@ -79,7 +79,7 @@ def test_heights_flatten_the_bed_and_are_accepted_for_that(by_heights):
     assert (values.facts["sigma"], values.facts["size_sigma"]) == (bed.sideways, bed.size)
 
 
-def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
+def test_heights_do_not_separate_rods_from_radius_and_a_finding_states_it(tmp_path):
     """As few as the bed's four bends, which leave little over: warned of, and explained."""
     value = probe_kit(tmp_path / "session", n=7).calibrated()
     assert value.verdict.usable
@@ -102,7 +102,7 @@ def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
     assert not value.verdict.of("configurations.few")
 
 
-def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
+def test_what_looks_as_flat_is_what_the_sentence_states(by_heights):
     """Rods and radius changed as stated: the heights stay, x and y stretch as stated."""
     _, value = by_heights
     text = next(

@@ -23,7 +23,7 @@ from pkmcal.papers.methods import linear_estimate
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from test_identify_scene import exact
 
-DRAWING = exact("gough-stewart")
+NOMINAL = exact("gough-stewart")
 STATION = look_at(
     np.array([0.01, -0.02, 0.06]), np.array([0.01, -0.02, 0.4]), np.array([0, -1.0, 0])
 )
@@ -35,12 +35,12 @@ MIRROR = camera_models()["unified"](
 
 def true_machine(rng, share=1.0):
     """Machine with errors as large as the prior sigmas."""
-    table = DRAWING.parameters
+    table = NOMINAL.parameters
     off = share * table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
-    return DRAWING.with_values(table.nominal + table.free_matrix() @ off)
+    return NOMINAL.with_values(table.nominal + table.free_matrix() @ off)
 
 
-def seen(machine, rng, noise, configurations=12, shading=0.0):
+def measured_lines(machine, rng, noise, configurations=12, shading=0.0):
     """Edges in the mirror; shading (px) of each side of a tube by Student's t."""
     spread = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.04])
     poses = perturb(machine.home(), rng.uniform(-1, 1, (configurations, 6)) * spread)
@@ -66,12 +66,12 @@ def missed(value, truth):
 
 def leg_by_leg(measurements):
     """The paper's own: each leg alone, then the scale (16)."""
-    value = linear.centres(DRAWING, measurements, "robust").centres[0]
-    return value / linear.procrustes_scale(value, DRAWING.base_centers())
+    value = linear.centres(NOMINAL, measurements, "robust").centres[0]
+    return value / linear.procrustes_scale(value, NOMINAL.base_centers())
 
 
 def together(measurements):
-    return DRAWING.with_values(base_together(DRAWING, measurements).theta).base_centers()
+    return NOMINAL.with_values(base_together(NOMINAL, measurements).theta).base_centers()
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def scenes():
         rng = np.random.default_rng(seed)
         machine = true_machine(rng)
         noise = EdgeNoise(outward=0.3 * rng.normal(), wrong=0.03)
-        made.append((machine, seen(machine, rng, noise, shading=0.05)))
+        made.append((machine, measured_lines(machine, rng, noise, shading=0.05)))
     return made
 
 
@@ -93,12 +93,12 @@ def test_exact_edges_give_the_base_and_the_edge_shift():
     radii = truth.parameters.of_kind("radius")
     tolerance = np.ones(len(truth.values))
     tolerance[radii] = 1e-9
-    nominal = DRAWING.values.copy()
+    nominal = NOMINAL.values.copy()
     nominal[radii] = truth.values[radii]
-    table = replace(DRAWING.parameters, nominal=nominal, tolerance=tolerance)
-    machine = replace(DRAWING, parameters=table, values=nominal)
+    table = replace(NOMINAL.parameters, nominal=nominal, tolerance=tolerance)
+    machine = replace(NOMINAL, parameters=table, values=nominal)
     sharp = EdgeNoise(shift=1e-6, tilt=1e-6, outward=0.2)
-    measurements = seen(truth, rng, sharp)
+    measurements = measured_lines(truth, rng, sharp)
     stated = replace(measurements.edges, covariance=1e6 * measurements.edges.covariance)
     measurements = replace(measurements, edges=stated, shaded=False)
     value = base_together(machine, measurements)
@@ -118,7 +118,7 @@ def test_better_than_leg_by_leg(scenes):
             for machine, m in scenes
         ]
     )
-    drawn = [missed(DRAWING.base_centers(), machine.base_centers()) for machine, _ in scenes]
+    drawn = [missed(NOMINAL.base_centers(), machine.base_centers()) for machine, _ in scenes]
     rms = np.sqrt(np.mean(errors**2, axis=0))
     assert rms[0] < 0.8 * rms[1]
     assert rms[0] < 0.7 * np.sqrt(np.mean(np.square(drawn)))
@@ -130,7 +130,7 @@ def test_a_leg_that_is_lost_alone_is_not_lost_together():
     for seed in range(4):
         rng = np.random.default_rng(50 + seed)
         machine = true_machine(rng)
-        measurements = seen(machine, rng, EdgeNoise(wrong=0.4), shading=0.05)
+        measurements = measured_lines(machine, rng, EdgeNoise(wrong=0.4), shading=0.05)
         alone.append(missed(leg_by_leg(measurements), machine.base_centers()))
         both.append(missed(together(measurements), machine.base_centers()))
     assert max(alone) > 10e-3
@@ -141,7 +141,7 @@ def test_one_side_of_a_tube_two_pixels_off():
     """A highlight's border along a whole tube: its leg alone is put a centimetre off."""
     rng = np.random.default_rng(5)
     machine = true_machine(rng)
-    measurements = seen(machine, rng, EdgeNoise())
+    measurements = measured_lines(machine, rng, EdgeNoise())
     edges = measurements.edges
     off = (edges.leg == 2) & (edges.tube == 0) & (edges.side == 1)
     measurements = replace(measurements, edges=shifted(edges, -2.0 * off[:, None]))
@@ -167,7 +167,7 @@ def test_deviations_are_true_for_base_platform_and_lengths(scenes):
     """Standard deviations match the errors; nominal parameters keep their prior sigmas."""
     squares, shifts, count = [], [], 0
     for machine, measurements in scenes:
-        estimate = linear_estimate(DRAWING, measurements)
+        estimate = linear_estimate(NOMINAL, measurements)
         values = _laid_on(machine, estimate.machine)
         square, numbers = chi2(values, estimate.state.theta, estimate.covariance, estimate.machine)
         squares.append(square)
@@ -191,10 +191,10 @@ def _laid_on(machine, value):
     return values
 
 
-def test_verdict_says_how_far_the_method_goes(scenes):
+def test_verdict_states_how_far_the_method_goes(scenes):
     """Base joints by edges, by the nominal model and by both: figures, and the better method."""
     machine, measurements = scenes[0]
-    estimate = linear_estimate(DRAWING, measurements)
+    estimate = linear_estimate(NOMINAL, measurements)
     observation = Observation(
         measurements.edges,
         (),
@@ -218,17 +218,17 @@ def test_verdict_says_how_far_the_method_goes(scenes):
     assert both == pytest.approx(1e3 * np.sqrt(spread.mean()), rel=0.05)
 
 
-def test_few_legs_are_told():
+def test_few_legs_are_reported():
     machine = true_machine(np.random.default_rng(0))
-    measurements = seen(machine, np.random.default_rng(0), EdgeNoise())
+    measurements = measured_lines(machine, np.random.default_rng(0), EdgeNoise())
     edges = measurements.edges
     few = replace(measurements, edges=edges.select(edges.leg < 2))
     with pytest.raises(ResultError, match=r"needs three legs.*2 legs"):
-        base_together(DRAWING, few)
+        base_together(NOMINAL, few)
 
 
-def test_joints_that_move_are_told():
+def test_joints_that_move_are_reported():
     machine = pkmcal.load_mechanism("6-rus")
-    measurements = seen(DRAWING, np.random.default_rng(0), EdgeNoise())
+    measurements = measured_lines(NOMINAL, np.random.default_rng(0), EdgeNoise())
     with pytest.raises(ResultError, match="turn about points of the base"):
         base_together(machine, measurements)

@@ -207,7 +207,7 @@ def test_covariance_and_step_are_those_of_the_whole_problem(machine, case):
     assert freedom[2] == pytest.approx(remainder[:, problem.closure_rows].sum(), rel=1e-4)
 
 
-def test_pieces_say_what_the_whole_says(case, monkeypatch):
+def test_pieces_say_what_the_whole_states(case, monkeypatch):
     """With three configurations at a time, links lead from one piece into another."""
     assembled, state, _ = case
     problem = assembled.problem

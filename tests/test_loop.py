@@ -19,7 +19,7 @@ MACHINE = load_mechanism("gough-stewart")
 HOME = MACHINE.home()
 READINGS = MACHINE.inverse(HOME[None])[0]
 GOAL = perturb(HOME, np.array([0.05, -0.04, 0.08, 0.012, -0.01, 0.015]))
-SEEN = machine_view(MACHINE, BESIDE)
+VIEW = machine_view(MACHINE, BESIDE)
 WITH_TUBES = [n for n in catalogue() if any(g.tubes for g in load_mechanism(n).document.legs)]
 
 
@@ -28,7 +28,7 @@ def servo(goal=GOAL, machine=MACHINE, **options) -> VisualServo:
 
 
 def edges(T_base_platform=HOME):
-    return true_edges(SEEN, T_base_platform)
+    return true_edges(VIEW, T_base_platform)
 
 
 def stopped(step) -> bool:
@@ -75,8 +75,8 @@ def test_the_first_step_is_the_laws_own():
     from pkmcal.control.laws import joint_velocities
 
     step = servo(gain=0.7).step_edges(edges(), READINGS)
-    goal = true_edges(SEEN, GOAL)
-    expected = joint_velocities("edges", SEEN, edges(), goal, READINGS, 0.7)
+    goal = true_edges(VIEW, GOAL)
+    expected = joint_velocities("edges", VIEW, edges(), goal, READINGS, 0.7)
     np.testing.assert_allclose(step.joint_velocities, expected, rtol=1e-9)
     np.testing.assert_allclose(step.joint_velocities, -0.7 * step.remaining, rtol=1e-12)
     assert np.isnan(step.sigma).all()
@@ -96,7 +96,7 @@ def test_rate_limits_slow_all_motors_together():
 
 
 def test_edges_are_a_goal_as_well():
-    step = servo(true_edges(SEEN, GOAL)).step_edges(edges(), READINGS)
+    step = servo(true_edges(VIEW, GOAL)).step_edges(edges(), READINGS)
     np.testing.assert_allclose(
         step.joint_velocities, servo().step_edges(edges(), READINGS).joint_velocities, atol=1e-12
     )
@@ -106,7 +106,7 @@ def test_a_lost_leg_is_done_without():
     loop = servo(gain=0.5)
     pose, readings = HOME, READINGS.copy()
     for k in range(24):
-        in_view = true_edges(SEEN, pose)
+        in_view = true_edges(VIEW, pose)
         if k > 2:
             in_view[1] = np.nan
         step = loop.step_edges(in_view, readings)
@@ -143,7 +143,7 @@ def other_assembly():
     return above[0]
 
 
-def test_a_wrong_assembly_at_the_start_is_told_from_the_right_one():
+def test_a_wrong_assembly_at_the_start_is_distinguished_from_the_right_one():
     mode = other_assembly()
     step = servo().step_edges(edges(mode), READINGS)
     assert stopped(step)
@@ -165,7 +165,7 @@ def test_legs_of_no_assembly_at_all_are_no_start():
 
 def test_a_goal_on_the_other_side_is_too_far():
     below = perturb(HOME, np.array([0, 0, 0, 0, 0, -2 * HOME[2, 3]]))
-    step = servo(true_edges(SEEN, below)).step_edges(edges(), READINGS)
+    step = servo(true_edges(VIEW, below)).step_edges(edges(), READINGS)
     assert stopped(step)
     assert step.status is Status.TOO_FAR
     assert "90 degrees" in step.sentence
@@ -295,7 +295,7 @@ def test_images_lead_to_the_goal_and_past_a_painted_leg(view):
     assert np.nanmax(np.abs(step.remaining) / step.sigma) < 5
 
 
-def test_an_image_is_a_goal_and_a_wrong_start_is_said():
+def test_an_image_is_a_goal_and_a_wrong_start_is_stated():
     lab = Lab(MACHINE, PERSPECTIVE, BESIDE)
     image = lab.image(HOME, READINGS)
     loop = VisualServo(MACHINE, PERSPECTIVE, BESIDE, GoalImage(image, READINGS))

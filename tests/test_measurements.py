@@ -165,7 +165,7 @@ def test_words_of_a_kind(kind):
     assert len({other.one for _, other in KINDS}) == len(KINDS)
 
 
-def test_headers_tell_the_kinds_of_tables_apart():
+def test_headers_distinguish_the_kinds_of_tables():
     headers = [set(h) for kind in kinds_of(TargetKind).values() for h in kind.headers]
     assert all(headers.count(h) == 1 for h in headers)
 

@@ -118,7 +118,7 @@ def test_parameter_names_are_paths_in_the_file(machine):
         assert [at_path(document, name) for name in names] == values.tolist()
 
 
-def test_every_number_of_the_drawing_is_a_parameter():
+def test_every_number_of_the_nominal_model_is_a_parameter():
     """A hexapod's file holds 6 (3 + 3 + 1) kinematic numbers, a scale and two radii a leg."""
     machine = load_mechanism("gough-stewart")
     table = machine.parameters
@@ -152,7 +152,7 @@ legs:
 """
 
 
-def test_what_a_machine_tells():
+def test_properties_of_a_machine():
     machine = read(SMALL)
     assert (machine.n_legs, machine.n_joints) == (3, 2)
     np.testing.assert_array_equal(
@@ -252,7 +252,7 @@ def test_roles_in_a_file():
     assert third is None
 
 
-def test_an_unknown_name_is_told_with_the_nearest():
+def test_an_unknown_name_is_reported_with_the_nearest():
     with pytest.raises(InputError) as caught:
         roles(fixed=("legs[1].length.ofset",))
     assert str(caught.value) == (
@@ -423,7 +423,7 @@ def refused(source):
 
 
 @pytest.mark.parametrize(
-    ("text", "instead", "place", "known"),
+    ("text", "instead", "place", "expected"),
     [
         ("joint: spherical", "joint: ball", "m.yaml, line 4, legs[1].base", base_carriers()),
         (
@@ -435,14 +435,14 @@ def refused(source):
         ("motion: planar", "motion: flat", "m.yaml, line 2, motion", MOTION_DIRECTIONS),
     ],
 )
-def test_kinds_that_are_not_known_are_told_with_those_that_are(
-    tmp_path, text, instead, place, known
+def test_kinds_that_are_not_known_are_reported_with_those_that_are(
+    tmp_path, text, instead, place, expected
 ):
     (tmp_path / "m.yaml").write_text(SMALL.replace(text, instead, 1))
     message = refused(tmp_path / "m.yaml")
     assert message.startswith(place)
     assert instead.split()[-1] in message
-    assert all(name in message for name in known)
+    assert all(name in message for name in expected)
 
 
 def test_a_machine_has_two_legs_and_one_that_is_driven(tmp_path):

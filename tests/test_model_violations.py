@@ -137,7 +137,7 @@ def test_a_scale_beyond_its_tolerance_is_found_whole():
     assert abs(present * fit.value[0] - 1e-2) < 4 * np.hypot(fit.sigma[0], 5e-4)
 
 
-def test_play_and_a_pushed_camera_are_told_from_each_other():
+def test_play_and_a_pushed_camera_are_distinguished_from_each_other():
     nominal, data, where = measured(2, play=(4, 4e-4))
     _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
     assert [k for k, _ in tests.significant()] == [6 + 4]
@@ -151,7 +151,7 @@ def test_play_and_a_pushed_camera_are_told_from_each_other():
     assert np.all(np.abs(off) < 4 * fit.sigma + 0.05 * np.abs(step))
 
 
-def test_two_departures_are_found_one_after_the_other():
+def test_two_violations_are_found_one_after_the_other():
     nominal, data, where = measured(4, scale=(0, 4e-3), play=(3, 5e-4))
     _, tests = score_tests(nominal, data, where, scales(data) + plays(data), True)
     assert {k for k, _ in tests.significant()} == {0, 6 + 3}
@@ -237,7 +237,7 @@ def test_right_sessions_have_chances_like_dice():
     assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
 
 
-def test_errors_of_whole_configurations_are_no_departure():
+def test_errors_of_whole_configurations_are_no_violation():
     """Random errors of one reading, far larger than its noise, along a scale's column: without the
     scatter over configurations in the test, a scale would be reported.
     """
@@ -293,7 +293,7 @@ def test_what_is_seen_beside_what_is_not_keeps_its_deviation():
     assert np.isfinite(beside[1].sigma).tolist() == [True, False]
 
 
-def test_a_ratio_without_a_deviation_is_told_roughly():
+def test_a_ratio_without_a_deviation_is_reported_roughly():
     assert ratio_in_per_cent(-0.0042, np.inf) == "some 0.4 %"
     assert ratio_in_per_cent(0.00952, 0.0011) == "0.95 ± 0.11 %"
 

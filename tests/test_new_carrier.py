@@ -192,7 +192,7 @@ def test_it_is_a_machine_with_the_carriers_parameters(machine, folder):
     np.testing.assert_array_equal(load_mechanism(folder / "again.yaml").values, machine.values)
 
 
-def test_faults_of_its_fields_are_told_as_others_are(machine, folder):
+def test_faults_of_its_fields_are_reported_as_others_are(machine, folder):
     text = mechanism_text(machine).replace("arm: [", "arms: [", 1)
     (folder / "fault.yaml").write_text(text)
     with pytest.raises(InputError, match=r"fault.yaml, line \d+, legs\[1\].base.arms: this key is"):
@@ -338,7 +338,7 @@ def test_a_session_calibrates_to_the_truth(machine, calibrated):
     assert after < before / 5
 
 
-def test_what_data_leave_open_is_said(machine, calibrated):
+def test_what_data_leave_open_is_stated(machine, calibrated):
     """A centre may slide along its axis, with the arm sliding back: one direction a leg."""
     _, measurements, estimate = calibrated
     assembled = assemble(machine, measurements, default_gauge(machine))

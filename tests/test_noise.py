@@ -142,7 +142,7 @@ def test_a_noise_that_is_stated_right_is_left_alone():
     assert np.sum(values.reading_scale != 1) <= 2
 
 
-def test_where_the_data_cannot_tell_nothing_is_claimed():
+def test_where_the_data_cannot_decide_nothing_is_claimed():
     """Edges determine the platform to some ten micrometres: they do not show whether readings have
     errors of three micrometres or of three hundredths, and it makes no difference.
     """
@@ -154,7 +154,7 @@ def test_where_the_data_cannot_tell_nothing_is_claimed():
     assert np.all(high > 100)
 
 
-def test_too_few_degrees_of_freedom_tell_nothing():
+def test_too_few_degrees_of_freedom_decide_nothing():
     few = np.ones((1, 4))
     for z in (0.0, 100.0):
         shares = NoiseShares(z * few, few, 0 * few, 0 * few)
@@ -162,7 +162,7 @@ def test_too_few_degrees_of_freedom_tell_nothing():
         assert not shares.contradicts()
 
 
-def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
+def test_a_table_whose_noise_is_stated_too_large_is_reported(tmp_path):
     """But not used: errors common to all of a tracker's measurements do not scatter."""
     folder = make(tmp_path / "session", "gough-stewart", "poses").folder
     text = (folder / "session.yaml").read_text(encoding="utf-8")

@@ -65,7 +65,7 @@ def test_colour_and_sixteen_bits_become_grey(tmp_path):
     ("suffix", "bits", "times"), [("png", 12, 16), ("tiff", 12, 16), ("pgm", 12, 16),
                                   ("png", 10, 64), ("png", 8, 256)],
 )  # fmt: skip
-def test_twelve_bits_in_sixteen_are_told_as_such(tmp_path, suffix, bits, times):
+def test_twelve_bits_in_sixteen_are_reported_as_such(tmp_path, suffix, bits, times):
     levels = np.linspace(0, 2**bits - 1, 48).astype(np.uint16).reshape(6, 8)
     path = tmp_path / f"a.{suffix}"
     assert cv2.imwrite(str(path), levels)
@@ -114,7 +114,7 @@ PNG, JPEG = encoded(".png"), encoded(".jpg")
 
 
 @pytest.mark.parametrize(
-    ("data", "found"),
+    ("data", "reason"),
     [
         pytest.param(PNG[: len(PNG) // 2], "a PNG file that ends early", id="half a PNG"),
         pytest.param(PNG[:-12], "a PNG file that ends early", id="PNG without its end"),
@@ -129,8 +129,8 @@ PNG, JPEG = encoded(".png"), encoded(".jpg")
         ),
     ],
 )
-def test_files_that_cannot_be_decoded(tmp_path, data, found):
-    assert sentence(tmp_path, data) == CUT.format(found=found)
+def test_files_that_cannot_be_decoded(tmp_path, data, reason):
+    assert sentence(tmp_path, data) == CUT.format(reason=reason)
 
 
 @pytest.mark.parametrize("data", [
@@ -144,7 +144,7 @@ def with_chunk(kind, body, data=PNG):
     return data[:33] + chunk(kind, body) + data[33:]
 
 
-def test_what_decoders_say_is_told_in_a_sentence_of_ours_alone(tmp_path, capfd):
+def test_messages_of_decoders_become_one_sentence(tmp_path, capfd):
     rows = zlib.decompress(png_rows(PNG))
     odd, cut = (
         png_of(64, 48).replace(chunk(b"IDAT", zlib.compress(b"0" * 100)), chunk(b"IDAT", held))
@@ -161,7 +161,7 @@ def test_what_decoders_say_is_told_in_a_sentence_of_ours_alone(tmp_path, capfd):
         (cut, "a PNG file that ends early"),
         (short, "a JPEG file that is damaged (its scan ends early)"),
     ):
-        assert sentence(tmp_path, data) == CUT.format(found=item)
+        assert sentence(tmp_path, data) == CUT.format(reason=item)
     assert capfd.readouterr() == ("", "")
 
 
@@ -229,7 +229,7 @@ def several(tmp_path, count=4):
     return paths, [path.name for path in paths]
 
 
-def test_several_keep_their_order_and_the_first_fault_is_told(tmp_path):
+def test_several_keep_their_order_and_the_first_fault_is_reported(tmp_path):
     paths, labels = several(tmp_path)
     images = Pictures.read(paths, SIZE, labels, 2)
     assert [int(image[0, 0]) for image in images] == [0, 10, 20, 30]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.observe import legs as looks
+from pkmcal.observe import legs as leg_edges
 from pkmcal.observe.grey_levels import levels_at
 from pkmcal.observe.image_batches import ImageWindow, Placed, StationImages
 from pkmcal.observe.legs import (
@@ -22,7 +22,7 @@ from pkmcal.observe.profiles import (
     edge_set,
     fit_edges,
 )
-from test_observe_drawing import (
+from test_observe_rendered_legs import (
     FRONT,
     camera_of,
     draw,
@@ -88,7 +88,7 @@ def test_profiles_are_one_a_pixel_of_what_is_clear():
     """
     mechanism, camera = redrawn(0, 0.0005), camera_of()
     visible = ImageWindow.of([Placed(taken(), FRONT, poses())])
-    tubes, points, clear = looks.predicted(
+    tubes, points, clear = leg_edges.predicted(
         visible, mechanism, EDGE_OPTIONS.segments * EDGE_OPTIONS.segment_points
     )
     clear[:, :, 7] = False
@@ -177,7 +177,7 @@ def test_spans_lie_on_the_tubes():
     assert np.all(edges.span[:, 1] - edges.span[:, 0] > 0.02)
 
 
-def test_a_known_blur_is_used_and_told():
+def test_a_known_blur_is_used_and_reported():
     count = measure(taken(), machine(), FRONT, poses(), blur=0.7)
     assert count.blur == 0.7
     assert rms(errors(count.edges)[0]) < 0.05
@@ -236,7 +236,7 @@ def test_exact_positions_give_the_exact_plane():
     assert np.abs(shift).max() < 3e-3
 
 
-def test_a_common_shift_of_all_points_is_what_shift_says():
+def test_a_common_shift_of_all_points_is_what_shift_states():
     """The plane's change by a pixel outward at every point, for a lens with distortion."""
     tubes, points = predicted()
     still = fitted(np.zeros(points.along.shape))[1]

@@ -17,15 +17,15 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
-from test_observe_drawing import (
+from test_observe_rendered_legs import (
     FRONT,
     camera_of,
+    drawn_image,
     machine,
     meet,
     outward_to,
     poses,
     redrawn,
-    shown,
     true_normals,
     tubes_at,
 )
@@ -48,7 +48,7 @@ def beside(legs, tubes, rays):
     return np.abs(np.sum(a * across, axis=-1)) / np.linalg.norm(across, axis=-1)
 
 
-def test_every_tube_of_the_drawing_has_two_edges():
+def test_every_tube_of_the_nominal_model_has_two_edges():
     tubes = tubes_of(machine())
     assert len(tubes) == 6 * 2 * 2
     names = [
@@ -109,7 +109,7 @@ def test_across_is_the_outward_motion_by_the_point():
 
 
 @pytest.mark.parametrize("distorted", [False, True])
-def test_by_normal_tells_where_a_turned_edge_passes(distorted):
+def test_by_normal_predicts_where_a_turned_edge_passes(distorted):
     """Against cylinders moved and widened by hundredths of a millimetre: up to 0.05 px, found on
     the image by secants; the second order is a ten-thousandth of it.
     """
@@ -173,7 +173,7 @@ def outline_away(shape, tubes, points, k):
     x, y = np.rint(points.pixel[k]).astype(int).clip(0, (639, 479)).transpose(2, 0, 1)
     for other in range(machine().n_legs):
         alone = [t for t in tubes_at(machine(), poses()[k]) if t.leg == other]
-        mask = shown(shape(alone)) >= 0
+        mask = drawn_image(shape(alone)) >= 0
         signed = distance_transform_edt(~mask) - distance_transform_edt(mask)
         mine = (tubes.leg == other)[:, None]
         away = np.where(~mine & (np.abs(signed[y, x]) < np.abs(away)), signed[y, x], away)

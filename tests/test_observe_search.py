@@ -26,7 +26,7 @@ from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_stati
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import camera_of_size
-from test_observe_drawing import (
+from test_observe_rendered_legs import (
     FRONT,
     camera_of,
     draw,
@@ -49,7 +49,7 @@ def images():
 # Legs
 
 
-def looked_for(mechanism, pictures, samples=12):
+def located(mechanism, pictures, samples=12):
     """Legs searched from a mechanism's prediction, and where their edges really are.
 
     Returns the places, found and true outward positions (K, E, n) px, and which count.
@@ -70,14 +70,14 @@ def looked_for(mechanism, pictures, samples=12):
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.001, 0.002, 0.004])
-def test_legs_are_found_where_a_wrong_drawing_does_not_put_them(spread):
+def test_legs_are_found_where_a_wrong_nominal_model_does_not_put_them(spread):
     """Nominal errors of up to 4 mm shift and tilt legs by up to ten pixels: found to 0.6 px.
 
     Shifts are tried by whole pixels and tilts too, so 0.3 px each is the best possible.
     """
     shifts = []
     for seed in range(2):
-        places, value, truth, counted = looked_for(redrawn(seed, spread), images())
+        places, value, truth, counted = located(redrawn(seed, spread), images())
         assert places.clear.mean() > 0.8
         off = (value - truth)[counted]
         assert np.sqrt(np.mean(off**2)) < 0.6
@@ -89,7 +89,7 @@ def test_legs_are_found_where_a_wrong_drawing_does_not_put_them(spread):
 def test_a_leg_that_is_not_there_is_not_found():
     """The image without leg 3: the others are found as before, leg 3 is nowhere clear."""
     without = [draw([t for t in tubes_at(machine(), T) if t.leg != 2])[0] for T in poses()[:3]]
-    places, value, truth, counted = looked_for(redrawn(0, 0.001), without)
+    places, value, truth, counted = located(redrawn(0, 0.001), without)
     assert not places.clear[:, 2].any()
     assert places.clear[:, [0, 1, 3, 4, 5]].mean() > 0.7
     assert np.sqrt(np.mean((value - truth)[counted] ** 2)) < 0.6
@@ -100,7 +100,7 @@ def test_a_leg_beyond_the_search_is_not_found():
     legs meet their neighbours' edges instead."""
     far = int(LEG_SEARCH_OPTIONS.reach) + 6
     shifted = [np.roll(image, far, axis=1) for image in images()]
-    assert looked_for(machine(), shifted)[0].clear.mean() < 0.35
+    assert located(machine(), shifted)[0].clear.mean() < 0.35
 
 
 def test_what_a_search_gives_and_why_it_leaves_legs_out():
@@ -226,7 +226,7 @@ def test_turned_images_are_found_from_nothing(turn):
     assert inconsistent_poses(inverse(turned) @ localization.T_camera_base) < 5
 
 
-def test_one_image_says_where_but_not_that_it_is_the_machine():
+def test_one_image_gives_a_pose_but_does_not_identify_the_machine():
     """From one image the pose is right; no other image confirms it."""
     localization = find_station(view_of(images()[:1]), None, np.random.default_rng(0))
     assert inconsistent_poses(localization.T_camera_base) < 5
@@ -285,7 +285,7 @@ def test_edges_behind_the_camera_count_as_not_found():
     assert half > 0.8
 
 
-def test_a_drawing_that_is_2_mm_wrong_is_recognised():
+def test_a_nominal_model_that_is_2_mm_wrong_is_localized():
     view = view_of(images(), redrawn(5, 0.002))
     localization = find_station(view, rough_pose(9), np.random.default_rng(9))
     assert localization.good
@@ -329,14 +329,14 @@ def sticks(rng):
      *(often(scene, 2) for scene in (blank, noisy, texture, clouds)),
      *(often(scene, 6) for scene in (blank, noisy, texture, clouds, sticks))],
 )  # fmt: skip
-def test_images_of_something_else_are_not_recognised(scene, count):
+def test_images_of_something_else_are_not_localized(scene, count):
     rng = np.random.default_rng(1)
     view = view_of([scene(rng) for _ in range(count)])
     for start in (rough_pose(0), None):
         assert not find_station(view, start, np.random.default_rng(0)).good
 
 
-def test_images_of_other_configurations_are_not_recognised():
+def test_images_of_other_configurations_are_not_localized():
     """Each image under its neighbour's name."""
     view = view_of([*images()[1:], images()[0]])
     for seed in range(2):

@@ -97,8 +97,8 @@ def hold_together(value, code, message):
 
 
 def test_a_good_session(checked, calibrating):
-    assert calibrating.found.verdict.usable
-    hold_together(checked.found, 0, None)
+    assert calibrating.result.verdict.usable
+    hold_together(checked.result, 0, None)
 
 
 @pytest.mark.parametrize(

@@ -114,7 +114,7 @@ def test_the_bound_has_its_own_end_effector(reduced):
     assert bound.error < 0.75 * joint.error
 
 
-def test_depth_as_printed_is_the_drawings(reduced):
+def test_depth_as_printed_is_that_of_the_nominal_model(reduced):
     """Products of distances do not determine depth; the nominal error stays, to the micrometre."""
     nominal, printed = (reduced.of(name) for name in ("drawing", "four steps as printed"))
     assert printed["base_z"].value == pytest.approx(nominal["base_z"].value, rel=1e-3)

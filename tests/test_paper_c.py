@@ -37,7 +37,7 @@ from pkmcal.studies.paper_c_validation import before
 from pkmcal.studies.reproduction import Compared
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Sample
-from test_report_page import Found, browse
+from test_report_page import PageParts, browse
 
 RUNS = 15
 
@@ -52,13 +52,13 @@ def short():
 
 
 @pytest.fixture(scope="module")
-def found(short):
+def reproduced(short):
     return paper_c_outcome(short)
 
 
 @pytest.fixture(scope="module")
-def page(found):
-    return page_html(found)
+def page(reproduced):
+    return page_html(reproduced)
 
 
 # ------------------------------------------------------------------ the simulation
@@ -175,9 +175,9 @@ def test_another_seed_draws_anew():
 # ------------------------------------------------------------------ terminal, JSON and page
 
 
-def test_the_command(tmp_path, monkeypatch, found):
+def test_the_command(tmp_path, monkeypatch, reproduced):
     monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: found
+        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: reproduced
     )
     done = run("reproduce", "c", "-o", tmp_path, "--json")
     assert (done.code, done.err) == (0, "")
@@ -194,8 +194,8 @@ def test_the_command(tmp_path, monkeypatch, found):
         assert words in text, words
 
 
-def test_tables_are_whole(found):
-    for part in found.parts:
+def test_tables_are_whole(reproduced):
+    for part in reproduced.parts:
         for table in part.tables:
             assert all(len(row.cells) + 1 == len(table.columns) for row in table.rows), table.title
 
@@ -210,7 +210,7 @@ def test_the_page_runs_in_a_browser(page, tmp_path):
     """On a telephone, where it is likeliest to overflow; the template's widths are all tried by
     the report, and plots of this kind by the page of [A] in test_reproduce.py."""
     document, console = browse(page, tmp_path, 390)
-    root = Found(document).tags[0][1]
+    root = PageParts(document).tags[0][1]
     assert root["data-errors"] == ""
     assert root["data-overhang"] == "0"
     assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console

@@ -30,7 +30,7 @@ from pkmcal.papers.rotation_axis import (
 from pkmcal.studies.paper_c import H4ByBoard, at_poses, start
 from pkmcal.studies.paper_c_machine import Deviations, model
 from pkmcal.studies.simulated import measurements
-from test_hand_eye import anywhere, measured, platform_poses, seen_from, true_machine
+from test_hand_eye import anywhere, measured, platform_poses, simulated_poses, true_machine
 
 H = 1e-6
 QUIET = H4ByBoard(turn=1e-9, shift=1e-9, joint_noise=1e-9)
@@ -104,7 +104,7 @@ def session(name, rng, chosen=None, noise=1.0):
     nominal = load_mechanism(name, model=chosen)
     truth = true_machine(nominal, rng, shift=5e-4, turn=2e-3)
     body, joints = platform_poses(truth, rng, 40)
-    data = measured(seen_from(anywhere(rng, 1.0), body, anywhere(rng, 0.05), rng), joints)
+    data = measured(simulated_poses(anywhere(rng, 1.0), body, anywhere(rng, 0.05), rng), joints)
     exact = data.poses.T_station_target if noise else None
     return nominal, truth, data, exact
 
@@ -228,7 +228,7 @@ def test_any_machine_with_a_board(name):
     truth = true_machine(nominal, rng, shift=1e-3, turn=3e-3)
     body, joints = platform_poses(truth, rng, 60)
     camera, mount = anywhere(rng, 1.0), anywhere(rng, 0.05)
-    first = seen_from(camera, body[:40], mount, rng)
+    first = simulated_poses(camera, body[:40], mount, rng)
     data = measured(first, joints[:40])
     begin = start_from_poses(nominal, data)
     state = inverse_kinematic(nominal, data, begin)
@@ -266,7 +266,7 @@ def test_without_a_board_on_the_platform():
     machine = load_mechanism("gough-stewart")
     body, joints = platform_poses(machine, rng)
     still = np.broadcast_to(np.eye(4), body.shape)
-    poses = seen_from(anywhere(rng, 1.0), still, anywhere(rng, 0.1), rng)
+    poses = simulated_poses(anywhere(rng, 1.0), still, anywhere(rng, 0.1), rng)
     data = measured(poses, joints, mounts=(Mount("board", "base"),))
     start = start_from_poses(machine, data, np.eye(4)[None])
     with pytest.raises(InputError, match="poses of a board on the platform"):

@@ -120,7 +120,7 @@ def test_every_pattern_takes_linear_time():
     (r"^[ \t]*G30", re.MULTILINE, "findall", None),
     (r"[^/]{256,}", 0, "sub", None),
 ])  # fmt: skip
-def test_growth_of_patterns_is_recognised(pattern, flags, method, growth):
+def test_growth_of_patterns_is_identified(pattern, flags, method, growth):
     assert ambiguity(pattern, flags, method) == growth
 
 

@@ -98,18 +98,20 @@ def stated_by(rig, measurements, work):
     return rows
 
 
-@pytest.mark.parametrize("seen", ["legs", "board", "points", "together"])
-def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch, planned):
-    if seen == "board":
+@pytest.mark.parametrize("target", ["legs", "board", "points", "together"])
+def test_what_is_promised_is_what_the_estimate_states(target, monkeypatch, planned):
+    if target == "board":
         machine = load_mechanism("h4")
         board = board_for(machine, "platform")
         subject = of_machine(machine, [camera_of_size(SIZE)], machine.joint_names, board=board)
-    elif seen == "points":
+    elif target == "points":
         machine = load_mechanism("linear-delta")
         subject = of_machine(machine, [], machine.joint_names, tracker=(2e-5, None))
     else:
         subject = hexapod()
-    count = planned if seen == "legs" else small(subject, monkeypatch, together=seen == "together")
+    count = (
+        planned if target == "legs" else small(subject, monkeypatch, together=target == "together")
+    )
     rig, n = count.subject.rig, len(count.names)
     numbers = {name: k for k, name in enumerate(rig.names)}
     pairs = np.array([(numbers[s], k) for k in range(n) for s in count.stations[k]])
@@ -144,7 +146,7 @@ def test_configurations_are_possible_and_their_way_is_short(planned):
     assert sorted(value.rank.tolist()) == sorted([*range(1, 6)] * 2)
 
 
-def test_more_configurations_never_tell_less(planned):
+def test_more_configurations_never_increase_the_sigma(planned):
     positions = [a.position for a in planned.curve]
     assert all(after < before for before, after in itertools.pairwise(positions))
     # noise of images alone would fall with the root; errors common to all fall more slowly

@@ -10,7 +10,7 @@ import pytest
 from pkmcal.boards.board import Detection
 from pkmcal.boards.poses import mean_poses, one_a_configuration
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
-from test_targets import CAMERA, board, poses_around, seen  # noqa: F401 - board is a fixture
+from test_targets import CAMERA, board, corners_in_view, poses_around  # noqa: F401 - board is a fixture
 
 CONFIGURATIONS, REPEATS = 300, 5
 SIGMA = np.repeat([3e-4, 2e-4], 3)
@@ -40,7 +40,7 @@ def squares(value, truth):
 
 
 @pytest.mark.parametrize("common", [0.0, 0.5, 0.9])
-def test_errors_are_what_the_mean_says(common):
+def test_errors_are_what_the_mean_states(common):
     truth, rows, T, covariance = repeated(1 - common, common)
     value = mean_poses(rows, T, covariance, common)
     assert value.used.all()
@@ -120,14 +120,14 @@ def images(board, rows, noise, seed=0):  # noqa: F811
 def test_images_of_one_configuration_become_one_measurement(board):  # noqa: F811
     rows = np.repeat(np.arange(60), 4)
     value, truth = images(board, rows, 0.1)
-    poses, odd = one_a_configuration(seen(board, value, rows), mount=3)
+    poses, odd = one_a_configuration(corners_in_view(board, value, rows), mount=3)
     assert poses.configuration.tolist() == list(range(60))
     assert set(poses.mount.tolist()) == {3}
     assert odd == ()
     error = pose_difference(poses.T_station_target, truth)
     white = np.einsum("nij,nj->ni", poses.whiten, error)
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.3)
-    single, _ = one_a_configuration(seen(board, value[::4], rows[::4]), mount=3)
+    single, _ = one_a_configuration(corners_in_view(board, value[::4], rows[::4]), mount=3)
     gain = np.linalg.norm(poses.whiten, axis=(1, 2)) / np.linalg.norm(single.whiten, axis=(1, 2))
     np.testing.assert_allclose(gain, 2.0, rtol=0.15)  # the root of four images
 
@@ -138,6 +138,6 @@ def test_an_odd_image_is_named(board):  # noqa: F811
     shifted = perturb(truth[2], np.array([0, 0, 0, 2e-3, 0, 0]))
     pixels = CAMERA.project(apply(shifted, board.points))
     values[9] = Detection(values[9].name, CAMERA.image_size, values[9].ids, pixels, values[9].sigma)
-    _, (odd,) = one_a_configuration(seen(board, values, rows), mount=0)
+    _, (odd,) = one_a_configuration(corners_in_view(board, values, rows), mount=0)
     assert odd.configuration == 2
     assert "from where the repeats show it" in odd.reason

@@ -114,7 +114,7 @@ def write_poses(folder, in_view, kind="poses"):
     (folder / "poses.csv").write_text(csv_text(COLUMNS[kind], names, values))
 
 
-def seen_poses(made):
+def measured_poses(made):
     """The tracker's poses without noise."""
     return T_TRACKER_BASE @ made.T @ T_PLATFORM_TARGET
 
@@ -159,7 +159,7 @@ def test_stations_and_targets_are_found_with_their_deviations(folder):
     result = calibrate_session(folder)
     state = result.estimate.state
     value = state.T_camera_base[0] @ state.T_base_platform @ state.T_mount[0]
-    error = rotation_vector((inverse(value) @ seen_poses(made))[:, :3, :3])
+    error = rotation_vector((inverse(value) @ measured_poses(made))[:, :3, :3])
     assert np.sqrt(np.mean(error**2)) < TURN
     sigma = np.sqrt(np.diag(result.estimate.mount_covariance[0]))
     assert np.all(sigma > 0)
@@ -248,7 +248,7 @@ def test_heights_of_a_flat_bed(folder):
 
 def test_outliers_are_let_go_and_named(folder):
     made = make(folder, "gough-stewart", n=30)
-    in_view = seen_poses(made)
+    in_view = measured_poses(made)
     in_view[7] = perturb(in_view[7], np.array([0, 0, 0, 0.004, 0, 0.0]))
     in_view[20] = perturb(in_view[20], np.array([0, 0.02, 0, 0, 0, 0.0]))
     write_poses(folder, in_view)
@@ -284,7 +284,7 @@ def test_poses_noisier_than_stated_need_no_richer_model(folder):
     """Three times the stated noise: more parameters fit more of it, as of any noise."""
     made, rng = make(folder, "h4", n=16, model="design"), np.random.default_rng(0)
     sigma = 3 * np.repeat([TURN, POSITION], 3)
-    write_poses(folder, perturb(seen_poses(made), sigma * rng.normal(size=(16, 6))))
+    write_poses(folder, perturb(measured_poses(made), sigma * rng.normal(size=(16, 6))))
     document = (folder / "session.yaml").read_text().replace("mechanism.yaml", "h4")
     (folder / "session.yaml").write_text(document)
     session = load_session(folder, "design")
@@ -321,7 +321,7 @@ def test_everything_is_saved_and_read_back(folder, tmp_path):
 
 def test_a_target_moved_on_the_platform(folder):
     made = make(folder, "gough-stewart", n=20)
-    in_view = seen_poses(made)
+    in_view = measured_poses(made)
     step = perturb(np.eye(4), np.array([0.01, 0.0, 0.02, 0.002, 0.0, 0.001]))
     in_view[12:] = in_view[12:] @ step
     write_poses(folder, in_view)
@@ -329,7 +329,7 @@ def test_a_target_moved_on_the_platform(folder):
         calibrate_session(folder)
 
 
-def test_one_wrong_reading_is_outvoted_and_told(folder):
+def test_one_wrong_reading_is_rejected_and_reported(folder):
     made = make(folder, "gough-stewart", n=30)
     joints = made.joints.copy()
     joints[7, 2] += 0.005
@@ -384,7 +384,7 @@ def test_poses_that_coarse_readings_explain_are_not_rejected(folder):
     assert low < np.deg2rad(0.5) / calibration.session.joint_noise < high
 
 
-def test_exchanged_rows_are_outvoted_and_told(folder):
+def test_exchanged_rows_are_rejected_and_reported(folder):
     made = make(folder, "h4", n=30)
     write_joints(folder, made.joints[[*range(11), 20, *range(12, 20), 11, *range(21, 30)]])
     calibration = calibrate_session(folder)
@@ -394,9 +394,9 @@ def test_exchanged_rows_are_outvoted_and_told(folder):
     assert (values.facts["configuration"], values.facts["both"]) == ("011", "yes")
 
 
-def test_a_pose_under_another_name_is_told(folder):
+def test_a_pose_under_another_name_is_reported(folder):
     made = make(folder, "gough-stewart", n=30)
-    in_view = seen_poses(made)
+    in_view = measured_poses(made)
     in_view[4] = in_view[17]
     write_poses(folder, in_view)
     calibration = calibrate_session(folder)
@@ -463,7 +463,7 @@ def test_readings_in_degrees(folder):
 
 def test_lengths_of_another_scale(folder):
     made = make(folder, "h4", n=30)
-    in_view = seen_poses(made)
+    in_view = measured_poses(made)
     in_view[:, :3, 3] *= 1.05
     write_poses(folder, in_view)
     verdict = calibrate_session(folder).verdict
@@ -472,13 +472,13 @@ def test_lengths_of_another_scale(folder):
     assert scale.facts["value"] == pytest.approx(0.05, rel=0.1)
 
 
-def test_check_tells_how_the_platform_turns(folder):
+def test_check_reports_how_the_platform_turns(folder):
     made = make(folder, "h4", n=20)
     check = check_session(folder)
     assert check.exit_code < 2
     assert "poses.turning" in [one.code for one in check.findings]
     rng = np.random.default_rng(1)
-    visible = perturb(seen_poses(made), np.concatenate([0.01 * rng.normal(size=(20, 3)),
+    visible = perturb(measured_poses(made), np.concatenate([0.01 * rng.normal(size=(20, 3)),
                                                      np.zeros((20, 3))], axis=1))  # fmt: skip
     write_poses(folder, visible)
     faults = [

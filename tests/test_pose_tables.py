@@ -98,7 +98,7 @@ def spoilt(row, column, value):
         (spoilt(1, 1, "much"), ["line 3, column y", "not a number"]),
     ],
 )  # fmt: skip
-def test_faults_are_told_with_their_place(tmp_path, text, parts):
+def test_faults_are_reported_with_their_place(tmp_path, text, parts):
     message = fault(table, tmp_path, text)
     for part in parts:
         assert part in message

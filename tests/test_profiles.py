@@ -142,8 +142,10 @@ def steepest(profiles):
     """Place of the strongest gradient, to sub-pixel by a parabola."""
     offsets, slope = PROFILE_OPTIONS.profile_offsets, np.abs(np.gradient(profiles.grey, axis=1))
     best = np.clip(slope.argmax(axis=1), 1, len(offsets) - 2)
-    left, here, right = (slope[np.arange(len(best)), best + d] for d in (-1, 0, 1))
-    step = np.clip((left - right) / (2 * (left - 2 * here + right) - 1e-9), -1, 1)
+    slope_before, here, slope_after = (slope[np.arange(len(best)), best + d] for d in (-1, 0, 1))
+    step = np.clip(
+        (slope_before - slope_after) / (2 * (slope_before - 2 * here + slope_after) - 1e-9), -1, 1
+    )
     return offsets[best] + step * (offsets[1] - offsets[0])
 
 

@@ -202,16 +202,16 @@ def test_parameters_as_a_data_frame(result):
 
 
 @pytest.mark.parametrize(
-    ("missing", "ask", "said"),
+    ("missing", "call", "message"),
     [
         ("pandas", lambda r: r.parameters.to_pandas(), "pip install pandas"),
         ("matplotlib", lambda r: r.plot_tool(), r"pip install '\.\[plot\]'"),
     ],
 )
-def test_what_is_not_installed_is_told(loaded, monkeypatch, missing, ask, said):
+def test_what_is_not_installed_is_reported(loaded, monkeypatch, missing, call, message):
     monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(InputError, match=f"needs? {missing}.*{said}"):
-        ask(loaded)
+    with pytest.raises(InputError, match=f"needs? {missing}.*{message}"):
+        call(loaded)
 
 
 # plots
@@ -271,7 +271,7 @@ def test_a_result_is_saved_as_the_command_saves_it(result, demo, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"method": "bundel"}, "method: there is no method of this name; found 'bundel', expected"
                                " bundle."),
@@ -281,10 +281,10 @@ def test_a_result_is_saved_as_the_command_saves_it(result, demo, tmp_path):
         ({"holdout": -2}, "holdout: this number cannot be used"),
     ],
 )  # fmt: skip
-def test_an_option_that_cannot_be_is_refused_before_any_work(options, said):
+def test_an_option_that_cannot_be_is_refused_before_any_work(options, message):
     with pytest.raises(InputError) as caught:
         pkmcal.calibrate("nowhere", **options)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_session_is_simulated(tmp_path):

@@ -96,7 +96,7 @@ def changed(tmp_path, old, new):
 
 
 @pytest.mark.parametrize(
-    ("written", "said"),
+    ("written", "expected"),
     [
         ("3 kg", "'3 kg' is not a length; write it in metres, or with a unit, such as 269.3 mm."),
         ("3 deg", "'3 deg' is not a length"),
@@ -106,13 +106,13 @@ def changed(tmp_path, old, new):
         ("1e99999 mm", "found '1e99999 mm', expected a number"),
     ],
 )
-def test_what_is_no_length_is_told_with_its_line(tmp_path, written, said):
+def test_what_is_no_length_is_reported_with_its_line(tmp_path, written, expected):
     message = changed(tmp_path, r"radius: [\d.]+", f"radius: {written}")
     assert re.match(r"m\.yaml, line \d+, legs\[1\]\.tubes\[1\]\.radius: ", message)
-    assert said in message
+    assert expected in message
 
 
-def test_a_drawing_in_millimetres_without_a_unit_is_told(tmp_path):
+def test_a_nominal_model_in_millimetres_without_a_unit_is_reported(tmp_path):
     content = yaml.safe_load(mechanism_text(load_mechanism("gough-stewart")))
     only = {"m": "m"}
     text = yaml.safe_dump(scaled(content, lambda path: only.get(unit_of(path, "m"), "")))

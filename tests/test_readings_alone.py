@@ -124,7 +124,7 @@ def test_the_truth_is_within_the_stated_deviations(make, noise, n):
     assert np.mean(scales) == pytest.approx(1, abs=4 / np.sqrt(2 * dof * len(scales)))
 
 
-def test_without_a_drawing_worth_the_name():
+def test_without_a_nominal_model_worth_the_name():
     """Tolerances of half a metre: the data determine all but the frame."""
     nominal = load_mechanism("four-belt")
     document = nominal.document.model_copy(
@@ -198,7 +198,7 @@ def test_a_session_of_readings_is_calibrated_from_the_command_line(belts):
     assert "4 readings of each, 2 more than the machine has freedoms" in page
 
 
-def test_new_readings_tell_whether_the_machine_changed(belts, tmp_path):
+def test_new_readings_decide_whether_the_machine_changed(belts, tmp_path):
     folder, truth = belts
     save(calibrate_session(folder), tmp_path / "out")
     rng = np.random.default_rng(6)
@@ -242,7 +242,7 @@ def test_a_machine_without_redundancy_is_refused(tmp_path):
     assert "stations" in str(refused.value.where)
 
 
-def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path):
+def test_readings_that_scatter_more_than_the_nominal_model_is_off_are_refused(tmp_path):
     """A centimetre, where an offset is drawn to five millimetres."""
     nominal, rng = load_mechanism("four-belt"), np.random.default_rng(8)
     joints = readings(nominal, 20, rng)
@@ -252,7 +252,7 @@ def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path
     assert calibration.verdict.of("readings.noise_beyond_tolerance")
 
 
-def test_what_needs_a_camera_says_so(belts):
+def test_what_needs_a_camera_states_so(belts):
     folder, _ = belts
     with pytest.raises(ResultError, match="four steps need images"):
         calibrate_session(folder, method="four-step")

@@ -73,7 +73,7 @@ def test_a_station_without_an_image_shows_nothing_of_the_last_one(calibrated, en
         assert not decoded(of(entries, *image(name, "photograph"), at=at)).any()
 
 
-def seen(calibrated, entries, name, points):
+def projected(calibrated, entries, name, points):
     """Pixels of points (n, 3), base frame, by the camera's logged pose."""
     (station,) = (s for s in calibrated.session.stations if s.name == name)
     T = of(entries, "machine", "cameras", name).values["T"]
@@ -104,7 +104,7 @@ def test_tubes_in_space_lie_on_their_edges_in_the_images(calibrated, entries):
             out = np.cross(b - a, (a + b) / 2 - T[:3, 3])
             out *= radius / np.linalg.norm(out)
             along = a + np.linspace(0, 1, 60)[:, None] * (b - a)  # a lens bends it
-            sides += [seen(calibrated, entries, station, along + s * out) for s in (-1, 1)]
+            sides += [projected(calibrated, entries, station, along + s * out) for s in (-1, 1)]
         off += [min(apart(strip, side) for side in sides) for strip in e.values["strips"]]
     assert max(off) < NEAR
     assert np.median(off) < MIDDLE
@@ -122,13 +122,13 @@ def test_contours_lie_on_the_edges(calibrated, entries):
     assert np.mean(np.array(off) < NEAR) > 0.8
 
 
-def test_edges_put_aside_are_apart(calibrated):
+def test_rejected_edges_are_recorded_apart(calibrated):
     weights = calibrated.estimate.edge_weights.copy()
     edges = calibrated.observation.edges
     n = 3
     weights[n] = 0.2
-    doubted = replace(calibrated, estimate=replace(calibrated.estimate, edge_weights=weights))
-    entries = list(recorded(doubted))
+    downweighted = replace(calibrated, estimate=replace(calibrated.estimate, edge_weights=weights))
+    entries = list(recorded(downweighted))
     station = calibrated.session.stations[edges.station[n]].name
     at = edges.configuration[n] + 1
     offset = of(entries, *image(station, "aside"), at=at).values
@@ -155,7 +155,7 @@ def test_poses_and_numbers_are_the_calibrations(calibrated, entries):
     assert len(rows) == 2 + len(calibrated.machine.parameters)
 
 
-def test_the_drawing_lies_beside_the_machine(calibrated, entries):
+def test_the_nominal_model_lies_beside_the_machine(calibrated, entries):
     """Fitted by all joint centres: millimetres off, as the tolerances allow, and not elsewhere."""
     new = np.array(of(entries, "machine", "calibrated", at=1).values["strips"])
     old = np.array(of(entries, "machine", "drawing", at=1).values["strips"])
@@ -176,7 +176,7 @@ def test_without_a_pose_nothing_of_the_machine_stays(calibrated):
 # ------------------------------------------------------------------ words
 
 
-def test_without_rerun_it_is_said_before_the_work(session, tmp_path, monkeypatch):
+def test_without_rerun_it_is_stated_before_the_work(session, tmp_path, monkeypatch):
     monkeypatch.setattr(rrd, "find_spec", lambda name: None)
     done = run("calibrate", session, "--rrd", tmp_path / "a.rrd", "-o", tmp_path / "out")
     assert done.code == 2
@@ -185,16 +185,16 @@ def test_without_rerun_it_is_said_before_the_work(session, tmp_path, monkeypatch
     assert not (tmp_path / "out").exists()
 
 
-def test_the_recording_is_told_with_the_other_files(tmp_path, monkeypatch):
+def test_the_recording_is_reported_with_the_other_files(tmp_path, monkeypatch):
     made, session = [], tmp_path / "session"
     bases.measured(session, seed=1, count=14)
     monkeypatch.setattr(rrd, "find_spec", lambda name: object())
-    monkeypatch.setattr(rrd, "write_rrd", lambda found, path: made.append((found, path)))
+    monkeypatch.setattr(rrd, "write_rrd", lambda value, path: made.append((value, path)))
     path = tmp_path / "a.rrd"
     done = run("calibrate", session, "--rrd", path, "-o", tmp_path / "out", "--json")
     assert done.code == 0
     assert done.json["files"][str(path)] == str(path)
-    assert [(found.session.folder, to) for found, to in made] == [(session, path)]
+    assert [(value.session.folder, to) for value, to in made] == [(session, path)]
     assert (tmp_path / "out" / "calibration.json").is_file()
 
 

@@ -59,7 +59,7 @@ def test_turns_are_those_of_the_motion_and_fill_the_ball():
     assert np.ptp(turns[:, 2]) > 0.3
 
 
-def test_a_machine_that_moves_aside_by_turning_only_turns_unless_told_not_to():
+def test_a_machine_that_moves_aside_by_turning_only_turns_unless_forbidden():
     limits = load_mechanism("3-rps").limits()
     turned = [
         np.linalg.norm(pose_difference(poses_in(limits, region, 30), limits.home)[:, :3], axis=1)
@@ -69,7 +69,7 @@ def test_a_machine_that_moves_aside_by_turning_only_turns_unless_told_not_to():
     assert turned[1].max() < 1e-6
 
 
-def test_a_region_out_of_reach_is_told():
+def test_a_region_out_of_reach_is_reported():
     limits = load_mechanism("gough-stewart").limits()
     with pytest.raises(InputError, match=r"does not come to the workspace .* z from 1 to 2 m"):
         poses_in(limits, Region(z=(1.0, 2.0)), 5)
@@ -81,7 +81,7 @@ def test_a_region_out_of_reach_is_told():
         poses_in(limits, corner, 5)
 
 
-def test_a_session_says_where_the_tool_is_to_be_right(folder):  # noqa: F811
+def test_a_session_states_where_the_tool_is_to_be_right(folder):  # noqa: F811
     from pkmcal.session.load import load_session
 
     assert load_session(folder).workspace is None
@@ -94,7 +94,7 @@ def test_a_session_says_where_the_tool_is_to_be_right(folder):  # noqa: F811
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "pattern"),
     [
         ("{x: [0.1, -0.1]}", "x is no interval; found .0.1, -0.1., expected .lowest, highest."),
         ("{z: [0.1]}", r"workspace.z: this has too few|expected \[lowest, highest\] z in m"),
@@ -102,10 +102,10 @@ def test_a_session_says_where_the_tool_is_to_be_right(folder):  # noqa: F811
         ("{w: [0, 1]}", "this key is not known"),
     ],
 )
-def test_a_workspace_that_is_none_is_told(folder, line, said):  # noqa: F811
+def test_a_workspace_that_is_none_is_reported(folder, line, pattern):  # noqa: F811
     import re
 
     replaced(folder / "session.yaml", "stations:", f"workspace: {line}\nstations:")
     message = fault(load_session, folder)
-    assert re.search(said, message), message
+    assert re.search(pattern, message), message
     assert "session.yaml, line 4, workspace" in message

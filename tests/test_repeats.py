@@ -198,7 +198,7 @@ def spoiled(many, rows, pixels):
     return turned(many, turn)
 
 
-def test_a_bad_repeat_is_left_out_and_told(machine, poses):
+def test_a_bad_repeat_is_left_out_and_reported(machine, poses):
     edges = edges_of(machine, poses[:6])
     many = repeated(edges, 5, 0.02, np.random.default_rng(0))
     good, bad = combine_repeats(look_of(many)), combine_repeats(look_of(spoiled(many, [7], 1.0)))
@@ -306,7 +306,7 @@ def shaken_machine(machine, rng):
 
 
 @pytest.mark.parametrize("cause", ["noise", "camera", "platform", "legs"])
-def test_what_moves_between_repeats_is_recognised(machine, poses, cause):
+def test_motion_between_repeats_is_detected(machine, poses, cause):
     poses, rng = poses[:5], np.random.default_rng(7)
     twist = np.repeat([5e-4, 5e-5], 3)
 
@@ -380,7 +380,7 @@ def test_the_first_repeat_is_the_image_of_a_session_without(tmp_path):
     assert len(load_session(repeats).stations[0].images) == 4
 
 
-def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
+def test_repeats_do_not_promise_more_than_they_hold(repeats, measured_repeats, tmp_path):
     """The standard deviations of one image's calibration, hardly less with four: the error is
     shading, the same in all of them.
     """
@@ -388,7 +388,7 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
     shutil.copytree(repeats, single)
     for path in single.glob("images/*/*_[234].png"):
         path.unlink()
-    one, four = calibrate_session(single), looked.calibration
+    one, four = calibrate_session(single), measured_repeats.calibration
     sigma = [np.sqrt(np.diag(c.estimate.covariance)) for c in (one, four)]
     above_limit = sigma[0] > 1e-9
     assert 0.7 < np.median(sigma[1][above_limit] / sigma[0][above_limit]) < 1.1
@@ -400,7 +400,7 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
 
 
 @dataclass(frozen=True)
-class Looked:
+class Repeats:
     """The study of the repeats, and the calibration it is made of."""
 
     study: RepeatStudy
@@ -408,7 +408,7 @@ class Looked:
 
 
 @pytest.fixture(scope="module")
-def looked(repeats):
+def measured_repeats(repeats):
     made: list[Calibration] = []
 
     def once(*words, **more):
@@ -419,17 +419,17 @@ def looked(repeats):
         patch.setattr("pkmcal.judge.repeatability.calibrate_session", once)
         study = study_repeats(repeats)
     (calibration,) = made
-    return Looked(study, calibration)
+    return Repeats(study, calibration)
 
 
 @pytest.fixture
-def once(looked, checked, monkeypatch):
+def once(measured_repeats, checked, monkeypatch):
     """Commands share one measurement of the repeats, as it does not depend on their outputs; the
     rest of the check is the demonstration's, which is not tested here.
     """
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
     monkeypatch.setattr(
-        "pkmcal.judge.repeatability.study_repeats", lambda *_, **_more: looked.study
+        "pkmcal.judge.repeatability.study_repeats", lambda *_, **_more: measured_repeats.study
     )
 
 
@@ -468,8 +468,8 @@ def test_check_repeat_as_json(repeats):
 
 
 @pytest.mark.slow
-def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
+def test_a_shaken_camera_is_reported(tmp_path, checked, monkeypatch):
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
     shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3, "size": (360, 270)}
     folder = simulated(tmp_path / "session", 3, **shaken)
     values = run("check", folder, "--repeat", "--json")
@@ -482,8 +482,8 @@ def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
     assert "as if the camera moved: fix the camera" in text
 
 
-def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
+def test_check_repeat_without_repeats_states_what_to_write(demo, checked, monkeypatch):
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
     values = run("check", demo.session, "--repeat")
     assert values.code == 2
     assert "the session has no repeated images" in values.err
@@ -503,14 +503,14 @@ def test_repeats_are_asked_of_cameras_that_stand(demo):
             require_repeats(replace(session, stations=stations))
 
 
-def test_check_repeat_of_a_broken_session_says_what_is_broken(session):
+def test_check_repeat_of_a_broken_session_states_what_is_broken(session):
     (session / "joints.csv").unlink()
     values = run("check", session, "--repeat", "--json")
     assert values.code == 2
     assert values.json["repeats"] is None
 
 
-def test_points_on_an_edge_project_where_the_turn_says(machine, poses):
+def test_points_on_an_edge_project_where_the_turn_states(machine, poses):
     """Pixel units: a turn by one moves the edge's middle by about a pixel in the image."""
     edges = edges_of(machine, poses[:2], shift=1e-9)
     legs = legs_in_camera(machine, STATION, poses[:2], machine.inverse(poses[:2]))

@@ -113,7 +113,7 @@ def test_groups_follow_the_legs(case):
     assert sum(len(g.rows) for g in groups) == len(case.session.machine.parameters)
 
 
-def test_what_can_hardly_be_told_apart_is_said_in_words(case):
+def test_what_can_hardly_be_distinguished_is_stated_in_words(case):
     covariance = case.estimate.covariance.copy()
     i, j = (case.session.machine.parameters.index(f"legs[6].{p}")
             for p in ("platform.center.z", "length.offset"))  # fmt: skip
@@ -152,7 +152,7 @@ def test_uncertainty_does_not_depend_on_the_frame(case):
     np.testing.assert_allclose(once, twice, atol=1e-6 * once.max())
 
 
-def test_drawing_is_laid_over_before_the_change_is_told(case):
+def test_nominal_model_is_laid_over_before_the_change_is_reported(case):
     session, estimate = case.session, case.estimate
     turned = np.array([0.01, -0.02, 0.03, 0.1, 0.2, 0.3])
     nominal, values = session.machine, session.machine.values.copy()

@@ -39,11 +39,13 @@ class Case:
     estimate: Estimate
 
 
-TOLD = Findings(Identifiability(54, 12, 42, (), (), np.full(42, 20.0)), (), (), 1e-3)
+IDENTIFIABILITY = Findings(Identifiability(54, 12, 42, (), (), np.full(42, 20.0)), (), (), 1e-3)
 """Findings if the data determine everything."""
 
 
-def calibration(session, observation, estimate, verdict=None, findings=TOLD, timings=None):
+def calibration(
+    session, observation, estimate, verdict=None, findings=IDENTIFIABILITY, timings=None
+):
     """The case as `calibrate` returns it, as far as the report needs it."""
     return Calibration(
         session, observation, None, estimate, verdict, findings, None, "bundle", 0, timings or {}

@@ -20,12 +20,12 @@ from pkmcal.report.identifiability import (
     tied,
 )
 from test_report_case import make_case, no_problem, report_html
-from test_report_page import Found
-from test_words import heaved, make, told_of
+from test_report_page import PageParts
+from test_words import heaved, identified, make
 
 
 def findings_of(scene, *views):
-    values, in_view, _ = told_of(scene, *views)
+    values, in_view, _ = identified(scene, *views)
     machine = scene.machine.with_values(scene.theta[0])
     estimate = replace(
         make_estimate_stub(), machine=machine, state=scene.state(),
@@ -62,7 +62,7 @@ def test_the_section_stands_on_the_page(case, apart):
     page = report_html(
         case.session, case.observation, case.estimate, Verdict(True, "Fine."), findings=apart
     )
-    text = " ".join(Found(page).text.split())
+    text = " ".join(PageParts(page).text.split())
     assert "The data fix 34 of 42 directions (54 free values less 12 that only place" in text
     assert "8 directions no amount of such data would fix" in text
     for sentence in (*apart.unidentified, *apart.weak):
@@ -100,7 +100,7 @@ def test_the_spectrum_shows_lost_directions_as_stubs(apart):
     assert (drawn.curve[0][1], "1") in drawn.ticks
 
 
-def test_what_was_held_is_said_with_its_reason(apart):
+def test_what_was_held_is_stated_with_its_reason(apart):
     table = load_mechanism("gough-stewart").parameters.with_roles(
         ("legs[1].base.center", "legs[2].length.offset"),
         (("legs[3].length.offset", "legs[4].length.offset"),),
@@ -114,7 +114,7 @@ def test_what_was_held_is_said_with_its_reason(apart):
     )
 
 
-def test_seen_legs_leaves_out_what_was_given_up():
+def test_seen_legs_leaves_out_what_was_rejected():
     edges = make("gough-stewart", n=1).measurements(np.random.default_rng(0)).edges
     weights = np.where(edges.leg == 2, 0.1, 1.0)
     assert observed_legs(edges, weights, 3, 7).tolist() == [[j not in (2, 6) for j in range(7)]] * 3

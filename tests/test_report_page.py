@@ -47,7 +47,7 @@ def page(case) -> str:
     )
 
 
-class Found(HTMLParser):
+class PageParts(HTMLParser):
     """Tags, attributes and text of a page."""
 
     def __init__(self, text: str) -> None:
@@ -71,20 +71,20 @@ class Found(HTMLParser):
 # ------------------------------------------------------------------ the page
 
 
-def test_page_tells_verdict_numbers_and_model_error(page):
-    text = Found(page).text
+def test_page_has_verdict_numbers_and_model_error(page):
+    text = PageParts(page).text
     for expected in ("Good to use.", "a little noisy", "more poses", "0.90", "15 of 15",
                      "multiplied by 1.25", "observe", "1.50 s", "three centres: legs 1, 3, 5",
                      "what these data show"):  # fmt: skip
         assert expected in text, expected
 
 
-def test_page_tells_when_and_from_what_it_was_made(case):
+def test_page_has_date_and_sources(case):
     noted = replace(case.session, document={"notes": "Machine 2.\nLeg 4 <b>exchanged</b>."})
     fine = Verdict(True, "Fine.")
     value = report_of(calibration(noted, case.observation, case.estimate, fine), digest="3f2a")
     html = page_html(value, datetime(2026, 3, 4, 15, 2))
-    text = Found(html).text
+    text = PageParts(html).text
     assert "4 March 2026, 15:02" in text
     assert f"pkmcal {version('pkmcal')}" in text
     assert "digest of the session 3f2a" in text
@@ -94,7 +94,7 @@ def test_page_tells_when_and_from_what_it_was_made(case):
 
 
 def test_charts_lead_to_images_that_are_there(page, case):
-    results = Found(page)
+    results = PageParts(page)
     links = [str(a["href"]) for tag, a in results.tags if tag == "a" and "download" not in a]
     names = {f"#{a['id']}" for _, a in results.tags if "id" in a}
     leading = [link for link in links if link.startswith("#image-")]
@@ -108,7 +108,7 @@ def test_charts_lead_to_images_that_are_there(page, case):
 
 def test_page_asks_for_nothing_outside(page):
     assert not re.search(r"https?:|//[a-z]+\.|@import|url\(", page)
-    for tag, attributes in Found(page).tags:
+    for tag, attributes in PageParts(page).tags:
         assert tag not in ("link", "iframe", "object", "embed", "base")
         for name in ("src", "href", "xlink:href", "srcset", "action"):
             inside = "data:" if "download" in attributes else "data:image/jpeg;base64,"
@@ -125,7 +125,7 @@ def test_hostile_names_stay_text(tmp_path):
     verdict = Verdict(False, HOSTILE, tuple(Finding("", x, saved_text=HOSTILE) for x in Level))
     estimate = replace(case.estimate, gauge=HOSTILE)
     page = report_html(session, observation, estimate, verdict, timings={HOSTILE: 1.0})
-    value = Found(page)
+    value = PageParts(page)
     assert "<script>alert" not in page
     assert not [a for tag, a in value.tags if "onerror" in a or tag == "img"]
     assert sum(tag == "script" for tag, _ in value.tags) == 6
@@ -173,7 +173,7 @@ def test_a_page_without_a_single_edge(case):
     assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
 
 
-def test_an_image_that_is_gone_is_said(tmp_path):
+def test_an_image_that_is_gone_is_stated(tmp_path):
     case = make_case(tmp_path, n_poses=4, n_stations=2)
     next(tmp_path.glob("*.png")).unlink()
     page = report_html(case.session, case.observation, case.estimate, Verdict(True, "Fine."))
@@ -243,7 +243,7 @@ LED = """
 
 def fine(document: str, console: str) -> dict[str, str | None]:
     """The page's log; nothing failed and nothing exceeds its width."""
-    root = Found(document).tags[0][1]
+    root = PageParts(document).tags[0][1]
     assert root["data-errors"] == ""
     assert root["data-overhang"] == "0"
     assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
@@ -262,7 +262,7 @@ def test_page_runs_in_a_browser(page, tmp_path):
     """
     document, console = browse(loaded(page, OPENED, LED), tmp_path, 390)
     root = fine(document, console)
-    tags = Found(document).tags
+    tags = PageParts(document).tags
     assert any(a.get("id") == "plot-space" and a.get("data-drawn") == "yes" for _, a in tags)
     assert any(tag == "canvas" for tag, _ in tags)
     changes = [abs(float(v.split()[2])) for v in re.findall(r'data-values="([^"]+)"', document)]
@@ -291,7 +291,7 @@ def test_the_browser_test_sees_errors(page, tmp_path):
     """And a page whose script fails has its text and its tables, on a wide screen as well."""
     broken = page.replace('"use strict";', 'fetch("https://example.org/x"); missing();', 1)
     document, console = browse(broken, tmp_path, 1280)
-    root = Found(document).tags[0][1]
+    root = PageParts(document).tags[0][1]
     assert root["data-overhang"] == "0"
     assert "missing is not defined" in root["data-errors"]
     assert "blocked https://example.org" in root["data-errors"]

@@ -135,7 +135,7 @@ def test_all_that_is_drawn_is_in_the_picture(case, scale):
         assert max(across, up) > 0.35
 
 
-def test_many_poses_are_thinned_and_that_is_said(case, monkeypatch):
+def test_many_poses_are_thinned_and_that_is_stated(case, monkeypatch):
     monkeypatch.setattr(image_scene, "MOST_SLIDER_POSES", 3)
     plot = figure(case)[1]
     assert [frame["name"] for frame in plot.frames] == ["c0", "c2", "c4"]

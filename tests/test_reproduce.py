@@ -32,7 +32,7 @@ from pkmcal.studies.paper_a_report import table_1
 from pkmcal.studies.reproduction import Compared, Options, Words, reproduce_paper
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Sample
-from test_report_page import Found, browse
+from test_report_page import PageParts, browse
 
 RUNS = 25
 
@@ -47,13 +47,13 @@ def short():
 
 
 @pytest.fixture(scope="module")
-def found():
+def reproduced():
     return reproduce_paper("a", Options(runs=RUNS))
 
 
 @pytest.fixture(scope="module")
-def page(found):
-    return page_html(found)
+def page(reproduced):
+    return page_html(reproduced)
 
 
 # ------------------------------------------------------------------ the command
@@ -78,9 +78,9 @@ def test_the_command(tmp_path):
     assert a["seconds"]["cpu"] > 0
 
 
-def test_in_words(tmp_path, monkeypatch, found):
+def test_in_words(tmp_path, monkeypatch, reproduced):
     monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: found
+        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: reproduced
     )
     done = run("reproduce", "-o", tmp_path)
     assert done.code == 0
@@ -94,7 +94,7 @@ def test_in_words(tmp_path, monkeypatch, found):
 
 
 @pytest.mark.parametrize("letter", tuple(Paper))
-def test_a_headline_says_what_is_reproduced_and_what_is_not(letter):
+def test_a_headline_states_what_is_reproduced_and_what_is_not(letter):
     words = read_yaml(Path(reproduction.__file__).with_name(f"paper_{letter}.yaml")).data
     assert words["headline"].startswith("Reproduced: ")
     assert " Not reproduced: " in words["headline"]
@@ -102,18 +102,18 @@ def test_a_headline_says_what_is_reproduced_and_what_is_not(letter):
         assert text.startswith("Not reproduced: ") == (name in words["not_reproduced"])
 
 
-def test_what_is_not_reproduced_is_no_green_sign(found, page, tmp_path, monkeypatch):
-    assert found.verdict.usable
-    assert "0.018, printed in rad where degrees must be meant" in found.verdict.headline
+def test_what_is_not_reproduced_is_no_green_sign(reproduced, page, tmp_path, monkeypatch):
+    assert reproduced.verdict.usable
+    assert "0.018, printed in rad where degrees must be meant" in reproduced.verdict.headline
     assert '<section class="verdict partial"' in page
     assert "</span> Reproduced in part</p>" in page
-    not_reproduced = found.document["not_reproduced"]
+    not_reproduced = reproduced.document["not_reproduced"]
     assert [text.partition(". ")[0] for text in not_reproduced] == [
         "Not reproduced: 0.08 mm by the paper's four steps as printed",
         "Not reproduced: 1 mm before calibration",
     ]
     monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: found
+        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: reproduced
     )
     done = run("reproduce", "-o", tmp_path)
     assert "\n! Reproduced: the end-effector" in done.out
@@ -134,8 +134,8 @@ def test_where_an_expectation_is_missed_nothing_is_called_reproduced():
     assert value.verdict.reasons == (bad.sentence,)
 
 
-def test_few_runs_that_miss_are_told_to_be_more(monkeypatch, found):
-    failed = replace(found, verdict=replace(found.verdict, usable=False))
+def test_few_runs_that_miss_are_reported_to_be_more(monkeypatch, reproduced):
+    failed = replace(reproduced, verdict=replace(reproduced.verdict, usable=False))
     monkeypatch.setattr("pkmcal.studies.paper_a_report.reproduce", lambda _options: failed)
     assert reproduce_paper("a", Options(runs=100)).verdict.advice == ()
     (advice,) = reproduce_paper("a", Options(runs=8)).verdict.advice
@@ -148,13 +148,13 @@ def test_another_seed_draws_anew():
     assert first == again != other
 
 
-def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, found):
-    checks = found.parts[-1].checks
+def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, reproduced):
+    checks = reproduced.parts[-1].checks
     bad = replace(checks[1], passed=False)
-    part = replace(found.parts[-1], checks=(checks[0], bad))
-    missed = wrong("study.missed", bad.what, found=bad.found, expected=bad.expected)
-    verdict = replace(found.verdict, usable=False, findings=(missed,))
-    failed = replace(found, verdict=verdict, stamp="Not reproduced", parts=(part,))
+    part = replace(reproduced.parts[-1], checks=(checks[0], bad))
+    missed = wrong("study.missed", bad.what, reproduced=bad.found, expected=bad.expected)
+    verdict = replace(reproduced.verdict, usable=False, findings=(missed,))
+    failed = replace(reproduced, verdict=verdict, stamp="Not reproduced", parts=(part,))
     failed.document["passed"] = False
     monkeypatch.setattr(
         "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: failed
@@ -165,21 +165,21 @@ def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, found):
     assert run("reproduce", "-o", tmp_path, "--json").json["papers"]["a"]["passed"] is False
     page = (tmp_path / "paper-a.html").read_text()
     assert "Not reproduced" in page
-    assert Found(page).text.count(bad.sentence) == 2
+    assert PageParts(page).text.count(bad.sentence) == 2
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reason"),
     [(("z",), "'z' is not"), (("--runs", "1"), "--runs"), (("--runs", "many"), "--runs")],
 )
-def test_refuses(words, said, tmp_path):
+def test_refuses(words, reason, tmp_path):
     done = run("reproduce", *words, "-o", tmp_path / "out")
     assert done.code == 2
-    assert said in done.err
+    assert reason in done.err
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_is_reported_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "pkmcal.studies.reproduction.reproduce_paper", lambda *_: pytest.fail("worked")
     )
@@ -189,7 +189,7 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monke
     assert "outputs cannot go here" in done.err
 
 
-def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, found):
+def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, reproduced):
     monkeypatch.setattr(
         "pkmcal.studies.reproduction.reproduce_paper", lambda *_: pytest.fail("worked first")
     )
@@ -199,7 +199,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, found):
     assert "something other than reproductions; found thesis.tex" in done.err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     (tmp_path / "thesis.tex").rename(tmp_path / "paper-c.json")  # an earlier one of another paper
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce_paper", lambda *_: found)
+    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce_paper", lambda *_: reproduced)
     assert run("reproduce", "a", "-o", tmp_path).code == 0
 
 
@@ -299,8 +299,8 @@ def test_table_1_on_images():
     assert middle["z"] > 3 * middle["x"]
 
 
-def test_the_figure_has_thirty_parameters_and_every_method(found):
-    figure = next(plot for part in found.parts for plot in part.plots)
+def test_the_figure_has_thirty_parameters_and_every_method(reproduced):
+    figure = next(plot for part in reproduced.parts for plot in part.plots)
     bars = [trace for trace in figure.figure["data"] if trace["type"] == "bar"]
     assert [len(trace["x"]) for trace in bars] == [30] * 4
     joint = next(trace for trace in bars if trace["name"] == "joint estimate")
@@ -311,8 +311,8 @@ def test_the_figure_has_thirty_parameters_and_every_method(found):
     assert all(name.endswith("z") for name in worst)
 
 
-def test_tables_are_whole(found):
-    for part in found.parts:
+def test_tables_are_whole(reproduced):
+    for part in reproduced.parts:
         for table in part.tables:
             assert all(len(row.cells) + 1 == len(table.columns) for row in table.rows), table.title
 
@@ -329,11 +329,11 @@ def test_the_page_runs_in_a_browser(page, tmp_path):
     """On a telephone, where it is likeliest to overflow; the template's widths are all tried by
     the report."""
     document, console = browse(page, tmp_path, 390)
-    root = Found(document).tags[0][1]
+    root = PageParts(document).tags[0][1]
     assert root["data-errors"] == ""
     assert root["data-overhang"] == "0"
     assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
-    plots = [a for _, a in Found(document).tags if "data-plot" in a]
+    plots = [a for _, a in PageParts(document).tags if "data-plot" in a]
     assert len(plots) == 1
     assert all(a.get("data-drawn") == "yes" for a in plots)
 

@@ -60,7 +60,7 @@ def ran(short):
 
 
 @pytest.fixture(scope="module")
-def found(short, ran):
+def reproduced(short, ran):
     return paper_b_outcome(short, ran, 12.5)
 
 
@@ -193,9 +193,9 @@ def test_figures_of_the_prototype_are_compared(short):
 # ------------------------------------------------------------------ the page
 
 
-def test_the_page_has_the_papers_figures(found):
-    assert found.verdict.usable
-    page = page_html(found)
+def test_the_page_has_the_papers_figures(reproduced):
+    assert reproduced.verdict.usable
+    page = page_html(reproduced)
     names = ("shares", "mirror", "lateral", "top", "camera", "start", "goal", "error", "beside")
     for name in names:
         text = re.search(rf'id="figure-{name}">(.*?)</script>', page, re.DOTALL)
@@ -203,12 +203,12 @@ def test_the_page_has_the_papers_figures(found):
         assert all(len(trace["x"]) == len(trace["y"]) > 0 for trace in figure["data"]), name
     for words in ("12 and 8 mm", "Not reproduced: the overshoot of E3", "E1 and E2 cannot be told"):
         assert words in " ".join(page.split())
-    assert "{" not in found.verdict.headline
+    assert "{" not in reproduced.verdict.headline
 
 
-def test_legs_are_drawn_as_the_camera_has_them(ran, found):
+def test_legs_are_drawn_as_the_camera_has_them(ran, reproduced):
     """[B] Fig. 9: a leg's outline is as wide as its cylinder there, and nearer legs hide others."""
-    parts = {plot.name: plot for part in found.parts for plot in part.plots}
+    parts = {plot.name: plot for part in reproduced.parts for plot in part.plots}
     machine, T = ran.eye.true.machine, ran.eye.true.T_camera_base
     for name, readings in (("start", CONTROL_START_READINGS), ("goal", CONTROL_GOAL_READINGS)):
         legs = [t for t in parts[name].figure["data"] if t["name"].startswith("leg ")]
@@ -226,8 +226,8 @@ def test_legs_are_drawn_as_the_camera_has_them(ran, found):
             assert width == pytest.approx(across, rel=0.25), (name, k)
 
 
-def test_numbers_for_programs(short, ran, found):
-    document = json.loads(json.dumps(found.document, default=list))
+def test_numbers_for_programs(short, ran, reproduced):
+    document = json.loads(json.dumps(reproduced.document, default=list))
     assert document["paper"]["from_drawing"] == {"mirror": 0.012, "perspective": 0.008}
     entries = {(a["view"], a["case"], a["method"]): a for a in document["accuracy"]}
     assert set(entries) == set(short.samples)

@@ -32,9 +32,9 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.observe.legs import measure
 from pkmcal.session.load import load_session
-from test_calibration import check_found
-from test_observe_drawing import FRONT, poses, redrawn, rendered_images
+from test_calibration import check_calibration
 from test_observe_measure import errors, rms, taken
+from test_observe_rendered_legs import FRONT, poses, redrawn, rendered_images
 
 SRGB = np.rint(levels_of_light(np.arange(256.0), "srgb")).astype(np.uint8)
 
@@ -134,7 +134,7 @@ def test_files_of_a_kind_are_taken_for_what_is_usual(session, kind, usual):
     assert not any(station.response_given for station in stations)
 
 
-def test_what_the_session_says_holds(session):
+def test_what_the_session_states_holds(session):
     stated(session, "srgb")
     stations = load_session(session).stations
     assert {station.response for station in stations} == {"srgb"}
@@ -154,7 +154,7 @@ def test_a_response_that_there_is_not(session):
 # detection from edges
 
 
-def test_a_session_that_is_as_usual_says_nothing(calibrated):
+def test_a_usual_session_has_no_finding(calibrated):
     assert not calibrated.verdict.of("image.response")
 
 
@@ -173,7 +173,7 @@ def check_overruled(calibration, value, usual, demo, worse=1.0):
     """
     (hint,) = calibration.verdict.of("image.response")
     assert (hint.facts["other"], hint.facts["usual"]) == (value, usual)
-    check_found(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480 * worse)
+    check_calibration(calibration, demo.session, 0.2e-3 * np.sqrt(18 / 12) * 640 / 480 * worse)
     assert {station.response for station in calibration.session.stations} == {value}
 
 
@@ -201,7 +201,7 @@ def painted(estimate):
     return replace(estimate, edge_noise=noise)
 
 
-def asked_of(calibrated, measurements, estimate, other):
+def response_of(calibrated, measurements, estimate, other):
     """Edges (N,) of the first test, and whether all are tested then. other : edges measured with
     the other response.
     """
@@ -240,7 +240,7 @@ def test_edges_that_are_not_asked_do_not_hold_back_those_that_are(calibrated, se
     px = sign[right.station, right.leg, right.tube, right.side]
     wrong = replace(calibrated.measurements, edges=displaced(right, px))
     estimate = bundle(calibrated.session.machine, wrong, calibrated.estimate.state)
-    some, every = asked_of(calibrated, wrong, estimate, right)
+    some, every = response_of(calibrated, wrong, estimate, right)
     assert 0.2 < np.mean(some) < 0.8
     assert every
     few = {("cameras/camera.yaml", "linear"): right.select(some)}
@@ -259,7 +259,7 @@ def test_right_images_are_seldom_all_asked(calibrated):
     for seed in range(20):
         px = np.random.default_rng(seed).choice([-0.25, 0.25], len(right))
         other = displaced(right, px)
-        some, every = asked_of(calibrated, calibrated.measurements, calibrated.estimate, other)
+        some, every = response_of(calibrated, calibrated.measurements, calibrated.estimate, other)
         assert 0 < np.mean(some) < 1
         times += every
     assert times <= 6
@@ -306,7 +306,7 @@ def test_a_stated_response_is_not_asked_about(session):
 
 
 @pytest.mark.parametrize(("gain", "sure"), [(30.0, True), (13.0, False), (-5.0, False)])
-def test_edges_that_do_not_tell_are_a_caution_with_what_to_do(gain, sure):
+def test_undecided_edges_are_a_warning_with_a_next_step(gain, sure):
     values = ResponseEstimate(("front", "left"), "linear", gain)
     assert values.sure == sure
     assert values.response == ("srgb" if sure else "linear")

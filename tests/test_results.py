@@ -94,7 +94,7 @@ def test_numbers_that_are_none_become_null(calibrated):
     assert data["covariance"] == [None, 1.0]
 
 
-def test_the_mechanism_file_says_what_it_is(folder, calibrated):
+def test_the_mechanism_file_states_what_it_is(folder, calibrated):
     path = folder / "mechanism.yaml"
     comment = [line for line in path.read_text().splitlines() if line.startswith("#")]
     assert re.match(
@@ -200,7 +200,7 @@ def test_a_run_that_was_killed_after_the_copy_leaves_no_second_one(
     assert load(earlier).seed == 0
 
 
-def test_where_nothing_can_be_kept_it_is_told_before_the_work(earlier, monkeypatch):
+def test_where_nothing_can_be_kept_it_is_reported_before_the_work(earlier, monkeypatch):
     def refuse(place):
         if place == earlier.parent:
             raise InputError("cannot be written")
@@ -251,7 +251,7 @@ def test_nothing_there(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "not valid JSON"),
         ('{"NaN":\n1,\n"a": NaN}', "json, line 3: not a number in JSON; found 'NaN'"),
@@ -264,11 +264,11 @@ def test_nothing_there(tmp_path):
         ("[" * 20_000, "not"),
     ],
 )
-def test_other_files(tmp_path, text, said):
+def test_other_files(tmp_path, text, message):
     (tmp_path / "calibration.json").write_text(text)
     with pytest.raises(InputError) as caught:
         load(tmp_path)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_changed_value(folder):

@@ -20,7 +20,7 @@ from pkmcal.judge.causes import single_causes
 from pkmcal.mechanisms import catalogue, load_mechanism, machine_from_document, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import inverse_result, on_manifold
-from test_drawing_checks import ROD, drawn, sentence
+from test_nominal_model_checks import ROD, drawn, sentence
 
 NAMES = sorted(catalogue())
 
@@ -53,7 +53,7 @@ def test_readings_in_metres_have_a_scale_and_turns_are_exact():
 
 
 @pytest.mark.parametrize(("name", "tolerance", "count"), [("gough-stewart", 0, 0), ("h4", 1e-4, 4)])
-def test_the_file_says_how_sure_scales_are(tmp_path, name, tolerance, count):
+def test_the_file_states_how_sure_scales_are(tmp_path, name, tolerance, count):
     machine = load_mechanism(
         drawn(tmp_path, name, ("tolerance: {", f"tolerance: {{scale: {tolerance}, "))
     )
@@ -170,7 +170,7 @@ def test_derivatives_by_scales_and_readings(name):
         ),
     ],
 )
-def test_a_firmware_without_scales_is_told_what_to_set(name, to, words):
+def test_a_firmware_without_scales_gets_the_settings_to_change(name, to, words):
     machine = built(name, seed=4)
     if to == "linuxcnc":  # whose own module a machine gets that is off in nothing but its scales
         off, machine = machine, with_scales(load_mechanism(name), 1e-3)
@@ -187,7 +187,7 @@ def test_a_firmware_without_scales_is_told_what_to_set(name, to, words):
 # Words, and files of earlier versions
 
 
-def test_scales_that_surely_differ_are_told_once(demo):
+def test_scales_that_surely_differ_are_reported_once(demo):
     machine = load_mechanism("gough-stewart")
     table = machine.parameters
     rows = table.of_kind("scale")

@@ -63,7 +63,7 @@ def test_errors_drawn_from_the_covariance_whiten_to_one(scenes, case):
     assert np.mean([e.tool_z**2 for e in results]) == pytest.approx(1, abs=0.2)
 
 
-def test_a_covariance_that_promises_too_much_is_told(scenes, case):
+def test_a_covariance_that_promises_too_much_is_reported(scenes, case):
     parts, covariance, truth = case
     honest = scenes.errors_of(*parts, covariance, truth)
     bold = scenes.errors_of(*parts, covariance / 4, truth)

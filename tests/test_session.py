@@ -399,7 +399,7 @@ def shifted(by, columns=range(6)):
     return header
 
 
-def test_one_constant_that_explains_all_readings_is_told(folder):
+def test_one_constant_that_explains_all_readings_is_reported(folder):
     """0.345 to 0.485, 7 mm to spare; readings are from 0.35 to 0.46."""
     (folder / "joints.csv").write_text(shifted(-0.34))
     message = fault(load_session, folder)
@@ -409,7 +409,7 @@ def test_one_constant_that_explains_all_readings_is_told(folder):
     assert "one number between +328 and +372 mm added" in message
 
 
-def test_one_constant_of_one_joint_is_told(folder):
+def test_one_constant_of_one_joint_is_reported(folder):
     (folder / "joints.csv").write_text(shifted(0.2, [2]))
     message = fault(load_session, folder)
     assert "column leg3: the readings of leg3 are off by one constant" in message
@@ -480,7 +480,7 @@ def test_one_stations_images_under_two_names(folder):
     assert "stations.left.images: station left has the images of station front" in message
 
 
-def test_images_of_another_ending_are_told(folder):
+def test_images_of_another_ending_are_reported(folder):
     for path in (folder / "images" / "front").iterdir():
         path.rename(path.with_suffix(".JPG"))
     assert "Images there end in .JPG: write images/front/{configuration}.JPG." in fault(

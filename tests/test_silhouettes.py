@@ -37,7 +37,7 @@ from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.truth import load_truth
 from rendered import rendered
-from test_handheld import at_truth, found_with
+from test_handheld import at_truth, localized_with
 
 SETTINGS = Settings(configurations=4, repeats=1, handheld=True, tolerance=0.0)
 
@@ -215,18 +215,18 @@ def turns_of(calibration, shading, images):
     )
 
 
-def looked_from_machines_as_likely(calibration, value):
+def passes_from_likely_machines(calibration, value):
     visible = SimpleNamespace(session=calibration.session, boards=Boards())
     return imputation_variance(visible, value, np.random.default_rng(0), lambda *_: None)
 
 
-@pytest.mark.parametrize(("times", "asked"), [(0.9, False), (1.1, True)])
-def test_painted_legs_on_a_tripod_are_not_looked_for_again(tripod_calibration, times, asked):
+@pytest.mark.parametrize(("times", "remeasured"), [(0.9, False), (1.1, True)])
+def test_painted_legs_on_a_tripod_are_not_looked_for_again(tripod_calibration, times, remeasured):
     images = read_images(tripod_calibration.session)
     value = turns_of(tripod_calibration, times * POLISHED_SHADING, images)
-    ended = looked_from_machines_as_likely(tripod_calibration, value)
-    assert (ended is value) != asked
-    assert (ended.measurements.imputation_covariance > 0) == asked
+    ended = passes_from_likely_machines(tripod_calibration, value)
+    assert (ended is value) != remeasured
+    assert (ended.measurements.imputation_covariance > 0) == remeasured
 
 
 def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibration):
@@ -236,7 +236,7 @@ def test_where_no_look_ends_as_much_again_as_noise_is_believed(tripod_calibratio
         for p in read_images(tripod_calibration.session)
     ]
     value = turns_of(tripod_calibration, 2 * POLISHED_SHADING, empty)
-    ended = looked_from_machines_as_likely(tripod_calibration, value)
+    ended = passes_from_likely_machines(tripod_calibration, value)
     assert ended.estimate.statistics.look_scatter == 1
 
 
@@ -263,7 +263,7 @@ def test_of_a_camera_on_a_tripod_the_first_image_stands_for_all(beside, monkeypa
     session = load_session(beside[0])
     images, T = read_images(session), beside[1]
     assert [len(p.images) for p in images] == [1, 1, 1, 1, 4]
-    found_with(monkeypatch, SimpleNamespace(T_camera_base=T), [1e-4] * 4)
+    localized_with(monkeypatch, SimpleNamespace(T_camera_base=T), [1e-4] * 4)
     case = handheld.localize_case(session, images, Boards(), np.random.default_rng(0))
     scene = case.scene
     assert [len(p.images) for p in case.images] == [1, 1, 1, 1, 4]
@@ -313,7 +313,7 @@ def test_a_machine_that_does_not_settle_is_refused(tripod_calibration):
     assert reason.facts["change"] == 2.5
 
 
-def test_few_coarse_edges_do_not_tell_how_they_scatter():
+def test_few_coarse_edges_do_not_determine_their_scatter():
     """A few that lie well by chance would count for more than all that was measured."""
     rows = 100
     estimate = SimpleNamespace(

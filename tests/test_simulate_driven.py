@@ -55,7 +55,7 @@ def parts_of(machine, T, joints):
     return machine_parts(machine, discs_of(machine), finish, T, joints)
 
 
-def seen_along(parts, origin, targets):
+def first_hits(parts, origin, targets):
     """Distances to the first part, and its number, along rays to targets (n, 3)."""
     rays = (targets - origin).T
     rays = rays / np.linalg.norm(rays, axis=0)
@@ -165,14 +165,14 @@ def test_little_of_a_machine_hides_its_own_forearms(machine):
         ends = limb_ends(machine.layout, truth.machine.values, joints, T)
         s = np.linspace(0.1, 0.9, 20)[:, None, None]
         axis = (ends.a + s * (ends.b - ends.a)).reshape(-1, 3)
-        near, _ = seen_along(parts, eye, axis)
+        near, _ = first_hits(parts, eye, axis)
         wide = max(r.max() for r in machine.radii())
         # the first hit is the forearm's own skin, a radius before its axis, more on a slant
         shares.append(np.mean(near > np.linalg.norm(axis - eye, axis=1) - 6 * wide))
     assert np.mean(shares) > 0.7
 
 
-def test_an_arm_is_as_long_as_the_drawing_says(h4):
+def test_an_arm_is_as_long_as_the_nominal_model_states(h4):
     T = h4.home()
     for q in (0.2, 0.9):
         parts = parts_of(h4, T, np.full(4, q))
@@ -180,7 +180,7 @@ def test_an_arm_is_as_long_as_the_drawing_says(h4):
         a = limb_ends(h4.layout, h4.values, np.full(4, q), T).a
         middle = (a[0] + drives.foot[0]) / 2
         above = middle + np.array([1e-4, 2e-4, 0.2])
-        near, which = seen_along(parts, above, middle[None])
+        near, which = first_hits(parts, above, middle[None])
         # the arm's web is less than a forearm thick on either side
         assert abs(near[0] - 0.2) < 0.03
         assert parts[which[0]].shape.half[0] == pytest.approx(0.13, abs=1e-9)
@@ -203,7 +203,7 @@ def test_platforms_with_side_bars_do_not_fold(h4):
         assert np.abs(turn).max() < FARTHEST_TURN * machine.most_turn[0]
 
 
-def test_the_drawing_takes_the_readings(machine):
+def test_the_nominal_model_takes_the_readings(machine):
     truth = draw_truth(machine, (SMALL,), Settings(stations=1, configurations=20), 2)
     assert machine.forward_result(truth.joints).converged.all()
     assert np.isfinite(truth.joints).all()
@@ -228,7 +228,7 @@ def test_hinges_of_side_bars_cannot_be_drawn(tmp_path):
 # by the command
 
 
-def test_the_command_writes_cylinders_into_the_sessions_drawing(tmp_path):
+def test_the_command_writes_cylinders_into_the_sessions_nominal_model(tmp_path):
     done = run(
         "simulate", tmp_path / "s", "--mechanism", "h4", "--stations", "1", "--configurations", "2",
         "--size", "96x72",
@@ -291,7 +291,7 @@ def test_forearms_alone_in_images(mixed):
 
 
 @pytest.mark.slow
-def test_the_board_says_where_the_camera_stands(mixed):
+def test_the_board_states_where_the_camera_stands(mixed):
     """With it, no pose by hand is needed to find the forearms."""
     path = observing(mixed, ["legs", "board"]) / "session.yaml"
     text = path.read_text()
@@ -303,7 +303,7 @@ def test_the_board_says_where_the_camera_stands(mixed):
     assert len(edges) > 40
 
 
-def test_the_blur_is_not_told_by_a_few_odd_profiles():
+def test_a_few_odd_profiles_do_not_decide_the_blur():
     """Few profiles of slim legs are complete; a highlight on these does not affect the rest."""
     from test_profiles import make
 
@@ -348,7 +348,7 @@ def test_legs_and_board_know_more_than_each(name, tmp_path):
     assert errors.calibrated.position < errors.drawing.position / 3
 
 
-def test_a_home_that_a_limb_does_not_reach_is_told_with_its_file(tmp_path):
+def test_a_home_that_a_limb_does_not_reach_is_reported_with_its_file(tmp_path):
     text = mechanism_text(load_mechanism("6-rus"))
     path = tmp_path / "short.yaml"
     path.write_text(re.sub(r"constant: [\d.]+", "constant: 0.01", text, count=1))

@@ -206,7 +206,7 @@ def test_a_minimum_with_residual_left():
     np.testing.assert_allclose(2 * x * (x**2 + 0.1), 1 - x, atol=1e-6)
 
 
-def test_step_limit_is_told():
+def test_step_limit_is_reported():
     values = minimise_dense(rosenbrock, np.array([[-1.2, 1.0]]))
     assert values.steps[0] > 3
     limited = minimise(Dense(rosenbrock, np.arange(1)), np.array([[-1.2, 1.0]]), max_steps=2)
@@ -226,7 +226,7 @@ def test_damped_steps_are_smaller_and_lead_to_the_same_minimum():
     np.testing.assert_allclose([damped.state, usual.state], 2 / 3, atol=1e-7)
 
 
-def test_nothing_predictable_is_told():
+def test_nothing_predictable_is_reported():
     """No pose is a number, so no row can be predicted."""
     rng = np.random.default_rng(5)
     assembled, truth = make_scene(rng).batch(rng)

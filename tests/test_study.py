@@ -74,7 +74,7 @@ def test_a_grid_has_every_combination():
         (["observe=arms"], "no such observe.*legs, board and legs\\+board"),
     ],
 )
-def test_what_cannot_be_varied_is_told(words, message):
+def test_what_cannot_be_varied_is_reported(words, message):
     with pytest.raises(InputError) as caught:
         parsed(subject_of("3-rpr"), words)
     assert re.search(message, str(caught.value))
@@ -99,12 +99,12 @@ def test_too_many_combinations_are_refused():
         cells_of(subject, parsed(subject, [f"stations={values}", f"focal={values}"]))
 
 
-def test_an_unknown_subject_is_told():
+def test_an_unknown_subject_is_reported():
     with pytest.raises(InputError, match=r"there is nothing of this name to study.*gough-stewart"):
         subject_of("gough")
 
 
-def test_hinged_bars_are_told():
+def test_hinged_bars_are_reported():
     with pytest.raises(InputError, match=r"'h4-rods' has side bars.*one rod a forearm, such as h4"):
         subject_of("h4-rods")
 
@@ -125,7 +125,7 @@ def test_a_machine_of_another_size_is_the_same_machine(name):
     np.testing.assert_array_equal(two.parameters.tolerance, one.parameters.tolerance)
 
 
-def test_cameras_change_as_told():
+def test_cameras_change_as_stated():
     usual = design_of("gough-stewart").cameras[0]
     fine = design_of("gough-stewart", "resolution=2048").cameras[0]
     assert fine.image_size == (2048, 1536)
@@ -151,7 +151,7 @@ def test_places_are_where_they_are_asked_for():
     np.testing.assert_allclose(above, 30, atol=2)
 
 
-def test_a_camera_that_sees_too_little_is_told():
+def test_a_camera_that_sees_too_little_is_reported():
     design = design_of("gough-stewart", "distance=0.4", "focal=3000")
     with pytest.raises(InputError, match="does not see the machine"):
         captured(design, np.random.default_rng(0))
@@ -262,7 +262,7 @@ def test_coverage(subject, vary):
         assert 0.93 <= item.value <= 0.97
 
 
-def test_edges_that_scatter_more_than_stated_are_told():
+def test_edges_that_scatter_more_than_stated_are_reported():
     """Ten times as much, which no session's judgement would let pass."""
     setting = SimulatedCalibrations(design_of("gough-stewart", "configurations=8"))
     batch = batch_of(setting, 2)
@@ -281,7 +281,7 @@ def test_edges_that_scatter_more_than_stated_are_told():
     assert noisy["failed"].all()
 
 
-def test_wrong_deviations_are_told():
+def test_wrong_deviations_are_reported():
     """Half of the true standard deviations: the study reports it, in exit code and page."""
     rng = np.random.default_rng(0)
     sigma = np.ones((40, 30))
@@ -304,7 +304,7 @@ def test_standard_errors_know_of_batches():
     assert np.mean(np.square(errors)) == pytest.approx(1 / 25, rel=0.05)
 
 
-def test_calibrations_that_all_fail_are_told(tmp_path, one_process):
+def test_calibrations_that_all_fail_are_reported(tmp_path, one_process):
     """A thousand times the noise of [A] Table 1: no calibration can be used, and the study reports
     it.
     """
@@ -326,7 +326,7 @@ def test_calibrations_that_all_fail_are_told(tmp_path, one_process):
     assert all("NaN" not in figure for figure in figures)
 
 
-def test_a_platform_that_does_not_turn_is_told_no_turns(tmp_path, one_process):
+def test_a_platform_that_does_not_turn_has_no_rotations_in_its_table(tmp_path, one_process):
     out = tmp_path / "out"
     done = run("study", "delta", *SMALL[:2], "--vary", "stations=1", "--runs", 4, "-o", out)
     assert done.code == 0, done.err
@@ -334,7 +334,7 @@ def test_a_platform_that_does_not_turn_is_told_no_turns(tmp_path, one_process):
     assert "mrad" not in re.sub("<script.*?</script>", "", (out / "study.html").read_text())
 
 
-def test_one_run_tells_no_standard_error():
+def test_one_run_has_no_standard_error():
     one = clustered(np.array([0.3]), np.array([5]))
     assert one.value == 0.3
     assert np.isnan(one.error)
@@ -377,7 +377,7 @@ def test_what_chance_does_is_no_gain():
 # the command
 
 
-def test_the_command_tells_and_writes(tmp_path, one_process):
+def test_the_command_prints_and_writes(tmp_path, one_process):
     out = tmp_path / "study"
     done = run("study", "3-rpr", *SMALL, "--runs", 8, "-o", out)
     assert done.code == 0, done.err

@@ -157,14 +157,14 @@ def test_a_batch_that_kills_every_worker_ends_the_study(monkeypatch):
     assert "killed again and again" in str(pool.failure)
 
 
-def test_an_error_in_another_process_is_told():
+def test_an_error_in_another_process_is_reported():
     pool = workers._Pool([Job(Counting("input"), batch_of(Counting()))], lambda _k, _done: None)
     pool.elsewhere()
     assert isinstance(pool.failure, InputError)
     assert str(pool.failure) == "nothing to count."
 
 
-def test_an_error_here_is_told(one_process):
+def test_an_error_here_is_reported(one_process):
     with pytest.raises(InputError, match="nothing to count"):
         engine.run(Counting("input"), 10, 0)
 
@@ -242,14 +242,14 @@ def test_a_folder_where_nothing_was_finished_is_free(tmp_path, one_process):
 # a cluster
 
 
-def test_a_cluster_without_dask_is_told(monkeypatch):
+def test_a_cluster_without_dask_is_reported(monkeypatch):
     monkeypatch.setattr(cluster, "find_spec", lambda _name: None)
     with pytest.raises(InputError, match=r"dask.distributed.*pip install '\.\[cluster\]'"):
         study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
+def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "SCHEDULER_TIMEOUT", 1)
     with pytest.raises(InputError, match=r"no Dask scheduler answers.*127.0.0.1:1"):
@@ -257,14 +257,14 @@ def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["", "nonsense", "host:port", "ftp://10.0.0.1:21", "tcp://:1"])
-def test_what_is_no_address_is_told_at_once(address):
+def test_what_is_no_address_is_reported_at_once(address):
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match=r"no address of a Dask scheduler.*tcp://10.0.0.1:8786"):
         study("a", (), runs=4, scheduler=address)
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_scheduler_that_goes_away_is_told(tmp_path):
+def test_a_scheduler_that_goes_away_is_reported(tmp_path):
     """Batches finished by then are kept."""
     distributed, dask = (pytest.importorskip(name) for name in ("distributed", "dask"))
     local = distributed.LocalCluster(

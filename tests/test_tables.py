@@ -116,7 +116,7 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "reason"),
     [
         (b"x,1,2,3\n", "line {}: the row has another number of cells"),
         (b"x,1,\n", "line {}, column leg2: the cell is empty"),
@@ -128,14 +128,14 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
         (b'x,1,"2\n', "line {}: not valid CSV"),
     ],
 )
-def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, said, monkeypatch):
+def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, reason, monkeypatch):
     """For a table that is read in many blocks."""
     monkeypatch.setattr(documents, "TEXT_BLOCK_BYTES", 1 << 14)
     rows = [b"%06d,0.%06d,1e-3\n" % (k, k) for k in range(3000)]
     rows.insert(2400, line)
     path = written(tmp_path / "t.csv", HEADER.encode() + b"".join(rows))
     assert path.stat().st_size > 2 * documents.TEXT_BLOCK_BYTES
-    assert fault(read_csv, path).startswith("t.csv, " + said.format(2402))
+    assert fault(read_csv, path).startswith("t.csv, " + reason.format(2402))
 
 
 def test_a_large_table(tmp_path, monkeypatch):

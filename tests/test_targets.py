@@ -54,7 +54,7 @@ def detections(board, T_camera_board, seed=0, noise=NOISE, camera=CAMERA):
     ]
 
 
-def seen(board, value, rows=None, camera=CAMERA):
+def corners_in_view(board, value, rows=None, camera=CAMERA):
     rows = np.arange(len(value)) if rows is None else np.asarray(rows)
     return board_views(2, camera, rows, board, value)
 
@@ -80,7 +80,7 @@ def without(detection, keep):
 def test_errors_of_poses_are_what_their_covariances_say(board):
     n = 200
     truth = poses_around(n)
-    poses = one_a_configuration(seen(board, detections(board, truth)), mount=0)[0]
+    poses = one_a_configuration(corners_in_view(board, detections(board, truth)), mount=0)[0]
     assert len(poses) == n
     assert set(poses.station.tolist()) == {2}
     # 1200 squares of unit normals: four standard deviations of their mean
@@ -93,7 +93,7 @@ def test_rendered_boards(board):
     truth = poses_around(4, seed=3)
     images = [render(CAMERA, T, board, seed=k) for k, T in enumerate(truth)]
     result = detect_in(images, board, [f"{k}.png" for k in range(4)])
-    poses = one_a_configuration(seen(board, result), mount=0)[0]
+    poses = one_a_configuration(corners_in_view(board, result), mount=0)[0]
     error = pose_difference(poses.T_station_target, truth)
     value = chi2(error, poses.whiten)
     # 24 squares; sigma is by what the corner's fit leaves, which is a little too large
@@ -107,7 +107,7 @@ def test_a_hidden_part_costs_certainty_not_truth(board):
     T = poses_around(1)
     whole = detections(board, T)[0]
     part = without(whole, np.arange(12, 30))
-    both = seen(board, [whole, part])
+    both = corners_in_view(board, [whole, part])
     error = pose_difference(both.poses.T_camera_board, np.tile(T, (2, 1, 1)))
     poses = one_a_configuration(both, 0)[0]
     assert np.all(chi2(error, poses.whiten) < 24)  # one in two thousand
@@ -121,7 +121,7 @@ def test_outlying_corners_lose_their_weight(board):
     spoilt = value[1].pixels.copy()
     spoilt[[3, 17, 40]] += [[6.0, -4.0], [-5.0, 5.0], [8.0, 0.0]]
     value[1] = replace(value[1], pixels=spoilt)
-    views = seen(board, value)
+    views = corners_in_view(board, value)
     assert np.all(views.poses.weight[1, [3, 17, 40]] == 0)
     assert views.poses.weight[1].sum() > 40
     poses = one_a_configuration(views, 0)[0]
@@ -132,7 +132,7 @@ def test_images_without_a_board_are_rejected_with_the_reason(board):
     values = detections(board, poses_around(3))
     none = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     values[1] = Detection("0001.png", CAMERA.image_size, *none, reason="nothing is recognised")
-    views = seen(board, values, rows=[4, 5, 6])
+    views = corners_in_view(board, values, rows=[4, 5, 6])
     (item,) = views.rejected
     assert (item.station, item.configuration, item.leg) == (2, 5, -1)
     assert item.reason == "the board: nothing is recognised"
@@ -142,7 +142,7 @@ def test_images_without_a_board_are_rejected_with_the_reason(board):
 def test_no_image_shows_it(board):
     none = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     missed = Detection("0000.png", CAMERA.image_size, *none, reason="nothing is recognised")
-    views = seen(board, [missed])
+    views = corners_in_view(board, [missed])
     assert len(one_a_configuration(views, 0)[0]) == 0
     assert standing_board(views) is None
 
@@ -150,11 +150,11 @@ def test_no_image_shows_it(board):
 def test_a_tilt_that_is_not_sure_is_rejected(board):
     """Far away and seen from straight ahead, a board tilted left looks like one tilted right."""
     far = before(tilt=(0.0, 0.06, 0.0), place=(-0.12, -0.09, 6.0))
-    views = seen(board, detections(board, far[None], noise=0.1))
+    views = corners_in_view(board, detections(board, far[None], noise=0.1))
     assert not views.usable[0]
     assert "its tilt is not sure" in views.rejected[0].reason
     near = before(tilt=(0.0, 0.5, 0.0))
-    assert seen(board, detections(board, near[None], noise=0.1)).usable[0]
+    assert corners_in_view(board, detections(board, near[None], noise=0.1)).usable[0]
 
 
 # boards that cannot be used
@@ -163,14 +163,14 @@ def test_a_tilt_that_is_not_sure_is_rejected(board):
 def test_a_board_that_looks_the_same_turned_round():
     turnable = chessboard((8, 6), 0.03)
     with pytest.raises(InputError, match="itself turned by half a turn") as caught:
-        seen(turnable, [])
+        corners_in_view(turnable, [])
     assert caught.value.found == "a chessboard of 8x6 inner corners"
 
 
 def test_mirrored_images(board):
     results = [replace(d, mirrored=True) for d in detections(board, poses_around(2))]
     with pytest.raises(InputError, match="mirror images") as caught:
-        seen(board, results)
+        corners_in_view(board, results)
     assert caught.value.where == "0000.png and 0001.png"
 
 
@@ -178,7 +178,7 @@ def test_one_mirrored_image_is_named_alone(board):
     value = detections(board, poses_around(3))
     value[1] = replace(value[1], mirrored=True)
     with pytest.raises(InputError) as caught:
-        seen(board, value)
+        corners_in_view(board, value)
     assert caught.value.where == "0001.png"
     assert "Flip this image alone" in str(caught.value)
     assert "2 other images" in str(caught.value)
@@ -189,7 +189,7 @@ def test_corners_that_are_not_this_boards(board):
     stretched = replace(board, points=board.points * [1.5, 1.0, 1.0])
     value = detections(stretched, poses_around(3))
     with pytest.raises(InputError, match="do not lie as the board file") as caught:
-        seen(board, value)
+        corners_in_view(board, value)
     assert "px rms off their places (a ChArUco board of 9x7 squares)" in caught.value.found
 
 
@@ -232,7 +232,7 @@ def test_a_still_board_is_one_measurement(board):
     """Its covariance is that of the mean, and matches its error, over many sessions."""
     values, sigmas = [], []
     for seed in range(20):
-        views = seen(board, still(board, seed=seed), rows=np.arange(8) + 3)
+        views = corners_in_view(board, still(board, seed=seed), rows=np.arange(8) + 3)
         stood = standing_board(views)
         assert stood.agreed.all()
         assert stood.rejected == ()
@@ -250,7 +250,9 @@ def test_what_all_images_share_does_not_average_out(board):
     rng = np.random.default_rng(5)
     printed = replace(board, points=board.points + [1, 1, 0] * rng.normal(0, 5e-5, (48, 3)))
     few, many = (
-        standing_board(seen(board, detections(printed, np.tile(before(), (n, 1, 1)), noise=0.01)))
+        standing_board(
+            corners_in_view(board, detections(printed, np.tile(before(), (n, 1, 1)), noise=0.01))
+        )
         for n in (2, 30)
     )
     assert many.noise == pytest.approx(0.055, rel=0.3)  # 0.05 mm at 1.1 px a mm
@@ -260,15 +262,15 @@ def test_what_all_images_share_does_not_average_out(board):
 def test_a_trembling_camera_makes_the_pose_less_sure(board):
     rng = np.random.default_rng(2)
     tremble = {k: np.concatenate([np.zeros(3), rng.normal(0, 1e-4, 3)]) for k in range(8)}
-    quiet = standing_board(seen(board, still(board)))
-    shaken = standing_board(seen(board, still(board, moves=tremble)))
+    quiet = standing_board(corners_in_view(board, still(board)))
+    shaken = standing_board(corners_in_view(board, still(board, moves=tremble)))
     assert shaken.agreed.all()
     assert shaken.scatter > 1.5 * quiet.scatter
     assert np.all(np.diag(shaken.covariance)[3:5] > 2 * np.diag(quiet.covariance)[3:5])
 
 
-def test_one_image_is_enough_and_says_nothing_of_standing_still(board):
-    views = seen(board, still(board, n=1))
+def test_one_image_is_enough_and_does_not_test_for_motion(board):
+    views = corners_in_view(board, still(board, n=1))
     stood = standing_board(views)
     assert np.isnan(stood.scatter)
     np.testing.assert_allclose(stood.covariance, views.poses.covariance[0], rtol=0.2)
@@ -276,7 +278,7 @@ def test_one_image_is_enough_and_says_nothing_of_standing_still(board):
 
 @pytest.mark.parametrize("odd", [0, 4, 7])
 def test_one_image_that_disagrees_is_left_out(board, odd):
-    stood = standing_board(seen(board, still(board, moves={odd: AWAY})))
+    stood = standing_board(corners_in_view(board, still(board, moves={odd: AWAY})))
     assert np.flatnonzero(~stood.agreed).tolist() == [odd]
     (item,) = stood.rejected
     assert item.configuration == odd
@@ -295,7 +297,7 @@ def test_one_image_that_disagrees_is_left_out(board, odd):
 )
 def test_a_board_that_moved(board, moved, last, first):
     with pytest.raises(InputError) as caught:
-        standing_board(seen(board, still(board, moves=dict.fromkeys(moved, AWAY))))
+        standing_board(corners_in_view(board, still(board, moves=dict.fromkeys(moved, AWAY))))
     assert caught.value.what == f"the board, or the camera, moved after {last}"
     assert caught.value.where == first
     assert "px away (2.0 mm, 0.0" in caught.value.found
@@ -304,7 +306,7 @@ def test_a_board_that_moved(board, moved, last, first):
 def test_a_board_that_never_stood_still(board):
     moves = {k: (0, 0, 0, 2e-3 * k, 0, 0) for k in (1, 3, 5)}
     with pytest.raises(InputError, match="did not stand still") as caught:
-        standing_board(seen(board, still(board, moves=moves)))
+        standing_board(corners_in_view(board, still(board, moves=moves)))
     assert caught.value.found.startswith("3 of 8 images")
 
 
@@ -313,7 +315,7 @@ def test_all_camera_models_see_a_still_board(board):
         camera = CAMERAS[model]
         place = before(place=(-0.12, -0.09, 0.2))
         values = detections(board, np.tile(place, (4, 1, 1)), camera=camera)
-        stood = standing_board(seen(board, values, camera=camera))
+        stood = standing_board(corners_in_view(board, values, camera=camera))
         assert stood.agreed.all()
         error = pose_difference(stood.T_camera_board, place)
         assert error @ np.linalg.solve(stood.covariance, error) < 24

@@ -27,7 +27,7 @@ NO_SLICES = {"3-rps", "constant-legs"}
 """Machines that cannot move aside without turning."""
 
 
-def known(machine, share=0.02):
+def determined(machine, share=0.02):
     """A covariance of the free parameters, correlated."""
     root = machine.parameters.free_matrix() * machine.parameters.tolerances_free() * share
     mixed = root @ np.random.default_rng(4).normal(size=(root.shape[1],) * 2)
@@ -40,7 +40,9 @@ def small():
     nominal = load_mechanism("gough-stewart")
     machine = true_machine(nominal, 1.0, np.random.default_rng(2))
     poses = poses_in(machine.limits(), Region(turn=0.2), 12)
-    return SimpleNamespace(nominal=nominal, machine=machine, poses=poses, covariance=known(machine))
+    return SimpleNamespace(
+        nominal=nominal, machine=machine, poses=poses, covariance=determined(machine)
+    )
 
 
 def drawn_poses(case, draws=600):
@@ -88,7 +90,7 @@ def test_what_frames_do_is_in_no_sigma_where_only_boards_saw_the_machine(small):
     assert values.position.max() < 1e-9
 
 
-def test_the_drawings_error_is_that_of_its_poses_at_the_same_readings(small):
+def test_the_nominal_error_is_that_of_its_poses_at_the_same_readings(small):
     machine, nominal = small.machine, small.nominal
     values = tool_error(nominal, machine, small.covariance, small.poses)
     joints = machine.inverse(small.poses)
@@ -119,7 +121,7 @@ def test_poses_out_of_reach_are_nan(small):
     far = small.poses.copy()
     machine = load_mechanism("delta")
     far = np.stack([machine.home(), perturb(machine.home(), np.array([0, 0, 0, 2.0, 0, 0]))])
-    values = tool_error(machine, machine, known(machine), far)
+    values = tool_error(machine, machine, determined(machine), far)
     assert np.isfinite(values.position[0])
     assert np.isnan(values.position[1])
     assert np.isnan(values.off_position[1])
@@ -147,7 +149,7 @@ def test_from_a_calibration_and_from_its_file(calibrated, tmp_path):
 def test_every_machine_has_a_map(name):
     nominal = load_mechanism(name)
     machine = true_machine(nominal, 0.2, np.random.default_rng(3))
-    made = map_of(nominal, machine, known(machine))
+    made = map_of(nominal, machine, determined(machine))
     assert made.spread == 250
     assert np.isfinite(made.after.position).all()
     assert (made.after.position > 0).all()
@@ -186,7 +188,7 @@ def page_of(name, **region):
     """The report's section of a machine whose map is made, and the map."""
     nominal = load_mechanism(name)
     machine = true_machine(nominal, 0.2, np.random.default_rng(3))
-    made = map_of(nominal, machine, known(machine), Region(**region))
+    made = map_of(nominal, machine, determined(machine), Region(**region))
     state = SimpleNamespace(T_base_platform=made.after.T_base_platform[:4])
     estimate = SimpleNamespace(configurations=np.ones(4, dtype=bool), state=state)
     session = SimpleNamespace(machine=nominal, configurations=tuple("abcd"))
@@ -230,7 +232,7 @@ def test_machines_of_few_freedoms_are_drawn_by_what_they_do(name, plots, axes):
 
 
 @pytest.mark.parametrize(
-    ("name", "region", "slices", "said"),
+    ("name", "region", "slices", "message"),
     [
         ("gough-stewart", {"z": (0.36, 0.36)}, [(0, 1, 0.36)], "z 360 mm"),
         ("gough-stewart", {"x": (0.02, 0.02)}, [(1, 2, 0.02)], "x 20 mm"),
@@ -239,17 +241,17 @@ def test_machines_of_few_freedoms_are_drawn_by_what_they_do(name, plots, axes):
         ("gough-stewart", {"x": (0.0, 0.0), "y": (0.0, 0.0), "z": (0.36, 0.36)}, [], "z 360 mm"),
     ],
 )
-def test_a_plane_a_line_and_a_point_are_regions_too(name, region, slices, said):
+def test_a_plane_a_line_and_a_point_are_regions_too(name, region, slices, message):
     """A plane is cut where it is, not at home; a line and a point have no slices, and say why."""
     part, made = page_of(name, **region)
     cuts = [(cut.across, cut.up, cut.level) for cut in made.slices]
     assert cuts == [(*plane[:2], pytest.approx(plane[2], abs=1e-6)) for plane in slices]
     assert all(np.count_nonzero(cut.rows >= 0) > 50 for cut in made.slices)
-    assert said in part.text[0]
+    assert message in part.text[0]
     assert ("extent along one axis at most" in part.text[1]) == (not slices)
 
 
-def test_a_machine_without_a_map_says_why():
+def test_a_machine_without_a_map_states_why():
     part = section(None, None, "There is no map of the workspace: out of reach.", Links.of([]))
     assert part.text == ("There is no map of the workspace: out of reach.",)
     assert part.plots == ()
@@ -286,6 +288,6 @@ def test_errors_beside_a_known_machine_are_those_of_its_poses(small):
     assert np.sum(by_poses.position**2) < np.sum(error.position**2)
 
 
-def test_machines_of_other_drawings_are_not_compared(small):
+def test_machines_of_other_nominal_models_are_not_compared(small):
     with pytest.raises(InputError, match="these are two different machines; found delta, 3 legs"):
         compare(load_mechanism("delta"), small.machine, np.zeros((1, 3)))

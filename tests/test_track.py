@@ -200,26 +200,26 @@ def turned(edges, turn):
     return replace(edges, normal=normal, basis=tangent_basis(normal, edges.basis[..., 0]))
 
 
-SEEN = machine_view(MACHINE, BESIDE)
+VIEW = machine_view(MACHINE, BESIDE)
 NEAR = perturb(AT, np.array([1e-3, -1e-3, 1e-3, 5e-4, -5e-4, 3e-4]))
 NEAR_READINGS = MACHINE.inverse(NEAR[None])[0]
 
 
 def test_lines_of_exact_edges_are_exact_to_second_order():
-    rows = edge_misfits(SEEN, NEAR_READINGS, NEAR, edges_of(AT, READINGS, sigma=1e-7), 0.0)
+    rows = edge_misfits(VIEW, NEAR_READINGS, NEAR, edges_of(AT, READINGS, sigma=1e-7), 0.0)
     rows = replace(rows, information=np.tile(np.eye(2) / 1e-14, (len(rows.leg), 1, 1)))
-    lines = leg_lines(SEEN, rows)
+    lines = leg_lines(VIEW, rows)
     assert lines.valid.all()
-    np.testing.assert_allclose(lines.normal, true_edges(SEEN, AT), atol=1e-5)
+    np.testing.assert_allclose(lines.normal, true_edges(VIEW, AT), atol=1e-5)
 
 
-def test_lines_scatter_as_their_covariance_says():
+def test_lines_scatter_as_their_covariance_states():
     rng = np.random.default_rng(0)
-    truth, whitened = true_edges(SEEN, AT), []
+    truth, whitened = true_edges(VIEW, AT), []
     for _ in range(60):
-        rows = edge_misfits(SEEN, READINGS, AT, edges_of(AT, READINGS, rng), 0.0)
+        rows = edge_misfits(VIEW, READINGS, AT, edges_of(AT, READINGS, rng), 0.0)
         rows = replace(rows, information=np.linalg.inv(edges_of(AT, READINGS).covariance))
-        lines = leg_lines(SEEN, rows)
+        lines = leg_lines(VIEW, rows)
         turn = np.swapaxes(lines.basis, -1, -2) @ truth[..., None]
         whitened.append(np.linalg.solve(root(lines), turn))
     assert np.mean(np.square(whitened)) == pytest.approx(1.0, abs=0.12)
@@ -230,8 +230,8 @@ def test_an_edge_of_something_else_costs_the_leg_and_not_the_truth():
     edges = edges_of(AT, READINGS)
     turn = np.zeros((len(edges), 2))
     turn[0, 0] = 3 * PIXEL  # leg 1, one of its four edges
-    rows = edge_misfits(SEEN, READINGS, AT, turned(edges, turn), 0.0)
-    lines = leg_lines(SEEN, rows)
+    rows = edge_misfits(VIEW, READINGS, AT, turned(edges, turn), 0.0)
+    lines = leg_lines(VIEW, rows)
     assert not lines.agrees[0]
     assert lines.valid.tolist() == [False, True, True, True, True, True]
     assert np.isnan(lines.normal[0]).all()
@@ -239,23 +239,23 @@ def test_an_edge_of_something_else_costs_the_leg_and_not_the_truth():
 
 def test_one_side_alone_is_no_leg():
     edges = edges_of(AT, READINGS)
-    rows = edge_misfits(SEEN, READINGS, AT, edges.select((edges.leg != 2) | (edges.side == 0)), 0.0)
-    assert leg_lines(SEEN, rows).valid.tolist() == [True, True, False, True, True, True]
+    rows = edge_misfits(VIEW, READINGS, AT, edges.select((edges.leg != 2) | (edges.side == 0)), 0.0)
+    assert leg_lines(VIEW, rows).valid.tolist() == [True, True, False, True, True, True]
 
 
 def test_only_the_legs_that_count_are_answered():
     view = machine_view(MACHINE, BESIDE, np.array([4, 1]))
     lines = leg_lines(view, edge_misfits(view, READINGS, AT, edges_of(AT, READINGS), 0.0))
-    np.testing.assert_allclose(lines.normal, true_edges(SEEN, AT)[[4, 1]], atol=1e-6)
+    np.testing.assert_allclose(lines.normal, true_edges(VIEW, AT)[[4, 1]], atol=1e-6)
 
 
 def test_the_constant_shift_of_a_camera_is_taken_off():
     edges = edges_of(AT, READINGS)
     outward = turned(edges, 0.3 * edges.shift)
-    rows = edge_misfits(SEEN, READINGS, AT, outward, 0.3)
-    np.testing.assert_allclose(leg_lines(SEEN, rows).normal, true_edges(SEEN, AT), atol=1e-6)
-    raw = leg_lines(SEEN, edge_misfits(SEEN, READINGS, AT, outward, 0.0))
-    assert np.abs(raw.normal - true_edges(SEEN, AT)).max() > 1e-4
+    rows = edge_misfits(VIEW, READINGS, AT, outward, 0.3)
+    np.testing.assert_allclose(leg_lines(VIEW, rows).normal, true_edges(VIEW, AT), atol=1e-6)
+    raw = leg_lines(VIEW, edge_misfits(VIEW, READINGS, AT, outward, 0.0))
+    assert np.abs(raw.normal - true_edges(VIEW, AT)).max() > 1e-4
 
 
 def test_the_pose_of_exact_edges_is_found_with_and_without_one_bad_leg():
@@ -268,30 +268,30 @@ def test_the_pose_of_exact_edges_is_found_with_and_without_one_bad_leg():
             edges = turned(edges, turn)
         T = NEAR
         for _ in range(4):
-            T = corrected_pose(SEEN, T, edge_misfits(SEEN, READINGS, T, edges, 0.0), every)
+            T = corrected_pose(VIEW, T, edge_misfits(VIEW, READINGS, T, edges, 0.0), every)
         # a leg of six that is 3 px aside would carry the pose along by ten times as much
         limit = 3e-3 if bad else 1e-6
         assert np.abs(pose_difference(T, AT)).max() < limit
 
 
 def test_a_pose_without_edges_stays():
-    rows = edge_misfits(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0)
-    assert corrected_pose(SEEN, AT, rows, np.zeros(6, dtype=bool)) is AT
+    rows = edge_misfits(VIEW, READINGS, AT, edges_of(AT, READINGS), 0.0)
+    assert corrected_pose(VIEW, AT, rows, np.zeros(6, dtype=bool)) is AT
 
 
 @pytest.mark.parametrize("law", ["edges", "directions"])
 def test_weights_make_errors_white(law):
     """Errors of measured edges, drawn with their covariance, come out of one size in all rows."""
     rng = np.random.default_rng(3)
-    goal, legs, every = true_edges(SEEN, AT), legs_at(SEEN, AT), np.ones(6, dtype=bool)
-    lines = leg_lines(SEEN, edge_misfits(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0))
+    goal, legs, every = true_edges(VIEW, AT), legs_at(VIEW, AT), np.ones(6, dtype=bool)
+    lines = leg_lines(VIEW, edge_misfits(VIEW, READINGS, AT, edges_of(AT, READINGS), 0.0))
     factor = 1e-2 * np.linalg.cholesky(lines.joint)  # small, so that all is linear
     rows = []
     for _ in range(400):
         turn = (factor @ rng.normal(size=(6, 4, 1))).reshape(6, 2, 2, 1)
         normals = lines.normal + (lines.basis @ turn)[..., 0]
         normals /= np.linalg.norm(normals, axis=-1)[..., None]
-        task, noise = weighted_task(law, task_of(law, SEEN, normals, goal, legs), lines, every)
+        task, noise = weighted_task(law, task_of(law, VIEW, normals, goal, legs), lines, every)
         rows.append(task.error / (1e-2 * noise))
     spread = np.cov(np.array(rows).T)
     assert len(spread) == (24 if law == "edges" else 12)

@@ -52,7 +52,7 @@ from pkmcal.simulation.truth import draw_truth, true_machine
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
 from test_bad_input import images, only
 from test_identify_scene import exact
-from test_report_page import Found
+from test_report_page import PageParts
 
 STATIONS = 3
 
@@ -77,13 +77,13 @@ def calibrated(seed):
     return nominal, true, bundle(nominal, data, start_state(nominal, data, stations)), data
 
 
-def seen_by(machine, data, stations):
+def observed_by(machine, data, stations):
     return predict(machine, data, start_state(machine, data, stations))
 
 
 def judged_on(nominal, estimate, machine, data, stations):
-    value = seen_by(machine, data, stations)
-    by_nominal = seen_by(nominal, data, stations)
+    value = observed_by(machine, data, stations)
+    by_nominal = observed_by(nominal, data, stations)
     rows = np.flatnonzero(value.observed)
     return compare_with_nominal(nominal, estimate.covariance, data, value, by_nominal, rows)
 
@@ -181,7 +181,7 @@ def test_own_readings_have_no_part_where_a_board_needs_the_others(h4):
     del nominal
 
 
-def test_a_board_in_one_configuration_tells_nothing(h4):
+def test_a_board_in_one_configuration_decides_nothing(h4):
     _, _, estimate, case, _ = h4
     one = select(case.measurements, np.arange(71) == 0)
     start = start_state(estimate.machine, one, T_CAMERA_BASE[None])
@@ -192,7 +192,7 @@ def test_a_board_in_one_configuration_tells_nothing(h4):
 # verdicts
 
 
-def test_better_than_the_drawing(hexapod, new):
+def test_better_than_the_nominal_model(hexapod, new):
     nominal, _, estimate, _ = hexapod
     stations, data = new
     judged = judged_on(nominal, estimate, estimate.machine, data, stations)
@@ -204,9 +204,9 @@ def test_better_than_the_drawing(hexapod, new):
     (advice,) = verdict.of("validation.noise_each_once")
     assert advice.facts["stations"] == 3
 
-    def report(seen_from):
+    def report(station_names):
         """Advice if station ``seen_from(row)`` sees a configuration, for each edge."""
-        edges = replace(data.edges, station=seen_from(data.edges))
+        edges = replace(data.edges, station=station_names(data.edges))
         case = replace(data, edges=edges)
         (text,) = validation_verdict(judged, (), estimate.machine, case).advice
         return text.partition("better still. ")[2]
@@ -260,7 +260,7 @@ def test_a_calibration_that_made_it_worse(hexapod, new):
     assert "larger than the calibration's deviations" in verdict.reasons[1]
 
 
-def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod, new):
+def test_the_nominal_model_is_not_better_than_itself(hexapod, new):
     nominal, _, estimate, _ = hexapod
     stations, data = new
     judged = judged_on(nominal, estimate, nominal, data, stations)
@@ -386,7 +386,7 @@ def test_regions_judged_together(hexapod):
     assert "of regions that it did not see" in verdict.headline
 
 
-def test_poor_extrapolation_is_told(hexapod):
+def test_poor_extrapolation_is_reported(hexapod):
     nominal, _, estimate, data = hexapod
     item = hold_out(nominal, data, estimate, chosen(nominal, estimate, data, 4))
     far = replace(item, left_out=replace(item.left_out, after=5 * item.left_out.after))
@@ -435,7 +435,7 @@ def test_a_pose_under_several_names_is_held_out_whole(hexapod):
         chosen(nominal, whole, again, 12)
 
 
-def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
+def test_the_report_states_the_number_of_poses_held_out(hexapod):
     nominal, _, estimate, data = hexapod
     item = hold_out(nominal, data, estimate, chosen(nominal, estimate, data, 4))
     joints = data.joints.copy()
@@ -468,7 +468,7 @@ def of_two_stations(session):
 
 
 @pytest.fixture(scope="module")
-def kept(demo, tmp_path_factory):
+def saved_result(demo, tmp_path_factory):
     """Two of the demonstration's stations calibrated without three configurations, and
     validated.
     """
@@ -480,15 +480,15 @@ def kept(demo, tmp_path_factory):
     return SimpleNamespace(folder=folder, made=made, found=value)
 
 
-def test_calibrate_with_some_held_out(kept):
-    out = kept.made.json["holdout"]
+def test_calibrate_with_some_held_out(saved_result):
+    out = saved_result.made.json["holdout"]
     assert len(out["left_out"]["configurations"]) == 3
-    assert_keys("calibrate --json", kept.made.json)
-    document = json.loads((kept.folder / "c" / "calibration.json").read_text())
+    assert_keys("calibrate --json", saved_result.made.json)
+    document = json.loads((saved_result.folder / "c" / "calibration.json").read_text())
     unused = [c["name"] for c in document["configurations"] if not c["used"]]
     assert unused == out["left_out"]["configurations"]
     assert document["holdout"] == out
-    report = Found((kept.folder / "c" / "report.html").read_text()).text
+    report = PageParts((saved_result.folder / "c" / "report.html").read_text()).text
     for station in document["session"]["stations"].values():
         names = [Path(image).stem for image in station["photographs"]]
         used = len(names) - len({*names} & {*unused})
@@ -496,32 +496,34 @@ def test_calibrate_with_some_held_out(kept):
         assert f"{station['camera']}, pinhole, {values} images" in report
     assert (
         "held out, the calibrated machine predicts"
-        in (kept.folder / "c" / "report.html").read_text()
+        in (saved_result.folder / "c" / "report.html").read_text()
     )
-    assert not any("did not take part" in w for w in kept.made.json["verdict"]["warnings"])
+    assert not any("did not take part" in w for w in saved_result.made.json["verdict"]["warnings"])
 
 
-def test_validate_on_what_was_held_out(kept, demo):
-    assert kept.found.err == ""
-    result = kept.found.json
+def test_validate_on_what_was_held_out(saved_result, demo):
+    assert saved_result.found.err == ""
+    result = saved_result.found.json
     assert_keys("validate --json", result)
-    out = kept.made.json["holdout"]["left_out"]["configurations"]
+    out = saved_result.made.json["holdout"]["left_out"]["configurations"]
     assert result["new_data"]["configurations"] == out
     assert set(result["known_configurations"]).isdisjoint(out)
     assert result["repeated_configurations"] == []
-    assert result["exit_code"] == kept.found.code == (0 if result["verdict"]["usable"] else 1)
-    page = (kept.folder / "v" / "validation.html").read_text()
+    assert (
+        result["exit_code"] == saved_result.found.code == (0 if result["verdict"]["usable"] else 1)
+    )
+    page = (saved_result.folder / "v" / "validation.html").read_text()
     assert result["verdict"]["headline"] in page
     assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
-    assert json.loads((kept.folder / "v" / "validation.json").read_text())["new_data"]
+    assert json.loads((saved_result.folder / "v" / "validation.json").read_text())["new_data"]
     del demo
 
 
-def test_validate_in_words(kept, session):
+def test_validate_in_words(saved_result, session):
     of_two_stations(session)
     path = "\npaths: {ruler: ['0000', '0001', '0002']}\n"
     (session / "session.yaml").write_text((session / "session.yaml").read_text() + path)
-    done = run("validate", kept.folder / "c", session, "--regions", 2)
+    done = run("validate", saved_result.folder / "c", session, "--regions", 2)
     assert "The calibrated machine" in done.out
     assert "Straight paths" in done.out
     assert "each left out once" in " ".join(done.out.split())
@@ -539,12 +541,12 @@ def test_poses_that_the_calibration_used_are_known_by_their_readings(demo):
     assert np.array_equal(repeated_rows(unused, session), rows < 4)
 
 
-def test_the_drawing_is_the_drawing_again(kept, demo):
+def test_the_nominal_model_is_recovered(saved_result, demo):
     """Held-out regions must not influence the calibration through the nominal model."""
     from pkmcal.judge.validate import nominal_of
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")
-    values = nominal_of(load(kept.folder / "c"))
+    values = nominal_of(load(saved_result.folder / "c"))
     assert np.array_equal(values.parameters.nominal, drawn.parameters.nominal)
     assert np.array_equal(values.values, drawn.values)
     assert np.array_equal(values.parameters.free_matrix(), drawn.parameters.free_matrix())
@@ -562,17 +564,17 @@ def test_the_same_images(demo, session):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("leg", "axis", "have no joint in common; found axis1"),
         ("leg6", "axis6", "reads other joints than the calibration"),
     ],
 )
-def test_sessions_that_do_not_belong(demo, session, old, new, said):
+def test_sessions_that_do_not_belong(demo, session, old, new, message):
     replaced(session / "joints.csv", old, new)
     done = run("validate", demo.calibration, session)
     assert done.code == 2
-    assert said in done.err
+    assert message in done.err
 
 
 def test_another_machine(demo, session):

@@ -142,7 +142,7 @@ def test_at_a_singular_pose_there_is_no_forward_jacobian_and_its_neighbours_keep
     ).all()
 
 
-def test_at_a_serial_singularity_the_twist_tells_no_rate():
+def test_at_a_serial_singularity_the_twist_determines_no_rate():
     """A slider whose rod stands square to its guide: moving it changes the length by nothing."""
     machine = load_mechanism("linear-delta")
     group = machine.layout.base[0]

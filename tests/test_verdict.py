@@ -78,14 +78,14 @@ def test_the_limits_of_a_verdict_are_its_options(whole):
 def test_light_that_moves_single_edges_is_warned_of(whole):
     observation, estimate, findings, _ = whole
 
-    def said_of(*shading):
+    def sentences_of(*shading):
         noise = replace(estimate.edge_noise, shading=np.array(shading))
         verdict = assess(observation, replace(estimate, edge_noise=noise), findings)
         return verdict.of("edges.polished")
 
-    (text,) = said_of(0.08, 0.2)
+    (text,) = sentences_of(0.08, 0.2)
     assert text.facts["value"] == 0.08
-    assert said_of(0.02, 0.2) == ()  # painted tubes are enough beside polished rods
+    assert sentences_of(0.02, 0.2) == ()  # painted tubes are enough beside polished rods
 
 
 def test_stations_apart_are_refused_with_words_and_advice(apart):
@@ -109,7 +109,7 @@ def test_one_configuration_is_refused(name):
     assert any("Take images of more configurations" in r for r in verdict.reasons)
 
 
-def test_heave_alone_is_said():
+def test_heave_alone_is_stated():
     scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart"), 12))
     _, _, _, verdict = judged(scene)
     text = " ".join(verdict.reasons + verdict.warnings)
@@ -138,7 +138,7 @@ def sentence(moves, *names, matters=True):
     return Sentence("It is open.", "Do something.", names, 1, moves, matters)
 
 
-def test_the_share_of_the_drawings_error_decides(whole):
+def test_the_share_of_the_nominal_error_decides(whole):
     observation, estimate, findings, _ = whole
     least = VERDICT.undetermined_share * findings.by_nominal
 
@@ -189,7 +189,7 @@ def test_without_a_degree_of_freedom_it_is_refused(whole):
         assert assess(observation, other, findings).usable == (dof > 0)
 
 
-def test_what_the_drawing_knows_better_counts_where_a_value_is_undecided(whole):
+def test_what_the_prior_determines_better_counts_where_a_value_is_undecided(whole):
     observation, estimate, findings, _ = whole
     name = "legs[3].length.offset"
     weak = replace(findings, weak=(sentence(findings.by_nominal, name),))

@@ -30,7 +30,7 @@ from pkmcal.view import server
 from pkmcal.view.content import Viewed
 from pkmcal.view.pose_file import PoseFile
 from rendered import BOARD_SESSION, by_command
-from test_report_page import CHROMIUM, Found
+from test_report_page import CHROMIUM, PageParts
 
 PORT, TOKEN = 4711, "the-token"
 
@@ -117,7 +117,7 @@ def test_the_page_opens_with_its_token(page):
 
 @pytest.mark.parametrize("path", ["", "view.js", "image/0/0", "nowhere"])
 @pytest.mark.parametrize("token", ["", "the-toke", "the-tokens", "é"])
-def test_without_the_token_nothing_is_told(page, path, token):
+def test_without_the_token_nothing_is_reported(page, path, token):
     answer = page.get(path, token)
     assert answer.status == 403
     assert answer.text == (
@@ -147,7 +147,7 @@ def test_sockets_are_refused(page):
 
 def test_the_page_asks_for_nothing_outside(page):
     text = page.get().text
-    for tag, attributes in Found(text).tags:
+    for tag, attributes in PageParts(text).tags:
         assert tag not in ("iframe", "object", "embed", "base")
         for name in ("src", "href"):
             assert attributes.get(name) in (None, "data:,", "view.js", "view.css")
@@ -159,7 +159,7 @@ def test_the_page_asks_for_nothing_outside(page):
 
 
 def test_all_images_are_named(page, demo):
-    text = Found(page.get().text).text
+    text = PageParts(page.get().text).text
     session = page.subject.session
     assert all(name in text for name in (*session.configurations, *session.station_names))
 
@@ -184,7 +184,7 @@ def test_a_large_image_is_sent_at_the_screens_size(page, monkeypatch):
     assert image.shape[1] == 100
 
 
-def test_faults_are_told_in_words(page, session):
+def test_faults_are_reported_in_words(page, session):
     (session / "images" / "station1").mkdir(exist_ok=True)
     broken = load_session(session).stations[0].images[0].path
     broken.write_bytes(broken.read_bytes()[:-40])
@@ -206,7 +206,7 @@ def test_faults_are_told_in_words(page, session):
     assert "no JSON object" in page.post("fit", b"[]").json()["message"]
 
 
-def test_a_defect_is_told_as_one(page, monkeypatch):
+def test_a_defect_is_reported_as_one(page, monkeypatch):
     monkeypatch.setattr(Viewed, "jpeg", lambda *_: 1 / 0)
     answer = page.get("image/0/0")
     assert answer.status == 500
@@ -344,7 +344,7 @@ def test_what_a_calibration_found_is_shown_with_its_judgement(page, demo):
     assert tip.endswith(f"weight {weight:.2f}")
 
 
-def test_reasons_of_what_was_left_out_are_told(page, monkeypatch):
+def test_reasons_of_what_was_left_out_are_reported(page, monkeypatch):
     saved = page.subject.saved
     name, configuration = saved.stations[0].name, saved.configurations[0]
     group = {"reason": "a cable hangs there", "cases": [[name, configuration, 3, 1, 2]]}
@@ -381,7 +381,7 @@ def test_a_calibration_of_another_session_is_refused(page, demo, session):
     assert "there is no calibration of this session" in message
 
 
-def test_a_station_that_was_left_out_is_told(page, monkeypatch):
+def test_a_station_that_was_left_out_is_reported(page, monkeypatch):
     saved = page.subject.saved
     others = replace(saved, stations=saved.stations[1:])
     monkeypatch.setitem(page.subject.__dict__, "saved", others)
@@ -489,7 +489,7 @@ def test_answers_are_sent_at_once():
         assert socket_.proto == socket.IPPROTO_TCP
 
 
-def test_what_cannot_be_shown_is_told_before(demo, session, tmp_path):
+def test_what_cannot_be_shown_is_reported_before(demo, session, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -597,7 +597,7 @@ def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch
             capture_output=True, text=True, timeout=240, check=True,
         )  # fmt: skip
     assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", done.stderr), done.stderr
-    root = Found(done.stdout).tags[0][1]
+    root = PageParts(done.stdout).tags[0][1]
     assert root.get("data-done") == "yes", root
     assert root["data-faults"] == ""
     assert root["data-overhang"] == "0"

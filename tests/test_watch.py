@@ -97,7 +97,7 @@ class Watched:
             self.true.values + self.half @ rng.standard_normal(len(self.half))
         )
 
-    def seen(self, machine, rng, few=FEW):
+    def observe(self, machine, rng, few=FEW):
         """New measurements of a machine by one camera."""
         rows = rng.choice(30, few, replace=False)
         edges, readings = simulate_edges(
@@ -135,7 +135,7 @@ def moved(machine, **by):
     return machine.with_values(values)
 
 
-def looked(n=FEW):
+def new_data(n=FEW):
     """The circumstances of n new configurations."""
     return ComparedSession(tuple("abcdefghijkl"[:n]), np.zeros(n, bool), np.ones(n, bool), 1.0)
 
@@ -261,7 +261,7 @@ def test_a_changed_offset_is_found_and_named(watched):
     judged = detect_changes(
         watched.evidence(moved(watched.true, leg3_length__offset=1e-3), rng), watched.true, ALPHA
     )
-    verdict = watch_verdict(judged, looked())
+    verdict = watch_verdict(judged, new_data())
     assert judged.changed
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("zero", (2,))
@@ -282,7 +282,7 @@ def test_a_joint_that_moved(watched):
     assert (first.cause.part, first.cause.legs) == ("base", (1,))
     off = first.change.value - [2e-3, -1e-3, 0]
     assert off @ np.linalg.solve(first.change.covariance, off) < 20
-    text = watch_verdict(judged, looked(8)).reasons[0]
+    text = watch_verdict(judged, new_data(8)).reasons[0]
     assert "the base joint of leg 2 by 2." in text
     assert "mm in the base frame" in text
 
@@ -294,19 +294,19 @@ def test_two_changes_are_both_named(watched):
     judged = detect_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
     causes = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
     assert causes == {("zero", (2,)), ("zero", (4,))}
-    verdict = watch_verdict(judged, looked(8))
+    verdict = watch_verdict(judged, new_data(8))
     assert "legs 3 and 5 have changed" in verdict.headline
     assert verdict.reasons[1].startswith("Besides, the zero of")
 
 
-def test_warming_is_told_from_a_leg(watched):
+def test_warming_is_distinguished_from_a_leg(watched):
     machine = watched.true
     lengths = np.array([k not in ("radius", "scale") for k in machine.parameters.kinds])
     warm = machine.with_values(machine.values * np.where(lengths, 1 + 2e-3, 1.0))
     judged = detect_changes(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
     assert judged.findings[0].suspect.cause.part == "scale"
     assert abs(judged.scale_change.value[0] - 2e-3) < 4 * judged.scale_change.sigma[0]
-    verdict = watch_verdict(judged, looked())
+    verdict = watch_verdict(judged, new_data())
     assert "all its lengths have another scale" in verdict.headline
     assert "K warmer" in verdict.reasons[0]
 
@@ -320,7 +320,7 @@ def test_causes_that_look_alike_are_all_named(watched):
     similar = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
     assert ("platform", (3,)) in similar
     assert len(similar) > 1
-    assert watch_verdict(judged, looked(3)).findings[0].facts["others"]
+    assert watch_verdict(judged, new_data(3)).findings[0].facts["others"]
 
 
 def test_detectable_changes_are_detected_so_often(watched):
@@ -421,7 +421,7 @@ def test_an_h4_by_its_board(h4):
     true, estimate, rng = h4
     poses = papers_poses()[rng.permutation(81)]
     same = detect_changes(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
-    verdict = watch_verdict(same, looked(5))
+    verdict = watch_verdict(same, new_data(5))
     assert verdict.usable, verdict
     assert "motor's zero by 0." in verdict.headline
     assert "°" in verdict.headline
@@ -438,7 +438,7 @@ def test_too_few_poses_of_a_board(h4):
     judged = detect_changes(
         by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA
     )
-    verdict = watch_verdict(judged, looked(1))
+    verdict = watch_verdict(judged, new_data(1))
     assert not verdict.usable
     assert "too few to tell" in verdict.headline
     assert [one.facts["legs"] for one in verdict.of("watch.leg_blind")] == ["legs 1 to 4"]
@@ -465,7 +465,7 @@ def test_a_planar_machine_by_its_board():
     assert ("zero", (1,)) in similar
 
 
-def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
+def test_three_poses_of_a_board_do_not_determine_a_hexapod():
     """They are reported as too few, with the detectable change."""
     rng = np.random.default_rng(5)
     nominal = load_mechanism("gough-stewart")
@@ -476,7 +476,7 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
     start = start_state(nominal, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(nominal, case.measurements, start)
     judged = detect_changes(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
-    verdict = watch_verdict(judged, looked(3))
+    verdict = watch_verdict(judged, new_data(3))
     assert not verdict.usable
     assert not judged.changed
     assert "which is more than the nominal model's tolerance" in verdict.reasons[0]
@@ -498,7 +498,7 @@ def test_a_family_that_sees_nothing():
     judged = detect_changes(blind, machine, ALPHA)
     assert judged.tests == ()
     assert not judged.changed
-    verdict = watch_verdict(judged, looked(1))
+    verdict = watch_verdict(judged, new_data(1))
     assert not verdict.usable
     assert [one.facts["legs"] for one in verdict.of("watch.leg_blind")] == ["legs 1 to 6"]
 

@@ -243,7 +243,7 @@ def test_stations_are_numbered_without_images_that_were_not_placed(demo, stayed,
 
 
 @pytest.mark.slow
-def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
+def test_a_camera_that_stands_elsewhere_is_reported(demo, later, stayed, tmp_path):
     """A camera decimetres away, far beyond the linear range: localized again, and no leg is
     reported.
     """
@@ -270,7 +270,7 @@ def test_a_station_that_is_none(demo, again, stayed, calibration):
 # the lens
 
 
-def seen_through(camera, wrong, edges):
+def edges_through(camera, wrong, edges):
     """Edges as a camera shows them that another is taken for, with the pixels on them."""
     # the tangent plane at a normal is the plane of the edge's rays
     one, other = edges.basis[..., 0], edges.basis[..., 1]
@@ -289,7 +289,7 @@ def seen_through(camera, wrong, edges):
     return Observation(visible, (), pixels.reshape(-1, 2), at, none)
 
 
-def test_a_cameras_magnification_is_told():
+def test_a_cameras_magnification_is_reported():
     """Images by a lens that is 0.5 % longer than its file states: the change is recovered."""
     nominal, camera, longer = load_mechanism("gough-stewart"), demo_camera(), 5e-3
     focal = camera.parameters.copy()
@@ -303,7 +303,7 @@ def test_a_cameras_magnification_is_told():
     )  # fmt: skip
     cause, got = magnification(nominal, 0), []
     for through in (camera, real):
-        observed = seen_through(through, camera, edges)
+        observed = edges_through(through, camera, edges)
         data = Measurements(observed.edges, readings, 3e-6, 2, np.zeros(2, dtype=int))
         start = start_state(nominal, data, truth.T_camera_base)
         wide = magnified(data, observed, (camera, camera))

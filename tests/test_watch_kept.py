@@ -17,7 +17,7 @@ from pkmcal.judge.causes import stations_moved, whole_machine, zeros
 from pkmcal.judge.changes import change, chi_square, detect_changes, detectable
 from pkmcal.judge.fixed_machine import Trust, change_evidence, hold
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
-from pkmcal.judge.watch import tests_with_fixed_stations as judged_with_kept
+from pkmcal.judge.watch import tests_with_fixed_stations as fixed_station_tests
 from pkmcal.measurements import Measurements
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from test_watch import ALPHA, CAMERA, half_of, images_of, made_calibration, moved
@@ -42,7 +42,7 @@ class Left:
         self.half = half_of(self.joint)
         self.poses = images_of(self.true).T_base_platform
 
-    def looked(self, machine, rng, by=None, few=FEW):
+    def watched(self, machine, rng, by=None, few=FEW):
         """A calibration with errors, fixed against the first camera's data of a machine; by :
         motion of the camera before, (6,) of T_camera_base.
         """
@@ -58,23 +58,23 @@ class Left:
         return held, CalibrationPrior(self.joint[: self.n + 6, : self.n + 6], (0,), there)
 
     def evidence(self, machine, rng, **more):
-        return change_evidence(*self.looked(machine, rng, **more))
+        return change_evidence(*self.watched(machine, rng, **more))
 
 
 @pytest.fixture(scope="module")
-def left():
+def in_place():
     return Left()
 
 
 @pytest.fixture(scope="module")
-def unchanged(left):
+def unchanged(in_place):
     """Sessions of an unchanged machine: the fixed machine, and the calibration's prior."""
-    return [left.looked(left.true, np.random.default_rng([k, 7])) for k in range(SESSIONS)]
+    return [in_place.watched(in_place.true, np.random.default_rng([k, 7])) for k in range(SESSIONS)]
 
 
-def test_an_unchanged_machine_gives_unit_noise(left, unchanged):
+def test_an_unchanged_machine_gives_unit_noise(in_place, unchanged):
     """With the calibration's errors of machine and place in the noise, and not without."""
-    every = whole_machine(left.true)
+    every = whole_machine(in_place.true)
     tests = [chi_square(change_evidence(*remeasured), every) for remeasured in unchanged]
     dof = sum(t.dof for t in tests)
     assert dof > SESSIONS * 30
@@ -84,17 +84,17 @@ def test_an_unchanged_machine_gives_unit_noise(left, unchanged):
     assert sum(t.chi2 for t in sharp) > 1.3 * sum(t.dof for t in sharp)
 
 
-def test_the_place_knows_smaller_changes_of_a_leg(left, unchanged):
+def test_the_place_knows_smaller_changes_of_a_leg(in_place, unchanged):
     """The same images detect half as large a slip of an encoder.
 
     The gain comes from the correlation of pose and machine: independent, with the same standard
     deviations, they detect no more than the machine alone.
     """
     held, retained = unchanged[0]
-    apart, n = retained.covariance.copy(), left.n
+    apart, n = retained.covariance.copy(), in_place.n
     apart[n:, :n] = apart[:n, n:] = 0.0
     sizes = [
-        np.mean([detectable(item, z, z.columns[:, 0], ALPHA / 14) for z in zeros(left.true)])
+        np.mean([detectable(item, z, z.columns[:, 0], ALPHA / 14) for z in zeros(in_place.true)])
         for reference_values in (retained, replace(retained, covariance=apart), retained.only(()))
         for item in (change_evidence(held, reference_values),)
     ]
@@ -102,27 +102,27 @@ def test_the_place_knows_smaller_changes_of_a_leg(left, unchanged):
     assert sizes[1] > 0.85 * sizes[2]
 
 
-def test_without_its_stations_it_is_the_evidence_of_a_machine_alone(left, unchanged):
+def test_without_its_stations_it_is_the_evidence_of_a_machine_alone(in_place, unchanged):
     held, retained = unchanged[1]
-    alone = change_evidence(held, CalibrationPrior(left.joint[: left.n, : left.n]))
+    alone = change_evidence(held, CalibrationPrior(in_place.joint[: in_place.n, : in_place.n]))
     none = change_evidence(held, retained.only(()))
     np.testing.assert_array_equal(none.w, alone.w)
     assert none.fixed_stations == ()
 
 
-def test_frames_of_machine_and_camera_together_change_nothing(left, unchanged):
+def test_frames_of_machine_and_camera_together_change_nothing(in_place, unchanged):
     """A rotation of the base frame moves the base joints and the camera, and shows in no residual;
     of the joints alone it is detected now.
     """
     held, retained = unchanged[2]
-    value, basis = change_evidence(held, retained), freedoms(left.true)
-    joints = generators(left.true.layout, held.machine.values) @ basis
+    value, basis = change_evidence(held, retained), freedoms(in_place.true)
+    joints = generators(in_place.true.layout, held.machine.values) @ basis
     camera = station_generators(retained.T_camera_base)[0] @ basis
     columns = stations_moved(value)[0].columns
     by_camera = np.linalg.inv(_by_twist(retained.T_camera_base[0])) @ camera
     both = value.along(np.concatenate([joints, by_camera]))
     assert np.abs(both).max() < 1e-3 * np.abs(value.along(joints)).max()
-    assert columns.shape == (left.n + 6, 6)
+    assert columns.shape == (in_place.n + 6, 6)
 
 
 def _by_twist(T_camera_base):
@@ -138,16 +138,16 @@ def _by_twist(T_camera_base):
     return np.stack(out, axis=-1)
 
 
-def test_a_camera_that_was_moved_is_told_and_no_leg_is_blamed(left):
+def test_a_camera_that_was_moved_is_reported_and_no_leg_is_blamed(in_place):
     """By 5 mm and half a degree: its shift is estimated within its standard deviations."""
     by = np.array([0.0, 8e-3, 0.0, 3e-3, 0.0, 4e-3])
     for k in range(3):
-        held, retained_rows = left.looked(left.true, np.random.default_rng([k, 9]), by=by)
-        judged, rest, gone = judged_with_kept(held, retained_rows, ALPHA)
+        held, retained_rows = in_place.watched(in_place.true, np.random.default_rng([k, 9]), by=by)
+        judged, rest, gone = fixed_station_tests(held, retained_rows, ALPHA)
         assert [s.station for s in gone] == [0]
         assert rest.stations == ()
         assert not judged.changed
-        expected = np.linalg.solve(_by_twist(left.T_camera_base[0]), by)
+        expected = np.linalg.solve(_by_twist(in_place.T_camera_base[0]), by)
         off = gone[0].change.value - expected
         assert off @ np.linalg.solve(gone[0].change.covariance, off) < 25  # of 6 degrees: 3e-4
         names = Names(("camera",), ("front",))
@@ -159,13 +159,13 @@ def test_a_camera_that_was_moved_is_told_and_no_leg_is_blamed(left):
         assert "camera front does not stand where the calibration had it" in verdict.warnings[0]
 
 
-def test_a_leg_that_changed_is_not_taken_for_the_camera(left):
+def test_a_leg_that_changed_is_not_taken_for_the_camera(in_place):
     """0.5 mm, which without the camera's place is found every other time."""
     count = 0
     for k in range(6):
-        now = moved(left.true, leg3_length__offset=5e-4)
-        held, retained_rows = left.looked(now, np.random.default_rng([k, 11]))
-        judged, rest, gone = judged_with_kept(held, retained_rows, ALPHA)
+        now = moved(in_place.true, leg3_length__offset=5e-4)
+        held, retained_rows = in_place.watched(now, np.random.default_rng([k, 11]))
+        judged, rest, gone = fixed_station_tests(held, retained_rows, ALPHA)
         assert gone == ()
         assert rest.stations == (0,)
         named = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
@@ -173,26 +173,27 @@ def test_a_leg_that_changed_is_not_taken_for_the_camera(left):
     assert count >= 5
 
 
-def test_a_change_moves_the_evidence_as_the_regression_says(left):
+def test_a_change_moves_the_evidence_as_the_regression_predicts(in_place):
     """The same noise with a camera that was moved: w moves by X times the motion."""
     by = np.array([1e-4, -2e-4, 1e-4, 2e-4, 1e-4, -3e-4])
     here, there = (
-        left.evidence(left.true, np.random.default_rng(3), by=move) for move in (np.zeros(6), by)
+        in_place.evidence(in_place.true, np.random.default_rng(3), by=move)
+        for move in (np.zeros(6), by)
     )
     cause = stations_moved(here)[0]
     off = change(there, cause).value - change(here, cause).value
-    expected = np.linalg.solve(_by_twist(left.T_camera_base[0]), by)
+    expected = np.linalg.solve(_by_twist(in_place.T_camera_base[0]), by)
     sigma = np.sqrt(np.diag(change(here, cause).covariance))
     assert (np.abs(off - expected) < 0.05 * sigma + 0.02 * np.abs(expected).max()).all()
 
 
 @pytest.mark.slow
-def test_false_alarms_of_200_sessions(left):
+def test_false_alarms_of_200_sessions(in_place):
     """At 0.01, 0.05 and 0.1."""
     chances = []
     for k in range(200):
         judged = detect_changes(
-            left.evidence(left.true, np.random.default_rng([k, 13])), left.true, ALPHA
+            in_place.evidence(in_place.true, np.random.default_rng([k, 13])), in_place.true, ALPHA
         )
         chances.append(min(t.adjusted for t in judged.tests))
     for share in (0.01, 0.05, 0.1):

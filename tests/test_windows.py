@@ -20,8 +20,8 @@ from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.image_batches import Placed, windows
 from pkmcal.observe.legs import measure, measure_stations, search, search_stations
 from pkmcal.session.load import load_session
-from test_observe_drawing import FRONT, poses, redrawn
 from test_observe_measure import taken
+from test_observe_rendered_legs import FRONT, poses, redrawn
 
 REPEATED = 3
 """Repetitions of the six rendered images."""
@@ -31,7 +31,7 @@ class Fresh(Sequence):
     """Images that are made when they are read; counts how many exist at a time."""
 
     def __init__(self, images):
-        self.images, self.alive, self.most, self.looks = images, 0, 0, 0
+        self.images, self.alive, self.most, self.reads = images, 0, 0, 0
 
     def __len__(self):
         return len(self.images)
@@ -39,7 +39,7 @@ class Fresh(Sequence):
     def __getitem__(self, index):
         image = self.images[index].view()  # an object of its own
         self.alive += 1
-        self.looks += 1
+        self.reads += 1
         self.most = max(self.most, self.alive)
         weakref.finalize(image, self._gone)
         return image
@@ -84,7 +84,7 @@ def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
     assert fresh.most == window
     assert fresh.alive == 0
     # each once, and a window's for the blur where that is not known
-    assert fresh.looks in (len(fresh), len(fresh) + window)
+    assert fresh.reads in (len(fresh), len(fresh) + window)
 
 
 @pytest.mark.parametrize("name", ["search", "refine"])
@@ -96,7 +96,7 @@ def test_windows_change_nothing(monkeypatch, name):
     same(value, whole)
 
 
-def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypatch):
+def test_the_blur_of_many_images_is_estimated_from_one_batch(monkeypatch):
     images, visible, _ = many()
     monkeypatch.setattr(passing, "IMAGES_A_WINDOW", 4)
     few = images.spread(4)
@@ -154,24 +154,27 @@ def test_images_that_are_looked_at_otherwise_do_not(other):
 
 
 @pytest.mark.parametrize("most", [8, 32])
-@pytest.mark.parametrize("known", [{}, {2: 0.7, 5: 0.55, 7: 0.8}], ids=["blur", "known"])
-def test_together_stations_are_seen_as_each_alone(monkeypatch, known, most):
+@pytest.mark.parametrize("with_pose", [{}, {2: 0.7, 5: 0.55, 7: 0.8}], ids=["blur", "known"])
+def test_together_stations_are_seen_as_each_alone(monkeypatch, with_pose, most):
     monkeypatch.setattr(passing, "IMAGES_A_WINDOW", most)
     drawn = redrawn(0, 0.0005)
-    coarse, fine = search_stations(stations(), drawn), measure_stations(stations(), drawn, known)
+    coarse, fine = (
+        search_stations(stations(), drawn),
+        measure_stations(stations(), drawn, with_pose),
+    )
     for (p, T, in_view), whole, exact in zip(stations(), coarse, fine, strict=True):
         same(whole, search(p, drawn, T, in_view))
-        same(exact, measure(p, drawn, T, in_view, known.get(p.station)))
+        same(exact, measure(p, drawn, T, in_view, with_pose.get(p.station)))
         assert (exact.edges.station == p.station).all()
     entries = dict(zip((2, 5, 7, 8), (station_edges.blur for station_edges in fine), strict=True))
-    assert entries.items() >= known.items()
-    assert known or entries[5] > entries[7] + 0.1
+    assert entries.items() >= with_pose.items()
+    assert with_pose or entries[5] > entries[7] + 0.1
 
 
 def test_tables_look_at_each_image_once_and_share_their_memory():
     _, _, fresh = many()
     tables = distance_tables(fresh)
-    assert (fresh.most, fresh.looks) == (2, len(fresh))
+    assert (fresh.most, fresh.reads) == (2, len(fresh))
     some = tables.select(np.array([7, 2]))
     assert np.shares_memory(some.tables.picture, tables.tables.picture)
     place = np.array([100.0, 200.0])

@@ -76,7 +76,7 @@ def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3, machine=No
     )  # fmt: skip
 
 
-def told_of(scene: Scene, *views):
+def identified(scene: Scene, *views):
     """Rank test and sentences where each station sees some legs only (numbers from 1)."""
     machine = scene.machine.with_values(scene.theta[0])
     measurements = scene.measurements(np.random.default_rng(0), noise=0.0)
@@ -104,7 +104,7 @@ def told_of(scene: Scene, *views):
 
 @pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "3-rps", "6-spu-passive"])
 def test_a_whole_session_leaves_nothing_open(name):
-    values, _, sentences = told_of(make(name))
+    values, _, sentences = identified(make(name))
     assert values.unidentified == ()
     assert sentences == ()
 
@@ -113,7 +113,7 @@ def test_a_whole_session_leaves_nothing_open(name):
 def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
     """Cameras measure angles; lengths come from readings, each uncertain by its scale."""
     machine = load_mechanism(name)
-    values, _, sentences = told_of(make(name, machine=machine))
+    values, _, sentences = identified(make(name, machine=machine))
     assert len(values.unidentified) == 1
     (size,) = sentences
     assert size.text.startswith(
@@ -131,7 +131,7 @@ def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
     [("gough-stewart", "Legs 1 to 6"), ("3-rpr", "Legs 1 to 3"), ("3-rps", "Legs 1 to 3")],
 )
 def test_one_configuration_lets_every_leg_slide_along_itself(name, legs):
-    values, _, sentences = told_of(make(name, n=1, n_stations=2))
+    values, _, sentences = identified(make(name, n=1, n_stations=2))
     slide = next(s for s in sentences if "grow and shift along itself" in s.text)
     assert slide.text.startswith(f"{legs} keep nearly one direction each")
     assert slide.dimensions == 2 * load_mechanism(name).n_legs
@@ -142,7 +142,7 @@ def test_one_configuration_lets_every_leg_slide_along_itself(name, legs):
 
 def test_heave_alone_leaves_the_depth_of_all_legs():
     machine = load_mechanism("gough-stewart")
-    values, _, sentences = told_of(make("gough-stewart", poses=heaved(machine)))
+    values, _, sentences = identified(make("gough-stewart", poses=heaved(machine)))
     assert len(values.unidentified) == 1
     assert len(sentences) == 1
     assert sentences[0].text.startswith(
@@ -151,10 +151,10 @@ def test_heave_alone_leaves_the_depth_of_all_legs():
     assert sentences[0].advice.startswith("Turn the platform in some configurations")
 
 
-def test_stations_without_shared_legs_are_said():
+def test_stations_without_shared_legs_are_reported():
     poses = moved(load_mechanism("gough-stewart"), np.random.default_rng(1), 8, turn=0.0)
     scene = make("gough-stewart", poses=poses)
-    values, _, sentences = told_of(scene, [1, 3, 4, 6], [1, 3, 4, 6], [2, 5])
+    values, _, sentences = identified(scene, [1, 3, 4, 6], [1, 3, 4, 6], [2, 5])
     group = sentences[0]
     assert group.text.startswith(
         "Legs 2 and 5 are never seen together with the others: legs 2 and 5 as a whole can shift"
@@ -169,7 +169,7 @@ def test_stations_without_shared_legs_are_said():
 
 def test_heave_with_stations_apart_also_turns_one_group():
     scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart")))
-    _, _, sentences = told_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
+    _, _, sentences = identified(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
     assert "legs 4 to 6 as a whole can shift in all directions and turn about z" in (
         sentences[0].text
     )
@@ -178,7 +178,7 @@ def test_heave_with_stations_apart_also_turns_one_group():
 
 
 def test_platform_turns_join_stations_that_share_no_leg():
-    values, _, sentences = told_of(make("gough-stewart", n_stations=2), [1, 2, 3], [4, 5, 6])
+    values, _, sentences = identified(make("gough-stewart", n_stations=2), [1, 2, 3], [4, 5, 6])
     assert values.unidentified == ()
     assert sentences == ()
 
@@ -186,7 +186,7 @@ def test_platform_turns_join_stations_that_share_no_leg():
 def test_a_leg_nobody_sees_stands_on_its_readings():
     scene = make("gough-stewart", n=4)
     without = [1, 2, 4, 5, 6]
-    rows, _, sentences = told_of(scene, without, without, without)
+    rows, _, sentences = identified(scene, without, without, without)
     assert [s.text.split(";")[0] for s in sentences] == ["Leg 3 is in no image"]
     assert sentences[0].dimensions == len(rows.unidentified) == 5
     assert sentences[0].matters
@@ -195,7 +195,7 @@ def test_a_leg_nobody_sees_stands_on_its_readings():
 
 
 def test_a_passive_leg_nobody_sees_moves_nothing():
-    values, _, sentences = told_of(make("6-spu-passive"), *[[1, 2, 3, 4, 5, 6]] * 3)
+    values, _, sentences = identified(make("6-spu-passive"), *[[1, 2, 3, 4, 5, 6]] * 3)
     assert len(sentences) == 1
     assert sentences[0].text == (
         "Leg 7 is in no image, so that nothing tells where its joints are."
@@ -211,7 +211,7 @@ def test_common_turns_of_parallel_axes_move_nothing():
     """
     machine = load_mechanism("3-upu")
     poses = moved(machine, np.random.default_rng(1), 15, turn=0.0)
-    _, _, sentences = told_of(make("3-upu", poses=poses, errors=0.0))
+    _, _, sentences = identified(make("3-upu", poses=poses, errors=0.0))
     turn = sentences[0]
     assert turn.text.startswith("The common direction of both axes of each of legs 1 to 3 is free")
     assert turn.dimensions == 6
@@ -237,7 +237,7 @@ def unit(machine, change):
     return out
 
 
-def seen_from(*views, legs=6):
+def scene_from(*views, legs=6):
     out = np.zeros((len(views), legs), bool)
     for s, view in enumerate(views):
         out[s, np.array(view) - 1] = True
@@ -268,7 +268,7 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
     for leg in (1, 4):
         row = machine.parameters.index(f"legs[{leg + 1}].base.center.x")
         change[row : row + 3] = np.cross(axis, centres[leg] - centres[0])
-    in_view = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
+    in_view = scene_from([1, 4, 2, 5], [1, 4, 3, 6])
     (sentence,) = describe(Situation(machine, in_view, poses), change[None])
     assert sentence.text.startswith(
         "Of the others, only legs 1 and 4 are ever seen together with legs 2 and 5: the base joints"
@@ -343,7 +343,7 @@ def test_a_leg_growing_into_its_base_is_found():
 
 def test_any_basis_of_the_space_gives_the_same_words():
     scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart")))
-    values, in_view, expected = told_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
+    values, in_view, expected = identified(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
     machine = scene.machine.with_values(scene.theta[0])
     null = direction_vectors(values.unidentified, machine)
     mix = np.random.default_rng(5).normal(size=(len(null), len(null)))
@@ -370,7 +370,7 @@ def test_many_open_directions_stay_readable():
     assert sum(s.dimensions for s in sentences) == 25
 
 
-def test_what_the_drawing_knows_better_is_not_called_free():
+def test_what_the_prior_determines_better_is_not_called_free():
     machine, poses = hexapod()
     null = unit(machine, {"legs[3].length.offset": 1.0})[None]
     visible = np.ones((1, 6), bool)
@@ -382,8 +382,8 @@ def test_what_the_drawing_knows_better_is_not_called_free():
 
 
 @pytest.mark.parametrize("name", ["gough-stewart", "3-upu"])
-def test_what_is_said_about_fixed_can_be_written_there(name):
-    _, _, sentences = told_of(make(name, n=1, n_stations=2))
+def test_advice_about_fixed_can_be_written_there(name):
+    _, _, sentences = identified(make(name, n=1, n_stations=2))
     table = load_mechanism(name).parameters
     for sentence in sentences:
         (line,) = re.findall(r"(fixed: \[.*\]) in the mechanism file", sentence.advice)
@@ -492,11 +492,11 @@ def test_one_pose_does_not_hide_what_others_show():
 
 
 def test_groups_follow_what_stations_share():
-    in_view = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
+    in_view = scene_from([1, 4, 2, 5], [1, 4, 3, 6])
     assert (1, 4) in movable_leg_groups(in_view)
     assert (2, 5) in movable_leg_groups(in_view)
     assert [tuple(np.flatnonzero(g)) for g in hanging_together(in_view)] == [tuple(range(6))]
-    apart = seen_from([1, 2], [3, 4], [4, 5], [6])
+    apart = scene_from([1, 2], [3, 4], [4, 5], [6])
     parts = {tuple(np.flatnonzero(g).tolist()) for g in hanging_together(apart)}
     assert parts == {(0, 1), (2, 3, 4), (5,)}
 
@@ -513,7 +513,7 @@ def test_a_board_on_the_base_joins_stations():
     measured = Measurements(
         edges, np.zeros((1, 6)), 1e-6, 3, np.zeros(3, int), poses=poses, mounts=mounts
     )
-    in_view = observed_by_boards(seen_from([1], [2], [3]), measured)
+    in_view = observed_by_boards(scene_from([1], [2], [3]), measured)
     assert [np.flatnonzero(row).tolist() for row in in_view] == [[0, 2], [1], [0, 2]]
 
 
@@ -531,7 +531,7 @@ def test_carriers_name_motions_of_their_own_numbers(carrier):
             assert not text or "{legs}" in text
 
 
-def test_what_a_carrier_names_is_said(monkeypatch):
+def test_what_a_carrier_names_is_stated(monkeypatch):
     """Words come from the carrier's file: no other file has its joint."""
 
     def drift(parameters, readings):

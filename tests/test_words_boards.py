@@ -31,7 +31,7 @@ from pose_sessions import estimated, measured, papers_poses, upright
 
 
 @cache
-def told_of(name, model=None, shape=""):
+def findings_of(name, model=None, shape=""):
     """Rank test and findings of a session of 40 to 71 poses; shape: straight, of one line."""
     rng = np.random.default_rng(1)
     machine = load_mechanism(name, model=model)
@@ -58,8 +58,8 @@ def of(findings, start):
     return [s for s in (*findings.unidentified, *findings.weak) if s.text.startswith(start)]
 
 
-def test_the_half_width_is_told_from_the_base_by_nobody():
-    values, findings, _ = told_of("h4")
+def test_the_half_width_is_never_distinguished_from_the_base():
+    values, findings, _ = findings_of("h4")
     assert len(values.unidentified) == 2
     (width,) = of(findings, "Of y of the base joints and of the side bars' joints (half a bar's")
     assert "only the difference is seen: both can shift alike in one way" in width.text
@@ -71,7 +71,7 @@ def test_the_half_width_is_told_from_the_base_by_nobody():
 
 
 def test_the_turn_about_z_is_found_and_one_number_holds_it():
-    _, findings, _ = told_of("h4")
+    _, findings, _ = findings_of("h4")
     (turn,) = of(findings, "The turn of the base frame about z is free")
     assert (turn.dimensions, turn.matters) == (1, False)
     assert '"legs[1].base.axis.x" beside what stands under fixed: in' in turn.advice
@@ -92,14 +92,14 @@ def test_what_the_advice_holds_leaves_nothing_open():
     assembled = assemble(machine, case.measurements, default_gauge(machine))
     info = Information(assembled.problem, batch_of(machine, assembled, estimate.state))
     values = identifiability(info, machine)
-    before = told_of("h4")[0]
+    before = findings_of("h4")[0]
     assert values.unidentified == ()
     assert values.rank == before.rank
     assert values.n_parameters == before.n_parameters - 2
 
 
-def test_parallelism_is_said_to_be_the_boards():
-    _, findings, _ = told_of("h4")
+def test_parallelism_is_attributed_to_the_board():
+    _, findings, _ = findings_of("h4")
     (tilt,) = of(findings, "How the cranks' axes of legs 1 to 4 are tilted to each other")
     assert "is known from the nominal model only in one way: +1 mm of leg " in tilt.text
     assert any(".base.axis." in name for name in tilt.parameters)
@@ -108,7 +108,7 @@ def test_parallelism_is_said_to_be_the_boards():
 
 @pytest.mark.parametrize("name", ["delta", "linear-delta"])
 def test_of_both_radii_only_the_difference_is_seen(name):
-    _, findings, _ = told_of(name)
+    _, findings, _ = findings_of(name)
     first = findings.unidentified[0]
     assert first.text.startswith(
         "Of x, y and z of the base joints and of the platform joints, only the difference is seen, "
@@ -119,23 +119,23 @@ def test_of_both_radii_only_the_difference_is_seen(name):
 
 
 def test_poses_on_one_line_confound_sizes():
-    _, findings, _ = told_of("delta", None, "straight")
+    _, findings, _ = findings_of("delta", None, "straight")
     (sizes,) = of(findings, "The base radius and the arm length, of all legs alike")
     assert sizes.matters
     assert sizes.moves_platform > 0.1 * findings.by_nominal
     assert set(sizes.parameters) >= {"legs[1].base.arm", "legs[1].base.center.y"}
-    whole = told_of("delta")[1]
-    assert all(s.moves_platform < 0.1 * whole.by_nominal for s in alike(whole))
+    whole = findings_of("delta")[1]
+    assert all(s.moves_platform < 0.1 * whole.by_nominal for s in common_values(whole))
 
 
-def alike(findings):
+def common_values(findings):
     every = (*findings.unidentified, *findings.weak)
     return [s for s in every if "of all legs alike, cannot be told apart" in s.text]
 
 
 def test_what_moves_with_hinges_moves_no_platform():
     """Bars that turn on hinges take up what shifts their joints: the centre bar stays."""
-    _, findings, estimate = told_of("h4", "rods")
+    _, findings, estimate = findings_of("h4", "rods")
     (shifts,) = of(findings, "Of x, y and z of the base joints and of the side bars' joints")
     assert shifts.text.count("in eight ways") == 1
     assert not shifts.matters
@@ -155,13 +155,13 @@ def test_what_moves_with_hinges_moves_no_platform():
 
 def test_radii_are_no_business_of_boards():
     """A hexapod by its platform's poses: its tubes are not mentioned."""
-    _, findings, _ = told_of("gough-stewart")
+    _, findings, _ = findings_of("gough-stewart")
     assert not [s for s in (*findings.unidentified, *findings.weak) if "tube" in s.text]
 
 
-def test_weak_and_free_are_told_together():
+def test_weak_and_free_are_reported_together():
     """Poses' noise mixes the two; a sentence distinguishes them by the data's information."""
-    _, findings, _ = told_of("linear-delta")
+    _, findings, _ = findings_of("linear-delta")
     (lean,) = of(findings, "How the guides of legs 1 to 3 lean cannot be told from where they")
     assert lean.weak
     assert lean in findings.weak
@@ -173,7 +173,7 @@ def test_weak_and_free_are_told_together():
     "case", [("h4",), ("h4", "rods"), ("delta",), ("linear-delta",), ("delta", None, "straight")]
 )
 def test_no_sentence_speaks_of_tubes_or_images_of_legs(case):
-    values, findings, _ = told_of(*case)
+    values, findings, _ = findings_of(*case)
     sentences = (*findings.unidentified, *findings.weak)
     text = " ".join(f"{s.text} {s.advice}" for s in sentences)
     for word in ("tube", "hotograph", "base.arm is", "caliper"):
@@ -197,7 +197,7 @@ def test_sizes_are_columns_of_the_machine():
 
 
 def test_a_search_that_has_not_settled_is_refused():
-    _, findings, estimate = told_of("h4")
+    _, findings, estimate = findings_of("h4")
     nothing = Observation(
         EdgeSet.empty(), (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
@@ -212,7 +212,7 @@ def test_a_search_that_has_not_settled_is_refused():
 
 
 def test_what_the_calibration_model_holds_is_convention():
-    _, findings, estimate = told_of("h4")
+    _, findings, estimate = findings_of("h4")
     assert set(findings.conventional) == set(estimate.machine.parameters.fixed)
     text = held_in_words(findings, estimate.machine.parameters)
     assert "are held by convention" in text
@@ -222,16 +222,16 @@ def test_what_the_calibration_model_holds_is_convention():
     assert "Of the heights of base joints and platform only the sum counts" in text
 
 
-def test_ties_are_said_once_with_their_signs():
-    _, _, estimate = told_of("h4")
+def test_ties_are_reported_once_with_their_signs():
+    _, _, estimate = findings_of("h4")
     assert tied_in_words(estimate.machine.parameters) == (
         "Changes together, as one value: platform centre y of legs 1 to 4 (by opposite amounts); "
         "hinge x of legs 1 to 4 (by opposite amounts)."
     )
 
 
-def test_pairs_that_a_finding_names_are_not_said_again():
-    _, findings, estimate = told_of("h4")
+def test_pairs_that_a_finding_names_are_not_repeated():
+    _, findings, estimate = findings_of("h4")
     pairs = {(i, j) for i, j, _ in tight_pairs(estimate)}
     names = estimate.machine.parameters.names
     turning = [(names[i], names[j]) for i, j in pairs if "axis" in names[i] and "axis" in names[j]]
@@ -240,8 +240,8 @@ def test_pairs_that_a_finding_names_are_not_said_again():
 
 
 @pytest.mark.parametrize("name", ["h4", "linear-delta", "gough-stewart"])
-def test_what_the_picture_of_correlations_says_fits_the_sentences_on_pairs(name):
-    _, _, estimate = told_of(name)
+def test_what_the_picture_of_correlations_states_fits_the_sentences_on_pairs(name):
+    _, _, estimate = findings_of(name)
     table, text = estimate.machine.parameters, bound_together(estimate)
     part = parameters.correlations_part(estimate)
     (heat,) = part.plots[0].figure["data"]
@@ -259,7 +259,7 @@ def test_what_the_picture_of_correlations_says_fits_the_sentences_on_pairs(name)
 
 
 def test_a_sum_that_alone_is_known_is_named_though_its_parts_correlate_fully():
-    _, _, estimate = told_of("linear-delta")
+    _, _, estimate = findings_of("linear-delta")
     (i, j, rho), *_ = tight_pairs(estimate)
     names = estimate.machine.parameters.names
     assert (names[i], names[j]) == ("legs[2].base.center.y", "legs[2].platform.center.y")
@@ -268,7 +268,7 @@ def test_a_sum_that_alone_is_known_is_named_though_its_parts_correlate_fully():
 
 
 def test_the_design_models_assumptions_are_no_conventions():
-    _, findings, estimate = told_of("h4", "design")
+    _, findings, estimate = findings_of("h4", "design")
     assert not any(".axis." in name for name in findings.conventional)
     assert findings.also_conventional > 0  # the heights' sum among them
     text = held_in_words(findings, estimate.machine.parameters)

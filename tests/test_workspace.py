@@ -127,7 +127,7 @@ def test_an_h4_of_rods_reads_as_one_of_parallelograms_at_any_turn():
     np.testing.assert_allclose(rods.inverse(poses), ideal.inverse(poses), atol=1e-14)
 
 
-def test_what_no_drive_allows_is_told():
+def test_what_no_drive_allows_is_reported():
     three = load_mechanism("3-rps")
     reach = three.reachable(shifted(three.home(), 0.003, 0, 0))
     assert reach.forbidden
@@ -141,7 +141,7 @@ def test_what_no_drive_allows_is_told():
     assert "the machine cannot turn or move in this way" in lifted.why()
 
 
-def test_same_assembly_tells_the_mirror_image_and_never_home():
+def test_same_assembly_rejects_the_mirror_image_and_never_home():
     machine = hexapod()
     mirror = machine.home()
     mirror[2, 3] *= -1
@@ -150,7 +150,7 @@ def test_same_assembly_tells_the_mirror_image_and_never_home():
     np.testing.assert_array_equal(machine.same_assembly(yawed(150), yawed(120)), True)
 
 
-def test_a_start_in_the_wrong_assembly_is_recognised():
+def test_a_start_in_the_wrong_assembly_is_detected():
     """Forward kinematics from below finds the mirror image, whose sign is the other."""
     machine = hexapod()
     readings = machine.inverse(yawed(10))

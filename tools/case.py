@@ -49,7 +49,7 @@ class Case:
         return pkmcal.calibrate(self.session)
 
     @cached_property
-    def looks(self) -> list[Array]:
+    def pose_passes(self) -> list[Array]:
         """Rough and localized poses of the stations, T_camera_base (S, 4, 4) each."""
         poses = platform_poses(self.session)
         rngs = np.random.default_rng(0).spawn(len(self.images) + 1)

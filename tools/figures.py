@@ -211,7 +211,7 @@ def compare(before: dict[str, Any], after: dict[str, Any], within: float) -> int
             bad += 1
             continue
         a, b = flat(before[name]), flat(after[name])
-        differ = [key for key in a if key in b and not _alike(a[key], b[key], within)]
+        differ = [key for key in a if key in b and not _agree(a[key], b[key], within)]
         gone, new = [key for key in a if key not in b], [key for key in b if key not in a]
         print(f"{name}: {len(a)} values, {len(differ)} differ, {len(gone)} gone, {len(new)} new")
         for key in differ[:8]:
@@ -222,7 +222,7 @@ def compare(before: dict[str, Any], after: dict[str, Any], within: float) -> int
     return bad
 
 
-def _alike(a: Any, b: Any, within: float) -> bool:
+def _agree(a: Any, b: Any, within: float) -> bool:
     if isinstance(a, int | float) and isinstance(b, int | float):
         return a == b or abs(a - b) <= within * max(abs(a), abs(b))
     return a == b

@@ -32,7 +32,7 @@ from pkmcal.pages import page
 from pkmcal.planning.plan import plan_measurements as make_plan
 from pkmcal.planning.subject import of_machine
 from pkmcal.report import pictures, scene
-from pkmcal.report import residuals as shown
+from pkmcal.report import residuals as residual_plots
 from pkmcal.report.calibration import outcome_of as outcome_of_calibration
 from pkmcal.report.calibration import save
 from pkmcal.report.links import Links
@@ -56,7 +56,7 @@ from pkmcal.view.server import (
 )
 
 sys.path.insert(0, str(Path(__file__).parent))
-import drawings
+import diagrams
 import guide
 from case import Case, simulated
 
@@ -123,7 +123,7 @@ def outward(case: Case) -> Array:
     """Pixels by which each edge lies outward."""
     session, value = case.session, case.result
     edges, cameras = value.observation.edges, session.camera_of_station
-    return shown.outward_shift(edges, value.estimate, session.joints, cameras)
+    return residual_plots.outward_shift(edges, value.estimate, session.joints, cameras)
 
 
 def report(case: Case) -> Shot:
@@ -137,44 +137,44 @@ def report(case: Case) -> Shot:
 
 def frames(case: Case) -> Shot:
     """The machine with its frames and cameras."""
-    return whole_page(drawings.frames(case.truth), 720, 415)
+    return whole_page(diagrams.frames(case.truth), 720, 415)
 
 
 def edge_planes(_case: Case) -> Shot:
     """Across a leg: the two planes through its edges and the camera's centre."""
-    return whole_page(drawings.edge_planes(), 800, 300)
+    return whole_page(diagrams.edge_planes(), 800, 300)
 
 
-def looks(case: Case) -> Shot:
+def measurement_passes(case: Case) -> Shot:
     """One image, and the edges predicted in it after each stage."""
-    return whole_page(drawings.looks(case), 1160, 360)
+    return whole_page(diagrams.measurement_passes(case), 1160, 360)
 
 
 def profile(case: Case) -> Shot:
     """Two profiles across edges with their model, and the strongest gradient."""
-    places = drawings.measured_places(case)
-    return whole_page(drawings.two_profiles(places), 880, 330)
+    places = diagrams.measured_places(case)
+    return whole_page(diagrams.two_profiles(places), 880, 330)
 
 
 def positions(case: Case) -> Shot:
     """Errors of edge positions: by the model, and by the strongest gradient."""
-    places = drawings.measured_places(case)
+    places = diagrams.measured_places(case)
     for name, values in (("model", places.model_error), ("gradient", places.gradient_error)):
         for tube in (0, 1):
             mine = values[places.tube == tube]
-            tell(
+            print_line(
                 f"position by {name}, tube {tube + 1}: median {np.median(mine):+.3f} px,"
                 f" rms {np.sqrt(np.mean(mine**2)):.3f} px, n {mine.size}"
             )
-    return whole_page(drawings.position_errors(places), 880, 330)
+    return whole_page(diagrams.position_errors(places), 880, 330)
 
 
 def residuals(case: Case) -> Shot:
     """The report's histogram of the edges' residuals, and the boxes by leg."""
     edges, estimate = case.result.observation.edges, case.result.estimate
     results = {
-        "histogram": shown.histogram(estimate.edge_residuals),
-        "by_leg": shown.by_leg(case.session, edges, estimate, Links()),
+        "histogram": residual_plots.histogram(estimate.edge_residuals),
+        "by_leg": residual_plots.by_leg(case.session, edges, estimate, Links()),
     }
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}<div class="two">'
@@ -193,10 +193,10 @@ def repeats(case: Case) -> Shot:
         for name, values in _image_scores(case, 100 + k).items():
             groups.setdefault(name, []).append(values)
     images = {name: np.concatenate(values) for name, values in groups.items()}
-    tell(f"edges only: error / sigma of centres {rms(edges):.2f}, n {edges.size}")
+    print_line(f"edges only: error / sigma of centres {rms(edges):.2f}, n {edges.size}")
     for name, values in images.items():
-        tell(f"photographs: error / sigma of {name} {rms(values):.2f}, n {values.size}")
-    return whole_page(drawings.repeats(edges, images["centres"]), 880, 330)
+        print_line(f"images: error / sigma of {name} {rms(values):.2f}, n {values.size}")
+    return whole_page(diagrams.repeats(edges, images["centres"]), 880, 330)
 
 
 def _edge_scores(case: Case, seed: int) -> Array:
@@ -253,10 +253,10 @@ def accuracy(case: Case) -> None:
     """Errors against the truth, as README quotes them, for 6 and 15 configurations a station."""
     for folder, count in ((case.folder, 6), (_larger(case.work / "larger", 15), 15)):
         value = pkmcal.calibrate(folder)
-        tell(f"{count} configurations a station, {sum(value.timings.values()):.1f} s")
+        print_line(f"{count} configurations a station, {sum(value.timings.values()):.1f} s")
         compared = compare_with_truth(value, folder)
         for what, e in (("drawing", compared.drawing), ("calibrated", compared.calibrated)):
-            tell(
+            print_line(
                 f"  {what}: centres {e.centre * 1e3:.3f} mm, offsets {e.offset * 1e3:.3f} mm,"
                 f" platform {e.position * 1e3:.3f} mm, {np.rad2deg(e.orientation):.4f} degrees"
             )
@@ -275,7 +275,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def tell(words: str) -> None:
+def print_line(words: str) -> None:
     """A line for people."""
     sys.stdout.write(words + "\n")
 
@@ -302,7 +302,7 @@ def captured_page(shot: Shot, path: Path) -> None:
     image = (image & 0xFC) | (image >> 6)
     cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     size = path.stat().st_size
-    tell(f"{path}: {shot.width}x{shot.height}, {size / 1e3:.0f} kB")
+    print_line(f"{path}: {shot.width}x{shot.height}, {size / 1e3:.0f} kB")
     if size > LARGEST:
         sys.exit(f"{path} is larger than {LARGEST / 1e3:.0f} kB")
 
@@ -388,7 +388,7 @@ PICTURES: dict[str, Callable[[Case], Shot]] = {
         report,
         frames,
         edge_planes,
-        looks,
+        measurement_passes,
         profile,
         positions,
         residuals,

@@ -12,7 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.pages.charts import ticks_between
 
 INK, MUTED, RULE = "#1a1e24", "#58626d", "#dde2e7"
-DRAWING, CALIBRATED, GOOD = "#0068a8", "#c2480c", "#00664b"
+NOMINAL, CALIBRATED, GOOD = "#0068a8", "#c2480c", "#00664b"
 
 Point = tuple[float, float]
 

@@ -155,7 +155,7 @@ def spots(tree, above=()):
 class Place:
     """A value in a tree, with the data needed to damage it.
 
-    holder, at : it is holder[at] or, for a mapping, holder[at][1]. found : all places as `spots`
+    holder, at : it is holder[at] or, for a mapping, holder[at][1]. spots : all places as `spots`
     gives them. words : one of them is expected in a message.
     """
 
@@ -163,7 +163,7 @@ class Place:
     holder: list
     at: int
     words: list[str]
-    found: list
+    spots: list
     suffix: str
 
     @property
@@ -232,7 +232,7 @@ def _type(place, rng):
 def _level(place, rng):
     mapping = place.mapping
     shifted = place.holder.pop(place.at)
-    mappings = [spot[0] for spot in place.found if isinstance(spot[0], Pairs)]
+    mappings = [spot[0] for spot in place.spots if isinstance(spot[0], Pairs)]
     other = rng.choice(mappings or [place.tree])
     if mapping and isinstance(other, Pairs):
         other.append(shifted)
@@ -281,7 +281,7 @@ def _ragged(place, rng):
 
 
 def _exchange(place, rng):
-    other, there, _ = rng.choice(place.found)
+    other, there, _ = rng.choice(place.spots)
     if not isinstance(other, Pairs):
         place.put(deepcopy(other[there]))
         return

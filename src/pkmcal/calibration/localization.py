@@ -391,9 +391,9 @@ def locate_stations(
         rngs = rng.spawn(len(images) + 1)
         progress = progress or (lambda _text, _share: None)
         count = sum(len(p.images) for p in images)
-        progress(f"Recognising the machine in {count} images", 0.2)
+        progress(f"Localizing the stations by {count} images", 0.2)
         value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
-        progress("Comparing with what is often mixed up", 0.3)
+        progress("Testing hypotheses about the images", 0.3)
         mixed_up = mistake_in(session, images, value, rngs[0])
         if mixed_up is not None:
             return StationSearch(value, start_poses, mixed_up)

@@ -87,7 +87,7 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
     progress("Reading images", 0.1)
     images, broken = _decode_images(session)
-    progress("Recognising the machine", 0.4)
+    progress("Localizing the stations", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
     # Images, readings, links and numbering of the legs.
     observed = _check_images(session, images, motion.poses, seed, progress)

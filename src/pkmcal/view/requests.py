@@ -15,7 +15,7 @@ from pkmcal.files import Document, Schema, validated_document
 
 Pixel = tuple[float, float]
 RequestedPoseRow = tuple[float, float, float, float]
-DisplayMachine = Literal["drawing", "calibration"]
+DisplayMachine = Literal["nominal", "calibration"]
 """Overlaid machine: the nominal one at the session's poses, or the calibrated one."""
 
 
@@ -52,7 +52,7 @@ class ViewRequest(Schema):
 
     station: int
     image: int
-    shown: DisplayMachine = "drawing"
+    shown: DisplayMachine = "nominal"
     pose: tuple[RequestedPoseRow, RequestedPoseRow, RequestedPoseRow, RequestedPoseRow] | None = (
         None
     )

@@ -8,7 +8,7 @@ const NOTCH = 100; // what browsers call one notch
 const ENOUGH = 2; // joints put to their places, after which the machine snaps to the images
 const PAUSE = 250; // ms without a turn of the wheel after which the next is another one
 
-const here = { s: 0, k: 0, shown: "drawing", kind: "aim" };
+const here = { s: 0, k: 0, shown: "nominal", kind: "aim" };
 // By station: the pose (null for the files' own), those before it, joints put to their places.
 const stations = state.stations.map(() => ({ pose: null, before: [], pins: [], changed: false }));
 let epoch = 0; // answers about an image that is not shown any more are let go
@@ -304,5 +304,5 @@ addEventListener("beforeunload", (event) => { if (stations.some((station) => sta
 const [s0, k0, shown0] = location.hash.slice(1).split("/");
 const first = state.stations.findIndex((station) => station.images.length);
 if (first < 0) say("The session has no images.", "bad");
-else if (state.stations[s0 - 1]?.images[k0 - 1]) go(s0 - 1, k0 - 1, state.calibrated && shown0 === "calibration" ? shown0 : "drawing");
+else if (state.stations[s0 - 1]?.images[k0 - 1]) go(s0 - 1, k0 - 1, state.calibrated && shown0 === "calibration" ? shown0 : "nominal");
 else go(first, 0);

@@ -197,9 +197,9 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(("name", "changes", "told"), FAULTS.values(), ids=FAULTS)
-def test_faults_of_drawings(tmp_path, name, changes, told):
-    assert sentence(drawn(tmp_path, name, *changes)) == told
+@pytest.mark.parametrize(("name", "changes", "message"), FAULTS.values(), ids=FAULTS)
+def test_faults_of_nominal_models(tmp_path, name, changes, message):
+    assert sentence(drawn(tmp_path, name, *changes)) == message
 
 
 def test_whole_axes_may_be_held_or_tied(tmp_path):
@@ -231,7 +231,7 @@ UNASSEMBLED = (
 )
 
 
-def test_simulate_refuses_a_drawing_that_cannot_be_assembled(tmp_path):
+def test_simulate_refuses_a_nominal_model_that_cannot_be_assembled(tmp_path):
     nominal = drawn(tmp_path, "constant-legs", *SHORT)
     values = run("simulate", tmp_path / "session", "--mechanism", nominal)
     assert values.code == 2
@@ -257,7 +257,7 @@ def small_session(tmp_path_factory):
 
 
 @pytest.mark.parametrize("command", ["check", "calibrate"])
-def test_sessions_with_such_a_drawing_are_refused(small_session, tmp_path, command):
+def test_sessions_with_such_a_nominal_model_are_refused(small_session, tmp_path, command):
     session = tmp_path / "session"
     shutil.copytree(small_session, session)
     drawn(tmp_path, "constant-legs", *SHORT).replace(session / "mechanism.yaml")

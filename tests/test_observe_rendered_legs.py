@@ -111,7 +111,7 @@ def pixel_rays(distorted):
     return middle, right - remainder, down - up
 
 
-def shown(tubes):
+def drawn_image(tubes):
     """Which leg each pixel's centre shows from FRONT, (480, 640); -1 for none."""
     return light_on(tubes, FRONT, pixel_rays(True)[0], np.zeros(480 * 640))[1].reshape(480, 640)
 
@@ -206,7 +206,7 @@ def outward_to(normal, pixel, outward, camera):
 
 
 @pytest.mark.parametrize("distorted", [False, True])
-def test_the_drawing_shows_a_tube_where_it_is(distorted):
+def test_the_nominal_model_shows_a_tube_where_it_is(distorted):
     """A ball of pixels beside the projected axis is lit; the tube's area is its length by width."""
     machine_tubes = tubes_at(machine(), poses()[0])
     tube = machine_tubes[0]

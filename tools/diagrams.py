@@ -135,16 +135,16 @@ def edge_planes() -> str:
     return svg(800, 300, *parts)
 
 
-# ------------------------------------------------------------------ looks
+# ------------------------------------------------------------------ measurement passes
 
 
-def looks(case: Case) -> str:
+def measurement_passes(case: Case) -> str:
     """Three panels: a rough pose, the localized station, the result."""
     s, k = 1, 5
     images, session, result = case.images[s], case.session, case.result
     row = int(images.configuration[k])
     image = images.images[k]
-    by_hand, recognised = (T[s] for T in case.looks)
+    by_hand, recognised = (T[s] for T in case.pose_passes)
     drawn = session.machine.forward(session.joints[row])
     state = result.estimate.state
     views = [
