@@ -15,8 +15,8 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.localization import boards_of, read_images
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
+from pkmcal.identify.hand_eye import solve_pairs
 from pkmcal.papers import methods
-from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.calibration import save
 from pkmcal.report.corners import board_corners
 from pkmcal.report.provenance import used_images

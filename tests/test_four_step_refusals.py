@@ -9,12 +9,12 @@ import pytest
 
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.conditions import Condition, conditions
+from pkmcal.identify.nominal_joints import nominal_joints
 from pkmcal.mechanisms import load_mechanism, machine_from_document
 from pkmcal.mechanisms.document import MechanismDocument
 from pkmcal.papers import four_step_checks as checks
-from pkmcal.papers.conditions import Condition, conditions
 from pkmcal.papers.four_step import four_step
-from pkmcal.papers.legs import legs_as_drawn
 from test_four_step_machines import (
     THREE_BY_THREE,
     THREE_BY_TWO,
@@ -159,7 +159,7 @@ def test_a_passive_leg_that_does_not_turn():
 def test_lengths_that_the_distances_do_not_determine():
     """A platform that only shifts with parallel legs: a common length is free (errata)."""
     scene = make_scene("constant-legs", np.random.default_rng(6), 12)
-    legs = legs_as_drawn(scene.nominal)
+    legs = nominal_joints(scene.nominal)
     # a parallelogram: all legs parallel in every configuration, platform and base congruent
     rng = np.random.default_rng(7)
     u = np.array([0.0, 0, 1]) + 0.3 * rng.normal(size=(12, 3))
@@ -182,7 +182,7 @@ def test_lengths_that_the_distances_do_not_determine():
 
 def test_a_length_that_collapsed_is_reported():
     nominal = exact("constant-legs")
-    legs = legs_as_drawn(nominal)
+    legs = nominal_joints(nominal)
     q0 = np.where(np.arange(6) == 2, 0.001, legs.rod)[None]
     with pytest.raises(ResultError, match="leg 3 of constant length shrank"):
         checks.not_collapsed(legs, q0[0])

@@ -9,6 +9,7 @@ import pytest
 
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
+from pkmcal.identify.hand_eye import size_of, solve_pairs, start_from_poses
 from pkmcal.measurements import (
     EdgeSet,
     Measurements,
@@ -18,7 +19,6 @@ from pkmcal.measurements import (
 )
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.papers.hand_eye import size_of, solve_pairs, start_from_poses
 from test_identify_scene import exact
 
 NOISE = np.repeat([np.radians(0.03), 2e-4], 3)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.geometry.rigid import dot
-from pkmcal.papers.axis_measurements import (
+from pkmcal.identify.axis_measurements import (
     AxisNoise,
     as_edges,
     from_coordinates,

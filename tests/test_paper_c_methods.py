@@ -10,22 +10,22 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.identify.bundle import bundle
-from pkmcal.measurements import Mount, PoseSet
-from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.document import MOTION_DIRECTIONS
-from pkmcal.papers.hand_eye import start_from_poses
-from pkmcal.papers.inverse_kinematic import (
-    inverse_kinematic,
-    pose_problem,
-    turn_between,
-)
-from pkmcal.papers.measured_platform import measured_platform, taken
-from pkmcal.papers.rotation_axis import (
+from pkmcal.identify.hand_eye import start_from_poses
+from pkmcal.identify.measured_platform import measured_platform, taken
+from pkmcal.identify.rotation_axis import (
     MOST_TURN_PAIRS,
     _pairs,
     axis_frames,
     facing,
     rotation_axis,
+)
+from pkmcal.measurements import Mount, PoseSet
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.document import MOTION_DIRECTIONS
+from pkmcal.papers.inverse_kinematic import (
+    inverse_kinematic,
+    pose_problem,
+    turn_between,
 )
 from pkmcal.studies.paper_c import H4ByBoard, at_poses, start
 from pkmcal.studies.paper_c_machine import Deviations, model

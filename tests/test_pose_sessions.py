@@ -26,10 +26,10 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
 )
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.hand_eye import solve_pairs, start_from_poses
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.outcome import Level
 from pkmcal.papers import methods
-from pkmcal.papers.hand_eye import solve_pairs, start_from_poses
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from pkmcal.session.poses import PoseTable, read_poses

@@ -14,6 +14,7 @@ from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
+from pkmcal.identify.axis_measurements import to_coordinates
 from pkmcal.judge.repeatability import (
     Cylinders,
     RepeatStudy,
@@ -40,7 +41,6 @@ from pkmcal.observe.repeats import (
     same_edges,
 )
 from pkmcal.outcome import Level
-from pkmcal.papers.axis_measurements import to_coordinates
 from pkmcal.session.load import load_session
 from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges
 from pkmcal.simulation.demo import camera_of_size

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.identify.conditions import conditions
 from pkmcal.identify.unidentified import explain, observed_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
-from pkmcal.papers.conditions import conditions
 from pkmcal.report.identifiability import (
     STUB_BAR_HEIGHT,
     directions_headline,

@@ -14,10 +14,10 @@ from conftest import run
 from document_keys import assert_keys
 from pkmcal.commands.reproduce import Paper
 from pkmcal.files import read_yaml
+from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Check
 from pkmcal.outcome.finding import wrong
 from pkmcal.pages.page import page_html
-from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies import engine, reproduction
 from pkmcal.studies import paper_a_expected as expected
 from pkmcal.studies.paper_a import (

@@ -10,6 +10,7 @@ import pytest
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_sigma
@@ -17,7 +18,6 @@ from pkmcal.identify.unidentified import Findings, explain, observed_legs
 from pkmcal.identify.verdict import VERDICT, VerdictOptions, assess, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.papers.conditions import conditions
 from pkmcal.report.parameters import unidentified
 from test_words import heaved, make, moved
 

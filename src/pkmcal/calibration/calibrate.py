@@ -56,6 +56,7 @@ from pkmcal.calibration.tube_radii import explain_radii
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import closest, quoted, resolved
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
@@ -74,7 +75,6 @@ from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import Ranked, decide, refuse
 from pkmcal.papers import PaperMethod
-from pkmcal.papers.conditions import conditions
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session, load_session
 from pkmcal.solver.kernels import INLIER_WEIGHT

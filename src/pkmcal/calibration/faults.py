@@ -257,7 +257,7 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[Fin
     motion = session.machine.document.motion
     if motion == "spatial" or not len(poses):
         return []
-    from pkmcal.papers.rotation_axis import rotation_axis
+    from pkmcal.identify.rotation_axis import rotation_axis
 
     whole = (poses.rows == 6) & on_platform[poses.mount]
     out: list[Finding] = []

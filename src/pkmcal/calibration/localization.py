@@ -433,7 +433,7 @@ def _by_poses(session: Session, boards: Boards, start_poses: Array) -> Array:
 
     Raises `InputError`, or `ResultError`, where these do not determine them.
     """
-    from pkmcal.papers.hand_eye import start_from_poses
+    from pkmcal.identify.hand_eye import start_from_poses
 
     measurements = measurements_of(session, boards)
     try:

@@ -34,6 +34,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.hand_eye import closed_forms, start_from_poses
 from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import identified, only_heights
@@ -55,7 +56,6 @@ from pkmcal.outcome.hypotheses import (
     parameter_cost,
     posterior,
 )
-from pkmcal.papers.hand_eye import closed_forms, start_from_poses
 from pkmcal.session.load import Session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
 from pkmcal.solver.kernels import INLIER_WEIGHT

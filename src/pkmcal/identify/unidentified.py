@@ -47,7 +47,7 @@ rounding."""
 
 @dataclass(frozen=True)
 class Condition:
-    """One of [A]'s conditions, counted by :mod:`pkmcal.papers.conditions`.
+    """One of [A]'s conditions, counted by :mod:`pkmcal.identify.conditions`.
 
     equation : its number in the paper.
     needed, available : counts.

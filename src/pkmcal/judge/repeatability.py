@@ -21,6 +21,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import json_value
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, skew
+from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.levels import ALIGNED_ANGLE, CAUSE_SHARE, NEARLY_ALL
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
@@ -36,7 +37,6 @@ from pkmcal.observe.repeats import (
 )
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note
-from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.solver.ranks import nonzero
 

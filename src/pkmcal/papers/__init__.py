@@ -1,13 +1,14 @@
 """Methods of the papers, for comparison and as starting values; one function for each equation.
 
 - [A] ``four_step`` (the steps in order), ``leg_axes`` (1), ``four_step_base`` (2),
-  ``four_step_platform`` (3, 4), with ``legs`` (joints and frames of the nominal model),
-  ``registration`` (rigid bodies), ``four_step_checks`` and ``conditions`` (what the data must
-  contain); ``axis_measurements`` (its Table 1).
+  ``four_step_platform`` (3, 4), with ``registration`` (rigid bodies) and ``four_step_checks`` (what
+  the data must contain).
 - [B] ``linear``, base centres from edges, leg by leg; ``linear_together``, all base centres
   jointly with the nominal model.
-- [C] ``hand_eye`` (camera and board), ``inverse_kinematic`` on the poses of ``measured_platform``,
-  ``rotation_axis``.
+- [C] ``inverse_kinematic``.
+
+What every calibration uses stands in :mod:`pkmcal.identify`: [A]'s conditions and joints of the
+nominal model, [C]'s camera and board (``hand_eye``), measured poses, and axis of rotation.
 
 ``methods`` returns their estimates with standard deviations. A form that follows a paper where the
 paper is in error is named *printed*; :doc:`formulation` gives the reasons.

@@ -25,6 +25,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot, nearest_rotation
 from pkmcal.identify.gauge import BestFit, centre_index, default_gauge, in_gauge
+from pkmcal.identify.nominal_joints import NominalJoints, base_gauge, nominal_joints, platform_gauge
 from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -62,7 +63,6 @@ from pkmcal.papers.leg_axes import (
     revolute_axes,
     through_centres,
 )
-from pkmcal.papers.legs import DrawnLegs, base_gauge, legs_as_drawn, platform_gauge
 from pkmcal.papers.registration import RegisteredBody, extent, fixes_pose, poses_laying_items
 
 FourStepForm = Literal["corrected", "printed"]
@@ -102,7 +102,7 @@ def base_items(
 
     a_camera : (B, S, L, 3) centres in the camera frames. valid : (S, L).
     """
-    legs, n = legs_as_drawn(machine), len(valid)
+    legs, n = nominal_joints(machine), len(valid)
     centres, visible = gathered_points(a_camera, valid, views)
     if legs.planar:
         v, v_valid = plane_normals(axes.u, axes.visible, axes.station, n, axes.information)
@@ -130,7 +130,7 @@ def solve_from_centres(
     stations that are joined already; by default each station is a view of its own.
     """
     # step 2: base joints in one frame
-    legs = legs_as_drawn(machine)
+    legs = nominal_joints(machine)
     views = stations_apart(len(valid)) if views is None else views
     items = base_items(machine, axes, a_camera, valid, views)
     join = base_by_registration if form == "corrected" else base_by_products
@@ -174,7 +174,7 @@ def solve_from_centres(
     )
 
 
-def _ends(machine: Machine, legs: DrawnLegs, merged: Axes, base: Array) -> tuple[Array, Array]:
+def _ends(machine: Machine, legs: NominalJoints, merged: Axes, base: Array) -> tuple[Array, Array]:
     """Offsets (B, L) and platform centres (B, L, 3), corrected: in the base frame."""
     with_length = replace(merged, visible=merged.visible & legs.closing)
     a = np.broadcast_to(base[:, None], merged.u.shape)
@@ -189,7 +189,7 @@ def _ends(machine: Machine, legs: DrawnLegs, merged: Axes, base: Array) -> tuple
 
 
 def _ends_printed(
-    machine: Machine, legs: DrawnLegs, axes: Axes, a_photo: Array
+    machine: Machine, legs: NominalJoints, axes: Axes, a_photo: Array
 ) -> tuple[Array, Array]:
     """Offsets and platform centres as printed: in each image's camera frame; a_photo (B,
     C, L, 3).
@@ -206,7 +206,7 @@ def _ends_printed(
 
 def _axes(
     machine: Machine,
-    legs: DrawnLegs,
+    legs: NominalJoints,
     merged: Axes,
     posed: Booleans,
     base: Base,
@@ -317,7 +317,7 @@ def four_step(
     theta = parameters_of(machine, steps)[0]
     poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
     state = with_boards(measurements, theta, stations, poses)
-    if legs_as_drawn(machine).framed:
+    if nominal_joints(machine).framed:
         return state  # already in the machine's own frames
     return in_gauge(machine, state, default_gauge(machine))
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
+from pkmcal.identify.nominal_joints import NominalJoints, nominal_joints
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.four_step_base import Items, StationViews
 from pkmcal.papers.four_step_platform import COLLAPSED_LENGTH_SHARE, joint_distance_deviations
 from pkmcal.papers.leg_axes import Axes, in_base
-from pkmcal.papers.legs import DrawnLegs, legs_as_drawn
 from pkmcal.papers.registration import fixes_pose, loose, parts_of
 from pkmcal.wording import named
 
@@ -70,7 +70,9 @@ def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> N
     visible = items.centres_visible[views.of_station[few[0]]]
     which = f" ({named(np.flatnonzero(visible))})" if visible.any() else ""
     need = (
-        "two or more" if legs_as_drawn(machine).planar else "three or more that are not on one line"
+        "two or more"
+        if nominal_joints(machine).planar
+        else "three or more that are not on one line"
     )
     raise ResultError(
         what=f"station {few[0] + 1} sees too few legs for the four steps",
@@ -113,7 +115,7 @@ def free_ways(items: Items) -> Array:
 
 def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
     """Raise ResultError unless enough legs with a length are seen together, [A] 3.5."""
-    legs = legs_as_drawn(machine)
+    legs = nominal_joints(machine)
     visible = axes.visible & usable[axes.station][:, None]
     if form == "corrected":
         configurations, row = np.unique(axes.configuration, return_inverse=True)
@@ -140,7 +142,7 @@ def platform_is_identifiable(machine: Machine, axes: Axes, usable: Booleans, for
     _needs_poses(legs, visible & posed[:, None])
 
 
-def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
+def _too_few_at_once(legs: NominalJoints, at_once: Booleans) -> None:
     turns = np.any(legs.motion[:3], axis=1)
     need = "three or more, not on one line" if turns.all() else "one or more"
     if turns.any() and not turns.all():  # rotation about z only
@@ -154,7 +156,7 @@ def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
     )
 
 
-def _needs_poses(legs: DrawnLegs, visible: Booleans) -> None:
+def _needs_poses(legs: NominalJoints, visible: Booleans) -> None:
     """Raise ResultError for a passive leg or revolute axis seen in fewer than two poses."""
     for which, what in (
         (~legs.closing, "passive leg {}'s platform joint"),
@@ -179,7 +181,7 @@ def lengths_are_fixed(
     A length is unidentifiable if the distances between platform joints do not depend on it.
     base : (1, L, 3), T_camera_base : (1, S, 4, 4) and offsets q0 : (1, L), results of the steps.
     """
-    legs = legs_as_drawn(machine)
+    legs = nominal_joints(machine)
     not_collapsed(legs, q0[0])
     case = axes.visible & usable[axes.station][:, None] & legs.closing
     merged = in_base(replace(axes, visible=case), T_camera_base)
@@ -204,7 +206,7 @@ def lengths_are_fixed(
     )
 
 
-def not_collapsed(legs: DrawnLegs, q0: Array) -> None:
+def not_collapsed(legs: NominalJoints, q0: Array) -> None:
     """Raise ResultError for a constant length in the false minimum of [A] 14, where B = A."""
     short = np.flatnonzero(legs.constant & (q0 < COLLAPSED_LENGTH_SHARE * legs.rod))
     if short.size:

@@ -26,6 +26,8 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
 from pkmcal.identify.gauge import default_gauge, in_gauge
+from pkmcal.identify.measured_platform import MeasuredPlatform, Taken, measured_platform, taken
+from pkmcal.identify.rotation_axis import axis_frames
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import Measurements
@@ -33,8 +35,6 @@ from pkmcal.measurements.readings import PERFECT_CLOSURE_SIGMA
 from pkmcal.mechanisms import Machine, kinematics
 from pkmcal.mechanisms.closure import Closure, closure, dense
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.papers.measured_platform import MeasuredPlatform, Taken, measured_platform, taken
-from pkmcal.papers.rotation_axis import axis_frames
 from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
 from pkmcal.solver.ranks import numerical_rank
 from pkmcal.solver.search import Solution, Stop, Values, minimise, of_runs, take
@@ -251,7 +251,7 @@ def inverse_kinematic(machine: Machine, measurements: Measurements, start: State
     """Machine, stations and mounts of one session from board poses and readings.
 
     [C] eq. 5, whitened, with the nominal values and their prior sigmas as a prior. start : from the
-    nominal model, see :mod:`pkmcal.papers.hand_eye`. Platform poses follow from the readings and
+    nominal model, see :mod:`pkmcal.identify.hand_eye`. Platform poses follow from the readings and
     the estimated machine. Raises InputError without whole poses of a board on the platform,
     ResultError if the search fails.
     """

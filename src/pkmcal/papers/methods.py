@@ -19,6 +19,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share, prior_in_gauge
 from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.gauge import default_gauge, in_gauge
+from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.measurements import OWN_SHADING, Measurements
@@ -27,7 +28,6 @@ from pkmcal.mechanisms import Machine
 from pkmcal.papers import PaperMethod
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.four_step_base import with_boards
-from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.inverse_kinematic import inverse_kinematic
 from pkmcal.papers.linear_together import base_together
 from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE

@@ -12,12 +12,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.bundle import BatchResult, solve_batch
+from pkmcal.identify.hand_eye import Pair, PairProblem
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, on_manifold, readings_at_poses
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.papers.hand_eye import Pair, PairProblem
 from pkmcal.solver.elimination import eliminate
 from pkmcal.solver.ranks import scaled_directions
 from pkmcal.solver.search import minimise

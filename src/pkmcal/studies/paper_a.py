@@ -26,6 +26,7 @@ from pkmcal.geometry.rigid import (
     register,
     rotation_vector,
 )
+from pkmcal.identify.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.problem import Problem
@@ -33,7 +34,6 @@ from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.closure import by_own, closure, dense
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.papers.four_step import FourStepForm, parameters_of, solve_from_centres
 from pkmcal.papers.leg_axes import Axes, centres_from_axes
 from pkmcal.studies.calibrations import CALIBRATED_QUANTITIES as CALIBRATED

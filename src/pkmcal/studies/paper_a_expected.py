@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Check
-from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.paper_a import (
     FOUR_STEPS_CORRECTED,

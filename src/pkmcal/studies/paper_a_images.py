@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.judge.repeatability import LegScatter, study_repeats
 from pkmcal.mechanisms import load_mechanism, machine_from_document, with_exact_scales
-from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import DEMO_MECHANISM, camera_of_size
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Outcome, Part, Row, Table
 from pkmcal.pages.plots import (
     COMMON_AXIS_LAYOUT,
@@ -18,7 +19,6 @@ from pkmcal.pages.plots import (
     bars,
     trace,
 )
-from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_a import (
     END_EFFECTOR_QUANTITIES,

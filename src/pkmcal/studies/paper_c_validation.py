@@ -13,9 +13,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse as inverted
 from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.identify.measured_platform import taken
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, readings_at_poses
-from pkmcal.papers.measured_platform import taken
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.paper_c_machine import (
     IDENTIFIED_TABLE_2,

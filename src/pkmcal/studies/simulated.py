@@ -14,12 +14,12 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, perturb
 from pkmcal.identify.assembly import assemble
+from pkmcal.identify.axis_measurements import as_edges, to_coordinates
 from pkmcal.identify.gauge import Gauge
 from pkmcal.identify.problem import Problem
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.papers.axis_measurements import as_edges, to_coordinates
 
 
 @dataclass(frozen=True)

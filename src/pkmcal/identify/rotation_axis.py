@@ -22,10 +22,10 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
     skew,
 )
+from pkmcal.identify.measured_platform import taken
 from pkmcal.measurements import PoseSet
 from pkmcal.measurements.poses import turn_jacobian
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
-from pkmcal.papers.measured_platform import taken
 
 Turning = Literal["none", "one axis", "any"]
 TURNING_BY_FREEDOMS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}

@@ -15,7 +15,7 @@ PLANAR_REVOLUTE_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class DrawnLegs:
+class NominalJoints:
     """Joints of a machine's nominal model, m; each body in its own frame.
 
     base, platform : (L, 3) centres. base_axes, platform_axes : (L, 3) unit, NaN without an axis.
@@ -51,7 +51,7 @@ class DrawnLegs:
         return self.motion.shape[1] == 6 and bool(self.closing.all())
 
 
-def legs_as_drawn(machine: Machine) -> DrawnLegs:
+def nominal_joints(machine: Machine) -> NominalJoints:
     """Joints of the machine's nominal model."""
     layout, nominal = machine.layout, machine.parameters.nominal
     base, platform = (nominal[index] for index in centre_index(layout))
@@ -65,7 +65,7 @@ def legs_as_drawn(machine: Machine) -> DrawnLegs:
         return np.isin(np.arange(len(base)), angles.leg[equation])
 
     closing = layout.rod >= 0
-    return DrawnLegs(
+    return NominalJoints(
         base=base,
         platform=platform,
         base_axes=base_axes,
@@ -81,7 +81,7 @@ def legs_as_drawn(machine: Machine) -> DrawnLegs:
     )
 
 
-def base_gauge(machine: Machine, legs: DrawnLegs) -> Array:
+def base_gauge(machine: Machine, legs: NominalJoints) -> Array:
     """Rows (6, 3 (L + D)) that fix the base frame, on the centres and then the directions.
 
     Three centres for a spatial machine ([A] 3.3, N_d = 3); for a planar machine its normal, its
@@ -99,7 +99,7 @@ def base_gauge(machine: Machine, legs: DrawnLegs) -> Array:
     return rows.reshape(6, -1)
 
 
-def platform_gauge(machine: Machine, legs: DrawnLegs) -> Array:
+def platform_gauge(machine: Machine, legs: NominalJoints) -> Array:
     """Rows (d, 3 L) that fix the platform frame on the centres of the legs with a length.
 
     As many rows as the platform's motion has directions; the others are determined, because the

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Booleans, Integers
+from pkmcal.identify.nominal_joints import nominal_joints
 from pkmcal.identify.unidentified import Condition
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.legs import legs_as_drawn
 from pkmcal.wording import named
 
 
@@ -47,7 +47,7 @@ def base(machine: Machine, visible: Booleans) -> Condition:
     C(n, 2) + C(r, 2) + r(n - 1). The axes of a planar machine are all its normal; their products do
     not depend on the points in the plane and are not counted.
     """
-    n, legs = visible.shape[1], legs_as_drawn(machine)
+    n, legs = visible.shape[1], nominal_joints(machine)
     count = visible.sum(axis=1)
     if legs.planar:
         text = "products of vectors between base joints, for their places in the plane"
@@ -76,7 +76,7 @@ def platform(machine: Machine, visible: Booleans) -> Condition:
     """
     closing = machine.layout.closing
     n = int(closing.sum())
-    needed = 1 + 2 * (n - 2) if legs_as_drawn(machine).planar else 3 + 3 * (n - 3)
+    needed = 1 + 2 * (n - 2) if nominal_joints(machine).planar else 3 + 3 * (n - 3)
     available = int(_pairs((visible & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their places"
     return _condition("17", needed, available, text)
@@ -87,7 +87,7 @@ def at_once(machine: Machine, visible: Booleans) -> tuple[Condition, ...]:
 
     Legs with a revolute joint count among the three themselves, passive legs do not.
     """
-    legs = legs_as_drawn(machine)
+    legs = nominal_joints(machine)
     count = (visible & legs.closing).sum(axis=1)
     out: list[Condition] = []
     for j in np.flatnonzero(~legs.closing | legs.platform_revolute):
