@@ -24,7 +24,7 @@ from pkmcal.control.loop import VisualServo
 from pkmcal.control.machine_view import true_edges
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulation.demo import camera_of_size
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.simulation.session import Studio
 from pkmcal.simulation.truth import Settings, Truth, draw_truth
 

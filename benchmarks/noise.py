@@ -22,8 +22,9 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulation import EdgeNoise, Settings, draw_truth, simulate_edges
-from pkmcal.simulation.demo import demo_camera
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation import Settings, draw_truth
 
 CASES = ((3e-6, 3e-6), (3e-6, 3e-3), (3e-6, 3e-8), (3e-4, 3e-4), (3e-4, 3e-6), (3e-4, 3e-2))
 """True noise of a reading and the stated one, m."""
@@ -36,7 +37,7 @@ def main() -> None:
     parser.add_argument("--configurations", type=int, default=15)
     parser.add_argument("--cases", type=int, nargs="*", default=list(range(len(CASES))))
     args = parser.parse_args()
-    nominal, camera = load_mechanism("gough-stewart"), demo_camera()
+    nominal, camera = load_mechanism("gough-stewart"), default_camera()
     print(f"{args.runs} sessions, {args.stations} x {args.configurations} images")
     print("true, stated (um)   told  factor   tool (mm)  stated    z")
     for true_noise, stated in (CASES[k] for k in args.cases):

@@ -64,10 +64,10 @@ def main() -> None:
 def simulated(folder: Path) -> Path:
     """A session of 45 images, 1024x768."""
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulation.demo import demo_camera
+    from pkmcal.placement.default_camera import default_camera
     from pkmcal.simulation.session import Settings, simulate_session
 
-    simulate_session(folder, load_mechanism("gough-stewart"), demo_camera(), Settings(), seed=1)
+    simulate_session(folder, load_mechanism("gough-stewart"), default_camera(), Settings(), seed=1)
     return folder
 
 

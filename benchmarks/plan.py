@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Integers
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.planning.candidates import Configurations, configurations, neighbours
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
 from pkmcal.planning.exchange import PLAN_INDICES, exchanged
@@ -26,7 +27,6 @@ from pkmcal.planning.information import Candidates, information_of
 from pkmcal.planning.plan import MeasurementPlan, plan_measurements
 from pkmcal.planning.subject import Subject, of_machine
 from pkmcal.simulation import board_for
-from pkmcal.simulation.demo import camera_of_size
 
 CASES = {
     "hexapod, 3 stations, legs": ("gough-stewart", 3, False),

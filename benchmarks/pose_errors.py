@@ -38,17 +38,17 @@ from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA, Observation, concate
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.observe.predict import tubes_of
 from pkmcal.outcome.finding import Level
-from pkmcal.session.load import load_session
-from pkmcal.simulation import Settings, with_forearms
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.edges import (
+from pkmcal.placement.default_camera import camera_of_size
+from pkmcal.placement.edges import (
     EDGE_TURN_POINTS,
     EdgeNoise,
     disturbed,
     moved_outward,
     visible_edges,
 )
-from pkmcal.simulation.placement import one_a_station
+from pkmcal.placement.stations import one_a_station
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings, with_forearms
 from pkmcal.simulation.truth import draw_truth
 
 FAR = 3.0

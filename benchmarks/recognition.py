@@ -61,8 +61,8 @@ class Mistake(NamedTuple):
 def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) -> Path:
     """The folder of a session, drawn where it is not there yet."""
     from pkmcal.mechanisms import load_mechanism
+    from pkmcal.placement.default_camera import camera_of_size
     from pkmcal.simulation import Settings, simulate_session, with_forearms
-    from pkmcal.simulation.demo import camera_of_size
 
     folder = keep / f"{machine}-{stations}x{count}-{seed}"
     if not folder.exists():

@@ -94,8 +94,8 @@ def imaged(
 
     def make(folder: Path, seed: int) -> Session:
         from pkmcal.mechanisms import load_mechanism
+        from pkmcal.placement.default_camera import camera_of_size
         from pkmcal.simulation import Settings, simulate_session, with_forearms
-        from pkmcal.simulation.demo import camera_of_size
 
         nominal = with_forearms(load_mechanism(machine))
         settings = Settings(stations=stations, configurations=count, handheld=handheld)
@@ -115,9 +115,9 @@ def board(machine: str, count: int, noise: float) -> Callable[[Path, int], Sessi
         from pkmcal.files import yaml_text
         from pkmcal.geometry.rigid import apply
         from pkmcal.mechanisms import load_mechanism
+        from pkmcal.placement.default_camera import camera_of_size
+        from pkmcal.placement.stations import one_a_station
         from pkmcal.simulation import Settings, board_for, draw_truth, with_forearms
-        from pkmcal.simulation.demo import camera_of_size
-        from pkmcal.simulation.placement import one_a_station
 
         nominal = with_forearms(load_mechanism(machine))
         made, camera = board_for(nominal, "platform"), camera_of_size((1280, 960))
@@ -164,8 +164,8 @@ def tracker(machine: str, count: int, noise: float, *, points: bool) -> Any:
         from pkmcal.files import csv_text
         from pkmcal.geometry.rigid import perturb, pose, rotation, rotation_vector
         from pkmcal.mechanisms import load_mechanism
+        from pkmcal.placement.configurations import draw_configurations
         from pkmcal.simulation import true_machine
-        from pkmcal.simulation.placement import draw_configurations
 
         rng = np.random.default_rng(seed)
         nominal = load_mechanism(machine)

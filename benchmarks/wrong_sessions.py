@@ -286,9 +286,9 @@ FACTS: dict[str, Fact] = {
 def ingredients(in_view: str, seed: int) -> tuple[Any, Any, Any, Any]:
     """Truth, cameras, settings and nominal model of a session."""
     from pkmcal.mechanisms import load_mechanism
+    from pkmcal.placement.default_camera import camera_of_size
+    from pkmcal.placement.stations import one_a_station
     from pkmcal.simulation import Settings, board_for, with_forearms
-    from pkmcal.simulation.demo import camera_of_size
-    from pkmcal.simulation.placement import one_a_station
     from pkmcal.simulation.truth import draw_truth
 
     stations, count, size = SESSIONS[in_view]

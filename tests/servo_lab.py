@@ -8,7 +8,7 @@ from pkmcal.cameras import Camera, camera_models
 from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.simulation.demo import camera_of_size
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, render_light, sensor_image
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Wall

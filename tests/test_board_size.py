@@ -24,7 +24,7 @@ from pkmcal.measurements import EdgeSet, Measurements, Mount
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
-from pkmcal.simulation.placement import draw_configurations
+from pkmcal.placement.configurations import draw_configurations
 
 CAMERA = np.array([[1, 0, 0, 0.02], [0, -1, 0, -0.03], [0, 0, -1, 0.6], [0, 0, 0, 1.0]])
 NOISE = np.array([3e-4, 3e-4, 3e-4, 3e-5, 3e-5, 6e-5])

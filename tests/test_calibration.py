@@ -15,9 +15,9 @@ from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.gauge import ThreeCentres, in_gauge
 from pkmcal.identify.state import State
 from pkmcal.mechanisms.machine import machine_from_document
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
-from pkmcal.simulation.demo import camera_of_size
 from rendered import rendered
 
 

@@ -31,16 +31,9 @@ from pkmcal.mechanisms import (
     mechanism_text,
 )
 from pkmcal.mechanisms.closure import closure, dense
-from pkmcal.simulation import (
-    EdgeNoise,
-    Settings,
-    draw_truth,
-    load_truth,
-    simulate_edges,
-    simulate_session,
-    true_machine,
-)
-from pkmcal.simulation.placement import draw_configurations
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation import Settings, draw_truth, load_truth, simulate_session, true_machine
 
 NAMES = sorted(n for n in catalogue() if any(r.size for r in load_mechanism(n).radii()))
 """Machines whose legs a camera can see; cranks and sliders are in test_h4 and test_delta."""

@@ -31,7 +31,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb, rotation, skew
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.velocities import forward_jacobian, inverse_jacobian
-from pkmcal.simulation.placement import draw_configurations
+from pkmcal.placement.configurations import draw_configurations
 
 OUTSIDE = look_at(np.array([0.1, -1.2, 0.25]), np.array([0, 0, 0.1]), np.array([0, 0, 1.0]))
 INSIDE = look_at(np.array([0.01, -0.02, 0.05]), np.array([0, 0, 0.4]), np.array([0, 1.0, 0.0]))

@@ -20,9 +20,9 @@ from pkmcal.observe.hypotheses import SuspectStation, _best_names, mistake
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LocalizedPose, find_station
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, simulate_session
-from pkmcal.simulation.demo import camera_of_size
 from pkmcal.wording import listed
 from test_observe_rendered_legs import (
     camera_of,

@@ -15,8 +15,8 @@ from unittest.mock import patch
 
 import pytest
 
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
-from pkmcal.simulation.demo import camera_of_size
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -136,7 +136,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pkmcal.api.simulate.demo_camera", lambda: camera_of_size((240, 180)))
+    monkeypatch.setattr("pkmcal.api.simulate.default_camera", lambda: camera_of_size((240, 180)))
     namespace: dict[str, object] = {}
     for cell in BOOK["cells"]:
         if cell["cell_type"] == "code":

@@ -56,12 +56,12 @@ from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.observe.tubes import TUBE_CHART_OPTIONS, tube_chart
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Level
+from pkmcal.placement.default_camera import camera_of_size
+from pkmcal.placement.stations import rough_poses
 from pkmcal.report.calibration import outcome_of
 from pkmcal.session.exif import camera_by_exif
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.placement import rough_poses
 from pkmcal.simulation.truth import load_truth
 from rendered import rendered
 

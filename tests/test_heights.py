@@ -22,13 +22,13 @@ from pkmcal.export.klipper import Klipper
 from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.placement.configurations import draw_configurations
 from pkmcal.printers import klipper
 from pkmcal.printers.probed import read_touches
 from pkmcal.printers.read import read_printer
 from pkmcal.printers.session import write_printer_session
 from pkmcal.session.load import load_session
-from pkmcal.simulation.drives import to_simulate
-from pkmcal.simulation.placement import draw_configurations
+from pkmcal.simulation.cylinders import to_simulate
 from pkmcal.starter import untouched_files
 
 SAYS = printers.Settings()

@@ -26,8 +26,9 @@ from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.papers.four_step import four_step
-from pkmcal.simulation import EdgeNoise, Settings, simulate_edges, true_machine
-from pkmcal.simulation.placement import default_stations
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
+from pkmcal.placement.stations import default_stations
+from pkmcal.simulation import Settings, true_machine
 from test_identify_scene import exact
 from test_joint_machines import JOINT_NOISE, Session, camera
 

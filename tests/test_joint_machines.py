@@ -16,7 +16,8 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements, Mount, PoseSet
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.simulation import EdgeNoise, Settings, draw_truth, simulate_edges
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation import Settings, draw_truth
 from test_identify_residuals import check
 from test_identify_scene import exact
 

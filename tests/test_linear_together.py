@@ -20,7 +20,7 @@ from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.papers import linear
 from pkmcal.papers.linear_together import base_together
 from pkmcal.papers.methods import linear_estimate
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from test_identify_scene import exact
 
 NOMINAL = exact("gough-stewart")

@@ -13,7 +13,8 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulation import EdgeNoise, simulate_edges, true_machine, with_forearms
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation import true_machine, with_forearms
 from test_joint_machines import camera
 
 READING = 1e-5

@@ -28,13 +28,12 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import Column, EdgeSet, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome.finding import doubtful
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.default_camera import camera_of_size
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.planning.subject import of_machine
 from pkmcal.session.load import load_session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT
-from pkmcal.simulation import simulate_edges
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.edges import EdgeNoise
-from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver import elimination
 from pkmcal.wording import ratio_in_per_cent
 from test_bad_input import only

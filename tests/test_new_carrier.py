@@ -33,9 +33,9 @@ from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.contract import base_carriers
 from pkmcal.mechanisms.carriers.crank import Crank
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
+from pkmcal.mechanisms.drives import BENT_GUIDE_PIECES, drives_of
 from pkmcal.report.scene import plane_projections, scene_of
 from pkmcal.simulation import with_forearms
-from pkmcal.simulation.drives import BENT_GUIDE_PIECES, drives_of
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Box
 from pkmcal.simulation.surfaces import SmoothNoise

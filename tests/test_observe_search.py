@@ -23,9 +23,9 @@ from pkmcal.observe.pose_likelihood import StationView, score
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.shadows import without_shadows
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_station
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
-from pkmcal.simulation.demo import camera_of_size
 from test_observe_rendered_legs import (
     FRONT,
     camera_of,

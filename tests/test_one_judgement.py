@@ -16,8 +16,8 @@ from pkmcal.check.check import check_session
 from pkmcal.errors import PkmcalError
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Level
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.simulation import Settings
-from pkmcal.simulation.demo import camera_of_size
 from rendered import rendered
 from test_bad_input import only
 

@@ -13,8 +13,8 @@ from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.papers import linear
+from pkmcal.placement.stations import StationPose
 from pkmcal.simulation import Settings
-from pkmcal.simulation.placement import StationPose
 from rendered import rendered
 
 RADIUS = 0.014

@@ -25,6 +25,8 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
+from pkmcal.placement.configurations import READING_RANGE_SHARES, draw_configurations, usable
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.planning.exchange import PLAN_INDICES, exchanged, greedy
 from pkmcal.planning.first import FirstEdges, first_edges
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
@@ -34,8 +36,6 @@ from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import of_machine, subject_of_session
 from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.placement import READING_RANGE_SHARES, draw_configurations, usable
 
 SIZE = (640, 480)
 

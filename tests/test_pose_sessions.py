@@ -30,10 +30,10 @@ from pkmcal.identify.hand_eye import solve_pairs, start_from_poses
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.outcome import Level
 from pkmcal.papers import methods
+from pkmcal.placement.configurations import draw_configurations
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from pkmcal.session.poses import PoseTable, read_poses
-from pkmcal.simulation.placement import draw_configurations
 from pkmcal.simulation.truth import true_machine
 
 T_TRACKER_BASE = pose(rotation(np.array([0.4, -0.2, 2.0])), np.array([1.5, 0.3, -0.4]))

@@ -22,10 +22,10 @@ from pkmcal.files import read_csv
 from pkmcal.identify.tool import ToolError
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level
+from pkmcal.placement.default_camera import camera_of_size, default_camera
+from pkmcal.placement.edges import EdgeNoise
 from pkmcal.planning.defaults import NOMINAL_EDGE_SIGMA, PLANNED_IMAGE_SIZE
 from pkmcal.simulation import Sensor, Settings
-from pkmcal.simulation.demo import camera_of_size, demo_camera
-from pkmcal.simulation.edges import EdgeNoise
 from printers import calibrated_cfg
 
 ROOT = Path(__file__).parents[1]
@@ -360,7 +360,7 @@ def test_a_command_and_its_function_have_the_same_defaults(verb):
 
 
 def test_images_are_of_the_size_that_the_options_say():
-    assert demo_camera().image_size == (800, 600)
+    assert default_camera().image_size == (800, 600)
     assert PLANNED_IMAGE_SIZE == (1280, 960)
     assert EdgeNoise().shift == NOMINAL_EDGE_SIGMA
 

@@ -26,9 +26,9 @@ from pkmcal.mechanisms import (
     mechanism_text,
 )
 from pkmcal.pages.page import page_html
+from pkmcal.placement.configurations import draw_configurations
 from pkmcal.report.calibration import outcome_of, save
 from pkmcal.session.load import load_session
-from pkmcal.simulation.placement import draw_configurations
 from pkmcal.simulation.truth import true_machine
 
 NOISE = 1e-3

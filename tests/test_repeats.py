@@ -41,10 +41,11 @@ from pkmcal.observe.repeats import (
     same_edges,
 )
 from pkmcal.outcome import Level
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.default_camera import camera_of_size
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.session.load import load_session
-from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.placement import draw_configurations
+from pkmcal.simulation import Settings, load_truth
 from rendered import rendered
 
 CAMERA = camera_of_size((640, 480))

@@ -35,9 +35,10 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
-from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.placement import default_stations, draw_configurations
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
+from pkmcal.placement.stations import default_stations
 
 QUIET = EdgeNoise(0.0, 0.0)
 CLEAN = LoopSettings(noise=QUIET, joint_noise=0.0, rate=10.0, delay=0, duration=8.0)
@@ -57,7 +58,7 @@ def eye_of(camera, name: str = "gough-stewart", legs=None) -> Eye:
 
 @pytest.fixture(scope="module")
 def eye() -> Eye:
-    return eye_of(demo_camera())
+    return eye_of(default_camera())
 
 
 def ways_of(eye: Eye, n: int):
@@ -79,7 +80,7 @@ def by_hand(eye: Eye, position: float, degrees: float, runs: int):
 # ------------------------------------------------------------------ the camera
 
 
-@pytest.mark.parametrize("camera", [demo_camera(), mirror()], ids=["pinhole", "mirror"])
+@pytest.mark.parametrize("camera", [default_camera(), mirror()], ids=["pinhole", "mirror"])
 def test_noise_is_that_of_simulated_edges(camera):
     """The same shift and tilt give the same covariance as the edges of whole sessions have."""
     eye = eye_of(camera)
@@ -128,7 +129,7 @@ def test_noise_has_the_size_that_was_asked_for(eye):
 
 @pytest.mark.parametrize(
     ("camera", "law"),
-    [(demo_camera(), "directions"), (mirror(), "edges")],
+    [(default_camera(), "directions"), (mirror(), "edges")],
     ids=["pinhole", "mirror"],
 )
 def test_true_geometry_arrives_exponentially(camera, law):
@@ -260,7 +261,7 @@ def turned_home(machine, angle: float):
 
 def wide() -> Eye:
     """The hexapod without limits, so that a turn may go through a singular pose."""
-    eye = eye_of(demo_camera())
+    eye = eye_of(default_camera())
     document = eye.true.machine.document
     legs = tuple(
         leg.model_copy(update={"length": leg.length.model_copy(update={"range": (0.1, 2.0)})})
@@ -354,7 +355,7 @@ def test_visibility_of_few_legs(eye):
 def test_directions_of_parallel_sliders_are_blind():
     machine = load_mechanism("hexaglide")
     case = replace(
-        eye_of(demo_camera()).true, machine=machine, legs=np.arange(6), radius=np.full(6, 0.004)
+        eye_of(default_camera()).true, machine=machine, legs=np.arange(6), radius=np.full(6, 0.004)
     )
     poses = draw_configurations(machine, 5, 0.2, np.random.default_rng(2))[0][:5]
     assert visibility(matrix_at(case, "directions", poses)).max() < 1e-6

@@ -12,7 +12,7 @@ import pytest
 from conftest import run
 from document_keys import assert_keys
 from pkmcal.cameras.files import camera_text
-from pkmcal.simulation.demo import demo_camera
+from pkmcal.placement.default_camera import default_camera
 
 QUICK = ("--runs", 3, "--rate", 6, "--noise", 0, "--joint-noise", 0, "--duration", 8, "--delay", 0)
 CHROMIUM = next(
@@ -116,7 +116,7 @@ def test_a_calibration_with_its_camera(demo, tmp_path):
 def test_one_way(tmp_path):
     """Requested start and goal: the same for every run; through a camera of one's own."""
     file = tmp_path / "camera.yaml"
-    file.write_text(camera_text(demo_camera()))
+    file.write_text(camera_text(default_camera()))
     done = run("servo", "gough-stewart", *QUICK, "--start", HOME, "--goal", "0.02,0,0.36,0,0,0.1",
                "--camera", file, "-o", tmp_path / "out", "--json")  # fmt: skip
     assert done.code == 0, done.out

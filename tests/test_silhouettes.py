@@ -31,10 +31,10 @@ from pkmcal.observe.pose_likelihood import LIKELIHOOD_OPTIONS
 from pkmcal.observe.predict import edge_points, legs_in_camera
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.pages.page import page_html
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.report.calibration import outcome_of
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
-from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.truth import load_truth
 from rendered import rendered
 from test_handheld import at_truth, localized_with

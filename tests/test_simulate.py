@@ -15,20 +15,20 @@ from pkmcal.geometry.cylinders import contour_point, edge_normal_jacobians
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose_difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import closure
+from pkmcal.placement.configurations import draw_configurations, usable
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
 from pkmcal.simulation import (
-    EdgeNoise,
     Sensor,
     Settings,
     draw_truth,
     load_truth,
-    simulate_edges,
     simulate_session,
     true_machine,
 )
-from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SETTINGS, demo_camera
-from pkmcal.simulation.placement import draw_configurations, usable
+from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SETTINGS
 from pkmcal.simulation.render import PixelRays, Scene, ScenePart, render_light, sensor_image
 from pkmcal.simulation.scene import CABLE_PIECES, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
@@ -502,7 +502,7 @@ def test_shared_configurations_are_imaged_by_all(machine):
 @pytest.mark.parametrize("shared", [False, True])
 def test_configurations_are_of_different_poses(name, shared):
     settings = Settings(configurations=15, shared=shared)
-    truth = draw_truth(load_mechanism(name), (demo_camera(),) * 3, settings, 1)
+    truth = draw_truth(load_mechanism(name), (default_camera(),) * 3, settings, 1)
     owner = same_pose(truth.readings, settings.joint_noise)
     assert len(np.unique(owner)) == len(truth.readings) == (15 if shared else 45)
     low, high = truth.machine.joint_ranges.T
@@ -514,14 +514,14 @@ def test_configurations_are_of_different_poses(name, shared):
 
 def test_images_by_hand_are_of_different_poses():
     settings = Settings(configurations=12, repeats=2, handheld=True)
-    truth = draw_truth(load_mechanism("delta"), (demo_camera(),) * 24, settings, 1)
+    truth = draw_truth(load_mechanism("delta"), (default_camera(),) * 24, settings, 1)
     assert len(np.unique(same_pose(truth.readings, settings.joint_noise))) == 12
 
 
 def test_more_ends_of_the_ranges_than_there_are_cannot_be_had():
     settings = Settings(configurations=15, extreme=1.0)
     with pytest.raises(GeometryError, match="not enough different configurations") as raised:
-        draw_truth(load_mechanism("delta"), (demo_camera(),) * 3, settings, 1)
+        draw_truth(load_mechanism("delta"), (default_camera(),) * 3, settings, 1)
     assert raised.value.found == "8"  # three arms, each near one of two ends
 
 
@@ -542,7 +542,7 @@ def test_a_session_is_written_whole_or_not_at_all(machine, tmp_path):
 
 
 def test_the_demonstration_can_be_drawn():
-    camera = demo_camera()
+    camera = default_camera()
     machine = load_mechanism(DEMO_MECHANISM)
     truth = draw_truth(machine, (camera,) * DEMO_SETTINGS.n_stations, DEMO_SETTINGS, 7)
     assert len(truth.images) == 18

@@ -16,7 +16,10 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.drives import drives_of, reaches, side_bars
 from pkmcal.observe.profiles import PROFILE_OPTIONS, Profiles, estimate_blur
+from pkmcal.placement.configurations import FARTHEST_TURN, platform_unfolded
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.simulation import (
     Settings,
     board_for,
@@ -26,9 +29,6 @@ from pkmcal.simulation import (
     with_forearms,
 )
 from pkmcal.simulation.board import board_from_fields
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.drives import drives_of, reaches, side_bars
-from pkmcal.simulation.placement import FARTHEST_TURN, platform_unfolded
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Cylinder
 from pkmcal.simulation.surfaces import SmoothNoise

@@ -43,11 +43,11 @@ from pkmcal.judge.prediction import predict
 from pkmcal.judge.sentences import validation_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.report.validation import held_out_part
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
-from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
 from test_bad_input import images, only
@@ -59,7 +59,7 @@ STATIONS = 3
 
 def legs_case(seed, true=None):
     """A hexapod's edges from three stations, eight configurations each."""
-    nominal, camera = exact("gough-stewart"), demo_camera()
+    nominal, camera = exact("gough-stewart"), default_camera()
     settings = Settings(stations=STATIONS, configurations=8)
     truth = draw_truth(nominal, (camera,) * STATIONS, settings, seed)
     true = true or truth.machine

@@ -23,9 +23,9 @@ from conftest import run
 from pkmcal.cameras.files import camera_text
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb, pose, pose_difference, rotation
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
-from pkmcal.simulation.demo import camera_of_size
 from pkmcal.view import server
 from pkmcal.view.content import Viewed
 from pkmcal.view.pose_file import PoseFile

@@ -39,16 +39,16 @@ from pkmcal.judge.fixed_machine import Evidence, Trust, change_evidence, hold
 from pkmcal.judge.sentences import ComparedSession, watch_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation import Settings
-from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
 from pkmcal.solver.search import Solution, Stop
 from pose_sessions import T_CAMERA_BASE, measured, papers_case, papers_poses
 from test_identify_scene import exact
 
 ALPHA = 0.01
-CAMERA = demo_camera()
+CAMERA = default_camera()
 SESSIONS = 50
 FEW = 4
 """Configurations of a session that watches."""

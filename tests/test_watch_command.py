@@ -25,12 +25,12 @@ from pkmcal.judge.fixed_machine import Trust, change_evidence, hold
 from pkmcal.judge.watch import watch_machine
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
+from pkmcal.placement.stations import StationPose
 from pkmcal.report.calibration import save
 from pkmcal.session.load import digests, load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
-from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.placement import StationPose
 from pkmcal.simulation.truth import draw_truth
 from rendered import rendered
 
@@ -291,7 +291,7 @@ def edges_through(camera, wrong, edges):
 
 def test_a_cameras_magnification_is_reported():
     """Images by a lens that is 0.5 % longer than its file states: the change is recovered."""
-    nominal, camera, longer = load_mechanism("gough-stewart"), demo_camera(), 5e-3
+    nominal, camera, longer = load_mechanism("gough-stewart"), default_camera(), 5e-3
     focal = camera.parameters.copy()
     focal[:2] *= 1 + longer
     real = replace(camera, parameters=focal)
@@ -323,7 +323,7 @@ def test_a_cameras_magnification_is_reported():
 @pytest.mark.slow
 def test_half_a_millimetre_in_five_images(tmp_path):
     """Rendered at 800x600: five machines that did not change, and a leg's zero off by 0.5 mm."""
-    nominal, camera = load_mechanism("gough-stewart"), demo_camera()
+    nominal, camera = load_mechanism("gough-stewart"), default_camera()
     settings = Settings(stations=3, configurations=8)
     truth = simulate_session(tmp_path / "before", nominal, camera, settings, seed=11)
     save(calibrate_session(tmp_path / "before"), tmp_path / "calibration")

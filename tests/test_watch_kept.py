@@ -19,7 +19,7 @@ from pkmcal.judge.fixed_machine import Trust, change_evidence, hold
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.judge.watch import tests_with_fixed_stations as fixed_station_tests
 from pkmcal.measurements import Measurements
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from test_watch import ALPHA, CAMERA, half_of, images_of, made_calibration, moved
 
 SESSIONS = 30

@@ -12,9 +12,10 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.localization import localize_by_legs, platform_poses, read_images
 from pkmcal.observe.image_batches import StationImages
+from pkmcal.placement.default_camera import default_camera
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Truth, load_truth, simulate_session
-from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
+from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 
 
 class Case:
@@ -62,5 +63,5 @@ def simulated(folder: Path, seed: int) -> Path:
     """A session like the demonstration's, made where it is not there yet."""
     if not folder.exists():
         machine = pkmcal.load_mechanism(DEMO_MECHANISM)
-        simulate_session(folder, machine, demo_camera(), DEMO_SETTINGS, seed=seed)
+        simulate_session(folder, machine, default_camera(), DEMO_SETTINGS, seed=seed)
     return folder

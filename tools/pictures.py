@@ -29,6 +29,8 @@ from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.pages import page
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.planning.plan import plan_measurements as make_plan
 from pkmcal.planning.subject import of_machine
 from pkmcal.report import pictures, scene
@@ -38,14 +40,8 @@ from pkmcal.report.calibration import save
 from pkmcal.report.links import Links
 from pkmcal.report.plan import outcome_of
 from pkmcal.session.load import Session
-from pkmcal.simulation import (
-    EdgeNoise,
-    load_truth,
-    simulate_edges,
-    simulate_session,
-    true_machine,
-)
-from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
+from pkmcal.simulation import load_truth, simulate_session, true_machine
+from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 from pkmcal.view.content import Viewed
 from pkmcal.view.server import (
     LOOPBACK_ADDRESS,
@@ -211,7 +207,7 @@ def _edge_scores(case: Case, seed: int) -> Array:
     edges, joints = simulate_edges(
         machine,
         truth.T_camera_base,
-        demo_camera(),
+        default_camera(),
         truth.T_base_platform,
         EdgeNoise(),
         rng,
@@ -266,7 +262,7 @@ def _larger(folder: Path, count: int) -> Path:
     if not folder.exists():
         machine = pkmcal.load_mechanism(DEMO_MECHANISM)
         settings = replace(DEMO_SETTINGS, configurations=count)
-        simulate_session(folder, machine, demo_camera(), settings, seed=DEMO_SEED)
+        simulate_session(folder, machine, default_camera(), settings, seed=DEMO_SEED)
     return folder
 
 
@@ -319,7 +315,7 @@ def served(session: Session) -> str:
 def plan(_case: Case) -> Shot:
     """Poses of three cameras round a hexapod from a plan: the page's plot in space."""
     machine = pkmcal.load_mechanism(DEMO_MECHANISM)
-    subject = of_machine(machine, [demo_camera()], machine.joint_names)
+    subject = of_machine(machine, [default_camera()], machine.joint_names)
     outcome = outcome_of(make_plan(subject, free_stations=3))
     retained = tuple(part for part in outcome.parts if part.name == "where")
     html = page.page_html(replace(outcome, parts=retained, findings=()))

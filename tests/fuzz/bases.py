@@ -17,8 +17,8 @@ from pkmcal.commands.cli import main
 from pkmcal.files import Exif, csv_text, with_exif, yaml_text
 from pkmcal.geometry.rigid import look_at, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.simulation import Settings
-from pkmcal.simulation.demo import camera_of_size
 from rendered import rendered
 
 SIZE = (160, 120)

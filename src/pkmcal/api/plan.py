@@ -12,6 +12,8 @@ from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.placement.default_camera import camera_of_size
+from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.defaults import (
     CONFIGURATIONS_A_CAPTURE,
     NOMINAL_CORNER_SIGMA,
@@ -25,8 +27,6 @@ from pkmcal.planning.plan import plan_measurements as run
 from pkmcal.planning.subject import as_it_stands, of_machine
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation import board_for
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 
 
 def plan(

@@ -11,10 +11,10 @@ from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.placement.default_camera import default_camera
 from pkmcal.ranges import RANGES, check_number
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Sensor, Settings, simulate_session, to_simulate
-from pkmcal.simulation.demo import demo_camera
 from pkmcal.wording import listed
 
 
@@ -71,7 +71,13 @@ def simulate(
     check_number("simulate", "seed", seed)
     _check_settings(settings)
     nominal = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
-    eye = camera if isinstance(camera, Camera) else load_camera(camera) if camera else demo_camera()
+    eye = (
+        camera
+        if isinstance(camera, Camera)
+        else load_camera(camera)
+        if camera
+        else default_camera()
+    )
     machine = to_simulate(nominal, nominal.name)
     simulate_session(folder, machine, eye, Settings(**settings), seed=seed, progress=progress)
     return load_session(folder)

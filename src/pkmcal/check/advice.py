@@ -19,8 +19,8 @@ from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_OPTIONS
 from pkmcal.outcome import Figure, Level, Part, Row, Table
 from pkmcal.outcome.finding import Finding, note
+from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.first import EdgesOf
-from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.wording import brief, count, listed, named
 
 INFORMATION_LOST_SHARE = 1 - 1 / RELEVANT_FACTOR**2

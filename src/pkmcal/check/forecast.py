@@ -19,11 +19,12 @@ from pkmcal.check.inspection import Inspection
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
 from pkmcal.observe.predict import tubes_of
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
 from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges
 from pkmcal.planning.information import tool_by_free
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
-from pkmcal.simulation.placement import PANORAMIC_HALF_VIEW, draw_configurations, view_angle
 
 NEAR_END = 0.15
 """Part of a joint's range, at either end, whose readings count as extreme."""

@@ -41,15 +41,10 @@ def demo(
     from pkmcal.calibration.results import check_output
     from pkmcal.commands.comparison import compare_with_truth
     from pkmcal.mechanisms import load_mechanism
+    from pkmcal.placement.default_camera import camera_of_size, default_camera
     from pkmcal.report.calibration import outcome_of
     from pkmcal.simulation import simulate_session
-    from pkmcal.simulation.demo import (
-        DEMO_MECHANISM,
-        DEMO_SEED,
-        DEMO_SETTINGS,
-        camera_of_size,
-        demo_camera,
-    )
+    from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 
     session, result = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
     _make_room(out)
@@ -58,7 +53,7 @@ def demo(
         simulate_session(
             session,
             load_mechanism(DEMO_MECHANISM),
-            camera_of_size(FAST_SIZE) if fast else demo_camera(),
+            camera_of_size(FAST_SIZE) if fast else default_camera(),
             replace(DEMO_SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else DEMO_SETTINGS,
             seed=DEMO_SEED,
             progress=console.counted(progress, upto=SIMULATING_SHARE),

@@ -114,9 +114,9 @@ def plan(
     from pkmcal.api.plan import plan as run
     from pkmcal.commands.simulate import parsed_size
     from pkmcal.files import check_own_folder, default_output
+    from pkmcal.placement.default_camera import camera_of_size
     from pkmcal.report.plan import outcome_of
     from pkmcal.session.load import session_folder
-    from pkmcal.simulation.demo import camera_of_size
 
     session = session_folder(subject)
     folder = out or default_output((session or Path()) / "plan")

@@ -95,8 +95,8 @@ def servo(
     from pkmcal.control.source import legs_of_text, load_plant, pose_of_text
     from pkmcal.control.study import Plan, study_servoing
     from pkmcal.files import check_own_folder, default_output
+    from pkmcal.placement.edges import EdgeNoise
     from pkmcal.report.servo import outcome_of
-    from pkmcal.simulation.edges import EdgeNoise
 
     law_named(law)
     loop = LoopSettings(

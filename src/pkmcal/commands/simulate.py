@@ -92,8 +92,8 @@ def simulate(
     """Simulate a session with images and known truth."""
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import load_mechanism
+    from pkmcal.placement.default_camera import camera_of_size
     from pkmcal.simulation import Sensor, Settings, board_for, simulate_session, to_simulate
-    from pkmcal.simulation.demo import camera_of_size
     from pkmcal.simulation.rehearsal import rehearsal_of
 
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))

@@ -1,7 +1,7 @@
 """Simulated camera of a control loop: edges with noise, and whether legs are in view.
 
 The edges are those of :mod:`pkmcal.observe.predict`, each with a sideways error and a tilt in
-pixels as in :class:`pkmcal.simulation.edges.EdgeNoise`; an edge has few samples, because a loop
+pixels as in :class:`pkmcal.placement.edges.EdgeNoise`; an edge has few samples, because a loop
 runs a hundred thousand images.
 """
 
@@ -24,7 +24,7 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
-from pkmcal.simulation.edges import EdgeNoise, disturbed, responses
+from pkmcal.placement.edges import EdgeNoise, disturbed, responses
 
 IMAGED_EDGE_POINTS = 5
 """Samples along an edge; more samples change its noise by less than a tenth."""
@@ -91,7 +91,7 @@ class Eye:
 def edge_responses(points: EdgePoints) -> tuple[Array, Array, Array]:
     """Rotations (R, E, 2) of the normals by a shift and by a tilt of one pixel, and their bases.
 
-    The rotations are those of :func:`pkmcal.simulation.edges.responses`, in the bases (R, E, 3, 2).
+    The rotations are those of :func:`pkmcal.placement.edges.responses`, in the bases (R, E, 3, 2).
     """
     middle = points.point[..., points.point.shape[-2] // 2, :]
     basis = tangent_basis(points.normal, middle / np.sqrt(dot(middle, middle))[..., None])

@@ -20,7 +20,7 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, closure_at, forward
 from pkmcal.mechanisms.velocities import assembly_sign
-from pkmcal.simulation.edges import EdgeNoise
+from pkmcal.placement.edges import EdgeNoise
 
 IMAGES_A_GOAL = 24
 """Images of each goal; the standard deviation over all goals is then accurate to a few percent."""

@@ -17,8 +17,8 @@ from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.outcome.finding import doubtful
-from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.placement import default_stations
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.placement.stations import default_stations
 from pkmcal.simulation.truth import stream, true_machine
 
 CALIBRATED_TOLERANCE_SHARE = 1 / 30
@@ -54,7 +54,7 @@ def load_plant(
             found=station or str(session),
             next_step="Name a calibration's folder, or give --camera alone",
         )
-    return _of_nominal(source, eye or demo_camera(), legs, seed)
+    return _of_nominal(source, eye or default_camera(), legs, seed)
 
 
 def _of_calibration(

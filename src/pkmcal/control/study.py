@@ -36,7 +36,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome.finding import Finding
-from pkmcal.simulation.placement import draw_configurations
+from pkmcal.placement.configurations import draw_configurations
 
 HAND_POSITION = 0.03
 HAND_ROTATION = float(np.deg2rad(3))

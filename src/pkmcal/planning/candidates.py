@@ -13,18 +13,11 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.drives import ball_of, legs_space
 from pkmcal.mechanisms.kinematics import on_manifold
+from pkmcal.placement.configurations import READING_RANGE_SHARES, draw_configurations, usable
+from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, StationPose, fitting_distance, view_angle
 from pkmcal.session.schema import BoardBody
-from pkmcal.simulation.drives import ball_of, legs_space
-from pkmcal.simulation.placement import (
-    PANORAMIC_HALF_VIEW,
-    READING_RANGE_SHARES,
-    StationPose,
-    draw_configurations,
-    fitting_distance,
-    usable,
-    view_angle,
-)
 
 CAMERA_POSES_A_RING = 12
 """Number of camera poses on a ring around the machine."""

@@ -27,8 +27,8 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages, placed_at
 from pkmcal.observe.predict import tubes_of
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.session.load import Session
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.solver.kernels import INLIER_WEIGHT
 
 FIRST_IMAGES_A_STATION = 3

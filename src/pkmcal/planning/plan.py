@@ -20,6 +20,8 @@ from pkmcal.errors import InputError
 from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
+from pkmcal.placement.configurations import usable
+from pkmcal.placement.stations import StationPose
 from pkmcal.planning.candidates import (
     Configurations,
     camera_ring_poses,
@@ -33,7 +35,6 @@ from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
 from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import Subject
 from pkmcal.ranges import check_number
-from pkmcal.simulation.placement import StationPose, usable
 
 PLAN_CANDIDATES = 400
 """Minimum number of candidate configurations."""

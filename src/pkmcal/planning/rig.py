@@ -31,9 +31,9 @@ from pkmcal.measurements import (
 )
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
+from pkmcal.placement.edges import hidden, pixel_angle, simulate_edges
 from pkmcal.planning.defaults import NOMINAL_CORNER_SIGMA, NOMINAL_EDGE_SIGMA
 from pkmcal.planning.first import EXACT_EDGE_NOISE, FIRST_EDGES_SEED, EdgePool, Pools, drawn_edges
-from pkmcal.simulation.edges import hidden, pixel_angle, simulate_edges
 
 FLATTEST_BOARD_COSINE = np.cos(np.deg2rad(70))
 """Minimum cosine of the angle between a board's normal and the line of sight."""

@@ -32,6 +32,8 @@ from pkmcal.measurements import SHADING_SIGMA, Mount
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.legs import first_binning
 from pkmcal.observe.predict import tubes_of
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.stations import default_stations
 from pkmcal.planning.defaults import (
     NOMINAL_CORNER_SIGMA,
     NOMINAL_EDGE_SIGMA,
@@ -48,7 +50,6 @@ from pkmcal.planning.rig import (
 )
 from pkmcal.session.load import Session
 from pkmcal.simulation.board import place_board
-from pkmcal.simulation.placement import default_stations, draw_configurations
 from pkmcal.wording import brief, listed
 
 PLAN_IMAGES_A_STATION = 12

@@ -24,9 +24,9 @@ from pkmcal.pages.plots import (
     path_between_cameras,
     uncropped,
 )
+from pkmcal.placement.stations import StationPose
 from pkmcal.planning.plan import Accuracy, MeasurementPlan, TriedStation
 from pkmcal.planning.rig import BoardFrom, LegsFrom
-from pkmcal.simulation.placement import StationPose
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, number
 
 PLAN_TABLE_FILE, PLAN_STATIONS_FILE = "plan.csv", "stations.yaml"

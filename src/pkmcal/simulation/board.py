@@ -20,8 +20,8 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import apply, cross, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.drives import ball_of, legs_space
 from pkmcal.session.schema import BoardBody
-from pkmcal.simulation.drives import ball_of, legs_space
 from pkmcal.simulation.render import ScenePart
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned_components

@@ -15,7 +15,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validated_document
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
-from pkmcal.simulation.placement import StationPose
+from pkmcal.placement.stations import StationPose
 from pkmcal.simulation.truth import RequestedConfigurations
 
 PLAN_FILE = "plan.json"

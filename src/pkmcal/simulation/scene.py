@@ -16,7 +16,7 @@ from pkmcal.geometry.rigid import apply, cross, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
+from pkmcal.mechanisms.drives import Drives, drives_of, reaches, side_bars
 from pkmcal.simulation.render import Scene, ScenePart
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulation.surfaces import (

@@ -20,8 +20,9 @@ from pkmcal.files import Exif, csv_text, entries, staged_folder, with_exif, yaml
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS
+from pkmcal.placement.configurations import check_drawable
+from pkmcal.placement.stations import one_a_station
 from pkmcal.simulation.board import board_part, holder_part
-from pkmcal.simulation.placement import check_drawable, one_a_station
 from pkmcal.simulation.render import PixelRays, Scene, ScenePart, Sensor, render_light, sensor_image
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise

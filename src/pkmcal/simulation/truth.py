@@ -22,19 +22,18 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
 from pkmcal.measurements.effects import FOCAL_SIGMA
 from pkmcal.mechanisms import Machine
+from pkmcal.placement.configurations import draw_configurations, platform_unfolded
+from pkmcal.placement.stations import (
+    StationPose,
+    default_stations,
+    in_picture,
+    rough_pose,
+    rough_poses,
+)
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
 from pkmcal.session.schema import BoardBody
 from pkmcal.simulation.board import place_board
-from pkmcal.simulation.placement import (
-    StationPose,
-    default_stations,
-    draw_configurations,
-    in_picture,
-    platform_unfolded,
-    rough_pose,
-    rough_poses,
-)
 from pkmcal.simulation.render import Sensor
 from pkmcal.simulation.surfaces import Light, Style
 

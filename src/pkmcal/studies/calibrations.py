@@ -52,8 +52,8 @@ from pkmcal.measurements.poses import PoseData
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.simulation.edges import EDGE_TURN_POINTS, moved_outward
-from pkmcal.simulation.placement import draw_configurations
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.edges import EDGE_TURN_POINTS, moved_outward
 from pkmcal.solver.search import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
 from pkmcal.studies.estimates import Fitted

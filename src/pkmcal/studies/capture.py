@@ -21,10 +21,11 @@ from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import tubes_of
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.edges import visible_edges
+from pkmcal.placement.stations import default_stations, in_picture
 from pkmcal.simulation.board import board_for, place_board
-from pkmcal.simulation.drives import with_forearms
-from pkmcal.simulation.edges import visible_edges
-from pkmcal.simulation.placement import default_stations, draw_configurations, in_picture
+from pkmcal.simulation.cylinders import with_forearms
 from pkmcal.simulation.truth import Settings
 
 LEAST_BOARD_SHARE_IN_IMAGE = 0.5

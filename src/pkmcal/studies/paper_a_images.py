@@ -10,8 +10,9 @@ from typing import NamedTuple
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.judge.repeatability import LegScatter, study_repeats
 from pkmcal.mechanisms import load_mechanism, machine_from_document, with_exact_scales
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.simulation import Settings, simulate_session
-from pkmcal.simulation.demo import DEMO_MECHANISM, camera_of_size
+from pkmcal.simulation.demo import DEMO_MECHANISM
 
 PAPER_A_PICTURE_SIZE = (1024, 768)
 """[A] 4.2: pixels; its lens of 6 mm is also that of the demonstration."""

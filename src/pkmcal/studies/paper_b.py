@@ -27,7 +27,7 @@ from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, with_exact_scales
 from pkmcal.papers import linear
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import true_machine
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample

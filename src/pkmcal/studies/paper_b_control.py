@@ -16,7 +16,7 @@ from pkmcal.control.simulation import LoopSettings, ServoRuns, simulate_servo_ru
 from pkmcal.control.study import Belief, Trials, Uncertainty, estimates, outcome
 from pkmcal.geometry.rigid import apply, inverse, register
 from pkmcal.identify.gauge import centre_index
-from pkmcal.simulation.edges import EdgeNoise
+from pkmcal.placement.edges import EdgeNoise
 from pkmcal.studies.paper_b import (
     PERSPECTIVE_VIEW,
     controlled_machine,

@@ -24,9 +24,9 @@ from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.outcome.finding import Finding, note
+from pkmcal.placement.configurations import check_drawable
+from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import Session, load_session, session_folder
-from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.placement import check_drawable
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
 from pkmcal.studies.paper_a import JointByAxes

@@ -115,7 +115,7 @@ class Viewed:
 
         The camera faces the machine, far enough away to have all of it in the image.
         """
-        from pkmcal.simulation.placement import default_stations
+        from pkmcal.placement.stations import default_stations
 
         machine, camera = self.session.machine, self.station(s).camera
         (place,) = default_stations(machine, (camera,), np.random.default_rng(0))

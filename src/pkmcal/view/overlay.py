@@ -99,7 +99,7 @@ def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
 
 def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     """Pose in the form of session.yaml, with the digits that are written there."""
-    from pkmcal.simulation.placement import StationPose
+    from pkmcal.placement.stations import StationPose
 
     return StationPose.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
 

@@ -24,7 +24,7 @@ from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import TubeList, tubes_of
-from pkmcal.simulation.placement import one_a_station
+from pkmcal.placement.stations import one_a_station
 
 POINTS_ALONG_EDGE = 48
 """Samples along each tube: a hidden stretch is bounded to a fiftieth of the tube."""
