@@ -210,16 +210,20 @@ def one_core_a_worker():
     """A study uses one core where the tests take all: another process takes a second to start."""
     with pytest.MonkeyPatch.context() as patch:
         if "PYTEST_XDIST_WORKER" in os.environ:
-            patch.setattr("pkmcal.studies.workers.cores", lambda: 1)
+            have_cores(patch, 1)
         yield
+
+
+def have_cores(patch: pytest.MonkeyPatch, count: int) -> None:
+    """A computer with so many processors."""
+    patch.setattr(os, "cpu_count", lambda: count)
+    patch.setattr(os, "sched_getaffinity", lambda _pid: set(range(count)), raising=False)
 
 
 @pytest.fixture
 def one_process(monkeypatch):
     """Studies in this process: other ones take a second to start."""
-    from pkmcal.studies import workers
-
-    monkeypatch.setattr(workers, "cores", lambda: 1)
+    have_cores(monkeypatch, 1)
 
 
 @pytest.fixture(scope="module")

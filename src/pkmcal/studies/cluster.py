@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from concurrent.futures import CancelledError
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any
 from urllib.parse import urlsplit
 
 from pkmcal.errors import InputError, ResultError
+from pkmcal.studies.executors import run_on
 from pkmcal.studies.tasks import Finished, Job, Runner, SolvedBatch, work
 from pkmcal.wording import install_step
 
@@ -118,16 +120,11 @@ def _count_threads(client: Any, address: str) -> int:
 
 def _run_tasks(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
     """Run all tasks; Dask repeats the tasks of a worker that has died on another one."""
-    from distributed import CancelledError, KilledWorker, as_completed
+    from distributed import KilledWorker
 
-    futures = {
-        client.submit(_work_on_one_thread, task, pure=False): k for k, task in enumerate(tasks)
-    }
     try:
-        for future in as_completed(list(futures), loop=client.loop):
-            number = futures.pop(future)
-            finished(number, future.result())
-            future.release()
+        with client.get_executor(pure=False) as executor:
+            run_on(executor, _work_on_one_thread, dict(enumerate(tasks)), finished)
     except KilledWorker as error:
         raise ResultError(
             "the cluster's workers die again and again at one batch",
@@ -139,6 +136,3 @@ def _run_tasks(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
             "the scheduler of the cluster is gone",
             next_step="Start it again; what is finished is kept, and the same command goes on",
         ) from None
-    finally:
-        if client.status == "running":
-            client.cancel(list(futures))

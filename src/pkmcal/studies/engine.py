@@ -15,10 +15,10 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.studies.executors import on_cores
 from pkmcal.studies.statistics import SUMMARIES_BY_STATISTIC, Summary
 from pkmcal.studies.store import Store
 from pkmcal.studies.tasks import Batch, Job, Key, Runner, Sample, SolvedBatch, StudySetting
-from pkmcal.studies.workers import on_cores
 
 StudyProgress = Callable[[str, float], None]
 

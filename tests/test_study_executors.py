@@ -9,19 +9,19 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from conftest import run
+from conftest import have_cores, run
 from pkmcal.errors import InputError, ResultError
-from pkmcal.studies import cluster, engine, tasks, workers
+from pkmcal.studies import cluster, engine, tasks
 from pkmcal.studies.calibrations import (
     JOINT_ESTIMATE_KEY,
 )
 from pkmcal.studies.findings import study
-from pkmcal.studies.paper_a import JointByAxes
 from pkmcal.studies.store import Store
 from pkmcal.studies.study_report import runs_bytes, study_document
 from pkmcal.studies.sweep import cells_of, subject_of
@@ -49,7 +49,7 @@ def whole(tmp_path_factory):
     """The command's study without a stop, by one process."""
     folder = tmp_path_factory.mktemp("study") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "cores", lambda: 1)
+        have_cores(patch, 1)
         assert run("study", *COMMAND, "-o", folder).code == 0
     return folder
 
@@ -106,7 +106,7 @@ class Counting:
     def draw(self, batch: Batch):
         if self.fails == "input":
             raise InputError("nothing to count")
-        if self.fails == "dies" and os.environ.get("PKMCAL_TEST_PARENT") != str(os.getpid()):
+        if self.fails == "dies":
             os._exit(9)
         return batch.generator(0).random(batch.runs)
 
@@ -118,71 +118,60 @@ class Counting:
         return {JOINT_ESTIMATE_KEY: Sample({"x": value[JOINT_ESTIMATE_KEY]})}
 
 
-def test_workers_that_die_are_replaced(monkeypatch):
-    """One is killed in the middle: the same numbers, and no batch twice."""
-    begun: list[subprocess.Popen[bytes]] = []
-    real = subprocess.Popen
-
-    def recorded(*words, **options):
-        begun.append(real(*words, **options))
-        return begun[-1]
-
-    monkeypatch.setattr(workers.subprocess, "Popen", recorded)
-    monkeypatch.setattr(workers, "cores", lambda: 2)
-    done: list[float] = []
+def test_processes_that_die_are_replaced(monkeypatch):
+    """All are killed in the middle: the same numbers, and no batch twice."""
+    have_cores(monkeypatch, 2)
+    shares, begun = [], set[int]()
 
     def report(_text, share):
-        done.append(share)
-        if len(done) == 75:
-            begun[0].kill()
+        shares.append(share)
+        begun.update(process.pid for process in active_children())
+        if len(shares) == 20:
+            for process in active_children():
+                process.kill()
 
-    setting = JointByAxes(poses=4, batch=2)
-    # long enough for the one in its place to begin, too
-    many = engine.run(Counting(takes=0.02), 750, 1, report)
-    assert len(done) == 150
-    assert len(begun) == 2  # beside this process one, and the one in its place
-    monkeypatch.setattr(workers, "cores", lambda: 1)
-    one = engine.run(Counting(), 750, 1)
+    # long enough for the pool in the place of the first to begin, too
+    many = engine.run(Counting(takes=0.02), 200, 1, report)
+    assert len(shares) == 40
+    assert len(begun) == 4
+    assert not active_children()
+    have_cores(monkeypatch, 1)
+    one = engine.run(Counting(), 200, 1)
     assert (many.workers, one.workers) == (2, 1)
     np.testing.assert_array_equal(*(r.values("x", *JOINT_ESTIMATE_KEY) for r in (many, one)))
-    assert engine.run(setting, 4, 0).values("position", *JOINT_ESTIMATE_KEY).shape == (4,)
 
 
 @pytest.mark.slow
-def test_a_batch_that_kills_every_worker_ends_the_study(monkeypatch):
-    monkeypatch.setenv("PKMCAL_TEST_PARENT", str(os.getpid()))
-    pool = workers._Pool([Job(Counting("dies"), batch_of(Counting()))], lambda _k, _done: None)
-    pool.elsewhere()
-    assert isinstance(pool.failure, ResultError)
-    assert "killed again and again" in str(pool.failure)
+def test_a_batch_that_kills_every_process_ends_the_study(monkeypatch):
+    have_cores(monkeypatch, 2)
+    with pytest.raises(ResultError, match="killed again and again") as error:
+        engine.run(Counting("dies"), 10, 0)
+    assert error.value.found.startswith("3 times")
 
 
-def test_an_error_in_another_process_is_reported():
-    pool = workers._Pool([Job(Counting("input"), batch_of(Counting()))], lambda _k, _done: None)
-    pool.elsewhere()
-    assert isinstance(pool.failure, InputError)
-    assert str(pool.failure) == "nothing to count."
-
-
-def test_an_error_here_is_reported(one_process):
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_error_of_a_task_is_raised(monkeypatch, count):
+    have_cores(monkeypatch, count)
     with pytest.raises(InputError, match="nothing to count"):
         engine.run(Counting("input"), 10, 0)
+    assert not active_children()
 
 
-class Caching(Counting):
-    """A setting that fills a cache while it works, as machines do."""
-
-    def draw(self, batch: Batch):
-        vars(self)["cache"] = len(vars(self))
-        return super().draw(batch)
-
-
-def test_work_in_this_process_changes_no_shared_task(one_process):
-    """Other threads pickle the tasks meanwhile, which fails on an object that grows."""
-    setting = Caching()
-    before = dict(vars(setting))
-    workers.on_cores([Job(setting, batch_of(setting))], lambda _number, _result: None)
-    assert vars(setting) == before
+def test_a_script_needs_no_guard(tmp_path):
+    """Processes do not run the script again, which would start a study in each."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os\n"
+        "os.sched_getaffinity = lambda _pid: {0, 1}\n"
+        "os.cpu_count = lambda: 2\n"
+        "from pkmcal.studies import engine\n"
+        "from pkmcal.studies.paper_a import JointByAxes\n"
+        "print(engine.run(JointByAxes(poses=4, batch=2), 4, 0).workers)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    words = [sys.executable, str(script)]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("2\n", "")
 
 
 def test_what_is_kept_is_what_was_done(tmp_path):
