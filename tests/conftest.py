@@ -9,7 +9,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable, Collection, Iterable
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import pytest
 from hypothesis import settings
 
-from pkmcal.calibration.refinement import IMPUTATION_PASSES as ALL_LOOKS
+from pkmcal.calibration.refinement import RefinementOptions
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from rendered import once
@@ -88,30 +88,9 @@ def unhurried(monkeypatch):
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 3600.0)
 
 
-@pytest.fixture(autouse=True)
-def few_looks(request, monkeypatch):
-    """Two measurement passes from machines drawn from the covariance, which take half of a
-    calibration's time, suffice unless their scatter is tested. In slow tests and in shared fixtures
-    there are as many as by default.
-    """
-    if not request.node.get_closest_marker("slow"):
-        monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
-
-
-@pytest.fixture
-def all_looks(few_looks, monkeypatch):
-    """As many further measurement passes as by default."""
-    monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", ALL_LOOKS)
-
-
-@contextmanager
-def two_looks():
-    """Two further measurement passes for a shared fixture whose calibration's variance between
-    passes is not tested.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
-        yield patch
+FEW_IMPUTATIONS = RefinementOptions(imputations=2)
+"""For calibrations whose variance between imputations is not tested: by default these measurement
+passes take half of a calibration's time."""
 
 
 def slow_but(few: Collection[str], names: Iterable[str]) -> list:
