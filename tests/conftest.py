@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -20,6 +21,7 @@ from hypothesis import settings
 from pkmcal.calibration.refinement import RefinementOptions
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
+from pkmcal.planning.plan import PlanOptions, plan_measurements
 from rendered import once
 
 # Examples of a property, unless its test says how many.
@@ -201,13 +203,17 @@ def one_process(monkeypatch):
     monkeypatch.setattr(workers, "cores", lambda: 1)
 
 
+FEW_CANDIDATES = PlanOptions(candidates=60, work_poses=20, rounds=1)
+"""For plans whose quality is not tested."""
+
+
 @pytest.fixture(scope="module")
 def quick_plans():
-    """Plans chosen among few candidates, where how good they are is not the question."""
+    """Plans of the command and of Python's function, which have no such options, among few
+    candidates.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
-        patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
-        patch.setattr("pkmcal.planning.plan.BETTERING_ROUNDS", 1)
+        patch.setattr("pkmcal.api.plan.run", partial(plan_measurements, options=FEW_CANDIDATES))
         yield
 
 

@@ -15,7 +15,6 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.localization import boards_of, read_images
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
-from pkmcal.papers import methods
 from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.calibration import save
 from pkmcal.report.corners import board_corners
@@ -179,11 +178,10 @@ def test_a_missing_board_file_and_another_camera(folder):
         load_session(folder)
 
 
-def test_the_method_of_paper_c_says_nothing_of_the_size(folder, tmp_path, monkeypatch):
+def test_the_method_of_paper_c_says_nothing_of_the_size(folder, tmp_path):
     """Without an estimate of the size none is reported, though the tolerance in board.yaml adds to
     sigma.
     """
-    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # standard deviations are not tested
     change(folder, lambda station: station.update(observe="board"))
     done = run("calibrate", folder, "-o", tmp_path / "out", "--method", "inverse-kinematic")
     assert done.code in (0, 1)

@@ -36,7 +36,6 @@ from pkmcal.simulation import simulate_edges
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.edges import EdgeNoise
 from pkmcal.simulation.placement import draw_configurations
-from pkmcal.solver import elimination
 from pkmcal.wording import ratio_in_per_cent
 from test_bad_input import only
 from test_identify_scene import exact
@@ -169,7 +168,7 @@ def test_nothing_is_found_twice():
     assert len(results) == len(set(results))
 
 
-def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
+def test_scores_are_those_of_the_whole_jacobian():
     """Against dense algebra, all columns of all rows at once; and in pieces as in one."""
     nominal, data, where = measured(8, scale=(1, 2e-3), count=14)
     estimate = bundle(nominal, data, start_state(nominal, data, where), scale_noise=False)
@@ -217,7 +216,8 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     scores = tests.scores(freed)
     for k in [2, 3, 5, 40, 70]:
         assert scores[k].chi2 == pytest.approx(oracle(reference_values, k)[0], rel=1e-5, abs=1e-6)
-    monkeypatch.setattr(elimination, "SOLVER_ROWS_AT_ONCE", 3 * problem.n_rows)
+    problem = replace(problem, rows_at_once=3 * problem.n_rows)
+    assembled = replace(assembled, problem=problem)
     pieces = ScoreTests(assembled, Information(problem, state), effects, [0, 1, 2], singles=True)
     for one, other in zip(pieces.scores(freed), scores, strict=True):
         assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-9)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from conftest import run
+from conftest import FEW_CANDIDATES, run
 from document_keys import assert_keys
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
@@ -26,9 +26,8 @@ from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.exchange import PLAN_INDICES, exchanged, greedy
-from pkmcal.planning.first import FirstEdges, first_edges
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
-from pkmcal.planning.plan import AT_WORK, plan_measurements
+from pkmcal.planning.plan import PLAN, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
 from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import of_machine, subject_of_session
@@ -45,19 +44,15 @@ def hexapod(places=2, **more):
     return of_machine(machine, [camera_of_size(SIZE)] * places, machine.joint_names, **more)
 
 
-def small(subject, monkeypatch, **more):
+def small(subject, options=FEW_CANDIDATES, **more):
     """A plan among few candidates, for tests' time."""
-    monkeypatch.setattr("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
-    monkeypatch.setattr("pkmcal.planning.plan.AT_WORK", 20)
-    monkeypatch.setattr("pkmcal.planning.plan.BETTERING_ROUNDS", 1)
-    return plan_measurements(subject, count=5, **more)
+    return plan_measurements(subject, count=5, options=options, **more)
 
 
 @pytest.fixture(scope="module")
 def planned():
     """Plan for a hexapod's legs from two places."""
-    with pytest.MonkeyPatch.context() as patch:
-        return small(hexapod(), patch)
+    return small(hexapod())
 
 
 def test_more_pixels_than_a_lens_resolves_promise_nothing():
@@ -99,7 +94,7 @@ def stated_by(rig, measurements, work):
 
 
 @pytest.mark.parametrize("seen", ["legs", "board", "points", "together"])
-def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch, planned):
+def test_what_is_promised_is_what_the_estimate_states(seen, planned):
     if seen == "board":
         machine = load_mechanism("h4")
         board = board_for(machine, "platform")
@@ -109,7 +104,7 @@ def test_what_is_promised_is_what_the_estimate_states(seen, monkeypatch, planned
         subject = of_machine(machine, [], machine.joint_names, tracker=(2e-5, None))
     else:
         subject = hexapod()
-    count = planned if seen == "legs" else small(subject, monkeypatch, together=seen == "together")
+    count = planned if seen == "legs" else small(subject, together=seen == "together")
     rig, n = count.subject.rig, len(count.names)
     numbers = {name: k for k, name in enumerate(rig.names)}
     pairs = np.array([(numbers[s], k) for k in range(n) for s in count.stations[k]])
@@ -273,10 +268,9 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
 # ------------------------------------------------------------------ places
 
 
-def test_places_stand_apart_and_better_one_alone(monkeypatch):
-    monkeypatch.setattr("pkmcal.planning.candidates.CAMERA_POSES_A_RING", 6)
-    monkeypatch.setattr("pkmcal.planning.plan.CONFIGURATIONS_FOR_STATIONS", 8)
-    results = small(hexapod(1), monkeypatch, free_stations=2)
+def test_places_stand_apart_and_better_one_alone():
+    few_stations = replace(FEW_CANDIDATES, poses_a_ring=6, for_stations=8)
+    results = small(hexapod(1), few_stations, free_stations=2)
     chosen = [tried for tried in results.tried if tried.chosen]
     eyes = np.array([tried.place.position for tried in chosen])
     middle = results.subject.rig.machine.home()[:3, 3]
@@ -326,15 +320,7 @@ def test_barred_steps_are_avoided():
 # ------------------------------------------------------------------ the command
 
 
-def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path, monkeypatch):
-    measured: list[FirstEdges] = []
-
-    def once(*inputs):
-        measured[:] = measured or [first_edges(*inputs)]
-        return measured[0]
-
-    # the edges' accuracy in the same images, for all three plans
-    monkeypatch.setattr("pkmcal.planning.subject.first_edges", once)
+def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     session = tmp_path / "session"
     shutil.copytree(demo.session, session)
     (session / "truth.json").unlink()
@@ -414,12 +400,12 @@ def test_what_cannot_be_planned(options, sentence, quick_plans, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_index_that_is_none(monkeypatch):
+def test_an_index_that_is_none():
     with pytest.raises(InputError, match="there is no such index"):
-        small(hexapod(1), monkeypatch, index="A")
+        small(hexapod(1), index="A")
 
 
-def test_a_camera_that_sees_nothing(monkeypatch):
+def test_a_camera_that_sees_nothing():
     subject = hexapod(1)
     (one,) = subject.rig.instruments
     away = np.diag([1.0, -1.0, -1.0, 1.0]) @ one.T_camera_base  # directed away from the machine
@@ -429,7 +415,7 @@ def test_a_camera_that_sees_nothing(monkeypatch):
         instruments=(replace(one, T_camera_base=away),),
     )
     with pytest.raises(InputError, match="nothing is seen in any configuration"):
-        small(replace(subject, rig=rig), monkeypatch)
+        small(replace(subject, rig=rig))
 
 
 def test_a_hand_held_session_is_not_planned(demo):
@@ -453,6 +439,6 @@ def test_the_promise_is_kept_by_images(seed, tmp_path):
     out = tmp_path / "out"
     assert run("calibrate", str(whole), "-o", str(out)).code == 0
     saved, values = load(out), json.loads((few / "plan" / "plan.json").read_text())
-    work = poses_in(saved.machine.limits(), Region(), AT_WORK, 0)
+    work = poses_in(saved.machine.limits(), Region(), PLAN.work_poses, 0)
     stated = float(saved.tool_error(work).position.mean())
     assert values["promised"]["position"] == pytest.approx(stated, rel=0.15)

@@ -28,7 +28,6 @@ from pkmcal.geometry.rigid import (
 from pkmcal.identify.bundle import bundle
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.outcome import Level
-from pkmcal.papers import methods
 from pkmcal.papers.hand_eye import solve_pairs, start_from_poses
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
@@ -295,8 +294,7 @@ def test_poses_noisier_than_stated_need_no_richer_model(folder):
     assert richer_model(session, measurements, fit) == (None, ())
 
 
-def test_inverse_kinematic_is_a_method(folder, monkeypatch):
-    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # standard deviations are not tested
+def test_inverse_kinematic_is_a_method(folder):
     made = make(folder, "gough-stewart", n=30)
     result = calibrate_session(folder, method="inverse-kinematic")
     assert tool_error(result.machine, made) < 0.1 * tool_error(made.nominal, made)

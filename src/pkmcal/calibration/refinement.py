@@ -648,14 +648,15 @@ def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
 def _search_pass(
     images: Sequence[StationImages],
     measure: Callable[[Sequence[StationImages]], list[legs.StationEdges]],
+    cached_bytes: float = CACHED_IMAGE_BYTES,
 ) -> list[legs.StationEdges]:
     """Edges of all stations, repeats combined.
 
     Stations are measured together, or in parallel where their images must be decoded, which
-    releases the interpreter's lock.
+    releases the interpreter's lock: those that need more than ``cached_bytes`` bytes.
     """
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in images)
-    if pixels <= CACHED_IMAGE_BYTES:
+    if pixels <= cached_bytes:
         return [combine_repeats(one) for one in measure(images)]
     with ThreadPoolExecutor(THREADS) as pool:
         return [combine_repeats(one) for (one,) in pool.map(measure, ([p] for p in images))]
