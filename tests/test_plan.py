@@ -26,6 +26,7 @@ from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.exchange import PLAN_INDICES, exchanged, greedy
+from pkmcal.planning.first import FirstEdges, first_edges
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.plan import PLAN, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
@@ -320,7 +321,15 @@ def test_barred_steps_are_avoided():
 # ------------------------------------------------------------------ the command
 
 
-def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
+def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path, monkeypatch):
+    measured: list[FirstEdges] = []
+
+    def once(*inputs):
+        measured[:] = measured or [first_edges(*inputs)]
+        return measured[0]
+
+    # the edges' accuracy in the same images, for all three plans
+    monkeypatch.setattr("pkmcal.planning.subject.first_edges", once)
     session = tmp_path / "session"
     shutil.copytree(demo.session, session)
     (session / "truth.json").unlink()

@@ -142,9 +142,8 @@ def test_a_place_that_is_off_by_degrees_is_found_again(views, axis):
 
 @pytest.fixture(scope="module")
 def calibration(folder):
-    with pytest.MonkeyPatch.context() as patch:
-        at_truth(patch, folder)
-        return calibrate_session(folder)
+    case = at_truth(folder)
+    return calibrate_session(case.session, case=case)
 
 
 def test_edges_that_could_not_be_measured_are_found_whole(calibration):

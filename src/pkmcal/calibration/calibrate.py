@@ -157,6 +157,7 @@ def calibrate_session(
     holdout: int = 0,
     progress: CalibrationProgress | None = None,
     options: RefinementOptions = REFINEMENT,
+    case: Case | None = None,
 ) -> Calibration:
     """Calibrate the machine of a session; nothing is written.
 
@@ -169,7 +170,8 @@ def calibrate_session(
     holdout : number of poses, spread over the workspace, that the estimate does not use and that
         test the result.
     progress : called with the step in words and the share done.
-    options : of the measurement passes.
+    options : of the measurement passes. case : the session with its images localized; by default
+        they are localized here.
     Raises InputError where the session is at fault, ResultError where there is no estimate.
     """
     from threadpoolctl import threadpool_limits
@@ -180,10 +182,10 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
         session = _load(session, refine_camera, clock)
-        case = _observe(session, seed, clock)
+        located = case or _observe(session, seed, clock)
 
         def calibrated(refine: bool) -> Calibration:
-            settled = settle(session, case, refine, seed, clock, options)
+            settled = settle(session, located, refine, seed, clock, options)
             return _finished(settled, method, seed, holdout, clock)
 
         if not refine_camera or refinement_of(session, False).refines_all:

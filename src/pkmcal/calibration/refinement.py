@@ -692,14 +692,20 @@ def observation_of(
     for k, station in enumerate(session.stations):
         binning[k] = of_camera.get(station.camera_file, 1)
     in_view = legs.joined_passes(passes, float("nan"), float("nan"))
-    given_up = np.flatnonzero(estimate.edge_weights < INLIER_WEIGHT).tolist()
+    outliers = np.flatnonzero(estimate.edge_weights < INLIER_WEIGHT).tolist()
+    # images of which most edges were rejected
+    images_as_wholes = tuple(
+        Rejection(unit.station, unit.configuration, -1, -1, -1, _IMAGE_OFF)
+        for unit in rejected_units(measurements, estimate)
+        if unit.is_image
+    )
     return Observation(
         edges=in_view.edges,
         rejected=in_view.rejected
         + boards.rejected
-        + tuple(in_view.edges.rejection(k, _OUTLIER) for k in given_up)
-        + _images_given_up(measurements, estimate)
-        + _poses_given_up(session, measurements, estimate),
+        + tuple(in_view.edges.rejection(k, _OUTLIER) for k in outliers)
+        + images_as_wholes
+        + _rejected_poses(session, measurements, estimate),
         points=in_view.points,
         point_edge=in_view.point_edge,
         T_camera_base=estimate.state.T_camera_base,
@@ -708,16 +714,7 @@ def observation_of(
     )
 
 
-def _images_given_up(measurements: Measurements, estimate: Estimate) -> tuple[Rejection, ...]:
-    """Images of which most edges were rejected, as wholes."""
-    return tuple(
-        Rejection(unit.station, unit.configuration, -1, -1, -1, _IMAGE_OFF)
-        for unit in rejected_units(measurements, estimate)
-        if unit.is_image
-    )
-
-
-def _poses_given_up(
+def _rejected_poses(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[Rejection, ...]:
     """Poses that do not fit the rest, with how far they lie off."""

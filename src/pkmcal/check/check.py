@@ -465,6 +465,7 @@ def _unseen_border(one: StationBoard) -> str:
 
 
 def _board_check(one: StationBoard) -> BoardCheck:
+    """Figures of a board in a station's images."""
     views, stood = one.views, one.stood
     return BoardCheck(
         found=len(views.numbers),

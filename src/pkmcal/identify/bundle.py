@@ -212,7 +212,13 @@ def solve_batch(
         )
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
         if scale_noise and scale_readings and fit.scale.poses.min() <= hopeless:
-            by_data = _readings_speak(fit)
+            # The readings' noise is estimated where the data contradict the stated one, or where
+            # nothing else was measured, so that it is only the unit of all standard deviations.
+            noise = fit.reading_noise
+            alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
+            by_data = noise.contradicts() | (
+                alone & (noise.freedom(noise.best) > LEAST_NOISE_FREEDOM)
+            )
             if by_data.any():
                 fit = settle(fit, hopeless=hopeless, by_data=by_data)
     return fit
@@ -370,15 +376,6 @@ def _readings_step(
     )
     pace = np.where(shrinks, made / np.where(shrinks, before - log_factor, 1.0), 1.0)
     return log_factor, log_factor * np.clip(pace, 1.0, options.furthest_noise_pace)
-
-
-def _readings_speak(fit: BatchResult) -> Booleans:
-    """Runs (B,) whose readings' noise is estimated: where the data contradict the stated one, or
-    where nothing else was measured, so that it is only the unit of all standard deviations.
-    """
-    noise = fit.reading_noise
-    alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
-    return noise.contradicts() | (alone & (noise.freedom(noise.best) > LEAST_NOISE_FREEDOM))
 
 
 def _settled(

@@ -303,9 +303,14 @@ def _minimised(
     normal: Array | None = None
     for _ in range(max_steps):
         # a step of the active runs
-        new, gain = _try(part, here, at, search, tolerance, options)
+        before = here
+        new, gain = _try(part, before, at, search, tolerance, options)
         steps[active] += 1
-        here, at = _accepted_state(here, new, gain)
+        # accepted steps; the residuals are known where all are
+        here, at = new, gain.values
+        if not gain.accepted.all():
+            runs = np.flatnonzero(gain.accepted)
+            here, at = put(before, runs, take(new, runs)), None
         # accepted states into the result
         if active.size == n_runs:
             state, normal = here, gain.normal
@@ -324,14 +329,6 @@ def _minimised(
             search = take(search, keep)
     final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
     return Solution(state, cost, steps, final, cast(Array, normal))
-
-
-def _accepted_state(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values] | None]:
-    """The state with accepted steps applied, and the residuals there if known."""
-    if gain.accepted.all():
-        return new, gain.values
-    runs = np.flatnonzero(gain.accepted)
-    return put(here, runs, take(new, runs)), None
 
 
 class _Search(NamedTuple):
