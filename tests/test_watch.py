@@ -43,6 +43,7 @@ from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
+from pkmcal.solver.search import Solution, Stop
 from pose_sessions import T_CAMERA_BASE, measured, papers_case, papers_poses
 from test_identify_scene import exact
 
@@ -481,12 +482,12 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
     assert "which is more than the nominal model's tolerance" in verdict.reasons[0]
 
 
-def test_poses_that_cannot_be_found(watched):
-    """Nothing can be predicted where the search begins."""
+def test_poses_that_cannot_be_found(watched, monkeypatch):
     rng = np.random.default_rng(1)
     data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
-    start = replace(start, T_base_platform=np.full_like(start.T_base_platform, np.nan))
+    module = "pkmcal.judge.fixed_machine.minimise"
+    monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,), None))
     with pytest.raises(ResultError, match="poses were not found with the calibrated machine"):
         hold(watched.true, data, start, Trust.full(data))
 
