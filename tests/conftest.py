@@ -9,17 +9,19 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable, Collection, Iterable
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import pytest
 from hypothesis import settings
 
-from pkmcal.calibration.refinement import IMPUTATION_PASSES as ALL_LOOKS
+from pkmcal.calibration.refinement import RefinementOptions
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
+from pkmcal.planning.plan import PlanOptions, plan_measurements
 from rendered import once
 
 # Examples of a property, unless its test says how many.
@@ -88,30 +90,9 @@ def unhurried(monkeypatch):
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 3600.0)
 
 
-@pytest.fixture(autouse=True)
-def few_looks(request, monkeypatch):
-    """Two measurement passes from machines drawn from the covariance, which take half of a
-    calibration's time, suffice unless their scatter is tested. In slow tests and in shared fixtures
-    there are as many as by default.
-    """
-    if not request.node.get_closest_marker("slow"):
-        monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
-
-
-@pytest.fixture
-def all_looks(few_looks, monkeypatch):
-    """As many further measurement passes as by default."""
-    monkeypatch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", ALL_LOOKS)
-
-
-@contextmanager
-def two_looks():
-    """Two further measurement passes for a shared fixture whose calibration's variance between
-    passes is not tested.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.calibration.refinement.IMPUTATION_PASSES", 2)
-        yield patch
+FEW_IMPUTATIONS = RefinementOptions(imputations=2)
+"""For calibrations whose variance between imputations is not tested: by default these measurement
+passes take half of a calibration's time."""
 
 
 def slow_but(few: Collection[str], names: Iterable[str]) -> list:
@@ -226,13 +207,17 @@ def one_process(monkeypatch):
     have_cores(monkeypatch, 1)
 
 
+FEW_CANDIDATES = PlanOptions(candidates=60, work_poses=20, rounds=1)
+"""For plans whose quality is not tested."""
+
+
 @pytest.fixture(scope="module")
 def quick_plans():
-    """Plans chosen among few candidates, where how good they are is not the question."""
+    """Plans of the command and of Python's function, which have no such options, among few
+    candidates.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
-        patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
-        patch.setattr("pkmcal.planning.plan.BETTERING_ROUNDS", 1)
+        patch.setattr("pkmcal.api.plan.run", partial(plan_measurements, options=FEW_CANDIDATES))
         yield
 
 

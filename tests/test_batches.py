@@ -9,7 +9,7 @@ from pkmcal.geometry.batches import batch_last, damped_step, is_batch_last, step
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.closure import base_ends, closure, platform_ends, rows_between
-from pkmcal.mechanisms.kinematics import CONFIGURATIONS_A_CHUNK, base_batch_last
+from pkmcal.mechanisms.kinematics import KINEMATICS, base_batch_last
 from test_kinematics import SMALL, hexapod, workspace
 
 
@@ -21,9 +21,9 @@ def machine(request):
 def test_many_poses_are_solved_as_one_is(machine):
     """Several thousand, in another order of memory, over more than one chunk, with rows among them
     that cannot be closed."""
-    poses = np.tile(workspace(machine, 6, 10), (CONFIGURATIONS_A_CHUNK // 5, 1, 1))
+    poses = np.tile(workspace(machine, 6, 10), (KINEMATICS.chunk // 5, 1, 1))
     readings = machine.inverse(poses)
-    hopeless = [3, 17, CONFIGURATIONS_A_CHUNK + 4]
+    hopeless = [3, 17, KINEMATICS.chunk + 4]
     readings[hopeless, 0] += 50.0
     fk = machine.forward_result(readings, machine.home())
     converged = np.ones(len(poses), dtype=bool)

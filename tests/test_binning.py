@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from conftest import FEW_IMPUTATIONS
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.refinement import observation_of
@@ -143,7 +144,7 @@ def test_images_larger_than_sharp(blurred, calibrated):
 
     Without binning their edges are blurred over three pixels, and hardly one is found.
     """
-    calibration = calibrate_session(blurred)
+    calibration = calibrate_session(blurred, options=FEW_IMPUTATIONS)
     np.testing.assert_array_equal(calibration.observation.binning, 2)
     assert calibration.verdict.usable
     assert np.sqrt(np.mean(away(calibration, calibrated) ** 2)) < np.sqrt(2)
@@ -171,7 +172,7 @@ def test_images_out_of_focus(session, calibrated, spread):
     for path in (session / "images").rglob("*.png"):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(path), cv2.GaussianBlur(image, (0, 0), spread))
-    calibration = calibrate_session(session)
+    calibration = calibrate_session(session, options=FEW_IMPUTATIONS)
     np.testing.assert_array_equal(calibration.observation.binning, 2)
     assert calibration.verdict.usable
     sigma, sharp = (c.estimate.covariance.diagonal() ** 0.5 for c in (calibration, calibrated))

@@ -8,13 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pkmcal.calibration import calibrate, chance_matches
-from pkmcal.calibration.chance_matches import IMAGE_OFFSET, by_chance, chance_match_reason
+from pkmcal.calibration import calibrate
+from pkmcal.calibration.chance_matches import (
+    IMAGE_OFFSET,
+    by_chance,
+    chance_match_reason,
+    chance_of_count,
+)
 from pkmcal.calibration.refinement import RefinementResult
 from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
 from pkmcal.observe.legs import measure
 from pkmcal.observe.profiles import PROFILE_OPTIONS
+from pkmcal.wording import how_often
 from test_observe_measure import taken
 from test_observe_rendered_legs import FRONT, machine, poses
 
@@ -61,11 +67,7 @@ def test_edges_of_a_machine_that_is_elsewhere_are():
     assert f"Of {in_sight} edges in sight only {len(in_view.edges)} were measured" in why.text
 
 
-def test_nothing_is_asked_where_most_were_measured(monkeypatch):
-    def query(*_):
-        pytest.fail("asked")
-
-    monkeypatch.setattr(chance_matches, "_count", query)
+def test_most_edges_of_the_right_machine_are_no_chance():
     assert chance_match_reason(turns_of(taken())) == ()
 
 
@@ -79,13 +81,12 @@ def test_repeats_count_once():
     assert chance_match_reason(turns._replace(images=[twice])) == chance_match_reason(turns) != ()
 
 
-def test_chance_that_offers_more_is_reported_in_words(monkeypatch):
+def test_chance_that_offers_more_is_reported_in_words():
     """A chance of a half or more is not "once in 1 times"."""
-    few = turns_of(displaced(taken(), 2.5 * IMAGE_OFFSET))
-    counts = iter([9, 8, 10, 9, 9, 8, 10, 9, 9])
-    monkeypatch.setattr(chance_matches, "_count", lambda *_: next(counts))
-    (why,) = chance_match_reason(few)
-    assert "chance offers as many as a rule" in why.text
+    counts = np.array([9, 8, 10, 9, 9, 8, 10, 9])
+    assert chance_of_count(9, counts) == pytest.approx(0.5)
+    assert chance_of_count(20, counts) < 0.01
+    assert how_often(chance_of_count(9, counts)) == "as a rule"
 
 
 def two_stations(second, **values):

@@ -338,18 +338,18 @@ def test_the_command_writes_page_and_pictures(alone, check_once, tmp_path):
     assert "something other than pictures of a check" in refused.err
 
 
-def test_without_these_options_nothing_is_drawn(alone, check_once, monkeypatch):
-    def never(*_):
-        raise AssertionError
-
-    monkeypatch.setattr("pkmcal.check.pictures.nominal_over_image", never)
+def test_without_these_options_nothing_is_drawn(alone, check_once):
     before = sorted(alone.rglob("*"))
     assert run("check", alone).code < 2
     assert sorted(alone.rglob("*")) == before
 
 
-def test_pictures_whole_or_not_at_all(checked_session, tmp_path, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.pictures.CAPTION_BAR_HEIGHT", -1)  # fails in the first image
-    with pytest.raises(ValueError, match="negative"):
-        write_pictures(checked_session.look, tmp_path / "pictures")
+def test_pictures_whole_or_not_at_all(checked_session, tmp_path):
+    """The images of the last station are missing."""
+    *others, last = checked_session.look.stations
+    broken = replace(last, images=replace(last.images, images=[]))
+    with pytest.raises(IndexError):
+        write_pictures(
+            replace(checked_session.look, stations=(*others, broken)), tmp_path / "pictures"
+        )
     assert list(tmp_path.iterdir()) == []

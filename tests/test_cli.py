@@ -450,11 +450,8 @@ def test_calibrate_as_json_in_a_process_of_its_own(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
+def test_the_four_steps_on_four_configurations_a_station(session):
     """Barely enough for the methods: marked as comparison, or refused with [A]'s own condition."""
-    monkeypatch.setattr(
-        "pkmcal.papers.methods.SIGMA_REPETITIONS", 3
-    )  # requested: the verdict, no standard deviation
     done = run("calibrate", session, "--method", "four-step", "--json")
     assert done.code == 1
     if (session / "calibration").exists():

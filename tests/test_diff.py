@@ -18,7 +18,7 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.gauge import moved_centres
 from pkmcal.judge.difference import _shared_data, difference
 from pkmcal.judge.machine_change import machine_change
-from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.pages.page import page_html
@@ -318,12 +318,12 @@ def test_a_folder_with_other_things_is_left_alone(demo, tmp_path):
     assert "something other than a difference" in done.err
 
 
-def test_a_machine_without_a_map_is_compared_all_the_same(monkeypatch):
-    def refuse(*_, **__):
-        raise InputError("nothing can be reached")
-
-    monkeypatch.setattr("pkmcal.judge.difference.map_of", refuse)
-    value = difference("h4", "h4")
+def test_a_machine_without_a_map_is_compared_all_the_same(tmp_path):
+    """Its motors cannot go to the home pose."""
+    path = tmp_path / "h4.yaml"
+    text = catalogue()["h4"].read_text()
+    path.write_text(text.replace("range: [-0.1, 1.15]", "range: [-0.1, 0.1]"))
+    value = difference(str(path), str(path))
     outcome = outcome_of(value)
     assert "There is no map of the workspace: " in outcome.parts[0].text[0]
     assert value.document()["tool"]["why_not"]

@@ -11,7 +11,7 @@ import pytest
 from pkmcal.calibration.calibrate import calibrate_measurements
 from pkmcal.calibration.camera_refinement import edges_by_camera
 from pkmcal.calibration.discrepancy_basis import (
-    CORRELATION_LENGTHS,
+    DISCREPANCY_BASIS,
     discrepancy_components,
     smooth_functions,
     with_discrepancy,
@@ -215,7 +215,7 @@ def test_smooth_functions_are_orthonormal_and_have_unit_size():
     functions, roots = smooth_functions(points)
     np.testing.assert_allclose(functions.T @ functions / 40, np.eye(functions.shape[1]), atol=1e-9)
     np.testing.assert_allclose(functions.mean(axis=0), 0, atol=1e-9)
-    assert len(roots) == len(CORRELATION_LENGTHS)
+    assert len(roots) == len(DISCREPANCY_BASIS.lengths)
     straight = points - points.mean(axis=0)
     straight = np.linalg.qr(straight)[0]
     shares = []

@@ -8,7 +8,7 @@ import pytest
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.mechanisms.follower import POSES_BETWEEN_SQUARINGS, rods_of
+from pkmcal.mechanisms.follower import FOLLOWER, rods_of
 from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR
 
 SLOW = {"3-rps", "3-upu", "four-belt", "h4-rods"}
@@ -58,7 +58,7 @@ def test_rounding_does_not_add_up():
     machine = load_mechanism("gough-stewart")
     readings = path(machine, 120)
     follow = machine.follower()
-    for k in range(2 * POSES_BETWEEN_SQUARINGS):
+    for k in range(2 * FOLLOWER.poses_between_squarings):
         values = follow(readings[k % 120])
     np.testing.assert_allclose(values[:3, :3] @ values[:3, :3].T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(

@@ -406,9 +406,8 @@ def test_the_bundle_starts_from_the_steps(name):
 
 
 @pytest.mark.parametrize("name", slow_but(("3-rps",), ["3-rpr", "3-rps", "6-spu-passive"]))
-def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
+def test_the_method_as_a_result_of_its_own(name, tmp_path):
     """``--method four-step``: deviations by repetition, residuals, a mechanism that can be read."""
-    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 20)
     rng = np.random.default_rng(14)
     scene = make_scene(name, rng, 24)
     board = perturb(np.eye(4), rng.normal(size=(1, 6)))
@@ -416,7 +415,7 @@ def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     measurements = noisy(measurements, rng)
     reference_values = start_state(scene.nominal, measurements, scene.truth.T_camera_base)
     joint = bundle(scene.nominal, measurements, reference_values)
-    values = methods.by_paper("four-step", scene.nominal, measurements, joint)
+    values = methods.by_paper("four-step", scene.nominal, measurements, joint, repetitions=20)
     sigma = np.sqrt(np.diag(values.covariance))
     free = sigma > 1e-9
     ratio = ((values.state.theta - scene.truth.theta)[free] / sigma[free]) ** 2

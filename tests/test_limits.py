@@ -1,6 +1,7 @@
 """More than an input may hold is refused in a sentence that has the limit, before any work."""
 
 import re
+import shutil
 import tracemalloc
 
 import numpy as np
@@ -62,14 +63,14 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path, read, most):
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("text", ["a: [{}]\n", "{}"])
-def test_yaml_of_too_many_values_is_read_no_further(tmp_path, text, monkeypatch):
-    monkeypatch.setattr("pkmcal.files.documents.MOST_YAML_NODES", 1000)
+@pytest.mark.parametrize("text", [pytest.param("a: [{}]\n", marks=pytest.mark.slow), "{}"])
+def test_yaml_of_too_many_values_is_read_no_further(tmp_path, text):
+    most = limits.MOST_YAML_NODES
     each = "1, " if "[" in text else "k{}: 1\n"
-    lines = "".join(each.format(k) for k in range(1000))
+    lines = "".join(each.format(k) for k in range(most))
     path = tmp_path / "a.yaml"
     path.write_text(text.format(lines))
-    assert "more than 1000 keys and values" in fault(read_yaml, path)
+    assert f"more than {most} keys and values" in fault(read_yaml, path)
 
 
 def test_of_many_faults_in_a_file_the_first_are_looked_at(tmp_path):
@@ -109,23 +110,27 @@ def test_rows_and_columns_of_a_table(tmp_path):
         assert limited(most, most + 1 if columns > 1 else "", read_csv, tmp_path / "a.csv")
 
 
-@pytest.mark.parametrize("name", ["MOST_IMAGES", "MOST_HANDHELD_IMAGES"])
-def test_images(demo, tmp_path, monkeypatch, name):
-    monkeypatch.setattr(f"pkmcal.session.{'image_files' if 'D_' not in name else 'load'}.{name}", 2)
+@pytest.mark.parametrize(
+    "most",
+    [pytest.param(limits.MOST_IMAGES, marks=pytest.mark.slow), limits.MOST_HANDHELD_IMAGES],
+)
+def test_images(demo, tmp_path, most):
+    """One repeat of a configuration too many, by hand."""
     folder = tmp_path / "session"
-    folder.mkdir()
-    for path in demo.session.iterdir():
-        (folder / path.name).symlink_to(path)
-    (folder / "session.yaml").unlink()
-    (folder / "session.yaml").write_text((demo.session / "session.yaml").read_text())
+    shutil.copytree(demo.session, folder)
+    images = folder / "images" / "station1"
+    first = min(images.iterdir())
+    for k in range(most + 1):
+        (images / f"{first.stem}_{k}.png").symlink_to(first)
 
     def by_hand(data):
-        for station in data["stations"].values():
-            station.pop("pose", None)
-            station["handheld"] = True
+        station = data["stations"]["station1"]
+        station.pop("pose")
+        station.update(handheld=True, images="images/station1/{configuration}_{repeat}.png")
+        data["stations"] = {"station1": station}
 
     changed(folder / "session.yaml", by_hand)
-    assert limited(2, "", load_session, folder)
+    assert limited(most, most + 1, load_session, folder)
 
 
 def test_pixels(tmp_path):

@@ -27,7 +27,7 @@ from pkmcal.measurements import (
 from pkmcal.measurements.distances import DistanceSet
 from pkmcal.measurements.rows import Kinds
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.solver import elimination, search
+from pkmcal.solver import search
 from pkmcal.solver.strips import normal_equations
 from test_identify_scene import make_scene
 
@@ -207,14 +207,14 @@ def test_covariance_and_step_are_those_of_the_whole_problem(machine, case):
     assert freedom[2] == pytest.approx(remainder[:, problem.closure_rows].sum(), rel=1e-4)
 
 
-def test_pieces_say_what_the_whole_states(case, monkeypatch):
+def test_pieces_say_what_the_whole_states(case):
     """With three configurations at a time, links lead from one piece into another."""
     assembled, state, _ = case
     problem = assembled.problem
     one = search.minimise(problem, state)
     before = Information(problem, state)
     expected = before.rows[0][0].T @ before.rows[0][0], before.by_kind.trace
-    monkeypatch.setattr(elimination, "SOLVER_ROWS_AT_ONCE", 3 * problem.n_rows)
+    problem = replace(problem, rows_at_once=3 * problem.n_rows)
     info = Information(problem, state)
     assert len(list(info.pieces())) == 4
     normal = info.rows[0][0].T @ info.rows[0][0]

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from conftest import run
+from conftest import FEW_IMPUTATIONS, run
 from pkmcal import calibrate
 from pkmcal.boards.poses import board_size_column, pose_set
+from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_refinement import edges_by_camera
 from pkmcal.calibration.localization import frozen_in
 from pkmcal.calibration.saved_calibration import load
@@ -34,7 +35,6 @@ from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.planning.subject import of_machine
 from pkmcal.session.load import load_session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT
-from pkmcal.solver import elimination
 from pkmcal.wording import ratio_in_per_cent
 from test_bad_input import only
 from test_identify_scene import exact
@@ -167,7 +167,7 @@ def test_nothing_is_found_twice():
     assert len(results) == len(set(results))
 
 
-def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
+def test_scores_are_those_of_the_whole_jacobian():
     """Against dense algebra, all columns of all rows at once; and in pieces as in one."""
     nominal, data, where = measured(8, scale=(1, 2e-3), count=14)
     estimate = bundle(nominal, data, start_state(nominal, data, where), scale_noise=False)
@@ -215,7 +215,8 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     scores = tests.scores(freed)
     for k in [2, 3, 5, 40, 70]:
         assert scores[k].chi2 == pytest.approx(oracle(reference_values, k)[0], rel=1e-5, abs=1e-6)
-    monkeypatch.setattr(elimination, "SOLVER_ROWS_AT_ONCE", 3 * problem.n_rows)
+    problem = replace(problem, rows_at_once=3 * problem.n_rows)
+    assembled = replace(assembled, problem=problem)
     pieces = ScoreTests(assembled, Information(problem, state), effects, [0, 1, 2], singles=True)
     for one, other in zip(pieces.scores(freed), scores, strict=True):
         assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-9)
@@ -437,7 +438,7 @@ def test_one_wrong_reading_is_named_with_its_configuration(session):
     cells[3] = repr(float(cells[3]) + 0.004)
     lines[6] = ",".join(cells)
     path.write_text("\n".join(lines) + "\n")
-    value = calibrate(session)
+    value = calibrate_session(session, options=FEW_IMPUTATIONS)
     (one,) = value.violations
     assert (one.code, one.of) == ("readings.single", f"leg3, {cells[0]}")
     assert one.value[0] == pytest.approx(-0.004, rel=0.3)

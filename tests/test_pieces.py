@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,22 +26,17 @@ def problem_of(runs=1):
     return assembled.problem, truth, scene.machine
 
 
-@pytest.fixture
-def in_pieces(monkeypatch):
-    """Afterwards two configurations, or runs, are worked on at once."""
-
-    def begin(problem):
-        monkeypatch.setattr(elimination, "SOLVER_ROWS_AT_ONCE", 2 * problem.n_rows)
-
-    return begin
+def in_pieces(problem):
+    """The problem with two configurations, or runs, linearized together."""
+    return replace(problem, rows_at_once=2 * problem.n_rows)
 
 
 @pytest.mark.parametrize("runs", [1, 3])
-def test_noise_and_estimate_are_the_same(runs, in_pieces):
+def test_noise_and_estimate_are_the_same(runs):
     problem, truth, _ = problem_of(runs)
     whole = solve_batch(problem, truth)
     at_whole = components(whole.info, whole.weight)
-    in_pieces(problem)
+    problem = in_pieces(problem)
     value = solve_batch(problem, truth)
     pieces = list(value.info.pieces())
     counts = [piece.state.T_base_platform.shape[1] for piece in pieces]
@@ -54,10 +51,10 @@ def test_noise_and_estimate_are_the_same(runs, in_pieces):
 
 
 @pytest.mark.parametrize("runs", [1, 3])
-def test_residuals_by_themselves_are_the_same(runs, in_pieces):
+def test_residuals_by_themselves_are_the_same(runs):
     problem, truth, _ = problem_of(runs)
     whole = problem.unweighted(truth)
-    in_pieces(problem)
+    problem = in_pieces(problem)
     for item, expected in zip(problem.unweighted(truth), whole, strict=True):
         np.testing.assert_allclose(item, expected, atol=1e-9)
 
@@ -73,14 +70,14 @@ def test_what_weights_do_not_change_is_kept():
     assert wide.structure is not problem.structure
 
 
-def test_the_rows_of_pieces_say_the_same(in_pieces):
+def test_the_rows_of_pieces_say_the_same():
     problem, truth, machine = problem_of()
     names = ("machine", "stations")
     whole = Information(problem, truth)
     rows, residual = reduced_rows(whole, names)
     every, value = rows_on_shared(whole.linear, whole.reduced)
     spectrum = identifiability(whole, machine).singular_values
-    in_pieces(problem)
+    problem = in_pieces(problem)
     pieces = Information(problem, truth)
     few, rest = reduced_rows(pieces, names)
     assert len(few) <= 4 * (problem.unknowns.count + 1) + len(problem.prior)
@@ -108,7 +105,7 @@ def test_condensed_rows_say_the_same(n):
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_least_median_leg_after_leg(monkeypatch, noisy):
+def test_least_median_leg_after_leg(noisy):
     rng = np.random.default_rng(1)
     n = rng.normal(size=(2, 3, 20, 3))
     n /= np.linalg.norm(n, axis=-1, keepdims=True)
@@ -118,10 +115,10 @@ def test_least_median_leg_after_leg(monkeypatch, noisy):
         size=n.shape[:-1]
     )
 
-    def values():
-        return linear.least_median(n, radius, present, np.random.default_rng(0), noise=noise)
+    def values(**options):
+        rng = np.random.default_rng(0)
+        return linear.least_median(n, radius, present, rng, noise=noise, **options)
 
     whole = values()
     assert np.isfinite(whole).all()
-    monkeypatch.setattr(linear, "RESIDUALS_SORTED_TOGETHER", 1)
-    np.testing.assert_array_equal(values(), whole)
+    np.testing.assert_array_equal(values(residuals_at_once=1), whole)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from conftest import run
+from conftest import FEW_CANDIDATES, run
 from document_keys import assert_keys
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
@@ -30,7 +30,7 @@ from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.planning.exchange import PLAN_INDICES, exchanged, greedy
 from pkmcal.planning.first import FirstEdges, first_edges
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
-from pkmcal.planning.plan import AT_WORK, plan_measurements
+from pkmcal.planning.plan import PLAN, plan_measurements
 from pkmcal.planning.rig import At, BoardFrom, all_pairs
 from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import of_machine, subject_of_session
@@ -45,19 +45,15 @@ def hexapod(places=2, **more):
     return of_machine(machine, [camera_of_size(SIZE)] * places, machine.joint_names, **more)
 
 
-def small(subject, monkeypatch, **more):
+def small(subject, options=FEW_CANDIDATES, **more):
     """A plan among few candidates, for tests' time."""
-    monkeypatch.setattr("pkmcal.planning.plan.PLAN_CANDIDATES", 60)
-    monkeypatch.setattr("pkmcal.planning.plan.AT_WORK", 20)
-    monkeypatch.setattr("pkmcal.planning.plan.BETTERING_ROUNDS", 1)
-    return plan_measurements(subject, count=5, **more)
+    return plan_measurements(subject, count=5, options=options, **more)
 
 
 @pytest.fixture(scope="module")
 def planned():
     """Plan for a hexapod's legs from two places."""
-    with pytest.MonkeyPatch.context() as patch:
-        return small(hexapod(), patch)
+    return small(hexapod())
 
 
 def test_more_pixels_than_a_lens_resolves_promise_nothing():
@@ -99,7 +95,7 @@ def stated_by(rig, measurements, work):
 
 
 @pytest.mark.parametrize("target", ["legs", "board", "points", "together"])
-def test_what_is_promised_is_what_the_estimate_states(target, monkeypatch, planned):
+def test_what_is_promised_is_what_the_estimate_states(target, planned):
     if target == "board":
         machine = load_mechanism("h4")
         board = board_for(machine, "platform")
@@ -109,9 +105,7 @@ def test_what_is_promised_is_what_the_estimate_states(target, monkeypatch, plann
         subject = of_machine(machine, [], machine.joint_names, tracker=(2e-5, None))
     else:
         subject = hexapod()
-    count = (
-        planned if target == "legs" else small(subject, monkeypatch, together=target == "together")
-    )
+    count = planned if target == "legs" else small(subject, together=target == "together")
     rig, n = count.subject.rig, len(count.names)
     numbers = {name: k for k, name in enumerate(rig.names)}
     pairs = np.array([(numbers[s], k) for k in range(n) for s in count.stations[k]])
@@ -275,10 +269,9 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
 # ------------------------------------------------------------------ places
 
 
-def test_places_stand_apart_and_better_one_alone(monkeypatch):
-    monkeypatch.setattr("pkmcal.planning.candidates.CAMERA_POSES_A_RING", 6)
-    monkeypatch.setattr("pkmcal.planning.plan.CONFIGURATIONS_FOR_STATIONS", 8)
-    results = small(hexapod(1), monkeypatch, free_stations=2)
+def test_places_stand_apart_and_better_one_alone():
+    few_stations = replace(FEW_CANDIDATES, poses_a_ring=6, for_stations=8)
+    results = small(hexapod(1), few_stations, free_stations=2)
     chosen = [tried for tried in results.tried if tried.chosen]
     eyes = np.array([tried.place.position for tried in chosen])
     middle = results.subject.rig.machine.home()[:3, 3]
@@ -416,12 +409,12 @@ def test_what_cannot_be_planned(options, sentence, quick_plans, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_index_that_is_none(monkeypatch):
+def test_an_index_that_is_none():
     with pytest.raises(InputError, match="there is no such index"):
-        small(hexapod(1), monkeypatch, index="A")
+        small(hexapod(1), index="A")
 
 
-def test_a_camera_that_sees_nothing(monkeypatch):
+def test_a_camera_that_sees_nothing():
     subject = hexapod(1)
     (one,) = subject.rig.instruments
     away = np.diag([1.0, -1.0, -1.0, 1.0]) @ one.T_camera_base  # directed away from the machine
@@ -431,7 +424,7 @@ def test_a_camera_that_sees_nothing(monkeypatch):
         instruments=(replace(one, T_camera_base=away),),
     )
     with pytest.raises(InputError, match="nothing is seen in any configuration"):
-        small(replace(subject, rig=rig), monkeypatch)
+        small(replace(subject, rig=rig))
 
 
 def test_a_hand_held_session_is_not_planned(demo):
@@ -455,6 +448,6 @@ def test_the_promise_is_kept_by_images(seed, tmp_path):
     out = tmp_path / "out"
     assert run("calibrate", str(whole), "-o", str(out)).code == 0
     saved, values = load(out), json.loads((few / "plan" / "plan.json").read_text())
-    work = poses_in(saved.machine.limits(), Region(), AT_WORK, 0)
+    work = poses_in(saved.machine.limits(), Region(), PLAN.work_poses, 0)
     stated = float(saved.tool_error(work).position.mean())
     assert values["promised"]["position"] == pytest.approx(stated, rel=0.15)

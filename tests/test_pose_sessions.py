@@ -295,11 +295,14 @@ def test_poses_noisier_than_stated_need_no_richer_model(folder):
     assert richer_model(session, measurements, fit) == (None, ())
 
 
-def test_inverse_kinematic_is_a_method(folder, monkeypatch):
-    monkeypatch.setattr(methods, "SIGMA_REPETITIONS", 3)  # standard deviations are not tested
+def test_inverse_kinematic_is_a_method(folder):
     made = make(folder, "gough-stewart", n=30)
-    result = calibrate_session(folder, method="inverse-kinematic")
-    assert tool_error(result.machine, made) < 0.1 * tool_error(made.nominal, made)
+    joint = calibrate_session(folder)
+    machine, measurements = joint.session.machine, joint.measurements
+    estimate = methods.by_paper(
+        "inverse-kinematic", machine, measurements, joint.estimate, repetitions=3
+    )
+    assert tool_error(estimate.machine, made) < 0.1 * tool_error(made.nominal, made)
 
 
 def test_everything_is_saved_and_read_back(folder, tmp_path):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from conftest import run, two_looks
+from conftest import FEW_IMPUTATIONS, run
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
@@ -25,7 +25,7 @@ from pkmcal.judge.repeatability import (
     fit_motions,
     repeat_findings,
     require_repeats,
-    study_repeats,
+    scatter_of_repeats,
 )
 from pkmcal.measurements import concatenate
 from pkmcal.mechanisms import load_mechanism
@@ -389,7 +389,7 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, measured_repeats, t
     shutil.copytree(repeats, single)
     for path in single.glob("images/*/*_[234].png"):
         path.unlink()
-    one, four = calibrate_session(single), measured_repeats.calibration
+    one, four = calibrate_session(single, options=FEW_IMPUTATIONS), measured_repeats.calibration
     sigma = [np.sqrt(np.diag(c.estimate.covariance)) for c in (one, four)]
     above_limit = sigma[0] > 1e-9
     assert 0.7 < np.median(sigma[1][above_limit] / sigma[0][above_limit]) < 1.1
@@ -410,17 +410,8 @@ class Repeats:
 
 @pytest.fixture(scope="module")
 def measured_repeats(repeats):
-    made: list[Calibration] = []
-
-    def once(*words, **more):
-        made.append(calibrate_session(*words, **more))
-        return made[0]
-
-    with two_looks() as patch:
-        patch.setattr("pkmcal.judge.repeatability.calibrate_session", once)
-        study = study_repeats(repeats)
-    (calibration,) = made
-    return Repeats(study, calibration)
+    calibration = calibrate_session(repeats, options=FEW_IMPUTATIONS)
+    return Repeats(scatter_of_repeats(calibration), calibration)
 
 
 @pytest.fixture

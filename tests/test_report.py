@@ -245,14 +245,15 @@ def test_straight_curves_are_two_points_and_bent_ones_are_kept():
     assert value[4] == [line[7].tolist()]
 
 
-def album_of(case: Case, **changed) -> pictures.Album:
+def album_of(case: Case, largest=pictures.ALBUM_SIZE, **changed) -> pictures.Album:
     """The case's images with another observation or estimate."""
     observation, estimate = (
         changed.get(name, getattr(case, name)) for name in ("observation", "estimate")
     )
     centres = joint_centres(case.session.machine, estimate.machine, estimate.covariance)
     shifts = np.zeros(len(observation.edges))
-    return pictures.album(calibration(case.session, observation, estimate), shifts, centres)
+    value = calibration(case.session, observation, estimate)
+    return pictures.album(value, shifts, centres, largest)
 
 
 def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):
@@ -296,22 +297,21 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
     assert "too dark" in shots["front1", "c3"].caption
 
 
-def test_as_many_pictures_are_shown_as_there_is_room_for(case, monkeypatch):
-    monkeypatch.setattr(pictures, "MOST_PAGE_IMAGES", 7)
-    html = str(pictures.section(case.session, album_of(case)).html)
+def test_as_many_pictures_are_shown_as_there_is_room_for(case):
+    seven = pictures.AlbumSize(images=7)
+    display = album_of(case, seven).pictures
+    html = str(pictures.section(case.session, album_of(case, seven)).html)
     assert "Here are 7 of 15 images" in html
     assert html.count('<figure class="picture"') == html.count("data-large=") == 7
-    whole = sum(len(shot.jpeg) + len(shot.large) for shot in album_of(case).pictures)
-    small = sum(len(shot.jpeg) for shot in album_of(case).pictures)
-    monkeypatch.setattr(pictures, "JPEG_CHARACTERS_A_PAGE", (whole + small) // 2)
-    display = album_of(case).pictures
+    whole = sum(len(shot.jpeg) + len(shot.large) for shot in display)
+    small = sum(len(shot.jpeg) for shot in display)
+    room = (whole + small) // 2
+    display = album_of(case, replace(seven, jpeg_characters=room)).pictures
     assert len(display) == 7
     assert 0 < sum(bool(shot.large) for shot in display) < 7
-    assert (
-        sum(len(shot.jpeg) + len(shot.large) for shot in display) <= pictures.JPEG_CHARACTERS_A_PAGE
-    )
-    monkeypatch.setattr(pictures, "JPEG_CHARACTERS_A_PAGE", small // 2)
-    assert 0 < len(album_of(case).pictures) < 7
+    assert sum(len(shot.jpeg) + len(shot.large) for shot in display) <= room
+    fewer = album_of(case, replace(seven, jpeg_characters=small // 2)).pictures
+    assert 0 < len(fewer) < 7
 
 
 def test_rejections_are_grouped_by_reason(case):

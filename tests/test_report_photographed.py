@@ -20,13 +20,14 @@ def case(tmp_path_factory) -> Case:
     return make_case(tmp_path_factory.mktemp("session"))
 
 
-def figure(case: Case):
+def figure(case: Case, **options):
     centres = joint_centres(case.session.machine, case.estimate.machine, case.estimate.covariance)
     shifts = np.zeros(len(case.observation.edges))
     value = calibration(case.session, case.observation, case.estimate)
     album = pictures.album(value, shifts, centres)
     none = np.zeros((0, 3)), np.zeros(0, dtype=int)
-    return album, image_scene.plot(case.session, case.estimate, album.links, none)
+    plot = image_scene.plot(case.session, case.estimate, album.links, none, **options)
+    return album, plot
 
 
 def points(trace) -> np.ndarray:
@@ -135,9 +136,8 @@ def test_all_that_is_drawn_is_in_the_picture(case, scale):
         assert max(across, up) > 0.35
 
 
-def test_many_poses_are_thinned_and_that_is_stated(case, monkeypatch):
-    monkeypatch.setattr(image_scene, "MOST_SLIDER_POSES", 3)
-    plot = figure(case)[1]
+def test_many_poses_are_thinned_and_that_is_stated(case):
+    plot = figure(case, most=3)[1]
     assert [frame["name"] for frame in plot.frames] == ["c0", "c2", "c4"]
     assert "3 poses of 5, evenly chosen" in plot.caption
     assert [s["label"] for s in plot.figure["layout"]["sliders"][0]["steps"]] == ["c0", "c2", "c4"]

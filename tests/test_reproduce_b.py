@@ -68,11 +68,11 @@ def reproduced(short, ran):
 
 
 @pytest.mark.parametrize("view", PAPER_B_VIEW_NAMES)
-def test_without_noise_every_method_is_exact(view, monkeypatch):
-    monkeypatch.setattr(paper_b, "POINT_NOISE", 1e-7)
-    monkeypatch.setattr(paper_b, "PAPER_B_READING_NOISE", 1e-12)
+def test_without_noise_every_method_is_exact(view):
     rng = np.random.default_rng(3)
-    one = measured_hexapod(drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng)
+    one = measured_hexapod(
+        drawn_machine(rng), views_by_name()[view], PAPER_B_CASES["right"], rng, 1e-7, 1e-12
+    )
     for centres in solved(one, PAPER_B_REGRESSIONS, rng).values():
         assert np.abs(centres - one.centres).max() < 1e-8
 

@@ -14,8 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import pkmcal
-from conftest import two_looks
+from conftest import FEW_IMPUTATIONS
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_responses import (
     LEAST_RESPONSE_GAIN,
@@ -31,6 +30,7 @@ from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import bundle
 from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.observe.legs import measure
+from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from test_calibration import check_calibration
 from test_observe_measure import errors, rms, taken
@@ -163,8 +163,8 @@ def coded(demo, tmp_path_factory):
     """The demonstration's images with a response unusual for PNG files, and its detection."""
     folder = shutil.copytree(demo.session, tmp_path_factory.mktemp("coded") / "session")
     recode(folder, ".png", SRGB)
-    with two_looks():
-        return SimpleNamespace(folder=folder, calibration=pkmcal.calibrate(folder))
+    calibration = calibrate_session(folder, options=FEW_IMPUTATIONS)
+    return SimpleNamespace(folder=folder, calibration=calibration)
 
 
 def check_overruled(calibration, value, usual, demo, worse=1.0):
@@ -343,7 +343,7 @@ def test_each_camera_is_asked_by_itself(session):
 
 
 def test_new_images_are_measured_as_the_calibration_found_them_to_be(coded, tmp_path):
-    coded.calibration.save(tmp_path / "calibration")
+    save(coded.calibration, tmp_path / "calibration")
     saved = load(tmp_path / "calibration")
     assert {row["response"] for row in saved.document["stations"]} == {"srgb"}
     fresh = _as_calibrated(saved, load_session(coded.folder))

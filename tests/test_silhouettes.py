@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from conftest import FEW_IMPUTATIONS
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import handheld, refinement
 from pkmcal.calibration.calibrate import calibrate_session
@@ -16,6 +17,7 @@ from pkmcal.calibration.camera_refinement import edges_by_camera
 from pkmcal.calibration.camera_responses import _normal_turn
 from pkmcal.calibration.localization import platform_poses, read_images
 from pkmcal.calibration.refinement import (
+    REFINEMENT,
     RefinementResult,
     _scatter_of,
     _variance,
@@ -140,9 +142,8 @@ def test_a_place_that_is_off_by_degrees_is_found_again(views, axis):
 
 @pytest.fixture(scope="module")
 def calibration(folder):
-    with pytest.MonkeyPatch.context() as patch:
-        at_truth(patch, folder)
-        return calibrate_session(folder)
+    case = at_truth(folder)
+    return calibrate_session(case.session, case=case)
 
 
 def test_edges_that_could_not_be_measured_are_found_whole(calibration):
@@ -176,9 +177,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
 @pytest.fixture(scope="module")
 def tripod_calibration(beside):
     """For the images of the camera on the tripod alone."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refinement, "IMPUTATION_PASSES", 2)
-        return calibrate_session(beside[0].parent / "tripod")
+    return calibrate_session(beside[0].parent / "tripod", options=FEW_IMPUTATIONS)
 
 
 @pytest.mark.slow
@@ -212,6 +211,7 @@ def turns_of(calibration, shading, images):
         calibration.cameras,
         images=images,
         start=estimate.state,
+        options=FEW_IMPUTATIONS,
     )
 
 
@@ -286,15 +286,15 @@ def test_without_images_by_hand_none_is_searched(tripod_calibration):
     assert value.places == {}
 
 
-def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
+def test_machines_as_likely_have_their_edges_near(calibration):
     """In pairs to both sides; places, focal lengths and machine are drawn together, so that no leg
     is predicted far from where it is.
     """
     estimate, session = calibration.estimate, calibration.session
     rng = np.random.default_rng(0)
-    drawn = list(refinement._as_likely(session, estimate, rng))
+    drawn = list(refinement._as_likely(session, estimate, 6, rng))
     away = np.stack([one.state.theta - estimate.state.theta for one in drawn])
-    assert len(drawn) == refinement.IMPUTATION_PASSES
+    assert len(drawn) == 6
     np.testing.assert_allclose(away[::2], -away[1::2], atol=1e-4)
     for one in drawn:
         cameras = calibration.cameras.updated(one)
@@ -307,7 +307,7 @@ def test_machines_as_likely_have_their_edges_near(calibration, all_looks):
 def test_a_machine_that_does_not_settle_is_refused(tripod_calibration):
     """Change of the machine by the last measurement pass, in its standard deviations."""
     results = turns_of(tripod_calibration, 0.0, ())
-    assert list(results._replace(change=0.9 * refinement.SETTLED_MACHINE_CHANGE).reasons) == []
+    assert list(results._replace(change=0.9 * REFINEMENT.settled_change).reasons) == []
     (reason,) = results._replace(change=2.5).reasons
     assert reason.code == "estimate.unsettled"
     assert reason.facts["change"] == 2.5

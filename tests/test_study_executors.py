@@ -238,11 +238,11 @@ def test_a_cluster_without_dask_is_reported(monkeypatch):
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch):
+def test_a_scheduler_that_does_not_answer_is_reported():
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "SCHEDULER_TIMEOUT", 1)
+    run_on = cluster.on_cluster("tcp://127.0.0.1:1", timeout=1)
     with pytest.raises(InputError, match=r"no Dask scheduler answers.*127.0.0.1:1"):
-        study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
+        run_on([], lambda *_: None)
 
 
 @pytest.mark.parametrize("address", ["", "nonsense", "host:port", "ftp://10.0.0.1:21", "tcp://:1"])

@@ -107,9 +107,7 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
     path = tmp_path_factory.mktemp("text") / "t.txt"
     text = "\ufeff" + end.join(["header", *lines, ""])
     path.write_bytes(text.encode())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(documents, "TEXT_BLOCK_BYTES", block)
-        value = list(documents.text_blocks(path, "t.csv"))
+    value = list(documents.text_blocks(path, "t.csv", block_bytes=block))
     whole = text[1:].replace("\r\n", "\n").replace("\r", "\n")
     assert "".join(value) == whole
     assert all(part.endswith("\n") for part in value[:-1])
@@ -128,21 +126,21 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
         (b'x,1,"2\n', "line {}: not valid CSV"),
     ],
 )
-def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, reason, monkeypatch):
-    """For a table that is read in many blocks."""
-    monkeypatch.setattr(documents, "TEXT_BLOCK_BYTES", 1 << 14)
-    rows = [b"%06d,0.%06d,1e-3\n" % (k, k) for k in range(3000)]
+def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, reason):
+    """For a table that is read in several blocks, because its numbers are long."""
+    zeros = b"0" * 800
+    rows = [b"%06d,0.%06d%b,1e-3\n" % (k, k, zeros) for k in range(3000)]
     rows.insert(2400, line)
     path = written(tmp_path / "t.csv", HEADER.encode() + b"".join(rows))
     assert path.stat().st_size > 2 * documents.TEXT_BLOCK_BYTES
     assert fault(read_csv, path).startswith("t.csv, " + reason.format(2402))
 
 
-def test_a_large_table(tmp_path, monkeypatch):
-    monkeypatch.setattr(documents, "TEXT_BLOCK_BYTES", 1 << 14)
+def test_a_large_table(tmp_path):
     names = [f"{k:06d}" for k in range(MOST_ROWS)]
-    values = np.random.default_rng(0).normal(size=(len(names), 2))
-    path = written(tmp_path / "t.csv", csv_text(["leg1", "leg2"], names, values))
+    values = np.random.default_rng(0).normal(size=(len(names), 15))
+    legs = [f"leg{k}" for k in range(15)]
+    path = written(tmp_path / "t.csv", csv_text(legs, names, values))
     assert path.stat().st_size > 2 * documents.TEXT_BLOCK_BYTES
     table = read_csv(path)
     assert (table.names, table.lines) == (tuple(names), tuple(range(2, len(names) + 2)))

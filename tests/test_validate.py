@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from conftest import run, two_looks
+from conftest import run
 from document_keys import assert_keys
 from faults import replaced
 from pkmcal.calibration.holdout import (
@@ -474,8 +474,7 @@ def saved_result(demo, tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("validate")
     session = of_two_stations(shutil.copytree(demo.session, folder / "session"))
-    with two_looks():
-        made = run("calibrate", session, "--holdout", 3, "-o", folder / "c", "--json")
+    made = run("calibrate", session, "--holdout", 3, "-o", folder / "c", "--json")
     value = run("validate", folder / "c", session, "-o", folder / "v", "--json")
     return SimpleNamespace(folder=folder, made=made, found=value)
 

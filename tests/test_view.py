@@ -178,10 +178,11 @@ def test_nothing_is_decoded_before_it_is_looked_at(demo):
     assert opened.subject.image.cache_info().misses == 1
 
 
-def test_a_large_image_is_sent_at_the_screens_size(page, monkeypatch):
-    monkeypatch.setattr("pkmcal.view.content.WIDEST_VIEWED_PICTURE", 100)
-    image = cv2.imdecode(np.frombuffer(page.get("image/0/0").content, np.uint8), 0)
-    assert image.shape[1] == 100
+def test_a_large_image_is_sent_at_the_screens_size(page):
+    for widest in (100, 10_000):
+        jpeg = np.frombuffer(page.subject.jpeg(0, 0, widest), np.uint8)
+        width = page.subject.station(0).camera.image_size[0]
+        assert cv2.imdecode(jpeg, 0).shape[1] == min(widest, width)
 
 
 def test_faults_are_reported_in_words(page, session):

@@ -11,13 +11,18 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from pkmcal.calibration import localization, refinement
-from pkmcal.calibration.localization import mistake_in, platform_poses, read_images
+from pkmcal.calibration import refinement
+from pkmcal.calibration.localization import (
+    SearchImages,
+    localize_by_legs,
+    platform_poses,
+    read_images,
+    suspect_stations,
+)
 from pkmcal.geometry.rigid import perturb
-from pkmcal.observe import image_batches as passing
 from pkmcal.observe import legs
 from pkmcal.observe.distance_tables import distance_tables
-from pkmcal.observe.image_batches import Placed, windows
+from pkmcal.observe.image_batches import WINDOW_SIZE, Placed, WindowSize, windows
 from pkmcal.observe.legs import measure, measure_stations, search, search_stations
 from pkmcal.session.load import load_session
 from test_observe_measure import taken
@@ -48,12 +53,13 @@ class Fresh(Sequence):
         self.alive -= 1
 
 
-def many(repeated=REPEATED):
-    """Images, their platform poses, and their counter."""
+def many(most=WINDOW_SIZE.images, repeated=REPEATED):
+    """Images in windows of ``most``, their platform poses, and their counter."""
     few = taken()
     rows = np.tile(np.arange(len(few.images)), repeated)
     fresh = Fresh([few.images[k] for k in rows])
-    return replace(few.select(rows), images=fresh), poses()[rows], fresh
+    images = replace(few.select(rows), images=fresh, largest=WindowSize(most))
+    return images, poses()[rows], fresh
 
 
 LOOKS = {
@@ -77,9 +83,8 @@ def same(edges, other):
 
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 @pytest.mark.parametrize("window", [1, 4])
-def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
-    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", window)
-    images, visible, fresh = many()
+def test_no_more_than_a_window_is_decoded_at_a_time(look, window):
+    images, visible, fresh = many(window)
     look(images, visible)
     assert fresh.most == window
     assert fresh.alive == 0
@@ -88,36 +93,33 @@ def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
 
 
 @pytest.mark.parametrize("name", ["search", "refine"])
-def test_windows_change_nothing(monkeypatch, name):
+def test_windows_change_nothing(name):
     images, visible, _ = many()
     whole = LOOKS[name](images, visible)
-    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", 4)
-    value = LOOKS[name](images, visible)
+    value = LOOKS[name](many(4)[0], visible)
     same(value, whole)
 
 
-def test_the_blur_of_many_images_is_estimated_from_one_batch(monkeypatch):
-    images, visible, _ = many()
-    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", 4)
+def test_the_blur_of_many_images_is_estimated_from_one_batch():
+    images, visible, _ = many(4)
     few = images.spread(4)
     assert few.tolist() == [0, 5, 11, 17]
     of_few = LOOKS["measure"](images.select(few), visible[few]).blur
     assert LOOKS["measure"](images, visible).blur == of_few
 
 
-def test_large_images_have_small_windows(monkeypatch):
+def test_large_images_have_small_windows():
     images, visible, _ = many()
     width, height = images.camera.image_size
-    monkeypatch.setattr(passing, "WINDOW_BYTES", 5 * width * height)
+    images = replace(images, largest=WindowSize(bytes=5 * width * height))
     placed = [Placed(images, FRONT, visible)]
     assert [len(window.images) for window in windows(placed)] == [5, 5, 5, 3]
-    monkeypatch.setattr(passing, "WINDOW_BYTES", 1)  # one may take more
-    assert images.window == 1
+    assert replace(images, largest=WindowSize(bytes=1)).window == 1  # one may take more
 
 
-def stations():
-    """Images of one camera at three places, many at the first, from a little aside and more blurred
-    at the second, and of another camera.
+def stations(most):
+    """Images in windows of ``most``, of one camera at three places, many at the first, from a
+    little aside and more blurred at the second, and of another camera.
     """
     longer = replace(taken().camera, parameters=taken().camera.parameters * 1.0001)
     soft = taken([gaussian_filter(image, 0.6) for image in taken().images])
@@ -128,7 +130,8 @@ def stations():
         (replace(taken(), station=7), FRONT, poses()),
         (replace(taken(), station=8, camera=longer), FRONT, poses()),
     ]
-    return [Placed(*one) for one in made]
+    size = WindowSize(most)
+    return [Placed(replace(images, largest=size), T, at) for images, T, at in made]
 
 
 @pytest.mark.parametrize(
@@ -139,9 +142,8 @@ def stations():
         (8, [{2: 8}, {2: 8}, {2: 2, 5: 6}, {7: 6}, {8: 6}]),
     ],
 )
-def test_stations_of_one_camera_share_windows(monkeypatch, most, expected):
-    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", most)
-    counted = [np.unique(w.station, return_counts=True) for w in windows(stations())]
+def test_stations_of_one_camera_share_windows(most, expected):
+    counted = [np.unique(w.station, return_counts=True) for w in windows(stations(most))]
     assert [dict(zip(*map(np.ndarray.tolist, c), strict=True)) for c in counted] == expected
 
 
@@ -155,14 +157,10 @@ def test_images_that_are_looked_at_otherwise_do_not(other):
 
 @pytest.mark.parametrize("most", [8, 32])
 @pytest.mark.parametrize("with_pose", [{}, {2: 0.7, 5: 0.55, 7: 0.8}], ids=["blur", "known"])
-def test_together_stations_are_seen_as_each_alone(monkeypatch, with_pose, most):
-    monkeypatch.setattr(passing, "IMAGES_A_WINDOW", most)
-    drawn = redrawn(0, 0.0005)
-    coarse, fine = (
-        search_stations(stations(), drawn),
-        measure_stations(stations(), drawn, with_pose),
-    )
-    for (p, T, in_view), whole, exact in zip(stations(), coarse, fine, strict=True):
+def test_together_stations_are_seen_as_each_alone(with_pose, most):
+    drawn, placed = redrawn(0, 0.0005), stations(most)
+    coarse, fine = search_stations(placed, drawn), measure_stations(placed, drawn, with_pose)
+    for (p, T, in_view), whole, exact in zip(placed, coarse, fine, strict=True):
         same(whole, search(p, drawn, T, in_view))
         same(exact, measure(p, drawn, T, in_view, with_pose.get(p.station)))
         assert (exact.edges.station == p.station).all()
@@ -186,9 +184,8 @@ def test_tables_look_at_each_image_once_and_share_their_memory():
 
 
 @pytest.mark.parametrize(("enough", "each"), [(0.0, [1, 1, 1]), (np.inf, [3])])
-def test_stations_are_looked_at_beside_one_another_or_together(monkeypatch, enough, each):
+def test_stations_are_looked_at_beside_one_another_or_together(enough, each):
     """With the same result, in their order."""
-    monkeypatch.setattr(refinement, "CACHED_IMAGE_BYTES", enough)
     images = [replace(many()[0], station=number) for number in range(3)]
     threads: set[int] = set()
     counts: list[int] = []
@@ -198,14 +195,11 @@ def test_stations_are_looked_at_beside_one_another_or_together(monkeypatch, enou
         counts.append(len(some))
         return [legs.joined_passes([], 0.5 + one.station, 0.0) for one in some]
 
-    assert [in_view.blur for in_view in refinement._search_pass(images, measure)] == [
-        0.5,
-        1.5,
-        2.5,
-    ]
+    edges = refinement._search_pass(images, measure, enough)
+    assert [in_view.blur for in_view in edges] == [0.5, 1.5, 2.5]
     assert (get_ident() in threads) == (enough > 0)
     assert counts == each
-    assert refinement._search_pass([], measure) == []
+    assert refinement._search_pass([], measure, enough) == []
 
 
 # ------------------------------------------------------------------ a session
@@ -216,46 +210,36 @@ def session(demo):
     return load_session(demo.session)
 
 
-def test_so_many_bytes_of_a_session_stay_decoded(session, monkeypatch):
+def test_so_many_bytes_of_a_session_stay_decoded(session):
     sizes = [np.prod(station.camera.image_size) for station in session.stations]
     each = len(session.stations[0].images)
-    monkeypatch.setattr(localization, "CACHED_IMAGE_BYTES", int(sizes[0] * each + sizes[1]))
-    retained = [
-        [p.images[k] is p.images[k] for k in range(len(p.images))] for p in read_images(session)
-    ]
+    images = read_images(session, sizes[0] * each + sizes[1])
+    retained = [[p.images[k] is p.images[k] for k in range(len(p.images))] for p in images]
     assert retained[0] == [True] * each
     assert retained[1] == [True] + [False] * (each - 1)
     assert not any(retained[2])
 
 
-def test_the_machine_is_looked_for_in_some_of_many_images(session, monkeypatch):
+def localized(session, numbers):
+    """Stations localized in some of their images."""
+    images = read_images(session)
+    assert all(len(p.images) == 4 for p in images)
+    rngs = np.random.default_rng(0).spawn(len(images))
+    poses = platform_poses(session)
+    return images, localize_by_legs(session, images, poses, rngs, numbers=numbers)
+
+
+def test_the_machine_is_looked_for_in_some_of_many_images(session):
     """Spread over all of them, each under its own name."""
-    monkeypatch.setattr(localization, "MOST_AT_A_STATION", 3)
-    monkeypatch.setattr(localization, "FEWEST_AT_A_STATION", 2)
-    tables, in_view = [], []
-
-    def counted(images):
-        tables.append(len(images))
-        return distance_tables(images)
-
-    monkeypatch.setattr(localization, "distance_tables", counted)
-    monkeypatch.setattr(localization, "mistake", lambda stations, _rng: in_view.extend(stations))
-    station_images, rng = read_images(session), np.random.default_rng(0)
-    assert all(len(p.images) == 4 for p in station_images)
-    rngs = rng.spawn(len(station_images))
-    results = localization.localize_by_legs(session, station_images, platform_poses(session), rngs)
-    assert tables == [3] * len(station_images)
-    assert [numbers.tolist() for numbers in results.used] == [[0, 1, 3]] * len(station_images)
-    mistake_in(session, station_images, results, rng)
-    for station in in_view:
+    few = SearchImages(most_at_station=3, fewest_at_station=2)
+    images, results = localized(session, few)
+    assert [numbers.tolist() for numbers in results.used] == [[0, 1, 3]] * len(images)
+    for station in suspect_stations(session, images, results):
         names = [session.configurations[k] for k in station.view.configuration]
         assert [name in file for name, file in zip(names, station.files, strict=True)] == [True] * 3
 
 
-def test_many_stations_share_the_images_that_are_looked_at(session, monkeypatch):
-    monkeypatch.setattr(localization, "MOST_IN_ALL", 2 * len(session.stations))
-    monkeypatch.setattr(localization, "FEWEST_AT_A_STATION", 1)
-    images = read_images(session)
-    rngs = np.random.default_rng(0).spawn(len(images))
-    results = localization.localize_by_legs(session, images, platform_poses(session), rngs)
+def test_many_stations_share_the_images_that_are_looked_at(session):
+    few = SearchImages(most=2 * len(session.stations), fewest_at_station=1)
+    images, results = localized(session, few)
     assert [len(numbers) for numbers in results.used] == [2] * len(images)

@@ -45,6 +45,8 @@ from pkmcal.calibration.model_violations import DetectedViolation, model_violati
 from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.calibration.pose_hypotheses import explain_closure, explain_poses
 from pkmcal.calibration.refinement import (
+    REFINEMENT,
+    RefinementOptions,
     RefinementResult,
     identify_poses,
     imputation_variance,
@@ -154,6 +156,8 @@ def calibrate_session(
     refine_camera: bool = False,
     holdout: int = 0,
     progress: CalibrationProgress | None = None,
+    options: RefinementOptions = REFINEMENT,
+    case: Case | None = None,
 ) -> Calibration:
     """Calibrate the machine of a session; nothing is written.
 
@@ -166,6 +170,8 @@ def calibrate_session(
     holdout : number of poses, spread over the workspace, that the estimate does not use and that
         test the result.
     progress : called with the step in words and the share done.
+    options : of the measurement passes. case : the session with its images localized; by default
+        they are localized here.
     Raises InputError where the session is at fault, ResultError where there is no estimate.
     """
     from threadpoolctl import threadpool_limits
@@ -176,10 +182,10 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
         session = _load(session, refine_camera, clock)
-        case = _observe(session, seed, clock)
+        located = case or _observe(session, seed, clock)
 
         def calibrated(refine: bool) -> Calibration:
-            settled = settle(session, case, refine, seed, clock)
+            settled = settle(session, located, refine, seed, clock, options)
             return _finished(settled, method, seed, holdout, clock)
 
         if not refine_camera or refinement_of(session, False).refines_all:
@@ -302,7 +308,14 @@ class Settled(NamedTuple):
     findings: tuple[Finding, ...] = ()
 
 
-def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: Clock) -> Settled:
+def settle(
+    session: Session,
+    case: Case,
+    refine_camera: bool,
+    seed: int,
+    clock: Clock,
+    options: RefinementOptions = REFINEMENT,
+) -> Settled:
     """All that decides whether a session can be calibrated: `calibrate` goes on from it, and
     `check` ends with it.
 
@@ -318,7 +331,7 @@ def settle(session: Session, case: Case, refine_camera: bool, seed: int, clock: 
         # mistakes in the readings, without which no estimate means anything
         refuse(partial(explain_closure, case.session, case.boards))
         try:
-            turns = _identify(case, refine_camera, clock)
+            turns = _identify(case, refine_camera, clock, options)
         except ResultError:
             refuse(partial(explain_radii, case, None, refine_camera, seed))
             raise
@@ -408,14 +421,16 @@ def _observe(session: Session, seed: int, clock: Clock) -> Case:
     return case
 
 
-def _identify(case: Case, refine_camera: bool, clock: Clock) -> RefinementResult:
+def _identify(
+    case: Case, refine_camera: bool, clock: Clock, options: RefinementOptions
+) -> RefinementResult:
     """Refine the machine in turns with measurement passes."""
     session, cameras = case.session, refinement_of(case.session, refine_camera)
     if case.images:
-        turns = refine_alternating(case, cameras, clock.progress, clock.lap)
+        turns = refine_alternating(case, cameras, clock.progress, clock.lap, options)
     else:
         turns = identify_poses(
-            session, case.boards, case.scene.T_camera_base, cameras, clock.progress
+            session, case.boards, case.scene.T_camera_base, cameras, clock.progress, options
         )
     clock.lap("identify")
     return turns

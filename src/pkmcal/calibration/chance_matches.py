@@ -91,8 +91,6 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
 
 def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | None:
     """Chance matches among the edges of some stations; None if these are significantly more."""
-    from scipy.special import stdtr
-
     in_view = turns.observation
     mine = np.isin(in_view.edges.station, stations)
     measured = int(np.sum(mine & ~in_view.edges.coarse))
@@ -108,14 +106,20 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     angle = 2 * np.pi * np.arange(OFFSET_DIRECTIONS) / OFFSET_DIRECTIONS
     lateral = IMAGE_OFFSET * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     counts = np.array([_count(turns, stations, away) for away in lateral])
+    chance = chance_of_count(_count(turns, stations, np.zeros(2)), counts)
+    surely = chance < LOCALIZATION_OPTIONS.by_chance
+    return None if surely else _Offered(in_sight, measured, float(counts.mean()), chance)
+
+
+def chance_of_count(own: int, counts: Array) -> float:
+    """Probability of so many edges or more by chance, from the counts (n,) in shifted images."""
+    from scipy.special import stdtr
+
     mean = float(counts.mean())
     # the scatter of eight counts may be smaller by chance than that of Poisson's distribution
     spread = max(float(counts.std(ddof=1)), np.sqrt(mean), 1.0)
-    own = _count(turns, stations, np.zeros(2))
     apart = (own - mean) / (spread * np.sqrt(1 + 1 / len(counts)))
-    chance = float(stdtr(len(counts) - 1, -apart))
-    surely = chance < LOCALIZATION_OPTIONS.by_chance
-    return None if surely else _Offered(in_sight, measured, mean, chance)
+    return float(stdtr(len(counts) - 1, -apart))
 
 
 def _count(turns: RefinementResult, stations: Sequence[int], offset: Array) -> int:

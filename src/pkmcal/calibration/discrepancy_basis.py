@@ -31,21 +31,31 @@ from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements
 from pkmcal.outcome.finding import Finding, doubtful
 
-CORRELATION_LENGTHS = (1.0, 1.5, 2.5, 4.0, 7.0)
-"""Distances over which errors of neighbouring poses are alike, in the root mean square distance of
-the session's poses from their middle; the last one leaves functions that are nearly straight."""
-MOST_FUNCTIONS = 40
-"""Smooth functions of the pose: in six dimensions straight and square ones are 27."""
-LENGTH_STEP = 1.5
-"""Factor from one correlation length of the bed to the next, from the points' mean distance, below
-which unevenness is noise, to LONGEST_BED_LENGTH, from which on it is nearly a parabola."""
-LONGEST_BED_LENGTH = 1.0
-"""In the root mean square distance of the points from their middle. Over longer lengths a surface
-is what the machine's own parameters bend as well, and the data do not determine its size: a kit
-whose towers lean was refused for it."""
-LANDMARK_POSES = 200
-"""Poses, evenly of all, by which the functions are made where there are more."""
-POINTS_ALONG_EDGE_SPAN = 9
+
+@dataclass(frozen=True)
+class DiscrepancyBasisOptions:
+    """Constants of the smooth functions that may be added to the model."""
+
+    # distances over which errors of neighbouring poses are alike, in the root mean square distance
+    # of the session's poses from their middle; the last one leaves functions that are nearly
+    # straight
+    lengths: tuple[float, ...] = (1.0, 1.5, 2.5, 4.0, 7.0)
+    # smooth functions of the pose: in six dimensions straight and square ones are 27
+    most_functions: int = 40
+    # factor from one correlation length of the bed to the next, from the points' mean distance,
+    # below which unevenness is noise, to the longest one, from which on it is nearly a parabola
+    length_step: float = 1.5
+    # the longest one, in the root mean square distance of the points from their middle. Over longer
+    # lengths a surface is what the machine's own parameters bend as well, and the data do not
+    # determine its size: a kit whose towers lean was refused for it
+    longest_bed_length: float = 1.0
+    # poses, evenly of all, by which the functions are made where there are more
+    landmarks: int = 200
+    # points along the visible part of an edge at which a change of the pose is evaluated
+    points_along_edge: int = 9
+
+
+DISCREPANCY_BASIS = DiscrepancyBasisOptions()
 
 
 @dataclass(frozen=True)
@@ -158,9 +168,14 @@ def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
     # n points all over a disc of that size are about so far from their neighbours
     places = len(np.unique(xy.round(6), axis=0))
     apart = np.sqrt(2 * np.pi / places)
-    count = int(np.ceil(np.log(LONGEST_BED_LENGTH / apart) / np.log(LENGTH_STEP)))
-    lengths = apart * LENGTH_STEP ** np.arange(max(count, 1))
-    basis, roots = smooth_functions(xy, lengths.tolist(), LANDMARK_POSES)
+    count = int(
+        np.ceil(
+            np.log(DISCREPANCY_BASIS.longest_bed_length / apart)
+            / np.log(DISCREPANCY_BASIS.length_step)
+        )
+    )
+    lengths = apart * DISCREPANCY_BASIS.length_step ** np.arange(max(count, 1))
+    basis, roots = smooth_functions(xy, lengths.tolist(), DISCREPANCY_BASIS.landmarks)
     if not roots:
         return []
     effect = np.zeros((len(poses), 6, basis.shape[1]))
@@ -216,8 +231,8 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
 
 def smooth_functions(
     points: Array,
-    lengths: Sequence[float] = CORRELATION_LENGTHS,
-    most: int = MOST_FUNCTIONS,
+    lengths: Sequence[float] = DISCREPANCY_BASIS.lengths,
+    most: int = DISCREPANCY_BASIS.most_functions,
 ) -> tuple[Array, tuple[Array, ...]]:
     """Functions (K, p) of places (K, d) with a mean of zero and orthonormal over the places, and
     for each correlation length the root (p, p) of their coefficients' covariance, of functions
@@ -229,7 +244,9 @@ def smooth_functions(
     """
     size = float(np.sqrt(np.mean(np.sum(points**2, axis=1))))
     points = points / (size or 1.0)
-    marks = points[np.unique(np.linspace(0, len(points) - 1, LANDMARK_POSES).astype(int))]
+    marks = points[
+        np.unique(np.linspace(0, len(points) - 1, DISCREPANCY_BASIS.landmarks).astype(int))
+    ]
 
     def kernel(one: Array, length: float) -> Array:
         squares = np.sum((one[:, None] - marks) ** 2, axis=-1)
@@ -310,7 +327,7 @@ def _of_legs(measurements: Measurements, estimate: Estimate) -> Iterator[Compone
     T = state.T_camera_base[edges.station]
     a, b = (apply(T, x[edges.configuration, edges.leg]) for x in (ends.a, ends.b))
     u = line_through(a, b)[0]
-    part = np.linspace(0, 1, POINTS_ALONG_EDGE_SPAN)
+    part = np.linspace(0, 1, DISCREPANCY_BASIS.points_along_edge)
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * part
     radius = machine.values[machine.layout.radius_of(edges.leg, edges.tube)]
     points = contour_point(

@@ -46,24 +46,34 @@ from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, listed
 
-MISPLACED_PROBABILITY = 0.05
-"""Largest probability that any image of a session is accepted with a wrong pose."""
-CANDIDATES_SCORED_AGAIN = 4
-"""Number of an image's best poses that are always scored again with a better known machine,
-whatever their score by the image alone: a wrong pose corrupts the estimate."""
-RESCORING_GROWTH = 1.25
-"""Ratio by which the number of images that determine the machine must grow before the poses of
-an image are scored anew."""
 EDGES_DISAGREE_REASON = "too few of its edges agree with the other images"
 """Reason for rejecting an image with a certain pose whose edges the joint estimate rejects."""
 CAMERA_TURNED_REASON = "all images together turn its camera by more than ten degrees"
 """Reason for rejecting an image that has a single candidate pose and does not belong there."""
-MOST_TURN = SAME_POSE_TURN / 2
-"""Largest rotation (rad) by which the joint estimate may change the localized pose of an image."""
-FEWEST_LEGS, FEWEST_EDGES = 4, 4
-"""Fewest legs of an image, if the machine has so many, and fewest edges that determine its pose.
-Pose and focal length are seven numbers: each edge gives two, and each leg little more, so among
-three legs a wrong match contradicts none of the others."""
+
+
+@dataclass(frozen=True)
+class HandheldOptions:
+    """Constants of the localization of images by hand."""
+
+    # largest probability that any image of a session is accepted with a wrong pose (statistical)
+    misplaced: float = 0.05
+    # an image's best poses that are always scored again with a better known machine, whatever their
+    # score by the image alone: a wrong pose corrupts the estimate
+    scored_again: int = 4
+    # ratio by which the number of images that determine the machine must grow before the poses of
+    # an image are scored anew
+    rescoring_growth: float = 1.25
+    # largest rotation (rad) by which the joint estimate may change an image's localized pose
+    most_turn: float = SAME_POSE_TURN / 2
+    # fewest legs of an image, if the machine has so many, and fewest edges that determine its pose.
+    # Pose and focal length are seven numbers: each edge gives two, and each leg little more, so
+    # among three legs a wrong match contradicts none of the others
+    fewest_legs: int = 4
+    fewest_edges: int = 4
+
+
+_OPTIONS = HandheldOptions()
 
 
 @dataclass(frozen=True)
@@ -126,7 +136,7 @@ def localize(
         lost = {k: EDGES_DISAGREE_REASON if k in sure else why_lost(places[k]) for k in nowhere}
         for k in sorted(places.keys() & scene.edges.keys()):
             turn = angle_between(scene.T_camera_base[k], places[k].T_camera_base[0])
-            if turn > MOST_TURN and k in sure:
+            if turn > _OPTIONS.most_turn and k in sure:
                 lost[k] = CAMERA_TURNED_REASON
     # remove the rejected images
     case = Case(session, images, boards, scene)
@@ -307,11 +317,11 @@ def _with_sure(
 
 
 def _too_few_edges(scene: PriorScene, image: StationImages) -> bool:
-    """Whether fewer legs than FEWEST_LEGS can be measured in an image at its pose."""
+    """Whether too few legs can be measured in an image at its pose."""
     p, machine = image, scene.machine
     T, poses = scene.T_camera_base[p.station], scene.T_base_platform[p.configuration]
     visible = np.unique(legs.measure(p, machine, T, poses).edges.leg)
-    return len(visible) < min(FEWEST_LEGS, machine.n_legs)
+    return len(visible) < min(_OPTIONS.fewest_legs, machine.n_legs)
 
 
 def _image_hypotheses(session: Session, scene: PriorScene, image: StationImages) -> PoseHypotheses:
@@ -344,10 +354,12 @@ def _search(
     if scene.prior is not None:
         if before.by is None:
             alone = _image_hypotheses(session, scene, p)
-        elif len(placed) < RESCORING_GROWTH * before.beside and scene.prior.like(before.by):
+        elif len(placed) < _OPTIONS.rescoring_growth * before.beside and scene.prior.like(
+            before.by
+        ):
             scores, by, beside = before.scores, before.by, before.beside
     # further candidates: from landmarks, from the last scoring, and from the background
-    likely = before.places.T_camera_base[:CANDIDATES_SCORED_AGAIN]
+    likely = before.places.T_camera_base[: _OPTIONS.scored_again]
     others = np.concatenate([room.place(k, so_far.landmarks), likely])
     if placed:
         axes = _legs(session, p, scene, alone.T_camera_base)
@@ -412,14 +424,14 @@ def _sure(hypotheses: Mapping[int, PoseHypotheses], count: int) -> list[int]:
     """Station numbers of the images whose poses are accepted.
 
     These are the images with the smallest rival probabilities, as long as their sum stays below
-    MISPLACED_PROBABILITY, in proportion to the images scored so far among ``count``.
+    ``HandheldOptions.misplaced``, in proportion to the images scored so far among ``count``.
     """
     order = sorted(hypotheses, key=lambda k: hypotheses[k].rival_probability)
     together = np.cumsum([hypotheses[k].rival_probability for k in order])
     return [
         k
         for k, fault in zip(order, together, strict=True)
-        if fault < MISPLACED_PROBABILITY * len(hypotheses) / count
+        if fault < _OPTIONS.misplaced * len(hypotheses) / count
     ]
 
 
@@ -452,7 +464,7 @@ def inconsistent_poses(
 
     T_camera_base : (S, 4, 4) localized poses.
     """
-    astray = angle_between(estimate.state.T_camera_base, T_camera_base) > MOST_TURN
+    astray = angle_between(estimate.state.T_camera_base, T_camera_base) > _OPTIONS.most_turn
     station = measurements.edges.station
     measured = ~measurements.edges.coarse  # silhouettes match anywhere
     inliers = np.bincount(station, measured * estimate.edge_weights, len(session.stations))
@@ -464,8 +476,8 @@ def inconsistent_poses(
     visible = np.zeros((len(session.stations), session.machine.n_legs), dtype=bool)
     used = measured & (estimate.edge_weights >= INLIER_WEIGHT)
     visible[station[used], measurements.edges.leg[used]] = True
-    few = visible.sum(axis=1) < min(FEWEST_LEGS, session.machine.n_legs)
-    lost = ((2 * inliers < count) | (inliers < FEWEST_EDGES) | few) & ~by_board
+    few = visible.sum(axis=1) < min(_OPTIONS.fewest_legs, session.machine.n_legs)
+    lost = ((2 * inliers < count) | (inliers < _OPTIONS.fewest_edges) | few) & ~by_board
     return {
         k: EDGES_DISAGREE_REASON if lost[k] else CAMERA_TURNED_REASON
         for k, station in enumerate(session.stations)

@@ -33,16 +33,25 @@ from pkmcal.session.poses import check_lengths
 from pkmcal.session.readings import frozen
 from pkmcal.wording import listed
 
-MOST_AT_A_STATION, MOST_IN_ALL = 64, 128
-"""Images in which the machine is localized, spread over a station's and shared among the stations:
-a search uses eight, and thirty that confirm it, each with a z-score of one, have five together.
-Their tables take 200 to 400 MB."""
-FEWEST_AT_A_STATION = 8
-"""Images of each station, however many stations there are: as many as a search uses."""
 CalibrationProgress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share done, 0 to 1."""
 ALLOWED_LEG_MISS = 2.0
 """Prior sigmas of a centre by which legs may miss the platform at the nearest nominal pose."""
+
+
+@dataclass(frozen=True)
+class SearchImages:
+    """Numbers of images in which the machine is localized, spread over each station's."""
+
+    # most images of a station, and of all together: a search uses eight, and thirty that confirm
+    # it, each with a z-score of one, have five together. Their tables take 200 to 400 MB
+    most_at_station: int = 64
+    most: int = 128
+    # images of each station, however many stations there are: as many as a search uses
+    fewest_at_station: int = 8
+
+
+SEARCH_IMAGES = SearchImages()
 
 
 def check_observable(session: Session) -> None:
@@ -58,9 +67,9 @@ def check_observable(session: Session) -> None:
         )
 
 
-def read_images(session: Session) -> list[StationImages]:
+def read_images(session: Session, cached_bytes: int = CACHED_IMAGE_BYTES) -> list[StationImages]:
     """Image batches of the stations that observe legs, checked to be decodable; the first images
-    that fit into CACHED_IMAGE_BYTES bytes stay decoded.
+    that fit into ``cached_bytes`` bytes stay decoded.
     """
 
     def read(number: int, most: int) -> StationImages:
@@ -74,7 +83,7 @@ def read_images(session: Session) -> list[StationImages]:
             legs.first_binning(station.camera.image_size),
         )  # fmt: skip
 
-    numbers, room, retained = legs_stations(session), CACHED_IMAGE_BYTES, list[int]()
+    numbers, room, retained = legs_stations(session), cached_bytes, list[int]()
     for number in numbers:
         station = session.stations[number]
         size = station.camera.image_size
@@ -212,6 +221,7 @@ def localize_by_legs(
     rngs: list[np.random.Generator],
     boards: Boards | None = None,
     starts: Array | None = None,
+    numbers: SearchImages = SEARCH_IMAGES,
 ) -> LegLocalization:
     """Localize every station that observes legs; nothing is raised.
 
@@ -223,8 +233,8 @@ def localize_by_legs(
     """
     boards = boards or Boards()
     machine = session.machine
-    most = min(MOST_AT_A_STATION, MOST_IN_ALL // max(len(images), 1))
-    in_view = tuple(p.spread(max(most, FEWEST_AT_A_STATION)) for p in images)
+    most = min(numbers.most_at_station, numbers.most // max(len(images), 1))
+    in_view = tuple(p.spread(max(most, numbers.fewest_at_station)) for p in images)
 
     def view(p: StationImages) -> StationView:
         tables = distance_tables(p.images)
@@ -238,7 +248,7 @@ def localize_by_legs(
             T if T is not None or np.isnan(start).any() else start for T, start in start_pairs
         ]
     # one station after the other: what works its tables out uses all threads
-    views = tuple(view(p.select(numbers)) for p, numbers in zip(images, in_view, strict=True))
+    views = tuple(view(p.select(some)) for p, some in zip(images, in_view, strict=True))
     solution = _searched(views, [start_poses[s] for s in at], [None] * len(at), rngs)
     # Through the board a pose by hand would be off by its angle times the stations' distance, so
     # the rest are searched from where the search has ended with those that were found.
@@ -305,30 +315,34 @@ def mistake_in(
     still = frozen_in(session)
     if still is not None and not leg_localization.complete:  # an error in any case, and cheaper
         return still
-    stations = [session.stations[p.station] for p in images]
-    error = mistake(
-        [
-            SuspectStation(
-                station.name,
-                [label_of(session.folder, station.images[k].path) for k in visible],
-                session.configurations,
-                session.document["joints"]["file"],
-                session.document["joints"]["columns"],
-                view,
-                station.T_camera_base,
-                item,
-            )
-            for station, view, item, visible in zip(
-                stations,
-                leg_localization.views,
-                leg_localization.localizations,
-                leg_localization.used,
-                strict=True,
-            )
-        ],
-        rng,
-    )
+    error = mistake(suspect_stations(session, images, leg_localization), rng)
     return error and (still or error)
+
+
+def suspect_stations(
+    session: Session, images: list[StationImages], leg_localization: LegLocalization
+) -> list[SuspectStation]:
+    """Stations as hypotheses about them need them, with the files of the images in use."""
+    stations = [session.stations[p.station] for p in images]
+    return [
+        SuspectStation(
+            station.name,
+            [label_of(session.folder, station.images[k].path) for k in used],
+            session.configurations,
+            session.document["joints"]["file"],
+            session.document["joints"]["columns"],
+            view,
+            station.T_camera_base,
+            pose,
+        )
+        for station, view, pose, used in zip(
+            stations,
+            leg_localization.views,
+            leg_localization.localizations,
+            leg_localization.used,
+            strict=True,
+        )
+    ]
 
 
 def frozen_in(session: Session) -> InputError | None:

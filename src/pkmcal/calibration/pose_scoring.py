@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,19 +51,28 @@ from pkmcal.observe.pose_likelihood import (
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.session.load import Session
 
-CANDIDATES_RESCORED, MOST_BEHIND_BEST = 8, 12.0
-"""Largest number of an image's candidate poses that are scored, and how many measurements one
-may be behind the best: its odds are then one in a hundred thousand."""
-CANDIDATES_REFINED_LOCALLY = 4
-"""Number of poses around which likelier ones are searched, once other images have determined the
-machine."""
-PASSES_FROM_NOMINAL, PASSES_FROM_PRIOR = 4, 2
-"""Numbers of measurement passes of silhouettes, each from the estimate before: the nominal model
-is off by pixels, a machine that images have determined is not."""
-SILHOUETTE_SCATTER = legs.LEG_SEARCH_OPTIONS.sigma
-"""Largest scatter of silhouettes about image edges, pixels of the finest tables: a whole leg is
-measured no less accurately, and the nominal model's errors are explained by then. By chance legs
-lie near image edges; they do not lie on them."""
+
+@dataclass(frozen=True)
+class PoseScoringOptions:
+    """Constants of the scores of an image's candidate poses with a known machine."""
+
+    # candidate poses that are scored at most, and how many measurements one may be behind the best:
+    # its odds are then one in a hundred thousand
+    candidates: int = 8
+    most_behind_best: float = 12.0
+    # poses around which likelier ones are searched, once other images have determined the machine
+    refined_locally: int = 4
+    # measurement passes of silhouettes, each from the estimate before: the nominal model is off by
+    # pixels, a machine that images have determined is not
+    passes_from_nominal: int = 4
+    passes_from_prior: int = 2
+    # largest scatter of silhouettes about image edges, pixels of the finest tables: a whole leg is
+    # measured no less accurately, and the nominal model's errors are explained by then. By chance
+    # legs lie near image edges; they do not lie on them
+    silhouette_scatter: float = legs.LEG_SEARCH_OPTIONS.sigma
+
+
+_OPTIONS = PoseScoringOptions()
 
 ViewOf = Callable[[int, PriorScene], StationView]
 """Function that returns the view of a station's single image, given the station's number and a
@@ -89,9 +98,11 @@ def register_images(
     def view(k: int, scene: PriorScene) -> StationView:
         return finest_view(scene.machine, images[k], session.joints, scene.T_base_platform)
 
-    n_passes = PASSES_FROM_PRIOR if scene.edges else PASSES_FROM_NOMINAL
+    n_passes = _OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal
     every = {k: scene.T_camera_base[k] for k in scene.edges} | dict(places)
-    near = {k: refine_local(view(k, scene), T, SILHOUETTE_SCATTER)[0] for k, T in every.items()}
+    near = {
+        k: refine_local(view(k, scene), T, _OPTIONS.silhouette_scatter)[0] for k, T in every.items()
+    }
     updated_scene = scene._replace(prior=None)
     while True:
         last = _measurement_pass(session, updated_scene, near, boards, view)
@@ -123,7 +134,7 @@ def evaluate_pose(
         return replace(view, machine=now.machine, all_poses=now.T_base_platform)
 
     paid = 0.0
-    for _ in range(PASSES_FROM_PRIOR if scene.edges else PASSES_FROM_NOMINAL):
+    for _ in range(_OPTIONS.passes_from_prior if scene.edges else _OPTIONS.passes_from_nominal):
         last = _measurement_pass(session, scene, {station: T_camera_base}, Boards(), changed)
         scene, statistics = last.scene, last.estimate.statistics
         T_camera_base = scene.T_camera_base[station]
@@ -216,14 +227,16 @@ def rescore_poses(
     # candidates, refined with the machine as it is known
     near = (
         hypotheses.log_likelihood_ratio
-        > hypotheses.log_likelihood_ratio[0] - MOST_BEHIND_BEST * hypotheses.unit
+        > hypotheses.log_likelihood_ratio[0] - _OPTIONS.most_behind_best * hypotheses.unit
     )
-    places = np.concatenate([hypotheses.T_camera_base[near][:CANDIDATES_RESCORED], others])
+    places = np.concatenate([hypotheses.T_camera_base[near][: _OPTIONS.candidates], others])
     # maximum likelihood with the machine unchanged; a changed machine is tried below
-    settled, log_likelihood_ratio = refine_ml(view, places, one, 16, 6, SILHOUETTE_SCATTER)
+    settled, log_likelihood_ratio = refine_ml(view, places, one, 16, 6, _OPTIONS.silhouette_scatter)
     if before.edges:  # the machine changes little: search around the likeliest poses
-        for k in np.argsort(-log_likelihood_ratio, kind="stable")[:CANDIDATES_REFINED_LOCALLY]:
-            settled[k], log_likelihood_ratio[k] = refine_local(view, settled[k], SILHOUETTE_SCATTER)
+        for k in np.argsort(-log_likelihood_ratio, kind="stable")[: _OPTIONS.refined_locally]:
+            settled[k], log_likelihood_ratio[k] = refine_local(
+                view, settled[k], _OPTIONS.silhouette_scatter
+            )
         places = settled
     # drop poses that were scored before
     previous = ScoredPoses.nothing() if scores is None else scores
@@ -240,7 +253,7 @@ def rescore_poses(
     # estimate the machine with the camera at each remaining pose
     for number, T in enumerate(places[order], start=count):
         best = max(fit / hypotheses.unit - cost for fit, cost in zip(fits, paid, strict=True))
-        if before.edges and fits[number] / hypotheses.unit < best - MOST_BEHIND_BEST:
+        if before.edges and fits[number] / hypotheses.unit < best - _OPTIONS.most_behind_best:
             break  # the prior does not allow a change that large
         try:
             scene, cost = evaluate_pose(session, before, p.station, T, view)
@@ -249,7 +262,7 @@ def rescore_poses(
             continue
         changed = replace(view, machine=scene.machine, all_poses=scene.T_base_platform)
         there, fit = refine_ml(
-            changed, scene.T_camera_base[[p.station]], one, 16, 6, SILHOUETTE_SCATTER
+            changed, scene.T_camera_base[[p.station]], one, 16, 6, _OPTIONS.silhouette_scatter
         )
         at, fits, paid = [*at, there[0]], [*fits, float(fit[0])], [*paid, cost]
     previous = ScoredPoses(np.stack(at), np.array(fits), np.array(paid), tuple(failures))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
 from types import MappingProxyType
@@ -59,37 +59,48 @@ from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.ranks import nonzero
 from pkmcal.wording import listed
 
-MOST_MEASUREMENT_PASSES = 3
-"""Measurement passes after which convergence is judged by the machine's parameters alone. Refined
-cameras need all of them."""
-MOST_BAD_PASSES = 9
-"""Upper bound of the measurement passes."""
-SETTLED_MACHINE_CHANGE = 2.0
-"""Largest change of a converged machine by a measurement pass, root mean square over the determined
-directions, in standard deviations. The second pass changes it by one half or one, and passes over
-polished legs, which measure other edges each time, by one every time. A camera that starts
-centimetres off and moves slowly towards its pose predicts edges that agree, but each pass changes
-the machine by four or more."""
-SETTLED_AT_ONCE = SETTLED_MACHINE_CHANGE / 2
-"""The same for ending after the second pass: if that changes the machine by more, a further pass
-reduces the remaining dependence on the starting point to a quarter."""
-SETTLED_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 10
-"""Median distance (px) of edges from their prediction below which a further pass changes nothing:
-the first pass corrects a pixel, the second the remaining effect of shading, and profiles reach ten
-times as far."""
-ASTRAY_EDGE_DISTANCE = PROFILE_OPTIONS.shift_reach / 3
-"""The same (px), of the first pass, above which its edges may be those of other objects: edges
-found by chance are uniform over the profiles' reach, so that their median is half of it."""
-IMPUTATION_PASSES = 6
-"""Imputations, measurement passes from machines drawn from the estimate's distribution: with some
-thirty parameters in each, the standard deviations that they enlarge are known to a twentieth."""
-MOST_BINNING = 4
-"""Largest binning, relative to the first: to images of 256 pixels, in which a machine can still be
-localized."""
-IMAGES_FOR_WIDTH = 4
-"""Images of a station from which that blur is estimated: a lens blurs all of them equally."""
-FEWEST_EDGES_TO_IDENTIFY = 24
-"""Fewest edges of a calibration: one image of a hexapod shows as many."""
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """Constants of the alternation between measurement passes and estimates."""
+
+    # measurement passes after which convergence is judged by the machine's parameters alone;
+    # refined cameras need all of them
+    passes: int = 3
+    # upper bound of the measurement passes
+    most_passes: int = 9
+    # largest change of a converged machine by a measurement pass, root mean square over the
+    # determined directions, in standard deviations. The second pass changes it by one half or one,
+    # and passes over polished legs, which measure other edges each time, by one every time. A
+    # camera that starts centimetres off and moves slowly towards its pose predicts edges that
+    # agree, but each pass changes the machine by four or more
+    settled_change: float = 2.0
+    # the same for ending after the second pass: if that changes the machine by more, a further pass
+    # reduces the remaining dependence on the starting point to a quarter
+    early_settled_change: float = 1.0
+    # median distance (px) of edges from their prediction below which a further pass changes
+    # nothing: the first pass corrects a pixel, the second the remaining effect of shading, and
+    # profiles reach ten times as far
+    settled_distance: float = PROFILE_OPTIONS.shift_reach / 10
+    # the same (px), of the first pass, above which its edges may be those of other objects: edges
+    # found by chance are uniform over the profiles' reach, so that their median is half of it
+    astray_distance: float = PROFILE_OPTIONS.shift_reach / 3
+    # imputations, measurement passes from machines drawn from the estimate's distribution, an even
+    # number: with some thirty parameters in each, the standard deviations that they enlarge are
+    # known to a twentieth
+    imputations: int = 6
+    # largest binning, relative to the first: to images of 256 pixels, in which a machine can still
+    # be localized
+    most_binning: int = 4
+    # images of a station from which a blur wider than the profiles is estimated: a lens blurs all
+    # of them equally
+    images_for_blur: int = 4
+    # fewest edges of a calibration: one image of a hexapod shows as many
+    fewest_edges: int = 24
+
+
+REFINEMENT = RefinementOptions()
+
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
 _OFF = (
     "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
@@ -105,7 +116,7 @@ class RefinementResult(NamedTuple):
     images : as they were measured, with their binning. blur : of their edges, px, by station.
     scatter : of coarse edges, see :class:`PriorScene`. start : initial state of the last estimate.
     change : of the machine by the last pass, in its standard deviations, as
-    SETTLED_MACHINE_CHANGE. failures : why imputations gave no estimate.
+    ``RefinementOptions.settled_change``. failures : why imputations gave no estimate.
     """
 
     observation: Observation
@@ -119,19 +130,20 @@ class RefinementResult(NamedTuple):
     start: State | None = None
     change: float = 0.0
     failures: tuple[str, ...] = ()
+    options: RefinementOptions = REFINEMENT
 
     @property
     def reasons(self) -> tuple[Finding, ...]:
         """A reason if the machine did not converge, and a note if imputations failed."""
         if self.failures:
             why = self.failures[0].rstrip(".")
-            failed = note(
-                "edges.passes_failed", number=len(self.failures), of=IMPUTATION_PASSES, why=why
-            )
+            of = self.options.imputations
+            failed = note("edges.passes_failed", number=len(self.failures), of=of, why=why)
             return (*self._replace(failures=()).reasons, failed)
-        if self.change < SETTLED_MACHINE_CHANGE:
+        if self.change < self.options.settled_change:
             return ()
-        return (wrong("estimate.unsettled", passes=MOST_BAD_PASSES, change=self.change),)
+        passes = self.options.most_passes
+        return (wrong("estimate.unsettled", passes=passes, change=self.change),)
 
 
 def refine_alternating(
@@ -139,6 +151,7 @@ def refine_alternating(
     cameras: CameraRefinement,
     progress: CalibrationProgress,
     lap: Callable[[str], None],
+    options: RefinementOptions = REFINEMENT,
 ) -> RefinementResult:
     """Alternate measurement passes and estimates until neither edges nor machine change.
 
@@ -146,22 +159,22 @@ def refine_alternating(
     """
     session, images, boards, _ = case
     total, machine = sum(len(p.images) for p in images), session.machine
-    estimate = _first_estimate(case, total, progress, lap)
+    estimate = _first_estimate(case, total, progress, lap, options)
     blur: BlurByStation = {}
     passes: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
     responses: tuple[ResponseEstimate, ...] = ()
     scatter, start = case.scene.scatter, estimate.state
     change = 0.0
-    for turn in range(MOST_BAD_PASSES):
-        share = 0.45 + 0.35 * min(turn / MOST_MEASUREMENT_PASSES, 0.9)
+    for turn in range(options.most_passes):
+        share = 0.45 + 0.35 * min(turn / options.passes, 0.9)
         done = _counted(progress, "Measuring edges", total, share)
         cameras = cameras.updated(estimate)
         images = [replace(p, camera=cameras.at_station(p.station)) for p in images]
         passes, images, blur = _checked_pass(
-            session, images, estimate, blur, scatter, cameras.active, done
+            session, images, estimate, blur, scatter, cameras.active, done, options
         )
-        measurements = measurements_of(session, boards, _edges(passes), cameras)
+        measurements = measurements_of(session, boards, _edges(passes, options), cameras)
         lap("observe")
         progress("Identifying", share + 0.05)
         before = estimate
@@ -169,7 +182,7 @@ def refine_alternating(
             _without_camera_changes(estimate.state),
             max(station_edges.shift for station_edges in passes),
         )
-        if turn == 0 and shifted > ASTRAY_EDGE_DISTANCE:
+        if turn == 0 and shifted > options.astray_distance:
             start = initial_guess(machine, measurements, start)
         estimate = bundle(machine, measurements, start)
         scatter *= _scatter_of(measurements.edges.coarse, estimate)
@@ -184,21 +197,21 @@ def refine_alternating(
                 ]
                 blur = {}
                 continue
-        usual = shifted < SETTLED_EDGE_DISTANCE and not cameras.active
-        last = turn + 1 >= MOST_MEASUREMENT_PASSES
+        usual = shifted < options.settled_distance and not cameras.active
+        last = turn + 1 >= options.passes
         if usual or last:
             away = (estimate.state.theta - before.state.theta)[None]
             change = float(np.sqrt(_variance(away, estimate)))
-            if change < (SETTLED_MACHINE_CHANGE if last else SETTLED_AT_ONCE):
-                finer = _binned(session, images, blur, more=False)
-                if not finer or turn + 1 == MOST_BAD_PASSES:
+            if change < (options.settled_change if last else options.early_settled_change):
+                finer = _binned(session, images, blur, options, more=False)
+                if not finer or turn + 1 == options.most_passes:
                     break
                 images = finer
                 blur = {}
     observation = observation_of(session, passes, boards, measurements, estimate, images)
     return RefinementResult(
         observation, measurements, estimate, cameras, responses, images, blur, scatter, start,
-        change,
+        change, options=options,
     )  # fmt: skip
 
 
@@ -252,21 +265,21 @@ def imputation_variance(
     follow the machines that were drawn, so they count as independent, antithetic pairs too. Edges
     of painted legs from a tripod do not depend on the prediction, and nothing is repeated.
     """
-    session, estimate = case.session, turns.estimate
+    session, estimate, options = case.session, turns.estimate, turns.options
     by_hand = any(session.stations[p.station].handheld for p in turns.images)
     if turns.start is None or not (by_hand or estimate.edge_noise.shading.max() > POLISHED_SHADING):
         return turns
     offsets: list[Array] = []
     failures: list[str] = []
-    for number, drawn in enumerate(_as_likely(session, estimate, rng)):
-        progress(f"Looking by a machine as likely: {number + 1} of {IMPUTATION_PASSES}", 0.87)
+    for number, drawn in enumerate(_as_likely(session, estimate, options.imputations, rng)):
+        progress(f"Looking by a machine as likely: {number + 1} of {options.imputations}", 0.87)
         cameras = turns.cameras.updated(drawn)
         images = [replace(p, camera=cameras.at_station(p.station)) for p in turns.images]
         try:
             passes = _measurement_pass(
                 session, images, drawn, turns.blur, turns.scatter, cameras.active
             )
-            measurements = measurements_of(session, case.boards, _edges(passes), cameras)
+            measurements = measurements_of(session, case.boards, _edges(passes, options), cameras)
             ended = bundle(session.machine, measurements, _without_camera_changes(drawn.state))
         except (PkmcalError, np.linalg.LinAlgError) as error:
             failures.append(str(error))
@@ -282,9 +295,9 @@ def imputation_variance(
 
 
 def _as_likely(
-    session: Session, estimate: Estimate, rng: np.random.Generator
+    session: Session, estimate: Estimate, count: int, rng: np.random.Generator
 ) -> Iterator[Estimate]:
-    """Draws from the estimate's distribution, in antithetic pairs.
+    """``count`` draws from the estimate's distribution, in antithetic pairs.
 
     Machine, stations and cameras are drawn; the platform's poses are by forward kinematics of the
     readings.
@@ -292,7 +305,7 @@ def _as_likely(
     assembled, info = estimate.linearized
     problem, half = info.problem, info.root[0]
     still = np.zeros((1, assembled.observed.sum(), problem.layout.own_motion.shape[1]))
-    for step in rng.normal(size=(IMPUTATION_PASSES // 2, half.shape[1])) @ half.T:
+    for step in rng.normal(size=(count // 2, half.shape[1])) @ half.T:
         for away in (step, -step):
             shifted = problem.retract(info.state, away[None], still)
             there = state_of(assembled, shifted, estimate.state)
@@ -352,6 +365,7 @@ def _checked_pass(
     scatter: float,
     refine: bool,
     done: legs.ImageBatchesInUse,
+    options: RefinementOptions,
 ) -> tuple[list[legs.StationEdges], Sequence[StationImages], BlurByStation]:
     """Measurement pass, its images and their blur, by station.
 
@@ -363,8 +377,8 @@ def _checked_pass(
     blur_by_station = _blur_of(passes, images)
     # few of the localized edges can be measured: they may be too blurred
     if sum(len(one.edges) for one in passes) < FEW * len(estimate.edge_weights):
-        blur_by_station |= _width_of_edges(images, estimate)
-    while coarser := _binned(session, images, blur_by_station, more=True):
+        blur_by_station |= _width_of_edges(images, estimate, options.images_for_blur)
+    while coarser := _binned(session, images, blur_by_station, options, more=True):
         images = coarser
         passes = measure(images, blur={})
         blur_by_station = _blur_of(passes, images)
@@ -378,13 +392,15 @@ def _blur_of(
     return {p.station: edges.blur for p, edges in zip(images, passes, strict=True)}
 
 
-def _width_of_edges(images: Sequence[StationImages], estimate: Estimate) -> dict[int, float]:
-    """Blur (px) by station, from the width of the edges in some images: profiles determine no blur
-    that is wider than themselves. Stations whose edges do not determine it are absent.
+def _width_of_edges(
+    images: Sequence[StationImages], estimate: Estimate, count: int
+) -> dict[int, float]:
+    """Blur (px) by station, from the width of the edges in ``count`` images: profiles determine no
+    blur that is wider than themselves. Stations whose edges do not determine it are absent.
     """
     out: dict[int, float] = {}
     for p in images:
-        few = p.select(p.spread(IMAGES_FOR_WIDTH))
+        few = p.select(p.spread(count))
         T = estimate.state.T_camera_base[p.station]
         poses = estimate.state.T_base_platform[few.configuration]
         blur = quality(few, estimate.machine, T, poses).blur
@@ -397,6 +413,7 @@ def _binned(
     session: Session,
     images: Sequence[StationImages],
     blur: BlurByStation,
+    options: RefinementOptions,
     *,
     more: bool,
 ) -> list[StationImages]:
@@ -412,7 +429,7 @@ def _binned(
     out: list[StationImages] = []
     for file, p in zip(files, images, strict=True):
         binning = legs.sharp_binning(p.binning, float(np.median(of_camera[file])))
-        most = MOST_BINNING * legs.first_binning(p.camera.image_size)
+        most = options.most_binning * legs.first_binning(p.camera.image_size)
         wanted = max(binning, p.binning) if more else min(binning, p.binning)
         out.append(replace(p, binning=min(wanted, most)))
     changed = any(one.binning != p.binning for one, p in zip(out, images, strict=True))
@@ -462,6 +479,7 @@ def identify_poses(
     T_camera_base: Array,
     cameras: CameraRefinement,
     progress: CalibrationProgress,
+    options: RefinementOptions = REFINEMENT,
 ) -> RefinementResult:
     """Identification by boards, trackers and links alone.
 
@@ -473,13 +491,13 @@ def identify_poses(
     start = start_state(machine, measurements, T_camera_base, session.forward)
     start = _feasible_start(session, measurements, start)
     estimate = bundle(machine, measurements, start)
-    for turn in range(1, MOST_MEASUREMENT_PASSES if cameras.active else 1):
-        progress("Identifying with the cameras", 0.6 + 0.3 * turn / MOST_MEASUREMENT_PASSES)
+    for turn in range(1, options.passes if cameras.active else 1):
+        progress("Identifying with the cameras", 0.6 + 0.3 * turn / options.passes)
         cameras = cameras.updated(estimate)
         measurements = measurements_of(session, boards, None, cameras)
         estimate = bundle(machine, measurements, _without_camera_changes(estimate.state))
     observation = observation_of(session, [], boards, measurements, estimate)
-    return RefinementResult(observation, measurements, estimate, cameras)
+    return RefinementResult(observation, measurements, estimate, cameras, options=options)
 
 
 def _feasible_start(session: Session, measurements: Measurements, start: State) -> State:
@@ -510,7 +528,11 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
 
 
 def _first_estimate(
-    case: Case, total: int, progress: CalibrationProgress, lap: Callable[[str], None]
+    case: Case,
+    total: int,
+    progress: CalibrationProgress,
+    lap: Callable[[str], None],
+    options: RefinementOptions,
 ) -> Estimate:
     """Estimate by whole legs, to a pixel.
 
@@ -537,7 +559,7 @@ def _first_estimate(
         done = _counted(progress, text, total, share)
         search = partial(_whole_legs, scene=scene, reach=reach, done=done)
         passes = _search_pass(images, search)
-        measurements = measurements_of(session, boards, _edges(passes))
+        measurements = measurements_of(session, boards, _edges(passes, options))
         lap("observe")
         start = start or begin(measurements)
         estimate = bundle(session.machine, measurements, start)
@@ -626,25 +648,27 @@ def _scatter_of(coarse: Booleans, estimate: Estimate) -> float:
 def _search_pass(
     images: Sequence[StationImages],
     measure: Callable[[Sequence[StationImages]], list[legs.StationEdges]],
+    cached_bytes: float = CACHED_IMAGE_BYTES,
 ) -> list[legs.StationEdges]:
     """Edges of all stations, repeats combined.
 
     Stations are measured together, or in parallel where their images must be decoded, which
-    releases the interpreter's lock.
+    releases the interpreter's lock: those that need more than ``cached_bytes`` bytes.
     """
     pixels = sum(np.prod(p.camera.image_size) * len(p.images) for p in images)
-    if pixels <= CACHED_IMAGE_BYTES:
+    if pixels <= cached_bytes:
         return [combine_repeats(one) for one in measure(images)]
     with ThreadPoolExecutor(THREADS) as pool:
         return [combine_repeats(one) for (one,) in pool.map(measure, ([p] for p in images))]
 
 
-def _edges(passes: list[legs.StationEdges]) -> EdgeSet:
+def _edges(passes: list[legs.StationEdges], options: RefinementOptions) -> EdgeSet:
+    """Edges of a measurement pass; raises `ResultError` for too few to identify a machine."""
     edges = concatenate([station_edges.edges for station_edges in passes])
-    if len(edges) < FEWEST_EDGES_TO_IDENTIFY:
+    if len(edges) < options.fewest_edges:
         raise ResultError(
             f"only {len(edges)} edges of legs were found in all images",
-            expected=f"at least {FEWEST_EDGES_TO_IDENTIFY}",
+            expected=f"at least {options.fewest_edges}",
             next_step="Look whether the images show the legs sharply and brightly enough",
         )
     return edges
@@ -668,14 +692,20 @@ def observation_of(
     for k, station in enumerate(session.stations):
         binning[k] = of_camera.get(station.camera_file, 1)
     in_view = legs.joined_passes(passes, float("nan"), float("nan"))
-    given_up = np.flatnonzero(estimate.edge_weights < INLIER_WEIGHT).tolist()
+    outliers = np.flatnonzero(estimate.edge_weights < INLIER_WEIGHT).tolist()
+    # images of which most edges were rejected
+    images_as_wholes = tuple(
+        Rejection(unit.station, unit.configuration, -1, -1, -1, _IMAGE_OFF)
+        for unit in rejected_units(measurements, estimate)
+        if unit.is_image
+    )
     return Observation(
         edges=in_view.edges,
         rejected=in_view.rejected
         + boards.rejected
-        + tuple(in_view.edges.rejection(k, _OUTLIER) for k in given_up)
-        + _images_given_up(measurements, estimate)
-        + _poses_given_up(session, measurements, estimate),
+        + tuple(in_view.edges.rejection(k, _OUTLIER) for k in outliers)
+        + images_as_wholes
+        + _rejected_poses(session, measurements, estimate),
         points=in_view.points,
         point_edge=in_view.point_edge,
         T_camera_base=estimate.state.T_camera_base,
@@ -684,16 +714,7 @@ def observation_of(
     )
 
 
-def _images_given_up(measurements: Measurements, estimate: Estimate) -> tuple[Rejection, ...]:
-    """Images of which most edges were rejected, as wholes."""
-    return tuple(
-        Rejection(unit.station, unit.configuration, -1, -1, -1, _IMAGE_OFF)
-        for unit in rejected_units(measurements, estimate)
-        if unit.is_image
-    )
-
-
-def _poses_given_up(
+def _rejected_poses(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[Rejection, ...]:
     """Poses that do not fit the rest, with how far they lie off."""

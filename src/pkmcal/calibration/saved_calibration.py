@@ -389,7 +389,10 @@ def load(source: Path | str) -> SavedCalibration:
     document = _read(Path(source))
     saved = validated_document(document, _Saved)
     # consistency of machine, poses, readings and covariance
-    machine = checked_machine(_mechanism(saved), document, "mechanism")
+    mechanism = saved.mechanism
+    if not any(p.name.endswith(".scale") for p in saved.parameters):
+        mechanism = with_exact_scales(mechanism)  # written before scales were parameters
+    machine = checked_machine(mechanism, document, "mechanism")
     _check_parameters(document, saved, machine)
     for group, key in (
         ("stations", "T_base_camera"),
@@ -458,14 +461,6 @@ def _verdict(saved: _Verdict) -> Verdict:
                 )
             )
     return Verdict(saved.usable, saved.headline, tuple(findings))
-
-
-def _mechanism(saved: _Saved) -> MechanismDocument:
-    """Mechanism document; with exact scales if the file is from before scales were parameters."""
-    mechanism = saved.mechanism
-    if any(p.name.endswith(".scale") for p in saved.parameters):
-        return mechanism
-    return with_exact_scales(mechanism)
 
 
 def _read(source: Path) -> Document:

@@ -23,19 +23,28 @@ from pkmcal.mechanisms.workspace import ROUGH_EFFORT, Limits, reachable
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-TOOL_MAP_POSES = 250
-"""Number of poses spread over the region, from which figures are computed."""
-CELLS_ALONG_SLICE = 20
-"""Number of cells along the longer side of a slice."""
-SLICE_HEIGHT_SHARES = (0.15, 0.5, 0.85)
-"""Heights of the slices, as shares of the range of those poses."""
-SLICE_MARGIN_SHARE = 0.08
-"""Extension of the slices beyond those poses to either side, as a share of their range."""
-LEAST_CELLS, LEAST_FILLED_SHARE = 3, 0.4
-"""Fewest rows and columns of cells, and smallest share of reachable cells among these, for a
-slice: a platform that can only shift as it rotates has one orientation in few places."""
-MOST_OFF_CELL_MIDDLE = 0.25
-"""Largest distance, in cells, by which rods and axes may put a pose off its cell's middle."""
+
+@dataclass(frozen=True)
+class ToolMapOptions:
+    """Constants of a map of the tool's errors."""
+
+    # poses spread over the region, from which figures are computed
+    poses: int = 250
+    # cells along the longer side of a slice
+    cells: int = 20
+    # heights of the slices, as shares of the range of those poses
+    heights: tuple[float, ...] = (0.15, 0.5, 0.85)
+    # extension of the slices beyond those poses to either side, as a share of their range
+    margin: float = 0.08
+    # fewest rows and columns of cells, and smallest share of reachable cells among these, for a
+    # slice: a platform that can only shift as it rotates has one orientation in few places
+    least_cells: int = 3
+    least_filled: float = 0.4
+    # largest distance, in cells, by which rods and axes may put a pose off its cell's middle
+    most_off_middle: float = 0.25
+
+
+_OPTIONS = ToolMapOptions()
 
 
 @dataclass(frozen=True)
@@ -131,7 +140,7 @@ def map_of(
     """
     region = region or Region()
     limits = calibrated.limits()
-    even = poses_in(limits, region, TOOL_MAP_POSES)
+    even = poses_in(limits, region, _OPTIONS.poses)
     slices, more = _slices(limits, region, even)
     poses = np.concatenate([even, *more])
     table = calibrated.parameters
@@ -170,14 +179,14 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
     places = even[:, :3, 3]
     low, high = places.min(axis=0), places.max(axis=0)
     wide = high - low
-    box = low - SLICE_MARGIN_SHARE * wide, high + SLICE_MARGIN_SHARE * wide
+    box = low - _OPTIONS.margin * wide, high + _OPTIONS.margin * wide
     flat = wide <= NEGLIGIBLE * wide.max()
     middle = (low + high) / 2
     if flat[2]:
         # a planar machine has one horizontal slice
         planes = [(0, 1, float(middle[2]))]
     else:
-        planes = [(0, 1, float(low[2] + share * wide[2])) for share in SLICE_HEIGHT_SHARES]
+        planes = [(0, 1, float(low[2] + share * wide[2])) for share in _OPTIONS.heights]
         across = int(np.argmax(wide[:2]))
         planes.append((across, 2, float(middle[1 - across])))
     out: list[Slice] = []
@@ -190,7 +199,10 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
         there = made.rows >= 0
         rows, columns = there.any(axis=1).sum(), there.any(axis=0).sum()
         # keep slices that the machine fills sufficiently
-        if min(rows, columns) >= LEAST_CELLS and len(taken) >= LEAST_FILLED_SHARE * rows * columns:
+        if (
+            min(rows, columns) >= _OPTIONS.least_cells
+            and len(taken) >= _OPTIONS.least_filled * rows * columns
+        ):
             out.append(made)
             poses.append(taken)
             first += len(taken)
@@ -212,7 +224,7 @@ def _slice(
     """
     across, up, level = plane
     low, high = box
-    cell = max(high[across] - low[across], high[up] - low[up]) / CELLS_ALONG_SLICE
+    cell = max(high[across] - low[across], high[up] - low[up]) / _OPTIONS.cells
     u, v = (
         low[k] + cell * (np.arange(max(round((high[k] - low[k]) / cell), 1)) + 0.5)
         for k in (across, up)
@@ -224,7 +236,7 @@ def _slice(
     closed = on_manifold(limits.layout, limits.theta, wanted, ROUGH_EFFORT.newton)
     there = closed.T_base_platform
     off = pose_difference(there, wanted)
-    good = closed.converged & (np.linalg.norm(off[:, 3:], axis=1) < MOST_OFF_CELL_MIDDLE * cell)
+    good = closed.converged & (np.linalg.norm(off[:, 3:], axis=1) < _OPTIONS.most_off_middle * cell)
     good &= np.linalg.norm(off[:, :3], axis=1) < TRANSLATION_TURN
     good &= reachable(limits, there).inside & region.holds(limits, wanted)
     rows = np.full(len(good), -1)

@@ -214,9 +214,7 @@ def calibrate_camera(
     views = views_of(used, board)
     # Choose the model and its coefficients on a subset of the corners.
     selection = options.selection
-    pool = camera_candidates(
-        thinned(views, selection), image_size, tuple(DISTORTION_CANDIDATES), selection
-    )
+    pool = camera_candidates(thinned(views, selection), image_size, selection.models, selection)
     mine = tuple(c for c in pool if model in ("auto", c.model))
     if not mine:
         raise no_fit(model, pool)

@@ -39,6 +39,8 @@ width."""
 class ModelSelectionOptions:
     """Constants of the selection of a camera model and its coefficients."""
 
+    # camera models that are compared, a requested one among them
+    models: tuple[str, ...] = ("pinhole", "fisheye", "unified")
     # focal lengths of the grid, in geometric steps over the range
     focals: int = 16
     # values of xi of the grid

@@ -239,23 +239,12 @@ def _check_images(
     calibration.
     """
     whole = [p for p in images if p is not None]
-
-    def unsearched() -> tuple[StationCheck, ...]:
-        """Checks of stations in which the machine cannot be searched for."""
-        n_legs, observed = session.machine.n_legs, zip(session.stations, images, strict=True)
-        return tuple(
-            _station_check(
-                station, unlocalized_quality(p.images if p else [], n_legs), recognised=False
-            )
-            for station, p in observed
-        )
-
     try:
         check_observable(session)
     except InputError as error:
-        return _ImageChecks(unsearched(), (of_error(error),))
+        return _ImageChecks(_unsearched(session, images), (of_error(error),))
     if poses is None or len(whole) < len(legs_stations(session)):
-        return _ImageChecks(unsearched(), ())
+        return _ImageChecks(_unsearched(session, images), ())
     # Broken images have been reported already.
     lost = any(len(p.images) < len(session.stations[p.station].images) for p in whole)
     boards = BoardsCheck()
@@ -263,7 +252,7 @@ def _check_images(
         boards = look_for_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
-        return _ImageChecks(unsearched(), boards.findings)
+        return _ImageChecks(_unsearched(session, images), boards.findings)
     turn_findings = () if lost else pose_findings(session, boards.boards)
     located = localize(  # with the random numbers of `calibrate`
         session,
@@ -289,30 +278,57 @@ def _check_images(
         findings += settled.findings
         heights = settled.case.session.heights_alone
         findings += _height_findings(settled) if heights else _pose_scale_findings(settled)
-    stations = [  # default for stations that observe no legs
-        StationCheck(station.name, len(station.images), k in boards.checks)
-        for k, station in enumerate(session.stations)
-    ]
-    places = _search_results(session, whole, located)
     # A rejected station on a tripod was recognized, and its quality may explain the rejection.
     rejected_names = {one.station.name for one in rejected if one.station.handheld}
     if isinstance(case, PkmcalError):  # no hand-held image was localized then
         rejected_names = {station.name for station in session.stations if station.handheld}
+    localized = _search_results(session, whole, located)
+    stations, inspection = _searched(session, whole, poses, localized, boards, rejected_names)
+    return _ImageChecks(stations, tuple(findings), inspection)
+
+
+def _unsearched(session: Session, images: list[StationImages | None]) -> tuple[StationCheck, ...]:
+    """Checks of stations in which the machine cannot be searched for."""
+    n_legs, observed = session.machine.n_legs, zip(session.stations, images, strict=True)
+    return tuple(
+        _station_check(
+            station, unlocalized_quality(p.images if p else [], n_legs), recognised=False
+        )
+        for station, p in observed
+    )
+
+
+def _searched(
+    session: Session,
+    images: list[StationImages],
+    poses: Array,
+    localized: dict[int, LocalizedPose],
+    boards: BoardsCheck,
+    rejected: set[str],
+) -> tuple[tuple[StationCheck, ...], Inspection | None]:
+    """Checks of all stations after the search for the machine, and the images of those with a
+    pose.
+
+    localized : poses by station. rejected : names of the stations whose pose is not accepted.
+    """
+    stations = [  # default for stations that observe no legs
+        StationCheck(station.name, len(station.images), k in boards.checks)
+        for k, station in enumerate(session.stations)
+    ]
     parts: list[StationInspection] = []
-    for p in whole:
-        if p.station not in places:  # the search ended at the fault of another station
+    for p in images:
+        if p.station not in localized:  # the search ended at the fault of another station
             summary = unlocalized_quality(p.images, session.machine.n_legs)
             stations[p.station] = _station_check(
                 session.stations[p.station], summary, recognised=False
             )
             continue
-        pose = places[p.station]
-        recognised = pose.good and stations[p.station].name not in rejected_names
-        stations[p.station], station_edges = _check_station(session, p, pose, poses, recognised)
-        parts.append(station_edges)
-    stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
-    station_edges = Inspection(session, poses, tuple(parts)) if parts else None
-    return _ImageChecks(stations, tuple(findings), station_edges)
+        pose = localized[p.station]
+        recognised = pose.good and stations[p.station].name not in rejected
+        stations[p.station], part = _check_station(session, p, pose, poses, recognised)
+        parts.append(part)
+    checks = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
+    return checks, Inspection(session, poses, tuple(parts)) if parts else None
 
 
 def _calibration_start(
@@ -449,6 +465,7 @@ def _unseen_border(one: StationBoard) -> str:
 
 
 def _board_check(one: StationBoard) -> BoardCheck:
+    """Figures of a board in a station's images."""
     views, stood = one.views, one.stood
     return BoardCheck(
         found=len(views.numbers),

@@ -44,17 +44,19 @@ def read_text(path: Path, label: str | None = None, largest: int = LARGEST_TEXT_
     return "".join(text_blocks(path, label or path.name, largest))
 
 
-def text_blocks(path: Path, label: str, largest: int = LARGEST_TEXT_FILE) -> Iterator[str]:
-    """Text of a UTF-8 file in blocks of whole lines of some TEXT_BLOCK_BYTES bytes each, so that a
+def text_blocks(
+    path: Path, label: str, largest: int = LARGEST_TEXT_FILE, block_bytes: int = TEXT_BLOCK_BYTES
+) -> Iterator[str]:
+    """Text of a UTF-8 file in blocks of whole lines of some ``block_bytes`` bytes each, so that a
     table of many megabytes does not have to fit into memory.
     """
     lines, mark = 0, "\ufeff"
-    for raw in _raw_blocks(path, label, largest):
+    for raw in _raw_blocks(path, label, largest, block_bytes):
         yield _decoded(raw, label, lines).removeprefix(mark)
         lines, mark = lines + raw.count(b"\n"), ""
 
 
-def _raw_blocks(path: Path, label: str, largest: int) -> Iterator[bytes]:
+def _raw_blocks(path: Path, label: str, largest: int, block_bytes: int) -> Iterator[bytes]:
     """Bytes of a file, cut after line ends of any kind."""
     try:
         check_replaced(path.parent)
@@ -69,7 +71,7 @@ def _raw_blocks(path: Path, label: str, largest: int) -> Iterator[bytes]:
                     expected=f"at most {largest}",
                 )
             rest: list[bytes] = []
-            while block := stream.read(TEXT_BLOCK_BYTES):
+            while block := stream.read(block_bytes):
                 # a carriage return at the end may be half of a line end
                 end = max(block.rfind(b"\n"), block.rfind(b"\r", 0, -1)) + 1
                 if end:

@@ -23,7 +23,7 @@ from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.levels import ROUNDING
 from pkmcal.measurements import Column
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.solver.elimination import divisions, rows_on_shared
+from pkmcal.solver.elimination import rows_on_shared
 from pkmcal.solver.ranks import column_space
 
 POINTS_OVER_BED = 60
@@ -198,9 +198,7 @@ def _rows_beside(estimate: Estimate, uneven: Sequence[Column]) -> tuple[Array, A
     root = prior_root(uneven)
     machine, count = problem.unknowns.columns("machine"), problem.unknowns.count
     parts: list[tuple[Array, Array]] = []
-    for cut, piece in zip(
-        divisions(*problem.extent), Information(problem, state).pieces(), strict=True
-    ):
+    for cut, piece in zip(problem.cuts, Information(problem, state).pieces(), strict=True):
         linear = piece.linear
         own, value = eliminate_beside(linear, columns(cut, linear) @ root)
         parts.append((own.reshape(-1, own.shape[-1]), value.ravel()))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -211,7 +212,13 @@ def solve_batch(
         )
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
         if scale_noise and scale_readings and fit.scale.poses.min() <= hopeless:
-            by_data = _readings_speak(fit)
+            # The readings' noise is estimated where the data contradict the stated one, or where
+            # nothing else was measured, so that it is only the unit of all standard deviations.
+            noise = fit.reading_noise
+            alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
+            by_data = noise.contradicts() | (
+                alone & (noise.freedom(noise.best) > LEAST_NOISE_FREEDOM)
+            )
             if by_data.any():
                 fit = settle(fit, hopeless=hopeless, by_data=by_data)
     return fit
@@ -232,62 +239,32 @@ def _settle(
     by_data : (B,) runs whose readings' noise is estimated instead of stated.
     least : lower bound of the lines' shading, px.
     """
-    estimates_shading = scale_noise and fit.info.problem.shading.size > 0
     by_tube = scale_noise and robust and bool(fit.info.problem.blocks.n_effective.any())
     previous_factor = made = np.zeros(len(by_data))  # of the readings' noise, in the last round
     nearly = False
     for number in range(options.most_rounds):
-        problem, state, weight = fit.info.problem, fit.info.state, fit.weight
-        scale, edges, irls_weight = fit.scale, fit.edges, fit.irls_weight
+        noise = _Noise.of(fit)
         if scale_noise:
-            scale = Kinds(
-                np.ones_like(scale.edges),
-                _scale_of(fit, fit.scale.poses, POSE_ROWS_KIND),
-                _scale_of(fit, fit.scale.links, LINK_ROWS_KIND),
-            )
-            if scale.poses.min() > hopeless:
-                return replace(fit, scale=scale)
-            edges = _edges(fit, by_tube, number, options)
-            problem = replace(problem, data=edges.applied(problem.blocks, problem.data))
+            noise = noise.with_scales(fit)
+            if noise.scale.poses.min() > hopeless:
+                return replace(fit, scale=noise.scale)
             previous_factor, made = _readings_step(fit, by_data, previous_factor, made, options)
-        shading = problem.shading
-        if estimates_shading:
-            shading = _shading_of(fit, least, options.line_shading)
-        if number >= options.first_paced_round:
-            shading = np.maximum(
-                problem.shading * (shading / problem.shading) ** options.scatter_pace, least
-            )
-        if robust:
-            rows = problem.unweighted(state)
-            distance = norms(problem, rows)
-            poses = innovations(fit.info, distance.poses, weight.poses, scale.poses)
-            weight = settled_weights(distance._replace(poses=poses), scale)
-            if by_tube:
-                irls_weight = edges.irls_weight(problem.blocks, np.sum(rows.edges**2, axis=-1))
-        change = (shading - problem.shading) / np.maximum(problem.shading, SHADING_SIGMA)
-        shading_free = np.abs(change).max(initial=0.0) < options.shading_change
-        readings = problem.joint_noise
+            noise = noise.with_edges(fit, by_tube, number, least, options)
         if by_data.any():
-            readings = problem.joint_noise_times(np.where(by_data, np.exp(made), 1.0), state)
-        readings_free = np.abs(readings / problem.joint_noise - 1).max() < options.scale_change
-        edges_free = edges.close_to(
-            fit.edges, options.shading_change if by_tube else options.scale_change
-        )
-        all_free = shading_free and readings_free and edges_free
-        if all_free and _settled(scale, fit.scale, weight, fit.weight, options.scale_change):
+            noise = noise.with_readings(fit, np.where(by_data, np.exp(made), 1.0))
+        weight, irls_weight = fit.weight, fit.irls_weight
+        if robust:
+            weight, irls_weight = _weights(fit, noise, by_tube)
+        if noise.close_to(fit, by_tube, options) and _settled(
+            noise.scale, fit.scale, weight, fit.weight, options.scale_change
+        ):
             break
-        if estimates_shading:
-            state = problem.with_shading_units(state, shading)
-            problem = problem.shaded(shading)
-        problem = replace(problem, joint_noise=readings)
-        steps = fit.solution.steps
         fit = _solved(
-            problem,
-            state,
+            *noise.applied(fit.info.state),
             weight,
-            scale,
-            steps,
-            edges,
+            noise.scale,
+            fit.solution.steps,
+            noise.edges,
             irls_weight,
             fit.stated,
             options.nearly_solved,
@@ -301,6 +278,83 @@ def _settle(
         fit.info.problem, fit.info.state, fit.solution.steps, STEP_TOLERANCE, options
     )
     return replace(fit, solution=solution, info=info)
+
+
+class _Noise(NamedTuple):
+    """Noise of the next round, by the residuals of a solution.
+
+    problem : of the solution, with the edges' new noise. scale : of poses and links. shading :
+    (B, lines) px. readings : standard deviations of the readings.
+    """
+
+    problem: Problem
+    scale: Kinds[Array]
+    edges: EdgeScatter
+    shading: Array
+    readings: Array
+
+    @classmethod
+    def of(cls, fit: BatchResult) -> _Noise:
+        """Noise with which a solution was computed."""
+        problem = fit.info.problem
+        return cls(problem, fit.scale, fit.edges, problem.shading, problem.joint_noise)
+
+    def with_scales(self, fit: BatchResult) -> _Noise:
+        """With the scales that the residuals of poses and links require."""
+        poses = _scale_of(fit, fit.scale.poses, POSE_ROWS_KIND)
+        links = _scale_of(fit, fit.scale.links, LINK_ROWS_KIND)
+        return self._replace(scale=Kinds(np.ones_like(fit.scale.edges), poses, links))
+
+    def with_edges(
+        self, fit: BatchResult, by_tube: bool, number: int, least: Array, options: BatchOptions
+    ) -> _Noise:
+        """With the noise and the shading that the residuals of edges require; from a certain round
+        on, shading changes by a part of that only.
+        """
+        edges = _edges(fit, by_tube, number, options)
+        problem = replace(self.problem, data=edges.applied(self.problem.blocks, self.problem.data))
+        shading = problem.shading
+        if shading.size:
+            shading = _shading_of(fit, least, options.line_shading)
+        if number >= options.first_paced_round:
+            pace = (shading / problem.shading) ** options.scatter_pace
+            shading = np.maximum(problem.shading * pace, least)
+        return self._replace(problem=problem, edges=edges, shading=shading)
+
+    def with_readings(self, fit: BatchResult, factor: Array) -> _Noise:
+        """With the readings' noise times a factor (B,)."""
+        return self._replace(readings=self.problem.joint_noise_times(factor, fit.info.state))
+
+    def close_to(self, fit: BatchResult, by_tube: bool, options: BatchOptions) -> bool:
+        """Whether the noise of edges, lines and readings is nearly that of a solution."""
+        before = fit.info.problem
+        change = (self.shading - before.shading) / np.maximum(before.shading, SHADING_SIGMA)
+        most = options.shading_change if by_tube else options.scale_change
+        return (
+            np.abs(change).max(initial=0.0) < options.shading_change
+            and np.abs(self.readings / before.joint_noise - 1).max() < options.scale_change
+            and self.edges.close_to(fit.edges, most)
+        )
+
+    def applied(self, state: BatchState) -> tuple[Problem, BatchState]:
+        """The problem with this noise, and the state in its units of shading."""
+        problem = self.problem
+        if not np.array_equal(self.shading, problem.shading):
+            state = problem.with_shading_units(state, self.shading)
+            problem = problem.shaded(self.shading)
+        return replace(problem, joint_noise=self.readings), state
+
+
+def _weights(fit: BatchResult, noise: _Noise, by_tube: bool) -> tuple[Kinds[Array], Array]:
+    """Weights by a solution's residuals and the noise, and those of the edges' IRLS."""
+    problem, irls_weight = noise.problem, fit.irls_weight
+    rows = problem.unweighted(fit.info.state)
+    distance = norms(problem, rows)
+    poses = innovations(fit.info, distance.poses, fit.weight.poses, noise.scale.poses)
+    weight = settled_weights(distance._replace(poses=poses), noise.scale)
+    if by_tube:
+        irls_weight = noise.edges.irls_weight(problem.blocks, np.sum(rows.edges**2, axis=-1))
+    return weight, irls_weight
 
 
 def _readings_step(
@@ -322,15 +376,6 @@ def _readings_step(
     )
     pace = np.where(shrinks, made / np.where(shrinks, before - log_factor, 1.0), 1.0)
     return log_factor, log_factor * np.clip(pace, 1.0, options.furthest_noise_pace)
-
-
-def _readings_speak(fit: BatchResult) -> Booleans:
-    """Runs (B,) whose readings' noise is estimated: where the data contradict the stated one, or
-    where nothing else was measured, so that it is only the unit of all standard deviations.
-    """
-    noise = fit.reading_noise
-    alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
-    return noise.contradicts() | (alone & (noise.freedom(noise.best) > LEAST_NOISE_FREEDOM))
 
 
 def _settled(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers, short_repr
+from pkmcal.arrays import Array, short_repr
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.identify.gauge import BestFit, generators, projector
 from pkmcal.mechanisms import Machine
@@ -68,10 +68,11 @@ def joint_centres(nominal: Machine, calibrated: Machine, covariance: Array) -> t
     results: list[Centres] = []
     for side, old, new, by, index in sides:
         over = laid_over(np.array(old), np.array(new))
-        centre_covariance = _spread(by, index, covariance)
-        results.append(
-            Centres(side, np.array(new), apply(over, np.array(old)), over, centre_covariance)
-        )
+        # derivatives (L, 3, n) by the parameters at index (L, n), as (3L, P); P stands for none
+        n = len(covariance)
+        flat = (by @ np.eye(n + 1)[index, :n]).reshape(-1, n)
+        placed = apply(over, np.array(old))
+        results.append(Centres(side, np.array(new), placed, over, flat @ covariance @ flat.T))
     return tuple(results)
 
 
@@ -99,10 +100,3 @@ def laid_over(source: Array, target: Array) -> Array:
 def _ends(machine: Machine) -> LimbEnds:
     """Ends of all limbs at the middle readings, with both frames at the same place."""
     return limb_ends(machine.layout, machine.values, machine.middle_readings(), np.eye(4))
-
-
-def _spread(by: Array, index: Integers, covariance: Array) -> Array:
-    """Covariance (3L, 3L) of points with derivatives (L, 3, n) by the parameters at (L, n)."""
-    n = len(covariance)
-    flat = (by @ np.eye(n + 1)[index, :n]).reshape(-1, n)
-    return flat @ covariance @ flat.T

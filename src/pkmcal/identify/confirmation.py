@@ -37,7 +37,6 @@ from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.rows import Kinds
-from pkmcal.solver.elimination import divisions
 from pkmcal.solver.kernels import INLIER_WEIGHT, NO_WEIGHT_DISTANCE, final_loss
 
 NORMAL_RIDGE = 1e-12
@@ -227,7 +226,7 @@ class _Cases(NamedTuple):
         # normal equations of the estimate
         value, rows = problem.prior_values(state)[0] - problem.prior_target, problem.prior
         base = _Normal((rows.T @ rows)[None], (rows.T @ value)[None], np.sum(value**2)[None])
-        for cut in divisions(*problem.extent):
+        for cut in problem.cuts:
             part = _normal_equations(problem.among(cut), problem.state_among(state, cut))
             base = base.plus(_Normal(*(x.sum(axis=0, keepdims=True) for x in part)))
         # weights in use, and losses of rejected measurements
@@ -279,7 +278,7 @@ class _Cases(NamedTuple):
         """
         if not (self.row != IMAGE_ROW).any():
             return
-        for cut in divisions(*self.problem.extent):
+        for cut in self.problem.cuts:
             part, there = self.problem.among(cut), self.problem.state_among(state, cut)
             before = _normal_equations(part, there)
             weights = Kinds(*(kind.weight for kind in part.kinds))

@@ -37,7 +37,6 @@ from pkmcal.solver.elimination import (
     Linear,
     Reduced,
     condensed,
-    divisions,
     eliminate,
     rows_on_shared,
 )
@@ -83,7 +82,7 @@ class Information:
 
         Rows on shared unknowns only are in every part. A small problem is its own single part.
         """
-        cuts = divisions(self.state.T_base_platform.shape[1], self.problem.n_rows)
+        cuts = self.problem.cuts
         if len(cuts) < 2:
             yield self
             return

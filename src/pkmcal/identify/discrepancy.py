@@ -368,7 +368,7 @@ def _products(assembled: Assembled, info: Information, listed: Sequence[Column])
     squared, by_basis, value = np.zeros((n, n)), np.zeros((n, basis.shape[1])), np.zeros(n)
     in_basis, remainder, own_scale = np.zeros(basis.shape[1]), 0.0, 0.0
     configurations, n_rows = problem.extent
-    for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS):
+    for cut in divisions(configurations, n_rows * COLUMNS_BY_UNKNOWNS, problem.rows_at_once):
         piece = Information(problem.among(cut), problem.state_among(info.state, cut))
         linear = piece.linear
         rows, residuals = eliminate_beside(linear, columns(cut, linear))

@@ -24,7 +24,6 @@ from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.robust import as_pairs
 from pkmcal.measurements.rows import Kinds
-from pkmcal.solver.elimination import divisions
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.strips import eliminate_strips
 
@@ -44,7 +43,7 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
     if not rejected.any():
         return distance
     out, factor, count = distance.copy(), as_pairs(kind), info.problem.layout.n_equations
-    for cut in divisions(*info.problem.extent):
+    for cut in info.problem.cuts:
         part, state = info.problem.among(cut), info.problem.state_among(info.state, cut)
         # R and W by the weighted rows
         used = eliminate_strips(part.compact(state), np.zeros(len(state.z)))

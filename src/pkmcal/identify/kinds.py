@@ -13,7 +13,7 @@ from pkmcal.arrays import Array
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements.readings import joint_rows
-from pkmcal.solver.elimination import divisions, flat
+from pkmcal.solver.elimination import flat
 from pkmcal.solver.strips import Compact, Eliminated, eliminate_strips
 
 EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND = range(4)
@@ -63,7 +63,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     trace, normal = np.zeros((n_runs, ROWS_KINDS)), np.zeros((n_runs, ROWS_KINDS, na, na))
     every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, ROWS_KINDS))
     values: list[Array] = []
-    for cut in divisions(*problem.extent):
+    for cut in problem.cuts:
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
         eliminated_part = eliminate_strips(rows, np.zeros(n_runs))
@@ -84,7 +84,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
 def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
     """Rows of poses, readings or links at a state."""
     parts: list[KindRows] = []
-    for cut in divisions(*problem.extent):
+    for cut in problem.cuts:
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
         eliminated_part = eliminate_strips(rows, np.zeros(len(state.z)))

@@ -78,7 +78,7 @@ from pkmcal.mechanisms.closure import (
 )
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, scaled_rows, singularity_of
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.solver.elimination import Linear, divisions
+from pkmcal.solver.elimination import SOLVER_ROWS_AT_ONCE, Linear, divisions
 from pkmcal.solver.search import Values, of_runs
 from pkmcal.solver.strips import Compact, Strips
 
@@ -110,7 +110,8 @@ class Problem:
     pose_data : of boards. link_blocks, link_data : of links. reading_columns : effects on the
     readings. slopes : (B, K, E) closures by their readings, which tell their noise, where they are
     held; None where they are the state's own. structure_cache : the :attr:`structure`, which
-    problems of the same measurements share.
+    problems of the same measurements share. rows_at_once : of the configurations that are
+    linearized together.
     """
 
     layout: LimbLayout
@@ -130,6 +131,7 @@ class Problem:
     reading_columns: ReadingColumns
     slopes: Array | None = None
     structure_cache: Structure | None = None
+    rows_at_once: int = SOLVER_ROWS_AT_ONCE
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
@@ -396,6 +398,11 @@ class Problem:
         """Configurations K and rows of each, r."""
         return len(self.blocks.present), self.n_rows
 
+    @property
+    def cuts(self) -> list[slice]:
+        """Slices of the configurations that are linearized together."""
+        return divisions(*self.extent, self.rows_at_once)
+
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
         """Derivatives of the closures (B, K, E, n) by the structure's ``closure_index``, and by the
         own unknowns; zero where they are not finite.
@@ -453,7 +460,7 @@ class Problem:
         alone: without weights, and without the reduction for edges with correlated shading.
         """
         count, n_rows = self.extent
-        cuts = divisions(count, len(state.z) * n_rows)
+        cuts = divisions(count, len(state.z) * n_rows, self.rows_at_once)
         if len(cuts) > 1:
             parts = (self.among(cut).unweighted(self.state_among(state, cut)) for cut in cuts)
             return Kinds(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))

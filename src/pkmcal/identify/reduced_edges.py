@@ -79,7 +79,8 @@ class ReducedEdges:
 def reduced_edges(info: Information) -> Iterator[ReducedEdges]:
     """Reduced edges of a solution, some configurations at a time."""
     problem, n_runs = info.problem, len(info.state.z)
-    for cut in divisions(info.state.T_base_platform.shape[1], problem.n_rows * n_runs):
+    configurations, n_rows = problem.extent
+    for cut in divisions(configurations, n_rows * n_runs, problem.rows_at_once):
         part, state = problem.among(cut), problem.state_among(info.state, cut)
         rows = part.compact(state)
         eliminated_part, layout = eliminate_strips(rows, np.zeros(n_runs)), rows.strips.layout

@@ -50,7 +50,7 @@ from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.measurements import Column
-from pkmcal.solver.elimination import Linear, divisions, eliminate
+from pkmcal.solver.elimination import Linear, eliminate
 from pkmcal.solver.ranks import inverse_root
 
 OBSERVABLE_SQUARE_SHARE = 1e-10
@@ -200,7 +200,7 @@ class ScoreTests:
         columns = columns_of(assembled, info.state, throughout)
         by_random, root = columns_of(assembled, info.state, random), prior_root(random)
         scatter, clusters = np.zeros((n, n)), 0
-        for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
+        for cut, piece in zip(problem.cuts, info.pieces(), strict=True):
             linear = piece.linear
             further = [by_random(cut, linear) @ root, columns(cut, linear)]
             rows, remainder = eliminate_beside(linear, np.concatenate(further, axis=-1))
@@ -395,7 +395,7 @@ def _basis_beside(assembled: Assembled, info: Information, beside: Sequence[Colu
     columns = columns_of(assembled, info.state, beside)
     across, squared = np.zeros((basis.shape[1], count)), np.eye(count)
     na = len(basis)
-    for cut, piece in zip(divisions(*assembled.problem.extent), info.pieces(), strict=True):
+    for cut, piece in zip(assembled.problem.cuts, info.pieces(), strict=True):
         rows, _ = eliminate_beside(piece.linear, columns(cut, piece.linear) @ root)
         flat = rows.reshape(-1, na + count)
         across += (flat[:, :na] @ basis).T @ flat[:, na:]
@@ -437,7 +437,7 @@ def _products(
     throughout = [effect for effect in listed if effect.station is None]
     columns = columns_of(assembled, info.state, throughout, singles=singles)
     random, root = columns_of(assembled, info.state, beside), prior_root(beside)
-    for cut, piece in zip(divisions(*problem.extent), info.pieces(), strict=True):
+    for cut, piece in zip(problem.cuts, info.pieces(), strict=True):
         linear = piece.linear
         further = [random(cut, linear) @ root, columns(cut, linear)]
         rows, value = eliminate_beside(linear, np.concatenate(further, axis=-1))

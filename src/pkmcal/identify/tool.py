@@ -22,16 +22,25 @@ from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.solver.ranks import nonzero
 
-POSES_AROUND_SESSION = 40
-"""Number of poses sampled around the session's, for errors that few poses hide."""
-AROUND_SESSION_TURN, AROUND_SESSION_SHIFT = 0.2, 0.12
-"""Ranges of the samples: rotation in rad, and translation relative to the machine's size, the mean
-distance from base to platform plus the platform's radius."""
-AS_REGULAR = 0.7
-"""Smallest distance of a sample from singular poses, relative to the median of the session's own:
-near a singular pose any error is amplified, and no machine works there."""
-POSES_AROUND_SEED = 4
-"""Seed of the samples."""
+
+@dataclass(frozen=True)
+class PoseSamplingOptions:
+    """Constants of the poses sampled around a session's, for errors that few poses hide."""
+
+    # number of samples, and their seed
+    count: int = 40
+    seed: int = 4
+    # range of the rotation, rad
+    turn: float = 0.2
+    # range of the translation, relative to the machine's size, the mean distance from base to
+    # platform plus the platform's radius
+    shift: float = 0.12
+    # smallest distance of a sample from singular poses, relative to the median of the session's
+    # own: near a singular pose any error is amplified, and no machine works there
+    regular: float = 0.7
+
+
+_SAMPLING = PoseSamplingOptions()
 
 
 def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
@@ -81,19 +90,19 @@ def platform_sigma(estimate: Estimate) -> float:
 
 def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     """Readings and poses of the session, and of samples around it that the machine can take."""
-    rng = np.random.default_rng(POSES_AROUND_SEED)
+    rng = np.random.default_rng(_SAMPLING.seed)
     layout = machine.layout
     base, platform = machine.base_centers(), machine.platform_centers()
-    start = T_base_platform[rng.integers(len(T_base_platform), size=POSES_AROUND_SESSION)]
+    start = T_base_platform[rng.integers(len(T_base_platform), size=_SAMPLING.count)]
     lift = float(np.linalg.norm(start[:, :3, 3].mean(axis=0) - base.mean(axis=0)))
     size = lift + float(np.linalg.norm(platform, axis=-1).max())
-    reach = np.array([AROUND_SESSION_TURN] * 3 + [AROUND_SESSION_SHIFT * size] * 3)
-    step = rng.uniform(-1, 1, (POSES_AROUND_SESSION, 6)) * reach
+    reach = np.array([_SAMPLING.turn] * 3 + [_SAMPLING.shift * size] * 3)
+    step = rng.uniform(-1, 1, (_SAMPLING.count, 6)) * reach
     start = perturb(start, step @ layout.motion @ layout.motion.T)
     # constant legs and joints with axes restrict the poses: samples are projected onto these
     value = on_manifold(layout, machine.values, start)
     own = on_manifold(layout, machine.values, T_base_platform).singularity
-    regular = value.converged & (value.singularity >= AS_REGULAR * float(np.median(own)))
+    regular = value.converged & (value.singularity >= _SAMPLING.regular * float(np.median(own)))
     poses = np.concatenate([T_base_platform, value.T_base_platform[regular]])
     return machine.inverse(poses), poses
 

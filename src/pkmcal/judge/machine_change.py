@@ -122,7 +122,7 @@ def _spread(
     null_vectors = vectors[:, values < 1 - NEGLIGIBLE]
     if len(covariances) == 1:
         return covariances[0], null_vectors
-    one, other = (_firm(c) for c in covariances)
+    one, other = (_bounded(c) for c in covariances)
     inverse_one, inverse_other = np.linalg.inv(one), np.linalg.inv(other)
     lesser = _lesser(inverse_one, inverse_other)
     unit = np.eye(len(one))
@@ -134,7 +134,7 @@ def _spread(
     return spread, null_vectors
 
 
-def _firm(covariance: Array) -> Array:
+def _bounded(covariance: Array) -> Array:
     """Covariance in tolerances, no larger than the nominal model's, no smaller than rounding."""
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     return (vectors * np.clip(values, ROUNDING, 1.0)) @ vectors.T

@@ -153,7 +153,11 @@ def study_repeats(
     if not isinstance(session, Session):
         session = load_session(session)
     require_repeats(session)
-    calibration = calibrate_session(session, seed=seed, progress=progress)
+    return scatter_of_repeats(calibrate_session(session, seed=seed, progress=progress))
+
+
+def scatter_of_repeats(calibration: Calibration) -> RepeatStudy:
+    """Scatter of images of the same configurations about a calibration of their session."""
     session = calibration.session  # without hand-held images that were not localized
     observed = [p for p in read_images(session) if _sees_legs(session.stations[p.station])]
     parts = [_StationEdges.of(calibration, images) for images in observed]

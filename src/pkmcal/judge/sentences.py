@@ -148,24 +148,32 @@ def _not_better(gain: Ratio) -> list[Finding]:
 
 def _promise_findings(groups: Sequence[NominalComparison], units: tuple[str, ...]) -> list[Finding]:
     """Finding on residuals larger than their standard deviations, of the first group with such."""
+    same_unit = len(set(units)) == 1
     for group in groups:
-        if not group.promise.usual:
-            return [_residual_finding(group, units)]
-        if not group.promise.steady:
-            return [_offset_finding(group, units)]
+        promise = group.promise
+        if not promise.usual:
+            rms = finite_rms(group.figures(group.calibrated).joint_rms) if same_unit else None
+            found = wrong(
+                "validation.residuals_too_large",
+                value=promise.factor,
+                times=factor(promise.factor),
+                rms=rms,
+                promised=finite_rms(promise.joint_rms) if same_unit else None,
+                unit=units[0],
+            )
+            return [found]
+        if not promise.steady:
+            worst = int(np.argmax(np.abs(promise.common) / promise.common_sigma))
+            found = wrong(
+                "validation.joint_offset",
+                f"joint {worst + 1}",
+                joint=worst + 1,
+                value=float(promise.common[worst]),
+                sigma=float(promise.common_sigma[worst]),
+                unit=units[worst],
+            )
+            return [found]
     return []
-
-
-def _residual_finding(group: NominalComparison, units: tuple[str, ...]) -> Finding:
-    one = len(set(units)) == 1
-    return wrong(
-        "validation.residuals_too_large",
-        value=group.promise.factor,
-        times=factor(group.promise.factor),
-        rms=finite_rms(group.figures(group.calibrated).joint_rms) if one else None,
-        promised=finite_rms(group.promise.joint_rms) if one else None,
-        unit=units[0],
-    )
 
 
 def _unweighted_findings(group: NominalComparison, units: tuple[str, ...]) -> list[Finding]:
@@ -182,19 +190,6 @@ def _unweighted_findings(group: NominalComparison, units: tuple[str, ...]) -> li
     if worse.any():
         facts = {"joint": joint + 1, "sigma": promised, "unit": units[joint]}
     return [doubtful("validation.hardly_seen", **facts)]
-
-
-def _offset_finding(group: NominalComparison, units: tuple[str, ...]) -> Finding:
-    test = group.promise
-    worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
-    return wrong(
-        "validation.joint_offset",
-        f"joint {worst + 1}",
-        joint=worst + 1,
-        value=float(test.common[worst]),
-        sigma=float(test.common_sigma[worst]),
-        unit=units[worst],
-    )
 
 
 def _noise_findings(

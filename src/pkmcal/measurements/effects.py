@@ -12,9 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Integers
 from pkmcal.measurements.columns import Column
-from pkmcal.measurements.edges import EdgeSet
 from pkmcal.measurements.line_cells import TUBE_CORRELATION
 from pkmcal.measurements.poses import PoseSet
 from pkmcal.measurements.sets import Effect, Measurements
@@ -145,14 +144,10 @@ def lines(measurements: Measurements) -> tuple[Integers, Integers]:
     if not measurements.shaded or not len(e):
         return np.zeros((0, 4), dtype=int), np.zeros(0, dtype=int)
     number = np.full(len(e), -1)
-    many = ~_alone(e, measurements.n_stations)
+    # stations that saw one configuration alone, as images by hand do
+    pair = np.unique(np.stack([e.station, e.configuration], axis=1), axis=0)
+    many = np.bincount(pair[:, 0], minlength=measurements.n_stations)[e.station] != 1
     keys = np.stack([e.station, e.leg, e.tube, e.side], axis=1)[many]
     keys, own = np.unique(keys, axis=0, return_inverse=True)
     number[many] = own.reshape(-1)
     return keys, number
-
-
-def _alone(edges: EdgeSet, n_stations: int) -> Booleans:
-    """(N,) edges of stations that saw one configuration alone, as images by hand do."""
-    pair = np.unique(np.stack([edges.station, edges.configuration], axis=1), axis=0)
-    return np.bincount(pair[:, 0], minlength=n_stations)[edges.station] == 1

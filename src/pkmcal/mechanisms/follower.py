@@ -26,14 +26,22 @@ from pkmcal.mechanisms.closure import scales
 from pkmcal.mechanisms.kinematics import CONVERGED_CLOSURE_ERROR, forward
 from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
-MOST_FOLLOWER_STEPS = 8
-"""Most Newton steps; a pose 1 mm away takes three or four."""
-FOLLOWED_CLOSURE_ERROR = 0.1 * CONVERGED_CLOSURE_ERROR
-"""Closure error (m) of all rods together at which a search ends."""
-REUSED_FACTORS_SHRINK = 1e-8
-"""Ratio of squared errors after and before a step above which the next step needs new factors."""
-POSES_BETWEEN_SQUARINGS = 512
-"""Number of poses after which the rotation is orthonormalised; rounding is below 1e-12 by then."""
+
+@dataclass(frozen=True)
+class FollowerOptions:
+    """Constants of Newton's method from pose to pose."""
+
+    # most steps; a pose 1 mm away takes three or four
+    most_steps: int = 8
+    # closure error (m) of all rods together at which a search ends
+    closure_error: float = 0.1 * CONVERGED_CLOSURE_ERROR
+    # ratio of squared errors after and before a step above which the next step needs new factors
+    reused_factors_shrink: float = 1e-8
+    # poses after which the rotation is orthonormalised; rounding is below 1e-12 by then
+    poses_between_squarings: int = 512
+
+
+FOLLOWER = FollowerOptions()
 
 
 @dataclass(frozen=True)
@@ -198,7 +206,7 @@ class Follower:
         off, square = rods.ends(readings)
         now, factors, twist = self._pose, self._factors, self._twist
         before = np.inf
-        for _ in range(MOST_FOLLOWER_STEPS):
+        for _ in range(FOLLOWER.most_steps):
             b = now[:3].dot(rods.on_body)
             line = b + off
             residual = self._ones.dot(line * line)
@@ -206,12 +214,14 @@ class Follower:
             error = float(residual.dot(residual))
             if not error < before:
                 return False
-            if factors is None or (error > REUSED_FACTORS_SHRINK * before and before < np.inf):
+            if factors is None or (
+                error > FOLLOWER.reused_factors_shrink * before and before < np.inf
+            ):
                 factors = self._factors_at(b, line)
-                self._enough = 4 * FOLLOWED_CLOSURE_ERROR**2 * float(square.min())
+                self._enough = 4 * FOLLOWER.closure_error**2 * float(square.min())
             if error <= self._enough:
                 self._factors, self._since = factors, self._since + 1
-                if self._since == POSES_BETWEEN_SQUARINGS:
+                if self._since == FOLLOWER.poses_between_squarings:
                     # Remove the rounding of many steps from the rotation.
                     self._since, now = 0, pose(nearest_rotation(now[:3, :3]), now[:3, 3])
                 self._pose = now

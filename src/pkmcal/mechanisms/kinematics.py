@@ -41,33 +41,51 @@ from pkmcal.mechanisms.closure import (
 )
 from pkmcal.mechanisms.layout import LimbLayout
 
-MAX_STEPS = 60
-"""Most steps of a search."""
 CONVERGED_CLOSURE_ERROR = 1e-12
 """Closure error (m) below which a configuration is solved: 100 times rounding at 1 m."""
-CONFIGURATIONS_A_CHUNK = 2048
-"""Rows of a batch processed at a time; their data fit into a processor's second-level cache."""
-HOPELESS_DAMPING = 1e3
-"""Damping above which a row stops after a rejected step."""
-CLOSURE_ROUNDING = 16 * float(np.finfo(float).eps)
-"""Closure error due to rounding, as a share of the longest rod; a row below it stops after a
-rejected step."""
-SECOND_RODS_STEPS = 15
-"""Most steps of inverse kinematics with several rods for a motor; a pose that all rods allow takes
-four."""
-SECOND_RODS_SETTLED = 1e-15
-"""Step of readings (rad) and hinges below which these steps have converged."""
-LEVELLING_STEPS = 3
-"""Gauss-Newton steps to the least-squares pose of an overdetermined machine. Each multiplies the
-remaining distance by the ratio of the closure error to a rod."""
-OTHER_MACHINE_GAP = 0.05
-"""Closure error, as a share of a rod, above which readings belong to another machine, not to this
-one with errors."""
-STEPS_OUT_OF_REACH = 5
-"""Consecutive steps with a limb out of reach after which the search for a pose stops."""
 NEAR_SINGULAR = 0.02
 """Smallest singular value of the scaled inverse Jacobian below which a warning is due: an error of
 a reading then moves the platform fifty times as far."""
+
+
+@dataclass(frozen=True)
+class KinematicsOptions:
+    """Constants of forward and inverse kinematics."""
+
+    # most steps of a search
+    most_steps: int = 60
+    # rows of a batch processed at a time; their data fit into a processor's second-level cache
+    chunk: int = 2048
+    # first damping of a row, factors on it after an accepted and after a rejected step, and its
+    # lower bound: starts are near the solution, where Newton's full step is best
+    first_damping: float = 1e-6
+    damping_after_success: float = 0.05
+    damping_after_failure: float = 30.0
+    least_damping: float = 1e-14
+    # damping above which a row stops after a rejected step
+    hopeless_damping: float = 1e3
+    # closure error due to rounding, as a share of the longest rod; a row below it stops after a
+    # rejected step
+    rounding: float = 16 * float(np.finfo(float).eps)
+    # closure error at which a row stops, relative to CONVERGED_CLOSURE_ERROR: one more step of
+    # Newton's method costs little and leaves rounding
+    target: float = 1e-2
+    # most steps of inverse kinematics with several rods for a motor; a pose that all rods allow
+    # takes four
+    second_rods_steps: int = 15
+    # step of readings (rad) and hinges below which these steps have converged
+    second_rods_settled: float = 1e-15
+    # Gauss-Newton steps to the least-squares pose of an overdetermined machine; each multiplies the
+    # remaining distance by the ratio of the closure error to a rod
+    levelling_steps: int = 3
+    # closure error, as a share of a rod, above which readings belong to another machine, not to
+    # this one with errors
+    other_machine_gap: float = 0.05
+    # consecutive steps with a limb out of reach after which the search for a pose stops
+    steps_out_of_reach: int = 5
+
+
+KINEMATICS = KinematicsOptions()
 
 
 class Closed(NamedTuple):
@@ -122,14 +140,14 @@ def close(
     coordinates.
     """
     out = Closed(np.empty(start.shape), np.empty(internal.shape), np.empty(len(start)))
-    for first in range(0, len(start), CONFIGURATIONS_A_CHUNK):
-        rows = slice(first, first + CONFIGURATIONS_A_CHUNK)
+    for first in range(0, len(start), KINEMATICS.chunk):
+        rows = slice(first, first + KINEMATICS.chunk)
         own = theta[rows] if theta.ndim > 1 else theta
         base = base_ends(layout, own, readings[rows])
         poses, phi = start[rows], internal[rows]
         if len(poses) >= POSES_WORTH_BATCH_LAST:
             base, poses, phi = base_batch_last(base), batch_last(poses), batch_last(phi)
-        rounding = CLOSURE_ROUNDING * float(np.fmax.reduce(np.abs(base.length), axis=None))
+        rounding = KINEMATICS.rounding * float(np.fmax.reduce(np.abs(base.length), axis=None))
         number, platform = first + np.arange(len(poses)), platform_parameters(layout, own)
         _close(_Task(layout, own, platform, base, number, rounding), poses, phi, out)
     return out
@@ -144,10 +162,12 @@ def base_batch_last(base: BaseEnds) -> BaseEnds:
 def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
     """Solve the rows of a task and write their results."""
     now = _state_at(task, poses, internal)
-    damping, stuck = np.full(len(poses), 1e-6), np.zeros(len(poses), dtype=bool)
-    for _ in range(MAX_STEPS):
+    options, closed_error = KINEMATICS, KINEMATICS.target * CONVERGED_CLOSURE_ERROR
+    damping = np.full(len(poses), options.first_damping)
+    stuck = np.zeros(len(poses), dtype=bool)
+    for _ in range(options.most_steps):
         # Write and remove finished rows once they are a quarter of the batch.
-        done = stuck | (now.worst <= CONVERGED_CLOSURE_ERROR * 1e-2)
+        done = stuck | (now.worst <= closed_error)
         if 4 * np.count_nonzero(done) >= len(done):
             _write_results(task, now, out)
             remaining = np.flatnonzero(~done)
@@ -162,12 +182,15 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
         step = damped_step(now.jac, now.value, damping)
         trial = _state_at(task, *_retracted(task.layout, now, step))
         better = trial.cost < now.cost
+        smaller = np.maximum(damping * options.damping_after_success, options.least_damping)
         if np.count_nonzero(better) == len(better):
-            now, stuck, damping = trial, done, np.maximum(damping * 0.05, 1e-14)
+            now, stuck, damping = trial, done, smaller
             continue
         # Rejected steps increase the damping, or end a row that cannot improve.
-        stuck = done | (~better & ((damping > HOPELESS_DAMPING) | (now.worst < task.rounding)))
-        damping = np.where(better, np.maximum(damping * 0.05, 1e-14), damping * 30)
+        stuck = done | (
+            ~better & ((damping > options.hopeless_damping) | (now.worst < task.rounding))
+        )
+        damping = np.where(better, smaller, damping * options.damping_after_failure)
         now = _State(
             *(
                 np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
@@ -225,7 +248,7 @@ class ForwardResult:
     T_base_platform : (..., 4, 4).
     converged : (...). An overdetermined machine (more rows than unknowns) is closed by least
         squares, and has converged if the residual can be due to errors of readings and geometry,
-        see OTHER_MACHINE_GAP.
+        see ``KinematicsOptions.other_machine_gap``.
     error : (...) largest closure error, m.
     internal : (..., n) hinge angles of an articulated platform, rad; n = 0 for a rigid one.
     layout, theta, readings : the machine, and the readings at which it was closed.
@@ -335,14 +358,14 @@ def _least_squares_readings(
     m = layout.n_readings
     pick = layout.of_motor.astype(float)
     x = np.concatenate([readings, internal], axis=-1)
-    for _ in range(SECOND_RODS_STEPS):
+    for _ in range(KINEMATICS.second_rods_steps):
         c = closure(layout, theta, x[..., :m], poses, x[..., m:])
         jac = np.concatenate([c.by_reading[..., None] * pick, c.rows.by_internal], axis=-1)
         # x is NaN out of reach, and stays NaN
         jac, value = np.nan_to_num(jac), np.nan_to_num(c.rows.value)
-        step = damped_step(jac, value, np.full(value.shape[:-1], 1e-14))
+        step = damped_step(jac, value, np.full(value.shape[:-1], KINEMATICS.least_damping))
         x = x - step
-        if np.abs(step).max(initial=0.0) < SECOND_RODS_SETTLED:
+        if np.abs(step).max(initial=0.0) < KINEMATICS.second_rods_settled:
             break
     return x[..., :m], x[..., m:]
 
@@ -382,7 +405,7 @@ def forward(
     if layout.overdetermined:
         poses, inner, error = _least_squares_poses(layout, theta, readings, poses, inner)
         rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
-        converged = error < OTHER_MACHINE_GAP * rods
+        converged = error < KINEMATICS.other_machine_gap * rods
     return ForwardResult(poses, converged, error, inner, layout, theta, readings)
 
 
@@ -394,7 +417,7 @@ def _least_squares_poses(
     Gauss-Newton: near the minimum the sum of squares is constant to rounding, so a search by its
     value stalls.
     """
-    for _ in range(LEVELLING_STEPS):
+    for _ in range(KINEMATICS.levelling_steps):
         c = closure(layout, theta, readings, poses, internal)
         back = np.linalg.pinv(np.nan_to_num(by_own(layout, c.rows)))
         step = (back @ np.nan_to_num(c.rows.value)[..., None])[..., 0] @ layout.own_motion.T
@@ -482,7 +505,7 @@ def mobility(layout: LimbLayout, theta: Array, pose: Array) -> int:
 
 
 def on_manifold(
-    layout: LimbLayout, theta: Array, poses: Array, steps: int = MAX_STEPS
+    layout: LimbLayout, theta: Array, poses: Array, steps: int = KINEMATICS.most_steps
 ) -> ForwardResult:
     """Poses (..., 4, 4) projected onto those that satisfy all constraints which no drive can
     change.
@@ -496,6 +519,7 @@ def on_manifold(
     every = theta if theta.ndim == 1 else np.broadcast_to(theta, (*shape, theta.shape[-1]))
     every = every if theta.ndim == 1 else every.reshape(-1, theta.shape[-1])
     free = layout.driven_rows.size < layout.n_equations or layout.shares_motors
+    closed_error = KINEMATICS.target * CONVERGED_CLOSURE_ERROR
     remaining, out_of_reach = np.arange(len(current)), np.zeros(len(current), dtype=int)
     for _ in range(steps if free else 0):
         own = every if every.ndim == 1 else every[remaining]
@@ -507,8 +531,8 @@ def on_manifold(
             np.isfinite(c.readings).all(axis=-1), 0, out_of_reach[remaining] + 1
         )
         # Continue with poses that are neither converged nor out of reach.
-        more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED_CLOSURE_ERROR * 1e-2
-        more &= out_of_reach[remaining] < STEPS_OUT_OF_REACH
+        more = np.abs(value).max(axis=-1, initial=0.0) >= closed_error
+        more &= out_of_reach[remaining] < KINEMATICS.steps_out_of_reach
         remaining = remaining[more]
         if not remaining.size:
             break

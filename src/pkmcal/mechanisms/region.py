@@ -22,13 +22,22 @@ from pkmcal.mechanisms.workspace import (
 
 RegionSide = tuple[float, float]
 REGION_AXES = ("x", "y", "z")
-TRIES_A_WANTED_POSE = 200
-"""Most candidate poses for each pose wanted; if the machine can take a smaller share, fewer poses
-are returned."""
-AT_LEAST = 5000
-"""Fewest candidate poses before a region counts as out of reach."""
-REGION_POSES_AT_ONCE = 4096
-"""Most candidate poses in one batch."""
+
+
+@dataclass(frozen=True)
+class RegionSamplingOptions:
+    """Constants of the sampling of a region."""
+
+    # most candidate poses for each pose wanted; if the machine can take a smaller share, fewer
+    # poses are returned
+    candidates_a_pose: int = 200
+    # fewest candidate poses before a region counts as out of reach
+    fewest_candidates: int = 5000
+    # most candidate poses in one batch
+    batch: int = 4096
+
+
+_SAMPLING = RegionSamplingOptions()
 
 
 @dataclass(frozen=True)
@@ -158,9 +167,9 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
     within = within_reach(limits, region)
     batches: list[Array] = []
     accepted = tried = 0
-    most = max(TRIES_A_WANTED_POSE * count, AT_LEAST)
+    most = max(_SAMPLING.candidates_a_pose * count, _SAMPLING.fewest_candidates)
     while accepted < count and tried < most:
-        more = min(max(count, tried), REGION_POSES_AT_ONCE)
+        more = min(max(count, tried), _SAMPLING.batch)
         poses = _candidate_poses(limits, within, np.arange(tried, tried + more), seed)
         closed = on_manifold(limits.layout, limits.theta, poses, ROUGH_EFFORT.newton)
         poses = closed.T_base_platform[closed.converged]

@@ -19,7 +19,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference
 from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms.kinematics import (
-    MAX_STEPS,
+    KINEMATICS,
     NEAR_SINGULAR,
     closure_at,
     on_manifold,
@@ -181,28 +181,28 @@ def _outside_motion(limits: Limits, poses: Array) -> Booleans:
 
 @dataclass(frozen=True)
 class Effort:
-    """Resolution of the search for extents.
+    """Resolution of the searches in a workspace, and sizes of their batches."""
 
-    steps : poses along a path before the bisection; narrower gaps are missed.
-    halvings : steps of the bisection.
-    newton : steps of the projection onto admissible poses.
-    rounds : corrections along the direction for the distance that the projection took away.
-    """
-
+    # poses along a path before the bisection; narrower gaps are missed
     steps: int = 100
+    # subdivisions of each step of a given path that are checked
+    subdivisions: int = 8
+    # steps of the bisection
     halvings: int = 30
-    newton: int = MAX_STEPS
+    # steps of the projection onto admissible poses
+    newton: int = KINEMATICS.most_steps
+    # corrections along the direction for the distance that the projection took away
     rounds: int = 4
+    # poses of each path in one batch
+    ahead: int = 8
+    # poses of a grid in one batch
+    batch: int = 20_000
 
 
 FINE_EFFORT = Effort()
 """Default resolution."""
 ROUGH_EFFORT = Effort(steps=40, halvings=14, newton=6, rounds=1)
 """Resolution for a bounding box of the workspace."""
-PATH_POSES_AHEAD = 8
-"""Poses of each path in one batch."""
-GRID_POSES_AT_ONCE = 20_000
-"""Poses of a grid in one batch."""
 
 
 @dataclass(frozen=True)
@@ -274,8 +274,8 @@ def extents(
     distances = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
     inside_so_far = np.zeros(distances.shape, dtype=bool)
     ahead: Integers = np.arange(len(distances))
-    for first in range(0, effort.steps + 1, PATH_POSES_AHEAD):
-        at = slice(first, first + PATH_POSES_AHEAD)
+    for first in range(0, effort.steps + 1, effort.ahead):
+        at = slice(first, first + effort.ahead)
         inside = _reach_along(limits, start, twists[ahead, None], distances[ahead, at], effort)[
             1
         ].inside
@@ -408,15 +408,11 @@ def _refuse_flat(limits: Limits, unit: Array, sides: Array) -> None:
 def _at_positions(limits: Limits, middle: Array, positions: Array) -> tuple[Booleans, Array]:
     """Whether positions (n, 3) are in the workspace, and their singularity measure, (n,) each."""
     inside, singular = np.zeros(len(positions), dtype=bool), np.zeros(len(positions))
-    for first in range(0, len(positions), GRID_POSES_AT_ONCE):
-        rows = slice(first, first + GRID_POSES_AT_ONCE)
+    for first in range(0, len(positions), FINE_EFFORT.batch):
+        rows = slice(first, first + FINE_EFFORT.batch)
         reach = reachable(limits, pose(middle[:3, :3], positions[rows]))
         inside[rows], singular[rows] = reach.inside, reach.singularity
     return inside, singular
-
-
-LOOKS_A_PATH_STEP = 8
-"""Subdivisions of each step of a path that are checked."""
 
 
 @dataclass(frozen=True)
@@ -473,12 +469,12 @@ def check_path(limits: Limits, poses: Array) -> PathCheck:
             found=f"an array of shape {poses.shape}",
             expected="(n, 4, 4)",
         )
-    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * LOOKS_A_PATH_STEP + 1)
+    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * FINE_EFFORT.subdivisions + 1)
     reach = reachable(limits, _path_poses(poses, places))
     leaves, why = _first_exit(limits, poses, places, reach)
     nearest = np.where(np.isfinite(reach.singularity), reach.singularity, np.inf)
     k = int(np.argmin(nearest))
-    own = slice(None, None, LOOKS_A_PATH_STEP)
+    own = slice(None, None, FINE_EFFORT.subdivisions)
     return PathCheck(
         inside=reach.inside[own],
         leaves=leaves,

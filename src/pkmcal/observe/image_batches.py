@@ -18,10 +18,17 @@ from pkmcal.cameras import Camera
 from pkmcal.cameras.response import Response
 from pkmcal.observe.images import Selected, binned, fitting
 
-IMAGES_A_WINDOW = 32
-"""Largest number of images in a window; their profiles take some 20 MB."""
-WINDOW_BYTES = 96 * 2**20
-"""Largest size of a window's grey levels in bytes; a single image may be larger."""
+
+class WindowSize(NamedTuple):
+    """Largest window of images that are decoded and measured together."""
+
+    # number of images; the profiles of so many take some 20 MB
+    images: int = 32
+    # size of their grey levels in bytes; a single image may be larger
+    bytes: int = 96 * 2**20
+
+
+WINDOW_SIZE = WindowSize()
 
 
 @dataclass(frozen=True)
@@ -35,6 +42,7 @@ class StationImages:
     response : how grey levels encode light.
     binning : pixels across, and down, that are averaged to one before edges are measured
         (:meth:`binned`).
+    largest : window of images that are decoded and measured together.
     """
 
     station: int
@@ -44,6 +52,7 @@ class StationImages:
     images: Sequence[Integers]
     response: Response = "linear"
     binning: int = 1
+    largest: WindowSize = WINDOW_SIZE
 
     def select(self, numbers: Integers) -> StationImages:
         """The images with these numbers."""
@@ -61,7 +70,7 @@ class StationImages:
     @property
     def window(self) -> int:
         """Number of images in a window."""
-        return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), IMAGES_A_WINDOW)
+        return min(max(fitting(self.camera.image_size, self.largest.bytes), 1), self.largest.images)
 
     def decoded(self) -> StationImages:
         """A copy with all images decoded; for at most one window of images."""

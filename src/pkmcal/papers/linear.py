@@ -126,6 +126,7 @@ def least_median(
     present: Array,
     rng: np.random.Generator,
     noise: Array | None = None,
+    residuals_at_once: int = RESIDUALS_SORTED_TOGETHER,
 ) -> Array:
     """Least median of squares: the best of random triples' exact solutions, A (..., 3).
 
@@ -150,7 +151,7 @@ def least_median(
     half = np.minimum((count[..., 0] + 3) // 2, present.shape[-1] - 1)
     cost = np.empty(a.shape[:-1])
     # residuals of every edge for every triple, in blocks of legs that fit the memory
-    each = max(RESIDUALS_SORTED_TOGETHER // (RANDOM_EDGE_TRIPLES * max(present.shape[-1], 1)), 1)
+    each = max(residuals_at_once // (RANDOM_EDGE_TRIPLES * max(present.shape[-1], 1)), 1)
     every = a, n, np.broadcast_to(radius, present.shape), present
     a_of, n_of, radius_of, present_of = (x.reshape(-1, *x.shape[present.ndim - 1 :]) for x in every)
     half_of = half.reshape(-1, 1)

@@ -43,6 +43,7 @@ def by_paper(
     measurements: Measurements,
     joint: Estimate,
     seed: int = 0,
+    repetitions: int = SIGMA_REPETITIONS,
 ) -> Estimate:
     """Estimate by one of the papers' methods on the same edges.
 
@@ -57,7 +58,7 @@ def by_paper(
     # repetitions with the stated noise added
     repeats: list[State] = []
     failed: list[ResultError] = []
-    for _ in range(SIGMA_REPETITIONS):
+    for _ in range(repetitions):
         try:
             repeats.append(_solve(method, machine, _noisy(measurements, rng), guess))
         except ResultError as error:

@@ -19,8 +19,6 @@ from pkmcal.placement.configurations import READING_RANGE_SHARES, draw_configura
 from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, StationPose, fitting_distance, view_angle
 from pkmcal.session.schema import BoardBody
 
-CAMERA_POSES_A_RING = 12
-"""Number of camera poses on a ring around the machine."""
 CAMERA_RING_HEIGHTS = np.deg2rad([5.0, 22.0, 40.0, 60.0])
 """Elevations of the rings: angles of the line of sight above the ground, rad."""
 NEIGHBOUR_RANGE_SHARE = 0.12
@@ -87,7 +85,7 @@ def neighbours(
 
 
 def camera_ring_poses(
-    machine: Machine, camera: Camera, board: BoardBody | None = None
+    machine: Machine, camera: Camera, poses_a_ring: int, board: BoardBody | None = None
 ) -> tuple[StationPose, ...]:
     """Poses of a camera on a sphere around the machine, at the distance at which it fills the
     image.
@@ -106,9 +104,7 @@ def camera_ring_poses(
     away = fitting_distance(machine, camera, board) * radius
     out: list[StationPose] = []
     for k, height in enumerate(CAMERA_RING_HEIGHTS):
-        for azimuth in (
-            2 * np.pi * (np.arange(CAMERA_POSES_A_RING) + 0.5 * (k % 2)) / CAMERA_POSES_A_RING
-        ):
+        for azimuth in 2 * np.pi * (np.arange(poses_a_ring) + 0.5 * (k % 2)) / poses_a_ring:
             level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             direction = np.cos(height) * level + np.array([0.0, 0.0, np.sin(height)])
             out.append(StationPose(_tuple(centre + away * direction), _tuple(centre)))

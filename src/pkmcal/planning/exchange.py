@@ -138,6 +138,7 @@ class O1Index:
 
 
 def _tool(info: CandidateRows) -> Index:
+    """Index of the tool's variance over the poses of the workspace."""
     shift = info.work[:, 3:]
     return ToolIndex(np.einsum("kap,kaq->pq", shift, shift, optimize=True) / len(shift))
 

@@ -36,27 +36,36 @@ from pkmcal.planning.route import length, motor_distances, shortest_path
 from pkmcal.planning.subject import Subject
 from pkmcal.ranges import check_number
 
-PLAN_CANDIDATES = 400
-"""Minimum number of candidate configurations."""
-CANDIDATES_FOR_EACH_WANTED = 4
-"""Minimum number of candidates for each wanted configuration."""
-AT_WORK = 60
-"""Number of poses of the workspace at which the tool's accuracy is evaluated."""
-BETTERING_ROUNDS = 8
-"""Maximum number of rounds of local improvement."""
-CONFIGURATIONS_FOR_STATIONS = 24
-"""Number of configurations for the comparison of stations."""
-RANDOM_PLANS_COMPARED = 10
-"""Number of random selections with which a plan is compared."""
 CAPTURE_MULTIPLES = (2, 4)
 """Multiples of the planned number of images for which the accuracy is predicted as well."""
-POSES_BETWEEN_CONFIGURATIONS = 8
-"""Number of poses that are checked on the path between two configurations."""
-REROUTING_ATTEMPTS = 5
-"""Maximum number of reroutings around blocked steps."""
 CONFIGURATION_NAME_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 """First letters of new configurations' names, one for each group of stations."""
 PLAN_SEED = 0
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Constants of the choice of configurations and stations."""
+
+    # fewest candidate configurations, and fewest for each wanted one
+    candidates: int = 400
+    candidates_for_each: int = 4
+    # poses of the workspace at which the tool's accuracy is evaluated
+    work_poses: int = 60
+    # most rounds of local improvement
+    rounds: int = 8
+    # camera poses on each ring around the machine, and configurations for their comparison
+    poses_a_ring: int = 12
+    for_stations: int = 24
+    # random selections with which a plan is compared
+    random_plans: int = 10
+    # poses that are checked on the path between two configurations
+    poses_between: int = 8
+    # most reroutings around blocked steps
+    reroutings: int = 5
+
+
+PLAN = PlanOptions()
 
 
 @dataclass(frozen=True)
@@ -144,6 +153,7 @@ def plan_measurements(
     best_of: int | None = None,
     seed: int = PLAN_SEED,
     progress: ShareProgress | None = None,
+    options: PlanOptions = PLAN,
 ) -> MeasurementPlan:
     """Plan measurements for a subject.
 
@@ -153,22 +163,21 @@ def plan_measurements(
     configuration; by default if they have cameras of their own or there is a tracker.
     free_stations : number of stations to choose on a sphere around the machine. best_of : number of
     the rig's stations to choose. seed : of all random numbers. progress : callback with the share
-    done. Raises InputError for what cannot be planned.
+    done. options : of the search. Raises InputError for what cannot be planned.
     """
     progress = progress or (lambda _share: None)
     rig, rng = subject.rig, np.random.default_rng(seed)
     _check(rig, count, index, free_stations, best_of)
     region = region or Region()
-    work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
+    work = poses_in(rig.machine.limits(), region, options.work_poses, seed)
     # Candidate configurations, by which stations are chosen first, if they are free.
-    candidates = configurations(
-        rig.machine, max(PLAN_CANDIDATES, CANDIDATES_FOR_EACH_WANTED * count), rng
-    )
+    drawn = max(options.candidates, options.candidates_for_each * count)
+    candidates = configurations(rig.machine, drawn, rng)
     progress(0.1)
     tried: tuple[TriedStation, ...] = ()
     if free_stations or best_of:
         rig, prior, tried = _with_stations(
-            subject, work, candidates, count, index, free_stations, best_of
+            subject, work, candidates, count, index, free_stations, best_of, options
         )
         subject = replace(subject, rig=rig, prior=prior)
     progress(0.3)
@@ -179,7 +188,7 @@ def plan_measurements(
     stations = range(len(rig.names))
     groups = (tuple(stations),) if together else tuple((s,) for s in stations)
     # The best configurations for these stations.
-    selection = _Selection(rig, subject.prior, groups, count, index, work)
+    selection = _Selection(rig, subject.prior, groups, count, index, work, options)
     pool = selection.pool(Candidates.of_all(groups, *candidates))
     chosen = selection.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
     progress(0.9)
@@ -236,6 +245,7 @@ class _Selection:
     count: int
     index: str
     work: Array
+    options: PlanOptions
 
     def pool(self, candidates: Candidates, rng: np.random.Generator | None = None) -> _Pool:
         """Candidates with their rows. rng : as in :func:`information_of`."""
@@ -250,8 +260,9 @@ class _Selection:
         best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
         # Local improvement, until a round gains too little.
         size = np.inf
-        for k in range(BETTERING_ROUNDS):
-            progress(0.5 + 0.5 * k / BETTERING_ROUNDS)
+        rounds = self.options.rounds
+        for k in range(rounds):
+            progress(0.5 + 0.5 * k / rounds)
             pool, start = self._with_neighbours(best, rng)
             chosen = np.sort(exchanged(pool.info, start, index))
             best = pool.candidates.only(chosen)
@@ -312,7 +323,7 @@ def _routed_plan(
     by_chance, at_random = _random_accuracy(selection, pool, rng)
     rank = np.empty(len(every), dtype=int)
     rank[nested.chosen] = every // len(groups) + 1
-    order, blocked, travel = _route(machine, chosen, rng)
+    order, blocked, travel = _route(machine, chosen, rng, selection.options)
     return MeasurementPlan(
         subject=subject,
         stations=tuple(tuple(subject.rig.names[s] for s in groups[chosen.group[k]]) for k in order),
@@ -361,7 +372,7 @@ def _random_accuracy(
     evenly = np.arange(n // 2, n)  # the first half is at the ends of the ranges
     count = min(selection.count, len(evenly))
     figures: list[tuple[float, float, float]] = []
-    for _ in range(RANDOM_PLANS_COMPARED):
+    for _ in range(selection.options.random_plans):
         rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
         covariance = pool.info.covariance(pool.info.of(np.concatenate(rows)))
         figures.append((*pool.info.tool(covariance), float(index.value(covariance))))
@@ -373,7 +384,7 @@ def _random_accuracy(
 
 
 def _route(
-    machine: Machine, chosen: Candidates, rng: np.random.Generator
+    machine: Machine, chosen: Candidates, rng: np.random.Generator, options: PlanOptions
 ) -> tuple[Integers, Booleans, tuple[float, float]]:
     """Order (n,) of the configurations, group by group, blocked steps (n,), and the lengths of this
     path and of a random one.
@@ -386,7 +397,7 @@ def _route(
         rows = np.flatnonzero(chosen.group == g)
         joints, poses = chosen.joints[rows], chosen.T_base_platform[rows]
         apart = motor_distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
-        path, blocked = _free_path(machine, joints, poses, home, apart)
+        path, blocked = _free_path(machine, joints, poses, home, apart, options)
         order.append(rows[path])
         barred.append(blocked)
         own += length(path, apart[:-1, :-1], apart[-1, :-1])
@@ -395,14 +406,19 @@ def _route(
 
 
 def _free_path(
-    machine: Machine, joints: Array, poses: Array, home: Array, apart: Array
+    machine: Machine,
+    joints: Array,
+    poses: Array,
+    home: Array,
+    apart: Array,
+    options: PlanOptions,
 ) -> tuple[Integers, Booleans]:
     """Short path that avoids blocked steps where possible, and its blocked steps."""
     bars = np.zeros((len(joints), len(joints)), dtype=bool)
     first = apart[-1, :-1].copy()
     path = shortest_path(apart[:-1, :-1], first, bars)
-    blocked = _blocked_steps(machine, joints[path], poses[path], home)
-    for _ in range(REROUTING_ATTEMPTS):
+    blocked = _blocked_steps(machine, joints[path], poses[path], home, options.poses_between)
+    for _ in range(options.reroutings):
         steps = np.flatnonzero(blocked[1:])
         if not len(steps) and not blocked[0]:
             break
@@ -410,23 +426,22 @@ def _free_path(
         if blocked[0]:
             first[path[0]] += len(joints) * apart.max()
         path = shortest_path(apart[:-1, :-1], first, bars)
-        blocked = _blocked_steps(machine, joints[path], poses[path], home)
+        blocked = _blocked_steps(machine, joints[path], poses[path], home, options.poses_between)
     return path, blocked
 
 
-def _blocked_steps(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
-    """Whether the step to each configuration (n,) is blocked: with all motors moving uniformly, the
-    closure fails or legs touch.
+def _blocked_steps(machine: Machine, joints: Array, poses: Array, home: Array, n: int) -> Booleans:
+    """Whether the step to each configuration is blocked: with all motors moving uniformly, the
+    closure fails or legs touch, at one of ``n`` poses between.
     """
     before = np.concatenate([home[None], joints[:-1]])
-    n = POSES_BETWEEN_CONFIGURATIONS
     share = (np.arange(n) + 0.5)[:, None, None] / n
     between = (before + share * (joints - before)).reshape(-1, joints.shape[1])
     fk = machine.forward_result(between, np.tile(poses, (n, 1, 1)))
     good = fk.converged.copy()
     at = np.flatnonzero(good)
     good[at] = usable(machine, fk.T_base_platform[at], between[at])
-    return np.asarray(~good.reshape(POSES_BETWEEN_CONFIGURATIONS, -1).all(axis=0))
+    return np.asarray(~good.reshape(n, -1).all(axis=0))
 
 
 # ------------------------------------------------------------------ places of the camera
@@ -440,6 +455,7 @@ def _with_stations(
     index: str,
     free_stations: int | None,
     best_of: int | None,
+    options: PlanOptions,
 ) -> tuple[Rig, CalibrationPrior | None, tuple[TriedStation, ...]]:
     """Rig with the best stations, on a sphere or among its own.
 
@@ -448,13 +464,11 @@ def _with_stations(
     """
     rig = subject.rig
     if free_stations:
-        wide, poses = _on_sphere(rig)
+        wide, poses = _on_sphere(rig, options.poses_a_ring)
     else:
         wide, poses = rig, tuple(StationPose.of(T) for T in rig.T_station_base)
     # Rows of the same few configurations from each station.
-    few = np.unique(
-        np.linspace(0, len(candidates.joints) - 1, CONFIGURATIONS_FOR_STATIONS).astype(int)
-    )
+    few = np.unique(np.linspace(0, len(candidates.joints) - 1, options.for_stations).astype(int))
     part = Configurations(*(x[few] for x in candidates))
     machine_prior = subject.prior and subject.prior.only(())
     infos = [
@@ -509,11 +523,11 @@ def _view_information(
         return None
 
 
-def _on_sphere(rig: Rig) -> tuple[Rig, tuple[StationPose, ...]]:
+def _on_sphere(rig: Rig, poses_a_ring: int) -> tuple[Rig, tuple[StationPose, ...]]:
     """Rig with its first camera at every pose on a sphere, with the instruments of that camera."""
     one = next(one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom))
     board = "platform" if isinstance(one, BoardFrom) else None
-    spots = camera_ring_poses(rig.machine, one.camera, board)
+    spots = camera_ring_poses(rig.machine, one.camera, poses_a_ring, board)
     T = np.stack([spot.T_camera_base() for spot in spots])
     mine = [other for other in rig.instruments if other.station == one.station]
     instruments = tuple(

@@ -55,9 +55,13 @@ def posed_limbs(machine: Machine, joints: Array, T_base_platform: Array) -> Pose
 
 
 def plot(
-    session: Session, estimate: Estimate, links: Links, places: tuple[Array, Integers]
+    session: Session,
+    estimate: Estimate,
+    links: Links,
+    places: tuple[Array, Integers],
+    most: int = MOST_SLIDER_POSES,
 ) -> Plot | None:
-    """Figure; None if no pose was estimated.
+    """Figure with at most ``most`` poses; None if no pose was estimated.
 
     places : measured targets (N, 3), base frame, m, and their configurations (N,).
     """
@@ -65,9 +69,7 @@ def plot(
     if not len(used):
         return None
     # poses of the slider, evenly chosen
-    some = used[
-        np.unique(np.linspace(0, len(used) - 1, min(len(used), MOST_SLIDER_POSES)).astype(int))
-    ]
+    some = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), most)).astype(int))]
     machine, state = estimate.machine, estimate.state
     limbs = posed_limbs(machine, session.joints[some], state.T_base_platform[some])
     names = [session.configurations[k] for k in some]

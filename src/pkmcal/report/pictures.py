@@ -42,12 +42,21 @@ from pkmcal.wording import brief, count, number
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
 
-MOST_PAGE_IMAGES = 400
-"""Images on a page: browsers take a second to lay out as many."""
-JPEG_CHARACTERS_A_PAGE = 8_000_000
-"""Characters of all JPEGs on a page."""
 CORNER_ARROW_LENGTH = 0.03
 """Length of a large corner residual as drawn, in image widths."""
+
+
+@dataclass(frozen=True)
+class AlbumSize:
+    """Room for images on a page."""
+
+    # images: browsers take a second to lay out as many
+    images: int = 400
+    # characters of all JPEGs
+    jpeg_characters: int = 8_000_000
+
+
+ALBUM_SIZE = AlbumSize()
 
 
 @dataclass(frozen=True)
@@ -82,7 +91,12 @@ def section(session: Session, display: Album) -> Part:
     return Part("photographs", "Images", html=html)
 
 
-def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...]) -> Album:
+def album(
+    calibration: Calibration,
+    shifts: Array,
+    centres: tuple[Centres, ...],
+    largest: AlbumSize = ALBUM_SIZE,
+) -> Album:
     """Images with their overlays, as many as there is room for.
 
     Images without data in use come first, then those with the largest residuals.
@@ -102,21 +116,21 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     }
     files = [
         (images[s], session.stations[s].images.index(photo))
-        for s, photo in ordered[:MOST_PAGE_IMAGES]
+        for s, photo in ordered[: largest.images]
     ]
     # JPEGs until the budget is spent; overlays for the images that have one
-    shots = list(small_and_large(files, JPEG_CHARACTERS_A_PAGE))
+    shots = list(small_and_large(files, largest.jpeg_characters))
     chosen = ordered[: len(shots)]
     links = Links.of((s, photo.configuration) for s, photo in chosen)
     overlays = _ImageOverlays(calibration, shifts, centres, chosen)
-    room = JPEG_CHARACTERS_A_PAGE - sum(len(small) + len(large) for small, large in shots)
+    room = largest.jpeg_characters - sum(len(small) + len(large) for small, large in shots)
     return Album(
         tuple(
             overlays.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
             for (s, photo), shot in zip(chosen, shots, strict=True)
             for place in [(s, photo.configuration)]
         ),
-        tuple(_rejected(session, room)),
+        tuple(_rejected(session, largest.images, room)),
         len(every),
         overlays.factor,
         links,
@@ -124,16 +138,14 @@ def album(calibration: Calibration, shifts: Array, centres: tuple[Centres, ...])
     )
 
 
-def _rejected(session: Session, room: int) -> Iterator[Picture]:
-    """Images that could not be localized, each with the reason, in ``room`` characters of JPEGs.
+def _rejected(session: Session, most: int, room: int) -> Iterator[Picture]:
+    """Images that could not be localized, each with the reason.
 
-    Images without room are listed without their JPEG.
+    ``most`` of them are shown, in ``room`` characters of JPEGs. Images without room are listed
+    without their JPEG.
     """
     lost = [(one, photo) for one in session.rejected for photo in one.station.images]
-    files = [
-        (_decoded(one.station), one.station.images.index(photo))
-        for one, photo in lost[:MOST_PAGE_IMAGES]
-    ]
+    files = [(_decoded(one.station), one.station.images.index(photo)) for one, photo in lost[:most]]
     shots = list(small_and_large(files, room))
     shots += [("", "")] * (len(lost) - len(shots))
     for k, ((one, photo), shot) in enumerate(zip(lost, shots, strict=True), start=1):

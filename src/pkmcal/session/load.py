@@ -285,23 +285,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             " machine reaches",
         )
     # Joint readings.
-    if measured or (folder / schema.joints.file).exists():
-        path = _regular_file(folder, document, schema.joints.file, ("joints", "file"))
-        table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
-        written = written_unit(document.data["joints"]["noise"])
-        if written and written.kind not in machine.joint_units:
-            raise InputError(
-                no_such(machine.joint_units[0], document.data["joints"]["noise"]),
-                where=document.where("joints", "noise"),
-            )
-        findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
-        if measured and not schema.stations and not schema.links():
-            _check_redundant(document, machine)
-            table, repeated = without_repeats(table, noise)
-            findings += repeated
-    else:
-        none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
-        table, findings = CsvTable(schema.joints.file, columns, (), none, ()), list[Finding]()
+    table, findings = _readings(folder, document, schema, machine, measured)
     # Board, camera stations and trackers.
     board = _board(folder, document, schema)
     findings += _unused_board(document, schema)
@@ -311,16 +295,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         for camera_station in _stations(folder, document, name, station, table.names, measured)
     )
     findings += _rotated_images(folder, stations)
-    trackers: list[PoseTable] = []
-    for name, station in schema.trackers.items():
-        tracker, keys = station.tracker, ("stations", name, "tracker", "poses")
-        noise = tracker.noise.position, tracker.noise.rotation
-        if measured or (folder / tracker.poses).exists():
-            path = _regular_file(folder, document, tracker.poses, keys)
-            read = read_poses(path, tracker.poses, table.names, *noise, name, level=tracker.level)
-            trackers.append(read)
-        else:
-            trackers.append(PoseTable.to_come(name, tracker.poses, *noise))
+    trackers = _trackers(folder, document, schema, table.names, measured)
     links = _links(folder, document, schema, table.names, machine) if measured else ()
     # Checks across files.
     if measured:
@@ -330,7 +305,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     _check_noise(document, schema, machine)
     _check_names(document, (*stations, *trackers))
     if measured and (schema.stations or links):
-        findings += _unmeasured(table, stations, tuple(trackers), links)
+        findings += _unmeasured(table, stations, trackers, links)
     return Session(
         folder=folder,
         machine=machine,
@@ -342,12 +317,56 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         document=_resolved_document(folder, schema, table, stations),
         findings=tuple(findings),
         board_body=schema.board.fixed_to if schema.board else "platform",
-        trackers=tuple(trackers),
+        trackers=trackers,
         model=model,
         mechanism=source,
         workspace=_workspace(document, schema),
         links=links,
     )
+
+
+def _readings(
+    folder: Path, document: Document, schema: SessionDocument, machine: Machine, measured: bool
+) -> tuple[CsvTable, list[Finding]]:
+    """Table of the joint readings, and findings on them; empty where none exist before a plan."""
+    if not measured and not (folder / schema.joints.file).exists():
+        none = np.zeros((0, machine.n_joints))
+        return CsvTable(schema.joints.file, machine.joint_names, (), none, ()), []
+    path = _regular_file(folder, document, schema.joints.file, ("joints", "file"))
+    table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
+    written = written_unit(document.data["joints"]["noise"])
+    if written and written.kind not in machine.joint_units:
+        raise InputError(
+            no_such(machine.joint_units[0], document.data["joints"]["noise"]),
+            where=document.where("joints", "noise"),
+        )
+    findings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
+    if measured and not schema.stations and not schema.links():
+        _check_redundant(document, machine)
+        table, repeated = without_repeats(table, noise)
+        findings += repeated
+    return table, findings
+
+
+def _trackers(
+    folder: Path,
+    document: Document,
+    schema: SessionDocument,
+    names: tuple[str, ...],
+    measured: bool,
+) -> tuple[PoseTable, ...]:
+    """Tables of the trackers; names : of the configurations."""
+    out: list[PoseTable] = []
+    for name, station in schema.trackers.items():
+        tracker, keys = station.tracker, ("stations", name, "tracker", "poses")
+        noise = tracker.noise.position, tracker.noise.rotation
+        if measured or (folder / tracker.poses).exists():
+            path = _regular_file(folder, document, tracker.poses, keys)
+            read = read_poses(path, tracker.poses, names, *noise, name, level=tracker.level)
+            out.append(read)
+        else:
+            out.append(PoseTable.to_come(name, tracker.poses, *noise))
+    return tuple(out)
 
 
 def _session_document(folder: Path) -> tuple[Path, Document]:

@@ -99,7 +99,7 @@ def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
     return triangle[..., :-1], triangle[..., -1]
 
 
-def divisions(count: int, rows: int) -> list[slice]:
-    """Slices of ``count`` items of ``rows`` rows each, of SOLVER_ROWS_AT_ONCE rows together."""
-    each = max(1, SOLVER_ROWS_AT_ONCE // max(1, rows))
+def divisions(count: int, rows: int, at_once: int = SOLVER_ROWS_AT_ONCE) -> list[slice]:
+    """Slices of ``count`` items of ``rows`` rows each, of ``at_once`` rows together."""
+    each = max(1, at_once // max(1, rows))
     return [slice(first, min(first + each, count)) for first in range(0, count, each)]

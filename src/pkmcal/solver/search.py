@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol, TypeGuard, TypeVar, cast
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.solver.elimination import Linear, divisions
+from pkmcal.solver.elimination import SOLVER_ROWS_AT_ONCE, Linear, divisions
 from pkmcal.solver.strips import (
     Compact,
     compact,
@@ -132,6 +132,11 @@ class Divisible(LeastSquares, Protocol):
         """Number of configurations K, and of rows of each, r."""
         ...
 
+    @property
+    def rows_at_once(self) -> int:
+        """Rows of the configurations that are linearized together."""
+        ...
+
 
 def _is_divisible(problem: LeastSquares) -> TypeGuard[Divisible]:
     """Whether a problem is divisible, by one method: an isinstance check of the protocol takes a
@@ -208,13 +213,14 @@ def minimise(
     tolerance : of the last step, instead of STEP_TOLERANCE.
     """
     values: list[Values] | None = None
+    at_once = SOLVER_ROWS_AT_ONCE
     if _is_divisible(problem):
-        rows = problem.extent
+        rows, at_once = problem.extent, problem.rows_at_once
     else:
         values = [problem.residuals(start)]
         rows = values[0].value.shape[1:]
     n_runs = _count(start)
-    cuts = divisions(n_runs, prod(rows))
+    cuts = divisions(n_runs, prod(rows), at_once)
     if len(cuts) < 2:
         whole = _Divided.of(problem, n_runs, *rows)
         return _minimised(whole, start, values, max_steps, tolerance, options)
@@ -241,10 +247,11 @@ class _Divided(NamedTuple):
     @classmethod
     def of(cls, problem: LeastSquares, n_runs: int, count: int, rows: int) -> _Divided:
         """Divide a problem of ``count`` configurations of ``rows`` rows, where it is divisible."""
-        cuts = divisions(count, n_runs * rows)
-        if not _is_divisible(problem) or len(cuts) < 2:
-            return cls(problem, [(slice(0, count), problem)])
-        return cls(problem, [(cut, problem.among(cut)) for cut in cuts])
+        if _is_divisible(problem):
+            cuts = divisions(count, n_runs * rows, problem.rows_at_once)
+            if len(cuts) > 1:
+                return cls(problem, [(cut, problem.among(cut)) for cut in cuts])
+        return cls(problem, [(slice(0, count), problem)])
 
     def select(self, runs: Integers) -> _Divided:
         """The divided problem of some runs."""
@@ -296,9 +303,14 @@ def _minimised(
     normal: Array | None = None
     for _ in range(max_steps):
         # a step of the active runs
-        new, gain = _try(part, here, at, search, tolerance, options)
+        before = here
+        new, gain = _try(part, before, at, search, tolerance, options)
         steps[active] += 1
-        here, at = _accepted_state(here, new, gain)
+        # accepted steps; the residuals are known where all are
+        here, at = new, gain.values
+        if not gain.accepted.all():
+            runs = np.flatnonzero(gain.accepted)
+            here, at = put(before, runs, take(new, runs)), None
         # accepted states into the result
         if active.size == n_runs:
             state, normal = here, gain.normal
@@ -317,14 +329,6 @@ def _minimised(
             search = take(search, keep)
     final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
     return Solution(state, cost, steps, final, cast(Array, normal))
-
-
-def _accepted_state(here: Any, new: Any, gain: _Gain) -> tuple[Any, list[Values] | None]:
-    """The state with accepted steps applied, and the residuals there if known."""
-    if gain.accepted.all():
-        return new, gain.values
-    runs = np.flatnonzero(gain.accepted)
-    return put(here, runs, take(new, runs)), None
 
 
 class _Search(NamedTuple):

@@ -47,8 +47,10 @@ def _work_on_one_thread(task: Job) -> SolvedBatch:
     return work(task)
 
 
-def on_cluster(address: str) -> Runner:
+def on_cluster(address: str, timeout: float = SCHEDULER_TIMEOUT) -> Runner:
     """Runner on the cluster with the scheduler's address, such as ``tcp://10.0.0.1:8786``.
+
+    timeout : seconds until the scheduler and a first worker have to answer.
 
     Raises InputError if dask.distributed is not installed or the address is malformed; the runner
     raises InputError if the cluster does not answer, has no worker, or has workers with another
@@ -70,7 +72,7 @@ def on_cluster(address: str) -> Runner:
         from distributed import Client
 
         try:
-            client: Any = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
+            client: Any = Client(address, timeout=timeout, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
                 "no Dask scheduler answers",
@@ -82,7 +84,7 @@ def on_cluster(address: str) -> Runner:
         level = log.level
         log.setLevel(logging.CRITICAL)  # _run_tasks reports a lost scheduler
         try:
-            workers = _count_threads(client, address)
+            workers = _count_threads(client, address, timeout)
             _run_tasks(client, tasks, finished)
         finally:
             client.close()
@@ -92,10 +94,10 @@ def on_cluster(address: str) -> Runner:
     return runner
 
 
-def _count_threads(client: Any, address: str) -> int:
+def _count_threads(client: Any, address: str, timeout: float) -> int:
     """Number of the cluster's threads; raises InputError if any worker has another version."""
     try:
-        client.wait_for_workers(1, timeout=SCHEDULER_TIMEOUT)
+        client.wait_for_workers(1, timeout=timeout)
     except TimeoutError:
         raise InputError(
             "the cluster has no worker",

@@ -246,29 +246,34 @@ def views_by_name() -> dict[str, View]:
 
 
 def measured_hexapod(
-    truth: Machine, view: View, case: Case, rng: np.random.Generator
+    truth: Machine,
+    view: View,
+    case: Case,
+    rng: np.random.Generator,
+    point_noise: float = POINT_NOISE,
+    reading_noise: float = PAPER_B_READING_NOISE,
 ) -> MeasuredHexapod:
     """Measurements of a machine at the limits of its workspace by a camera."""
     corners = np.array(list(product(*truth.joint_ranges)))
     readings = corners[rng.permutation(len(corners))[:PAPER_B_CONFIGURATIONS]]
     poses = truth.forward(readings)
     noise = EdgeNoise(
-        shift=POINT_NOISE / np.sqrt(POINTS_FITTED_AN_EDGE),
+        shift=point_noise / np.sqrt(POINTS_FITTED_AN_EDGE),
         # at the ends of a line that is fitted to points all along it
-        tilt=POINT_NOISE * np.sqrt(3 / POINTS_FITTED_AN_EDGE),
+        tilt=point_noise * np.sqrt(3 / POINTS_FITTED_AN_EDGE),
         outward=case.outward,
         wrong=case.wrong,
     )
     T = view.T_camera_base
     edges, joints = simulate_edges(
-        truth, T[None], view.camera, poses, noise, rng, joint_noise=PAPER_B_READING_NOISE
+        truth, T[None], view.camera, poses, noise, rng, joint_noise=reading_noise
     )
     believed = hexapod_with_cylinder_legs()
     if case.radius:
         values = believed.values.copy()
         values[np.array(believed.parameters.kinds) == "radius"] *= 1 + case.radius
         believed = believed.with_values(values)
-    measured = Measurements(edges, joints, PAPER_B_READING_NOISE, 1, np.zeros(1, dtype=int))
+    measured = Measurements(edges, joints, reading_noise, 1, np.zeros(1, dtype=int))
     return MeasuredHexapod(view, apply(T, truth.base_centers()), believed, measured)
 
 

@@ -91,11 +91,11 @@ class Viewed:
         path = self.image_entry(s, k).path
         return decode(path, self.station(s).camera.image_size, label_of(self.session.folder, path))
 
-    def jpeg(self, s: int, k: int) -> bytes:
-        """Image as JPEG in the size of the screen."""
+    def jpeg(self, s: int, k: int, widest: int = WIDEST_VIEWED_PICTURE) -> bytes:
+        """Image as JPEG in the size of the screen, at most ``widest`` pixels across."""
         from pkmcal.pages.jpegs import coded, narrowed
 
-        return coded(narrowed(self.image(s, k), WIDEST_VIEWED_PICTURE), VIEWED_JPEG_QUALITY)
+        return coded(narrowed(self.image(s, k), widest), VIEWED_JPEG_QUALITY)
 
     def drawn(self, s: int, k: int) -> Pane:
         """Nominal machine in front of a station's camera.
