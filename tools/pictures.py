@@ -47,9 +47,9 @@ from pkmcal.simulation import (
 )
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS, demo_camera
 from pkmcal.view.content import Viewed
-from pkmcal.view.server import (
+from pkmcal.view.server import application
+from pkmcal.web.serving import (
     LOOPBACK_ADDRESS,
-    application,
     listening_socket,
     new_token,
     serve_until_interrupted,
