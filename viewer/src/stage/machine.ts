@@ -242,6 +242,7 @@ export class MachineModel {
   private readonly links: { rods: Rod[]; legs: number[]; side: "base" | "platform" }[] = [];
   private readonly points: Vector3[];
   private configuration: Configuration;
+  private highlighted: number[] | null = null;
 
   constructor(
     private readonly machine: Machine,
@@ -331,8 +332,9 @@ export class MachineModel {
 
   /** Dim all legs but some; null for none. */
   highlight(legs: number[] | null): void {
+    this.highlighted = legs;
     this.legs.forEach((leg, j) => leg.dim(legs !== null && !legs.includes(j)));
-    this.stage.draw();
+    this.stage.setLabels(this.labels());
   }
 
   setLayer(layer: Layer, visible: boolean): void {
@@ -444,7 +446,7 @@ export class MachineModel {
     if (this.layers.signs.visible) {
       machine.legs.forEach((_leg, j) => {
         const way = configuration.legs[j].positive as Point[];
-        if (way.length < 2) return;
+        if (way.length < 2 || this.highlighted?.includes(j) === false) return;
         const [before, end] = way.slice(-2).map(vector);
         const ahead = end.clone().sub(before).normalize();
         add("+", `sign leg-${(j % LEG_COLOURS) + 1}`, end.addScaledVector(ahead, 2.6 * HEAD * extent));

@@ -65,7 +65,6 @@ export function machineView(host: HTMLElement, content: ViewerDocument): void {
   };
   sliders.forEach((slider, k) => {
     slider.onchange = (value) => move(k, value);
-    slider.onfocus = (active) => highlight(active ? machine.readings[k].legs : null);
   });
 
   // legs: hovered on the stage, or chosen in the list
@@ -162,7 +161,6 @@ const sense = (reading: Reading): string => `+ ${reading.direction} · 0: ${read
 /** Slider of a reading, with a field for its value. */
 class Slider {
   onchange: (value: number) => void = () => undefined;
-  onfocus: (active: boolean) => void = () => undefined;
   private readonly range: HTMLInputElement;
   private readonly field: HTMLInputElement;
 
@@ -177,15 +175,14 @@ class Slider {
     const send = (value: number): void => {
       if (Number.isFinite(value)) this.onchange(Math.min(Math.max(value, low), high));
     };
-    const focus = { onfocus: () => this.onfocus(true), onblur: () => this.onfocus(false) };
     this.range = h("input", {
       type: "range", min: low, max: high, step: (high - low) / (content.sweeps ? 400 : 2000),
-      "aria-label": label, oninput: () => send(this.range.valueAsNumber), ...focus,
+      "aria-label": label, oninput: () => send(this.range.valueAsNumber),
     });
     this.field = h("input", {
       type: "number", min: (low * factor).toFixed(decimals), max: (high * factor).toFixed(decimals),
       step: "any", "aria-label": `${label}, value`,
-      onchange: () => send(this.field.valueAsNumber / factor), ...focus,
+      onchange: () => send(this.field.valueAsNumber / factor),
     });
   }
 
@@ -270,6 +267,7 @@ function legsList(content: ViewerDocument, onchoice: (leg: number | null) => voi
         : legTable(content, current),
     );
     onchoice(current);
+    if (current !== null) rows.scrollIntoView({ block: "nearest" });
   };
   const buttons = content.machine.legs.map((leg, j) =>
     h(
