@@ -1,6 +1,7 @@
 # make install   the package and what it needs, in .venv
 # make demo      simulates a session, calibrates it, writes the report
 # make docs      the documentation as a site, in site/; any warning is an error
+# make viewer    the viewer's bundle in src/pkmcal/web, from viewer/; needs Node 20.19 or newer
 # make test      formatting, lint, types and tests, as the continuous integration does
 # make clean     removes .venv and what tools left behind
 #
@@ -10,7 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: install demo docs test clean
+.PHONY: install demo docs viewer test clean
 
 install: $(VENV)/.installed
 
@@ -20,6 +21,11 @@ demo: install
 docs: $(VENV)/.test-tools
 	$(BIN)/mkdocs build --strict
 
+viewer: $(VENV)/.installed
+	$(BIN)/python -c 'from pkmcal.web.document import schema_text; print(schema_text(), end="")' \
+	    > src/pkmcal/web/schema.json
+	cd viewer && npm ci --ignore-scripts && npm run build
+
 test: $(VENV)/.test-tools
 	@./.ci/chromium $(VENV)/.chromium-tried
 	$(BIN)/ruff check
@@ -28,7 +34,7 @@ test: $(VENV)/.test-tools
 	./.ci/checks $(BIN)
 
 clean:
-	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site viewer/node_modules .pytest_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Stamps: a second call does nothing until pyproject.toml changes. The installation is editable,

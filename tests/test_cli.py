@@ -37,7 +37,7 @@ from test_pose_sessions import make
 from test_report_page import PageParts
 
 COMMANDS = (
-    *("demo", "new", "check", "view", "board", "camera", "plan", "calibrate", "validate"),
+    *("demo", "new", "show", "check", "view", "board", "camera", "plan", "calibrate", "validate"),
     *("servo", "export", "watch", "diff", "simulate", "study", "reproduce"),
 )
 

@@ -29,6 +29,7 @@ from pkmcal.simulation import load_truth
 from pkmcal.view import server
 from pkmcal.view.content import Viewed
 from pkmcal.view.pose_file import PoseFile
+from pkmcal.web import serving
 from rendered import BOARD_SESSION, by_command
 from test_report_page import CHROMIUM, PageParts
 
@@ -121,7 +122,7 @@ def test_without_the_token_nothing_is_reported(page, path, token):
     answer = page.get(path, token)
     assert answer.status == 403
     assert answer.text == (
-        "This page opens with the whole address that pkmcal view printed, token included.\n"
+        "This page opens with the whole address that pkmcal printed, token included.\n"
     )
 
 
@@ -485,7 +486,7 @@ def test_the_command_serves_until_it_is_interrupted(demo):
 
 def test_answers_are_sent_at_once():
     """asyncio sends without delay (TCP_NODELAY) if the protocol is registered, else 40 ms later."""
-    with server.listening_socket(0) as socket_:
+    with serving.listening_socket(0) as socket_:
         assert socket_.getsockname()[0] == "127.0.0.1"
         assert socket_.proto == socket.IPPROTO_TCP
 
@@ -577,7 +578,7 @@ async function pulled(target, from, to) {
 def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch, width):
     """A user walks, pulls, undoes, pins two joints, and the machine snaps to its pose."""
     template, before = server._template, (session / "session.yaml").read_text()
-    with server.listening_socket(0) as socket_:
+    with serving.listening_socket(0) as socket_:
         port = socket_.getsockname()[1]
         subject = Viewed(load_session(session), demo.calibration)
         pane = subject.drawn(0, 0)
@@ -588,7 +589,7 @@ def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch
         app = server.application(subject, TOKEN, port)
         # a thread of its own has no signals to be ended by: it ends with the tests
         threading.Thread(
-            target=server.serve_until_interrupted, args=(app, socket_), daemon=True
+            target=serving.serve_until_interrupted, args=(app, socket_), daemon=True
         ).start()
         done = subprocess.run(
             [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",

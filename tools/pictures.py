@@ -43,9 +43,9 @@ from pkmcal.session.load import Session
 from pkmcal.simulation import load_truth, simulate_session, true_machine
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 from pkmcal.view.content import Viewed
-from pkmcal.view.server import (
+from pkmcal.view.server import application
+from pkmcal.web.serving import (
     LOOPBACK_ADDRESS,
-    application,
     listening_socket,
     new_token,
     serve_until_interrupted,

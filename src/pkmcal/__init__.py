@@ -20,6 +20,7 @@ from pkmcal import errors
 if TYPE_CHECKING:
     from pkmcal.api.calibrate import calibrate, load_result
     from pkmcal.api.plan import plan
+    from pkmcal.api.show import show
     from pkmcal.api.simulate import simulate
     from pkmcal.cameras import load_camera
     from pkmcal.judge.machine_errors import compare
@@ -40,6 +41,7 @@ __all__ = [
     "load_result",
     "load_session",
     "plan",
+    "show",
     "simulate",
     "study",
 ]
@@ -53,6 +55,7 @@ _HOMES = {
     "load_result": "pkmcal.api.calibrate",
     "load_session": "pkmcal.session.load",
     "plan": "pkmcal.api.plan",
+    "show": "pkmcal.api.show",
     "simulate": "pkmcal.api.simulate",
     "study": "pkmcal.studies.findings",
 }

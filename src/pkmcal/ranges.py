@@ -105,6 +105,7 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
         },
         "study": {"runs": _whole(2, 1_000_000), "seed": _SEED},
         "validate": {"regions": _whole(0, 1000), "seed": _SEED},
+        "show": {"port": _whole(0, 65_535)},
         "view": {"port": _whole(0, 65_535)},
         "watch": {"alpha": Range(1e-6, 0.2), "seed": _SEED},
     }

@@ -38,7 +38,7 @@ class Task:
 
 
 QUICK = ("calibrate tracker", "check tracker", "validate", "watch", "export", "camera board/",
-         "simulate OUT --plan", "read-camera", "new")  # fmt: skip
+         "simulate OUT --plan", "read-camera", "new", "show")  # fmt: skip
 OF_OURS = ("read-camera", "look-at")
 """No commands but what commands are made of."""
 FIRST = 1000
@@ -79,6 +79,7 @@ TASKS = (
     Task("camera board -o OUT", BOARD[:2] + 2 * BOARD[-1:], "camera", 2),
     Task("camera board/images --board FILE -o OUT", ("board/board.yaml",), "camera", 2),
     Task("camera board/images --board board/board.yaml -o OUT", BOARD[-1:], "camera", 2),
+    Task("show FILE -o OUT/page.html", ("machines/*.yaml",), "", 4),
     Task("servo calibration --camera cameras/pinhole.yaml --runs 1 --duration 1 -o OUT",
          (*RESULT, "cameras/pinhole.yaml"), "servo", 1),
     Task("simulate OUT --plan plan", ("plan/plan.json",), "", 3),

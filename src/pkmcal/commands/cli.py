@@ -44,6 +44,7 @@ _UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
 COMMANDS_IN_ORDER = (
     "demo",
     "new",
+    "show",
     "check",
     "view",
     "board",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pkmcal.commands import console
+from pkmcal.commands.serve import serve
 
 
 def view(
@@ -29,13 +29,7 @@ def view(
     from pkmcal.errors import InputError
     from pkmcal.session.load import load_session
     from pkmcal.view.content import Viewed
-    from pkmcal.view.server import (
-        LOOPBACK_ADDRESS,
-        application,
-        listening_socket,
-        new_token,
-        serve_until_interrupted,
-    )
+    from pkmcal.view.server import application
 
     loaded = load_session(session)
     if not loaded.stations:
@@ -50,21 +44,7 @@ def view(
     )
     if calibration is not None:
         _ = viewed.saved  # raises for an unusable file before the page is served
-    token = new_token()
-    with listening_socket(port) as socket_:
-        port = socket_.getsockname()[1]
-        address = f"http://{LOOPBACK_ADDRESS}:{port}/{token}/"
-        app = application(viewed, token, port)
-        if as_json:
-            console.print_json({"url": address})
-        else:
-            out = console.out()
-            out.print(f"The page is at\n\n  {address}\n", soft_wrap=True)
-            out.print("It is served to this computer only, until you press Ctrl-C.")
-        sys.stdout.flush()
-        if not no_browser and not as_json and console.can_show():
-            import webbrowser
-
-            webbrowser.open(address)
-        serve_until_interrupted(app, socket_)
-    return 0
+    return serve(
+        lambda token, port: application(viewed, token, port), port,
+        no_browser=no_browser, as_json=as_json,
+    )  # fmt: skip

@@ -1,9 +1,7 @@
-"""Requests of the page, validated as files are, because a page may be older than the program."""
+"""Requests of the page."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -11,7 +9,7 @@ from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Schema, validated_document
+from pkmcal.files import Schema
 
 Pixel = tuple[float, float]
 RequestedPoseRow = tuple[float, float, float, float]
@@ -59,17 +57,6 @@ class ViewRequest(Schema):
     gesture: Gesture | None = None
     pins: tuple[Pin, ...] = ()
     anywhere: bool = False
-
-
-def checked_request(body: bytes) -> ViewRequest:
-    """Request of the page. Raises InputError for anything that is not one."""
-    try:
-        data = json.loads(body)
-    except ValueError:
-        raise InputError("the request is not valid JSON", where="the page") from None
-    if not isinstance(data, dict):
-        raise InputError("the request is no JSON object", where="the page")
-    return validated_document(Document(Path("the page"), "the page", data, {}), ViewRequest)
 
 
 def requested_pose(request: ViewRequest) -> Array | None:

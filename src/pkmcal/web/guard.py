@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 LOOPBACK_HOST_NAMES = ("127.0.0.1", "localhost")
 REFUSED_REQUEST_TEXT = (
-    "This page opens with the whole address that pkmcal view printed, token included.\n"
+    "This page opens with the whole address that pkmcal printed, token included.\n"
 )
-VIEW_RESPONSE_HEADERS = {
+RESPONSE_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; img-src 'self' data:; style-src 'self';"
     " script-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none';"
     " frame-ancestors 'none'",
@@ -45,13 +45,13 @@ class Guard:
             await self._app(scope, receive, send)
             return
         if scope["type"] != "http" or not self._allowed(scope):
-            response = PlainTextResponse(REFUSED_REQUEST_TEXT, 403, VIEW_RESPONSE_HEADERS)
+            response = PlainTextResponse(REFUSED_REQUEST_TEXT, 403, RESPONSE_HEADERS)
             await response(scope, receive, send)
             return
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(VIEW_RESPONSE_HEADERS)
+                MutableHeaders(scope=message).update(RESPONSE_HEADERS)
             await send(message)
 
         await self._app(scope, receive, with_headers)

@@ -1,0 +1,161 @@
+"""Machine in space with sliders for its readings, as ``pkmcal show`` opens it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.mechanisms import Machine
+
+if TYPE_CHECKING:
+    from pkmcal.web.document import ViewerDocument
+
+NOTEBOOK_HEIGHT = 760
+"""Height of the page in a notebook, px."""
+PAGE_MARK = b"/*! pkmcal viewer;"
+"""Text of every page with the viewer in it."""
+
+
+@dataclass(frozen=True)
+class MachineView:
+    """Machine to look at; in a notebook it shows itself.
+
+    Attributes
+    ----------
+    machine :
+        The machine.
+    origin :
+        Sentence on where its values are from.
+    sigma :
+        Standard deviations (P,) of its parameters, None for a nominal model.
+    cameras :
+        Camera and its pose T_base_camera (4, 4), m, by the station's name.
+
+    """
+
+    machine: Machine
+    origin: str
+    sigma: Array | None = None
+    cameras: Mapping[str, tuple[Camera, Array]] = field(
+        default_factory=lambda: MappingProxyType(dict[str, tuple[Camera, Array]]())
+    )
+
+    __repr__ = short_repr
+
+    @cached_property
+    def _swept(self) -> ViewerDocument:
+        """Document of a page in one file, with each reading's sweep from home."""
+        return self._document(sweeps=True)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The viewer's document as it is in the page."""
+        return self._swept.model_dump(mode="json")
+
+    @property
+    def html(self) -> str:
+        """Page in one file."""
+        from pkmcal.web.page import standalone_page
+
+        return standalone_page(self._swept)
+
+    def save(self, path: Path | str) -> None:
+        """Write the page. Raises InputError where another program's file has this name."""
+        path = Path(path)
+        regular = path.is_file() and not path.is_symlink()
+        if os.path.lexists(path) and not (regular and PAGE_MARK in path.read_bytes()):
+            raise InputError(
+                "this is not a page of the viewer, and stays as it is",
+                where=str(path),
+                next_step="Name another file with -o",
+            )
+        from pkmcal.files import write_text
+
+        write_text(path, self.html)
+
+    def served(self) -> ViewerDocument:
+        """Document of a page that asks for its poses."""
+        return self._document(sweeps=False)
+
+    def _document(self, *, sweeps: bool) -> ViewerDocument:
+        from pkmcal.web.machine_page import machine_document
+
+        return machine_document(
+            self.machine, origin=self.origin, sigma=self.sigma, cameras=self.cameras, sweeps=sweeps
+        )
+
+    def _repr_html_(self) -> str:
+        """Page in a frame, for notebooks."""
+        return (
+            f'<iframe srcdoc="{escape(self.html)}" sandbox="allow-scripts" loading="lazy"'
+            f' title="{escape(self.machine.name)}" width="100%" height="{NOTEBOOK_HEIGHT}"'
+            ' style="border: 0"></iframe>'
+        )
+
+
+def show(source: Machine | Path | str) -> MachineView:
+    """Machine in space, with sliders for its readings, the zeros and positive directions drawn.
+
+    Parameters
+    ----------
+    source :
+        A machine, a built-in machine's name, a mechanism file, a session's folder (with its
+        cameras at their stations' poses) or a calibration's folder.
+
+    Returns
+    -------
+    MachineView
+        ``view.save("machine.html")``, ``view.document``; in a notebook it shows itself.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        ``source`` is none of these, or its files have a fault.
+    pkmcal.errors.GeometryError
+        The machine cannot be assembled.
+
+    """
+    if isinstance(source, Machine):
+        return MachineView(source, "A machine in memory")
+    folder = Path(source)
+    if (folder / "session.yaml").is_file() and not (folder / "calibration.json").is_file():
+        return _of_session(folder)
+    from pkmcal.calibration.machine_source import load_source
+
+    loaded = load_source(source)
+    state = "calibrated values" if loaded.calibrated else "nominal values"
+    if not loaded.usable:
+        state += " that should not be used"
+    cameras = {
+        name: (camera, loaded.T_base_camera[name])
+        for name, camera in loaded.cameras.items()
+        if name in loaded.T_base_camera
+    }
+    return MachineView(
+        loaded.machine, f"From {loaded.origin}, {state}", loaded.sigma, MappingProxyType(cameras)
+    )
+
+
+def _of_session(folder: Path) -> MachineView:
+    """Nominal model of a session with its stations' rough poses."""
+    from pkmcal.files import resolved
+    from pkmcal.geometry.rigid import inverse
+    from pkmcal.session.load import load_session
+
+    session = load_session(folder)
+    cameras = {
+        station.name: (station.camera, inverse(station.T_camera_base))
+        for station in session.stations
+        if station.T_camera_base is not None and not station.handheld
+    }
+    origin = f"From the session {resolved(folder).name}, nominal values and rough camera poses"
+    return MachineView(session.machine, origin, cameras=MappingProxyType(cameras))

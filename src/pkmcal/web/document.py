@@ -1,0 +1,189 @@
+"""Document of the viewer: everything that a page shows, as one versioned JSON object.
+
+Python computes, the viewer draws: points are in metres in the base frame and angles in radians,
+unless a field says otherwise. ``schema.json`` beside this file is the JSON schema of
+:class:`ViewerDocument`; the viewer's types are generated from it. A change of a field's meaning
+raises the document's version.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator
+
+from pkmcal.errors import legible
+from pkmcal.files import Schema
+
+Text = Annotated[str, BeforeValidator(lambda text: legible(text, keep="\n"))]
+"""Text of a user's file: control characters are made visible."""
+Vector = tuple[float, float, float]
+Line = tuple[Vector, ...]
+"""Points of a polyline; empty where there is nothing to draw."""
+PoseRow = tuple[float, float, float, float]
+Pose = tuple[PoseRow, PoseRow, PoseRow, PoseRow]
+
+
+class Row(Schema):
+    """Row of a table of properties."""
+
+    label: Text
+    value: Text
+
+
+class Tube(Schema):
+    """Visible cylinder of a leg; ``start`` and ``stop`` from A towards B, m."""
+
+    radius: float
+    start: float
+    stop: float
+
+
+class Leg(Schema):
+    """What of a leg does not depend on the configuration.
+
+    number : from 1.
+    reading : index of its reading, null without one.
+    body : index of the platform's bar on which the leg ends, null for a rigid platform.
+    tubes : empty if the file has none; then the rod is drawn with a thin line.
+    path : of A over the range of the reading; empty if the reading does not move A.
+    rows : its parameters.
+    """
+
+    number: int
+    reading: int | None
+    body: int | None
+    tubes: tuple[Tube, ...]
+    path: Line
+    rows: tuple[Row, ...]
+
+
+class Reading(Schema):
+    """Joint reading: its range and the sense of its sign.
+
+    unit : m or rad.
+    low, high : range of the slider.
+    stated : whether this is the range of the mechanism file; otherwise it is an assumption.
+    legs : indices of the legs that it moves.
+    direction, zero : sentences on what a larger reading does, and where the reading is zero.
+    """
+
+    name: Text
+    unit: Literal["m", "rad"]
+    low: float
+    high: float
+    stated: bool
+    legs: tuple[int, ...]
+    direction: Text
+    zero: Text
+
+
+class Axis(Schema):
+    """Axis of a joint: a point and a unit direction, in the frame of the body that holds it."""
+
+    leg: int
+    side: Literal["base", "platform"]
+    point: Vector
+    direction: Vector
+    label: Text
+
+
+class LegConfiguration(Schema):
+    """Lines of a leg in one configuration.
+
+    base : from where a motor holds the arm, if there is one, to A.
+    platform : from the hinge of a bar, if there is one, to B.
+    positive : way of the moving point as the reading grows, for an arrow beside it.
+    zero : the arm, or A, or the point of the leg from which its length is counted, at reading zero.
+    """
+
+    base: Line
+    platform: Line
+    positive: Line
+    zero: Line
+
+
+class Configuration(Schema):
+    """Machine at one set of readings.
+
+    readings : in m or rad.
+    T_base_platform : rows of the matrix.
+    rotation : rotation vector of the platform, rad.
+    legs : in their order.
+    beyond : indices of the readings outside their stated ranges.
+    """
+
+    readings: tuple[float, ...]
+    T_base_platform: Pose
+    rotation: Vector
+    legs: tuple[LegConfiguration, ...]
+    beyond: tuple[int, ...]
+
+
+class CameraShape(Schema):
+    """Camera at its station: the border of the image at some depth, and rays to its corners."""
+
+    name: Text
+    position: Vector
+    lines: tuple[Line, ...]
+
+
+class Machine(Schema):
+    """Machine of a stage.
+
+    name, motion : of the mechanism file.
+    base_outline, platform_outline : closed polygons through joints; the latter in the platform
+        frame.
+    workspace : positions of the platform's origin at readings within their ranges.
+    home : the first configuration.
+    """
+
+    name: Text
+    motion: Text
+    legs: tuple[Leg, ...]
+    readings: tuple[Reading, ...]
+    axes: tuple[Axis, ...]
+    base_outline: Line
+    platform_outline: Line
+    cameras: tuple[CameraShape, ...]
+    workspace: Line
+    home: Configuration
+
+
+class Sweep(Schema):
+    """Configurations with one reading changed from home; null where no pose was found."""
+
+    values: tuple[float, ...]
+    configurations: tuple[Configuration | None, ...]
+
+
+class ViewerDocument(Schema):
+    """Document of a page.
+
+    version : of this format.
+    kind : the page; ``machine``: a machine with sliders for its readings.
+    program : name and version of the program that wrote it.
+    title, subtitle : heading of the page.
+    notes : sentences below it.
+    machine : the machine of the stage.
+    sweeps : one for each reading; null if the page asks the program for poses.
+    redundant : whether other readings follow if one changes.
+    """
+
+    version: Literal[1]
+    kind: Literal["machine"]
+    program: str
+    title: Text
+    subtitle: Text
+    notes: tuple[Text, ...]
+    machine: Machine
+    sweeps: tuple[Sweep, ...] | None
+    redundant: bool
+
+
+def schema_text() -> str:
+    """JSON schema of :class:`ViewerDocument`, the content of ``schema.json``."""
+    schema = ViewerDocument.model_json_schema(mode="serialization")
+    dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return json.dumps({**dialect, **schema}, indent=2) + "\n"

@@ -1,0 +1,176 @@
+"""Page of one machine: its document, and the poses that the page asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.files import Schema
+from pkmcal.mechanisms import Machine
+from pkmcal.web import document as shapes
+from pkmcal.web import serving
+from pkmcal.web.guard import Guard
+from pkmcal.web.motion import Postures, home_posture, moved, sweeps
+from pkmcal.web.page import SCRIPT_FILE, STYLE_FILE, bundle_file, served_page
+from pkmcal.web.stage import configurations, leg_rows, machine_shape, slider_ranges
+from pkmcal.wording import count
+
+SWEEP_CONFIGURATIONS = 41
+"""Configurations of each reading's sweep in a page without a program behind it."""
+MOTION_TEXTS = {
+    "spatial": "spatial",
+    "planar": "in the x-y plane with the turn about z",
+    "translation": "translation",
+    "schoenflies": "translation with the turn about z",
+    "planar-translation": "translation in the x-y plane",
+}
+"""Motions of the platform in the heading."""
+
+
+def machine_document(
+    machine: Machine,
+    *,
+    origin: str,
+    sigma: Array | None = None,
+    cameras: Mapping[str, tuple[Camera, Array]] | None = None,
+    notes: tuple[str, ...] = (),
+    sweeps: bool = True,
+) -> shapes.ViewerDocument:
+    """Document of a machine with sliders for its readings.
+
+    origin : of the machine's values, for the heading.
+    sigma : (P,) standard deviations of a calibration.
+    cameras : camera and T_base_camera (4, 4) by name.
+    sweeps : whether each reading's sweep is computed; otherwise the page asks for poses.
+    Raises InputError or GeometryError for a machine that cannot be assembled.
+    """
+    shape = machine_shape(machine, leg_rows(machine, sigma), cameras or {})
+    redundant = machine.redundancy > 0
+    notes += _notes(machine, shape, redundant)
+    return shapes.ViewerDocument(
+        version=1,
+        kind="machine",
+        program=f"pkmcal {version('pkmcal')}",
+        title=machine.name,
+        subtitle=f"{origin}. {count(machine.n_legs, 'leg')},"
+        f" {count(machine.n_joints, 'reading')},"
+        f" {count(machine.n_joints - machine.redundancy, 'degree')} of freedom"
+        f" ({MOTION_TEXTS[machine.document.motion]}).",
+        notes=notes,
+        machine=shape,
+        sweeps=_sweeps(machine) if sweeps else None,
+        redundant=redundant,
+    )
+
+
+def _notes(machine: Machine, shape: shapes.Machine, redundant: bool) -> tuple[str, ...]:
+    """Sentences on what the page assumes."""
+    out: list[str] = []
+    if shape.home.beyond:
+        names = ", ".join(shape.readings[k].name for k in shape.home.beyond)
+        out.append(f"At home these readings are outside their ranges: {names}.")
+    if not all(reading.stated for reading in shape.readings):
+        out.append("The mechanism file gives no range for some readings; their sliders assume one.")
+    if redundant:
+        out.append(
+            f"{count(machine.redundancy, 'reading')} more than the platform has freedoms: the"
+            " other readings follow the one that changes."
+        )
+    return tuple(out)
+
+
+def _sweeps(machine: Machine) -> tuple[shapes.Sweep, ...]:
+    """Sweeps of all readings from home."""
+    home = home_posture(machine)
+    ranges = slider_ranges(machine, home.readings[0])
+    values, postures = sweeps(machine, home, ranges, SWEEP_CONFIGURATIONS)
+    closed = postures.closed
+    shapes_of = iter(
+        configurations(machine, postures.readings[closed], postures.T_base_platform[closed])
+    )
+    each = [next(shapes_of) if is_closed else None for is_closed in closed]
+    return tuple(
+        shapes.Sweep(
+            values=tuple(round(float(v), 9) + 0.0 for v in row),
+            configurations=tuple(each[k * row.size : (k + 1) * row.size]),
+        )
+        for k, row in enumerate(values)
+    )
+
+
+class PoseRequest(Schema):
+    """Request of the page: one reading changes from a configuration that it has.
+
+    index, value : of the reading that changes, from 0, and its new value in m or rad.
+    readings, T_base_platform : of the present configuration.
+    """
+
+    index: int = Field(ge=0)
+    value: float
+    readings: tuple[float, ...]
+    T_base_platform: shapes.Pose
+
+
+def configuration_at(machine: Machine, request: PoseRequest) -> dict[str, Any]:
+    """Response to a request: the configuration, or null where the way to it has no pose.
+
+    Raises InputError for readings or a pose that do not belong to the machine.
+    """
+    if len(request.readings) != machine.n_joints or request.index >= machine.n_joints:
+        raise InputError(
+            "the request belongs to another machine",
+            where="the page, readings",
+            found=count(len(request.readings), "reading"),
+            expected=str(machine.n_joints),
+        )
+    posture = Postures(np.array([request.readings]), np.array([request.T_base_platform]))
+    rotation = posture.T_base_platform[0, :3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+        raise InputError("the pose is no rotation and translation", where="the page, pose")
+    low, high = slider_ranges(machine, home_posture(machine).readings[0])[request.index]
+    if not low <= request.value <= high:
+        raise InputError(
+            "this reading is outside its range",
+            where=f"the page, {machine.joint_names[request.index]}",
+            found=f"{request.value:g}",
+            expected=f"{low:g} to {high:g}",
+        )
+    after = moved(machine, posture, request.index, request.value, high - low)
+    if not after.closed.all():
+        return {"configuration": None}
+    (shape,) = configurations(machine, after.readings, after.T_base_platform)
+    return {"configuration": shape.model_dump(mode="json")}
+
+
+def application(machine: Machine, document: shapes.ViewerDocument, token: str, port: int) -> Guard:
+    """ASGI application: the page at /TOKEN/, its bundle, and the poses that it asks for."""
+    from starlette.requests import Request
+    from starlette.responses import HTMLResponse, Response
+    from starlette.routing import Route
+
+    async def page(_request: Request) -> Response:
+        return HTMLResponse(served_page(document))
+
+    async def script(_request: Request) -> Response:
+        return Response(bundle_file(SCRIPT_FILE), media_type="text/javascript")
+
+    async def style(_request: Request) -> Response:
+        return Response(bundle_file(STYLE_FILE), media_type="text/css")
+
+    def pose(request: PoseRequest) -> dict[str, Any]:
+        return configuration_at(machine, request)
+
+    routes = [
+        Route("/", page),
+        Route(f"/{SCRIPT_FILE}", script),
+        Route(f"/{STYLE_FILE}", style),
+        Route("/pose", serving.json_endpoint(PoseRequest, pose), methods=["POST"]),
+    ]
+    return serving.application(routes, token, port)

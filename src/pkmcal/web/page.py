@@ -1,0 +1,83 @@
+"""HTML of the viewer: a shell with the document, and the bundle inlined or beside it.
+
+The bundle is built from ``viewer/`` by ``make viewer`` and carries the SHA-256 of its sources. A
+self-contained page may fetch nothing: its Content-Security-Policy allows the scripts and styles
+with the hashes of the bundle, and no other, whatever a name in a file holds.
+"""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from functools import cache
+from hashlib import sha256
+from html import escape
+from importlib import resources
+
+from pkmcal.web.document import ViewerDocument
+
+SCRIPT_FILE, STYLE_FILE = "viewer.js", "viewer.css"
+
+
+@cache
+def bundle_file(name: str) -> str:
+    """Text of a file of the bundle."""
+    return (resources.files("pkmcal.web") / "bundle" / name).read_text("utf-8")
+
+
+def standalone_page(document: ViewerDocument) -> str:
+    """Page in one file that opens without a network."""
+    script, style = bundle_file(SCRIPT_FILE), bundle_file(STYLE_FILE)
+    policy = (
+        f"default-src 'none'; img-src data: blob:; style-src {_hash_source(style)};"
+        f" script-src {_hash_source(script)}; base-uri 'none'; form-action 'none'"
+    )
+    return _shell(
+        document,
+        head=f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f"<style>{style}</style>",
+        end=f"<script>{script}</script>",
+    )
+
+
+def served_page(document: ViewerDocument) -> str:
+    """Page beside which a server has the bundle; the server's headers hold its policy."""
+    return _shell(
+        document,
+        head=f'<link rel="stylesheet" href="{STYLE_FILE}">',
+        end=f'<script src="{SCRIPT_FILE}"></script>',
+    )
+
+
+def _hash_source(text: str) -> str:
+    """Source expression of an inline script or style in a Content-Security-Policy."""
+    return f"'sha256-{b64encode(sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
+
+
+def _shell(document: ViewerDocument, head: str, end: str) -> str:
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>{escape(document.title)}</title>
+<link rel="icon" href="data:,">
+{head}
+</head>
+<body>
+<div id="viewer"><noscript><p>{escape(document.title)}: this page is drawn by a script, and scripts
+are switched off in this browser.</p></noscript></div>
+<script type="application/json" id="document">{embedded_json(document)}</script>
+{end}
+</body>
+</html>
+"""
+
+
+def embedded_json(document: ViewerDocument) -> str:
+    """JSON inside a script element, which no text in it can end."""
+    text = json.dumps(document.model_dump(mode="json"), ensure_ascii=False, allow_nan=False)
+    for sign in "<>&\u2028\u2029":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return text

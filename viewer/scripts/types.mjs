@@ -1,0 +1,32 @@
+// Writes src/document.ts, the types of the document, from the schema that Python publishes.
+import { readFile, writeFile } from "node:fs/promises";
+import { compile } from "json-schema-to-typescript";
+
+const schema = JSON.parse(
+  await readFile(new URL("../../src/pkmcal/web/schema.json", import.meta.url), "utf8"),
+);
+// Python writes every field, also those with a default
+for (const part of [schema, ...Object.values(schema.$defs)]) {
+  if (part.properties) part.required = Object.keys(part.properties);
+}
+// a title on each field would become a type of its own; tuples are written as before 2020-12
+const strip = (node) => {
+  if (Array.isArray(node)) node.forEach(strip);
+  else if (node && typeof node === "object") {
+    if (node.prefixItems) {
+      node.items = node.prefixItems;
+      delete node.prefixItems;
+    }
+    for (const [key, value] of Object.entries(node)) {
+      if (key === "properties") for (const one of Object.values(value)) delete one.title;
+      strip(value);
+    }
+  }
+};
+strip(schema);
+const text = await compile(schema, "ViewerDocument", {
+  additionalProperties: false,
+  bannerComment: "// Generated from src/pkmcal/web/schema.json by `npm run types`; do not edit.",
+});
+const target = process.argv[2] ?? new URL("../src/document.ts", import.meta.url);
+await writeFile(target, text);

@@ -1,0 +1,178 @@
+// Generated from src/pkmcal/web/schema.json by `npm run types`; do not edit.
+
+/**
+ * Document of a page.
+ *
+ * version : of this format.
+ * kind : the page; ``machine``: a machine with sliders for its readings.
+ * program : name and version of the program that wrote it.
+ * title, subtitle : heading of the page.
+ * notes : sentences below it.
+ * machine : the machine of the stage.
+ * sweeps : one for each reading; null if the page asks the program for poses.
+ * redundant : whether other readings follow if one changes.
+ */
+export interface ViewerDocument {
+  version: 1;
+  kind: "machine";
+  program: string;
+  title: string;
+  subtitle: string;
+  notes: string[];
+  machine: Machine;
+  sweeps: Sweep[] | null;
+  redundant: boolean;
+}
+/**
+ * Machine of a stage.
+ *
+ * name, motion : of the mechanism file.
+ * base_outline, platform_outline : closed polygons through joints; the latter in the platform
+ *     frame.
+ * workspace : positions of the platform's origin at readings within their ranges.
+ * home : the first configuration.
+ */
+export interface Machine {
+  name: string;
+  motion: string;
+  legs: Leg[];
+  readings: Reading[];
+  axes: Axis[];
+  base_outline: [number, number, number][];
+  platform_outline: [number, number, number][];
+  cameras: CameraShape[];
+  workspace: [number, number, number][];
+  home: Configuration;
+}
+/**
+ * What of a leg does not depend on the configuration.
+ *
+ * number : from 1.
+ * reading : index of its reading, null without one.
+ * body : index of the platform's bar on which the leg ends, null for a rigid platform.
+ * tubes : empty if the file has none; then the rod is drawn with a thin line.
+ * path : of A over the range of the reading; empty if the reading does not move A.
+ * rows : its parameters.
+ */
+export interface Leg {
+  number: number;
+  reading: number | null;
+  body: number | null;
+  tubes: Tube[];
+  path: [number, number, number][];
+  rows: Row[];
+}
+/**
+ * Visible cylinder of a leg; ``start`` and ``stop`` from A towards B, m.
+ */
+export interface Tube {
+  radius: number;
+  start: number;
+  stop: number;
+}
+/**
+ * Row of a table of properties.
+ */
+export interface Row {
+  label: string;
+  value: string;
+}
+/**
+ * Joint reading: its range and the sense of its sign.
+ *
+ * unit : m or rad.
+ * low, high : range of the slider.
+ * stated : whether this is the range of the mechanism file; otherwise it is an assumption.
+ * legs : indices of the legs that it moves.
+ * direction, zero : sentences on what a larger reading does, and where the reading is zero.
+ */
+export interface Reading {
+  name: string;
+  unit: "m" | "rad";
+  low: number;
+  high: number;
+  stated: boolean;
+  legs: number[];
+  direction: string;
+  zero: string;
+}
+/**
+ * Axis of a joint: a point and a unit direction, in the frame of the body that holds it.
+ */
+export interface Axis {
+  leg: number;
+  side: "base" | "platform";
+  /**
+   * @minItems 3
+   * @maxItems 3
+   */
+  point: [number, number, number];
+  /**
+   * @minItems 3
+   * @maxItems 3
+   */
+  direction: [number, number, number];
+  label: string;
+}
+/**
+ * Camera at its station: the border of the image at some depth, and rays to its corners.
+ */
+export interface CameraShape {
+  name: string;
+  /**
+   * @minItems 3
+   * @maxItems 3
+   */
+  position: [number, number, number];
+  lines: [number, number, number][][];
+}
+/**
+ * Machine at one set of readings.
+ *
+ * readings : in m or rad.
+ * T_base_platform : rows of the matrix.
+ * rotation : rotation vector of the platform, rad.
+ * legs : in their order.
+ * beyond : indices of the readings outside their stated ranges.
+ */
+export interface Configuration {
+  readings: number[];
+  /**
+   * @minItems 4
+   * @maxItems 4
+   */
+  T_base_platform: [
+    [number, number, number, number],
+    [number, number, number, number],
+    [number, number, number, number],
+    [number, number, number, number]
+  ];
+  /**
+   * @minItems 3
+   * @maxItems 3
+   */
+  rotation: [number, number, number];
+  legs: LegConfiguration[];
+  beyond: number[];
+}
+/**
+ * Lines of a leg in one configuration.
+ *
+ * base : from where a motor holds the arm, if there is one, to A.
+ * platform : from the hinge of a bar, if there is one, to B.
+ * positive : way of the moving point as the reading grows, for an arrow beside it.
+ * zero : the arm, or A, or the point of the leg from which its length is counted, at reading zero.
+ */
+export interface LegConfiguration {
+  base: [number, number, number][];
+  platform: [number, number, number][];
+  positive: [number, number, number][];
+  zero: [number, number, number][];
+}
+/**
+ * Configurations with one reading changed from home; null where no pose was found.
+ */
+export interface Sweep {
+  values: number[];
+  configurations: (Configuration | null)[];
+}

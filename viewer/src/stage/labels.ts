@@ -1,0 +1,84 @@
+/** Labels of points in space: HTML over the canvas, none over another. */
+
+import type { Camera, Vector3 } from "three";
+import { h } from "../dom";
+
+export interface Label {
+  text: string;
+  className: string;
+  /** Where it may stand, best first. */
+  places: Vector3[];
+}
+
+interface Box {
+  left: number;
+  top: number;
+  right: number;
+  bottom: number;
+}
+
+const GAP = 2;
+
+export class Labels {
+  readonly layer = h("div", { class: "labels", "aria-hidden": "true" });
+  private elements: { element: HTMLElement; label: Label; width: number; height: number }[] = [];
+
+  /** Other labels; those that come first have the choice of places. */
+  replace(labels: Label[]): void {
+    const same =
+      labels.length === this.elements.length &&
+      labels.every((label, k) => {
+        const { label: old } = this.elements[k];
+        return old.text === label.text && old.className === label.className;
+      });
+    if (same) {
+      labels.forEach((label, k) => (this.elements[k].label = label));
+      return;
+    }
+    this.elements = labels.map((label) => {
+      const element = h("span", { class: label.className }, label.text);
+      return { element, label, width: 0, height: 0 };
+    });
+    this.layer.replaceChildren(...this.elements.map((one) => one.element));
+  }
+
+  /** Place all labels; one for which there is no room is hidden. */
+  place(camera: Camera, width: number, height: number): void {
+    const taken: Box[] = [];
+    for (const one of this.elements) {
+      if (!one.width) {
+        one.width = one.element.offsetWidth;
+        one.height = one.element.offsetHeight;
+      }
+      const box = one.label.places
+        .map((place) => screen(place, camera, width, height, one))
+        .find((candidate) => candidate && !taken.some((other) => overlap(candidate, other)));
+      one.element.style.visibility = box ? "visible" : "hidden";
+      if (!box) continue;
+      taken.push(box);
+      one.element.style.transform = `translate(${box.left}px, ${box.top}px)`;
+    }
+  }
+}
+
+function screen(
+  place: Vector3,
+  camera: Camera,
+  width: number,
+  height: number,
+  size: { width: number; height: number },
+): Box | undefined {
+  const p = place.clone().project(camera);
+  if (p.z > 1) return undefined;
+  const left = Math.round(((p.x + 1) / 2) * width - size.width / 2);
+  const top = Math.round(((1 - p.y) / 2) * height - size.height / 2);
+  const box = { left, top, right: left + size.width, bottom: top + size.height };
+  const inside = left >= 0 && top >= 0 && box.right <= width && box.bottom <= height;
+  return inside ? box : undefined;
+}
+
+function overlap(a: Box, b: Box): boolean {
+  return (
+    a.left < b.right + GAP && b.left < a.right + GAP && a.top < b.bottom + GAP && b.top < a.bottom + GAP
+  );
+}
