@@ -31,7 +31,7 @@ import printers
 from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.contract import make_export
+from pkmcal.exporters.contract import make_export
 from pkmcal.mechanisms import Machine
 from pkmcal.printers.klipper import sections
 from pkmcal.printers.session import write_printer_session

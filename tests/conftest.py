@@ -28,7 +28,7 @@ settings.load_profile("quick")
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.check.results import SessionCheck
+    from pkmcal.checks.results import SessionCheck
 
 Found = TypeVar("Found")
 
@@ -193,7 +193,7 @@ def calibrated(calibrating) -> Calibration:
 @pytest.fixture(scope="session")
 def checked(demo, common) -> Told[SessionCheck]:
     """The demonstration's session, checked from Python."""
-    from pkmcal.check.check import check_session
+    from pkmcal.checks.check import check_session
 
     def make() -> Told[SessionCheck]:
         progress: list[tuple[str, float]] = []

@@ -11,7 +11,7 @@ import pytest
 from pkmcal.calibration import calibrate, chance_matches
 from pkmcal.calibration.chance_matches import IMAGE_OFFSET, by_chance, chance_match_reason
 from pkmcal.calibration.refinement import RefinementResult
-from pkmcal.commands.comparison import compare_with_truth
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
 from pkmcal.observe.legs import measure
 from pkmcal.observe.profiles import PROFILE_OPTIONS

@@ -10,10 +10,10 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.leg_numbering import equal_numberings, numbering_note
-from pkmcal.check import check
-from pkmcal.check.check import _kinematics, check_session
-from pkmcal.check.results import JointCheck, StationCheck
-from pkmcal.check.sentences import joint_findings, station_findings
+from pkmcal.checks import check
+from pkmcal.checks.check import _kinematics, check_session
+from pkmcal.checks.results import JointCheck, StationCheck
+from pkmcal.checks.sentences import joint_findings, station_findings
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.outcome import Level
@@ -266,7 +266,7 @@ def test_nearly_singular_configurations_are_named(demo, monkeypatch):
     session = load_session(demo.session)
     singularity = session.machine.forward_result(session.joints).singularity
     weakest = session.configurations[int(np.argmin(singularity))]
-    monkeypatch.setattr("pkmcal.check.check.NEAR_SINGULAR", singularity.min() + 1e-9)
+    monkeypatch.setattr("pkmcal.checks.check.NEAR_SINGULAR", singularity.min() + 1e-9)
     (finding,) = _kinematics(session, np.random.default_rng(0)).findings
     assert finding.level is Level.DOUBTFUL
     assert finding.text.startswith(f"Near a singular pose in configuration {weakest}: ")

@@ -345,7 +345,7 @@ def test_new_in_a_folder_that_is_not_empty(demo):
 
 
 def test_check_of_a_good_session(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked.found)
     done = run("check", session)
     assert done.code == 0
     assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
@@ -366,7 +366,7 @@ def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path
 
 
 def test_check_as_json(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked.found)
     count = run("check", session, "--json").json
     assert count["exit_code"] == 0
     assert_keys("check --json", count)

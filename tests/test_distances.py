@@ -19,7 +19,7 @@ from pkmcal.calibration.localization import prior_station_poses
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.refinement import identify_poses
 from pkmcal.errors import InputError
-from pkmcal.export.contract import make_export
+from pkmcal.exporters.contract import make_export
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.session.load import load_session
 from test_heights import flat, pasted

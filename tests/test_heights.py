@@ -16,9 +16,9 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.machine_source import MachineSource, load_source
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
-from pkmcal.export import reprap
-from pkmcal.export.contract import make_export
-from pkmcal.export.klipper import Klipper
+from pkmcal.exporters import reprap
+from pkmcal.exporters.contract import make_export
+from pkmcal.exporters.klipper import Klipper
 from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import load_mechanism

@@ -10,7 +10,7 @@ import pytest
 from kit_sessions import Kit, board_kit, flatness, places, probe_kit, tool
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.contract import make_export
+from pkmcal.exporters.contract import make_export
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.calibration import report_of

@@ -19,7 +19,7 @@ from export_sources import built, calibration, source_of
 from fuzz import bases
 from pkmcal.commands import console
 from pkmcal.errors import InputError, legible
-from pkmcal.export.contract import exporters
+from pkmcal.exporters.contract import exporters
 from pkmcal.files import json_text, read_json, read_yaml
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict

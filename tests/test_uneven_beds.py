@@ -13,7 +13,7 @@ from pkmcal.calibration.discrepancy_basis import UNEVEN_BED
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.results import calibration_document
 from pkmcal.calibration.saved_calibration import load
-from pkmcal.check.check import check_session
+from pkmcal.checks.check import check_session
 from pkmcal.files import json_value
 from pkmcal.geometry.rigid import pose
 from pkmcal.outcome import Level

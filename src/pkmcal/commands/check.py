@@ -30,8 +30,8 @@ def check(
     as_json: console.Json = False,
 ) -> int:
     """Find what is wrong with a session before any work is spent."""
-    from pkmcal.check.check import check_session
-    from pkmcal.check.sentences import outcome_of
+    from pkmcal.checks.check import check_session
+    from pkmcal.checks.sentences import outcome_of
     from pkmcal.files import check_own_folder, check_writable
 
     if out is not None:
@@ -51,7 +51,7 @@ def check(
             outcome = replace(outcome, document={**outcome.document, "repeats": repeats})
         files: dict[str, str] = {}
         if pictures is not None and check.look:
-            from pkmcal.check.pictures import picture_names, write_pictures
+            from pkmcal.checks.pictures import picture_names, write_pictures
 
             progress("Drawing", 0.95)
             names = picture_names(check.look).values()
@@ -60,7 +60,7 @@ def check(
             files[str(pictures)] = OVERLAYS_DESCRIPTION
         if out is not None:
             if check.look:
-                from pkmcal.check.pictures import with_pictures
+                from pkmcal.checks.pictures import with_pictures
 
                 progress("Writing the page", 0.97)
                 outcome = replace(outcome, parts=(*outcome.parts, with_pictures(check.look)))

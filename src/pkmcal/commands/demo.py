@@ -16,7 +16,7 @@ from pkmcal.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.commands.comparison import AgainstTruth
+    from pkmcal.judge.against_truth import AgainstTruth
 
 DEMO_FOLDER = Path("pkmcal-demo")
 DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME = "session", "calibration"
@@ -39,7 +39,7 @@ def demo(
 
     from pkmcal.calibration.calibrate import calibrate_session
     from pkmcal.calibration.results import check_output
-    from pkmcal.commands.comparison import compare_with_truth
+    from pkmcal.judge.against_truth import compare_with_truth
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.report.calibration import outcome_of
     from pkmcal.simulation import simulate_session

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pkmcal.calibration.machine_source import MachineSource
-    from pkmcal.export.contract import Export
+    from pkmcal.exporters.contract import Export
 
 
 def export(
@@ -42,8 +42,8 @@ def export(
 ) -> int:
     """Write the machine for a controller, a firmware or a simulator."""
     from pkmcal.calibration.machine_source import load_source
-    from pkmcal.export.contract import exporter_of, write_export
-    from pkmcal.export.contract import make_export as run
+    from pkmcal.exporters.contract import exporter_of, write_export
+    from pkmcal.exporters.contract import make_export as run
     from pkmcal.files import default_output
 
     exporter_of(to)

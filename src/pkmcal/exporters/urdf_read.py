@@ -1,4 +1,4 @@
-"""Reader of URDF, as far as :mod:`pkmcal.export.urdf` uses it, with its file of loops.
+"""Reader of URDF, as far as :mod:`pkmcal.exporters.urdf` uses it, with its file of loops.
 
 Links and joints have the meaning of URDF's documentation.
 """
@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from pkmcal.arrays import Array
-from pkmcal.export.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
+from pkmcal.exporters.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
 from pkmcal.geometry.rigid import from_roll_pitch_yaw, pose
 
 URDF_JOINT_KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}

@@ -10,8 +10,8 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.agreement import differences
-from pkmcal.export.bodies import (
+from pkmcal.exporters.agreement import differences
+from pkmcal.exporters.bodies import (
     BODY_COLOURS,
     NOT_WEIGHED,
     BodyJoint,
@@ -22,10 +22,10 @@ from pkmcal.export.bodies import (
     body_tree,
     without_masses,
 )
-from pkmcal.export.contract import Difference, Exporter
-from pkmcal.export.home import SAME_HINGE_DIFFERENCE
-from pkmcal.export.markup import comment, document, file_name, numbers_text
-from pkmcal.export.sdf_read import SDF_MODEL_FRAME, SDF_NAMESPACE, read_sdf
+from pkmcal.exporters.contract import Difference, Exporter
+from pkmcal.exporters.home import SAME_HINGE_DIFFERENCE
+from pkmcal.exporters.markup import comment, document, file_name, numbers_text
+from pkmcal.exporters.sdf_read import SDF_MODEL_FRAME, SDF_NAMESPACE, read_sdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw
 from pkmcal.outcome.finding import Finding, doubtful
 

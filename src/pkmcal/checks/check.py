@@ -33,11 +33,11 @@ from pkmcal.calibration.localization import (
     platform_poses,
 )
 from pkmcal.calibration.model_violations import model_violations
-from pkmcal.check.advice import advice
-from pkmcal.check.forecast import NEAR_END, forecast
-from pkmcal.check.inspection import Inspection, StationInspection
-from pkmcal.check.results import BoardCheck, JointCheck, SessionCheck, StationCheck
-from pkmcal.check.sentences import (
+from pkmcal.checks.advice import advice
+from pkmcal.checks.forecast import NEAR_END, forecast
+from pkmcal.checks.inspection import Inspection, StationInspection
+from pkmcal.checks.results import BoardCheck, JointCheck, SessionCheck, StationCheck
+from pkmcal.checks.sentences import (
     board_findings,
     joint_findings,
     link_findings,

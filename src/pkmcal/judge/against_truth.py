@@ -1,24 +1,19 @@
-"""Comparison of a calibration with the truth of its simulated session, after everything is
-written.
-"""
+"""Comparison of a calibration with the truth of its simulated session."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pkmcal.arrays import Array, rms
+from pkmcal.calibration.calibrate import Calibration
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.state import State
 from pkmcal.judge.machine_errors import compare as machine_errors
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation import Truth, load_truth
-
-if TYPE_CHECKING:
-    from pkmcal.calibration.calibrate import Calibration
 
 WITHIN_TRUTH_SIGMAS = 2.0
 """Standard deviations within which 95 % of the values should be."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from pkmcal.check.forecast import Forecast
-from pkmcal.check.inspection import Inspection
+from pkmcal.checks.forecast import Forecast
+from pkmcal.checks.inspection import Inspection
 from pkmcal.files import json_value
 from pkmcal.outcome.finding import Finding, Level, first_error
 

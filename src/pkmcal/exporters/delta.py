@@ -22,8 +22,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference
-from pkmcal.export.limbs import (
+from pkmcal.exporters.contract import Difference
+from pkmcal.exporters.limbs import (
     FLOAT_CARRIER,
     SLIDE_CARRIER,
     TURN_CARRIER,

@@ -1,7 +1,7 @@
 """Machine as a tree of bodies at its home pose, and the loops that close it.
 
 MuJoCo, URDF and SDF exports write this tree in their own syntax. Limbs come as elementary joints
-(:mod:`pkmcal.export.limbs`). At home the frames of all bodies of a leg are parallel to the base
+(:mod:`pkmcal.exporters.limbs`). At home the frames of all bodies of a leg are parallel to the base
 frame, so their axes and points are components along the base's axes.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.home import (
+from pkmcal.exporters.home import (
     BASE_FRAME_UP,
     SAME_HINGE_DIFFERENCE,
     HomeState,
@@ -23,7 +23,7 @@ from pkmcal.export.home import (
     joint_axis,
     universal_hinges,
 )
-from pkmcal.export.limbs import FIXED_CARRIER, SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER
+from pkmcal.exporters.limbs import FIXED_CARRIER, SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER
 from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS, platform_carriers

@@ -18,8 +18,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter, commented, largest
-from pkmcal.export.delta import (
+from pkmcal.exporters.contract import Difference, Exporter, commented, largest
+from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     MM_A_METRE,
     SWITCH_ROUNDING,

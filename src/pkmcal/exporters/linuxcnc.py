@@ -31,9 +31,9 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.export.c import C_HEADER_FILE, C_SOURCE_FILE
-from pkmcal.export.contract import Difference, Exporter, commented, exact, largest
-from pkmcal.export.delta import (
+from pkmcal.exporters.c import C_HEADER_FILE, C_SOURCE_FILE
+from pkmcal.exporters.contract import Difference, Exporter, commented, exact, largest
+from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     MM_A_METRE,
     UNTOLD_SCALE_DIFFERENCE,
@@ -46,8 +46,8 @@ from pkmcal.export.delta import (
     fit_of,
     scales_of,
 )
-from pkmcal.export.limbs import Limbs, rod_limbs
-from pkmcal.export.linuxcnc_module import (
+from pkmcal.exporters.limbs import Limbs, rod_limbs
+from pkmcal.exporters.linuxcnc_module import (
     MODULE_BUILD_COMMAND,
     MODULE_CONVENTIONS,
     MODULE_NAME,
@@ -57,7 +57,7 @@ from pkmcal.export.linuxcnc_module import (
     module_differences,
     module_files,
 )
-from pkmcal.export.samples import samples
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import apply
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, note

@@ -1,4 +1,4 @@
-"""Reader of SDF, as far as :mod:`pkmcal.export.sdf` uses it.
+"""Reader of SDF, as far as :mod:`pkmcal.exporters.sdf` uses it.
 
 Links, frames and joints have the meaning of the specification.
 """
@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element, fromstring
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.export.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
+from pkmcal.exporters.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
 from pkmcal.geometry.rigid import from_roll_pitch_yaw, inverse, pose
 
 SDF_NAMESPACE = "urn:pkmcal"

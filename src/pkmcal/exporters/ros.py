@@ -19,7 +19,7 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.cameras.files import foreign_text, load_camera
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter, commented, exact
+from pkmcal.exporters.contract import Difference, Exporter, commented, exact
 from pkmcal.geometry.rigid import from_quaternion, pose, quaternion
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.wording import listed

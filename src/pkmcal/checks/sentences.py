@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.check.advice import forecast_figure, forecast_part
-from pkmcal.check.results import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
+from pkmcal.checks.advice import forecast_figure, forecast_part
+from pkmcal.checks.results import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
 from pkmcal.files import resolved
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.judge.repeatability import RepeatStudy, part_of

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, final
 import yaml
 
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.contract import Difference, Exporter, commented, largest
+from pkmcal.exporters.contract import Difference, Exporter, commented, largest
 from pkmcal.files import json_text
 from pkmcal.mechanisms import mechanism_text
 from pkmcal.mechanisms.machine import field_of

@@ -15,9 +15,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.export.c import C_HEADER_FILE, C_SELFTEST_FILE, CSource, c_value, filled, numbers_of
-from pkmcal.export.contract import Difference, largest
-from pkmcal.export.delta import DEGREES_A_RADIAN, MM_A_METRE
+from pkmcal.exporters.c import C_HEADER_FILE, C_SELFTEST_FILE, CSource, c_value, filled, numbers_of
+from pkmcal.exporters.contract import Difference, largest
+from pkmcal.exporters.delta import DEGREES_A_RADIAN, MM_A_METRE
 from pkmcal.mechanisms import Machine
 
 MODULE_NAME = "pkmcal_kins"

@@ -18,8 +18,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import legible
-from pkmcal.export.contract import Difference, Exporter, exact, largest
-from pkmcal.export.limbs import (
+from pkmcal.exporters.contract import Difference, Exporter, exact, largest
+from pkmcal.exporters.limbs import (
     CONSTANT_ROD,
     FLOAT_CARRIER,
     SLIDE_CARRIER,
@@ -27,7 +27,7 @@ from pkmcal.export.limbs import (
     Limbs,
     rod_limbs,
 )
-from pkmcal.export.samples import samples
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import cross, dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.check.forecast import Forecast, LegForecast
-from pkmcal.check.inspection import Inspection, StationInspection
+from pkmcal.checks.forecast import Forecast, LegForecast
+from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
 from pkmcal.levels import RELEVANT_FACTOR
 from pkmcal.observe.predict import tubes_of

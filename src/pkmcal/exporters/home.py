@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import GeometryError
-from pkmcal.export.limbs import SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER, Limbs, all_limbs
+from pkmcal.exporters.limbs import SLIDE_CARRIER, TELESCOPE_ROD, TURN_CARRIER, Limbs, all_limbs
 from pkmcal.geometry.rigid import cross, dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends

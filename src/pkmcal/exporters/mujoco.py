@@ -9,12 +9,12 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.agreement import differences
-from pkmcal.export.bodies import BODY_COLOURS, BodyTree, Loop, RoundBar, TreeBody, body_tree
-from pkmcal.export.contract import Difference, Exporter
-from pkmcal.export.home import HomeState
-from pkmcal.export.markup import comment, comment_text, document, file_name, numbers_text
-from pkmcal.export.mujoco_read import read_mujoco
+from pkmcal.exporters.agreement import differences
+from pkmcal.exporters.bodies import BODY_COLOURS, BodyTree, Loop, RoundBar, TreeBody, body_tree
+from pkmcal.exporters.contract import Difference, Exporter
+from pkmcal.exporters.home import HomeState
+from pkmcal.exporters.markup import comment, comment_text, document, file_name, numbers_text
+from pkmcal.exporters.mujoco_read import read_mujoco
 from pkmcal.geometry.rigid import quaternion
 from pkmcal.outcome.finding import Finding, note
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, numbered
-from pkmcal.check.inspection import Inspection
+from pkmcal.checks.inspection import Inspection
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.covariance import Information
 from pkmcal.observe.predict import tubes_of

@@ -15,7 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
-from pkmcal.check.inspection import Inspection, StationInspection
+from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.files import place_below, staged_folder
 from pkmcal.outcome import Part
 from pkmcal.pages import page

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.export.contract import Difference, largest
-from pkmcal.export.read_model import ReadModel
-from pkmcal.export.samples import samples
+from pkmcal.exporters.contract import Difference, largest
+from pkmcal.exporters.read_model import ReadModel
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends

@@ -1,4 +1,4 @@
-"""Reader of MJCF, as far as :mod:`pkmcal.export.mujoco` uses it.
+"""Reader of MJCF, as far as :mod:`pkmcal.exporters.mujoco` uses it.
 
 Bodies, joints and equality constraints have the meaning of MuJoCo's documentation.
 """
@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element, fromstring
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.export.read_model import (
+from pkmcal.exporters.read_model import (
     ReadBody,
     ReadCoupling,
     ReadJoint,

@@ -11,8 +11,8 @@ import yaml
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.agreement import differences
-from pkmcal.export.bodies import (
+from pkmcal.exporters.agreement import differences
+from pkmcal.exporters.bodies import (
     BODY_COLOURS,
     NOT_WEIGHED,
     BodyJoint,
@@ -23,9 +23,9 @@ from pkmcal.export.bodies import (
     body_tree,
     without_masses,
 )
-from pkmcal.export.contract import Difference, Exporter, commented
-from pkmcal.export.markup import comment, document, file_name, numbers_text
-from pkmcal.export.urdf_read import read_urdf
+from pkmcal.exporters.contract import Difference, Exporter, commented
+from pkmcal.exporters.markup import comment, document, file_name, numbers_text
+from pkmcal.exporters.urdf_read import read_urdf
 from pkmcal.geometry.rigid import pose, roll_pitch_yaw, rotation
 from pkmcal.outcome.finding import Finding, doubtful
 
