@@ -163,7 +163,7 @@ def calibrated(
 
 def exported(calibration: Calibration) -> printers.Settings:
     """Values exported for the firmware."""
-    bed = calibration.findings.bed
+    bed = calibration.identification.bed
     source = MachineSource(calibration.machine, bed=bed.z if bed else None)
     (text,) = make_export(source, "klipper").files.values()
     values = sections(text, "printer.cfg")
@@ -242,7 +242,7 @@ def _row(count: int, of_a_kit: bool, noise: float, n: int, wrong: float) -> None
         told_tolerance = KIT if of_a_kit else IDEAL
         calibration = calibrated(truth.says, readings, noise, told_tolerance)
         ours, usable = exported(calibration), calibration.verdict.usable
-        bed = calibration.findings.bed
+        bed = calibration.identification.bed
         pasted = {
             "before": truth.says,
             "Klipper": by_klipper(truth.says, readings),

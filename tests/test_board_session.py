@@ -211,7 +211,7 @@ def test_check_reports_the_board(folder, monkeypatch):
         assert station.board.rms < 0.03
         assert station.board.scatter < 0.03
         assert 0.5 < station.board.distance < 3
-    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked)
     display = run("check", folder).out
     assert "4 of 4" in display
     assert "Wander" in display

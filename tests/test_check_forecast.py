@@ -308,7 +308,7 @@ def test_a_page_with_pictures(found):
 @pytest.fixture
 def check_once(alone_checked, monkeypatch):
     """The command has the session checked already."""
-    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: alone_checked)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: alone_checked)
 
 
 def test_the_command_writes_page_and_pictures(alone, check_once, tmp_path):

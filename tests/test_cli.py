@@ -32,6 +32,7 @@ from pkmcal.identify.verdict import assess
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
+from pkmcal.simulation import load_truth
 from pkmcal.starter import TO_FILL, session_texts, untouched_files
 from test_pose_sessions import make
 from test_report_page import Found
@@ -107,12 +108,13 @@ def test_the_documentation_tells_of_all_commands_and_options():
 
 TELLS = """
 import sys
+from pkmcal import terminal
 from pkmcal.commands import cli, console
 
 @cli.app.command("tell")
 def tell() -> int:
     for _ in range(3_000):
-        console.out().print("some thing that was found")
+        terminal.out().print("some thing that was found")
     console.print_json({"verdict": "not to be used"})
     return 1
 
@@ -189,10 +191,11 @@ def test_demo(demo):
 
 
 def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
-    monkeypatch.setattr("pkmcal.simulation.simulate_session", lambda *_, **_more: None)
     monkeypatch.setattr(
-        "pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: calibrated
+        "pkmcal.api.simulate.simulate_session",
+        lambda folder, machine, *_, **_more: load_truth(folder, machine),
     )
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: calibrated)
     monkeypatch.setattr("pkmcal.commands.demo.DEMO_SESSION_NAME", str(demo.session))
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
@@ -345,7 +348,7 @@ def test_new_in_a_folder_that_is_not_empty(demo):
 
 
 def test_check_of_a_good_session(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.found)
     done = run("check", session)
     assert done.code == 0
     assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
@@ -366,7 +369,7 @@ def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path
 
 
 def test_check_as_json(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.found)
     count = run("check", session, "--json").json
     assert count["exit_code"] == 0
     assert_keys("check --json", count)
@@ -415,7 +418,7 @@ def test_calibrate(session, demo):
 
 def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "pkmcal.calibration.calibrate.calibrate_session",
+        "pkmcal.api.calibrate.calibrate_session",
         lambda *_, seed, **_more: replace(calibrated, seed=seed),
     )
     out = shutil.copytree(demo.calibration, tmp_path / "result")
@@ -468,9 +471,9 @@ def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
 def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
     value = calibrated
     others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
-    verdict = assess(value.observation, value.estimate, value.findings, others=others)
+    verdict = assess(value.observation, value.estimate, value.identification, others=others)
     value = replace(value, verdict=verdict)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: value)
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: value)
     done = run("calibrate", session)
     assert done.code == 1
     assert "This calibration should not be used" in done.out
@@ -618,7 +621,7 @@ def test_no_traceback_whatever_happens(error, code, said, tmp_path, monkeypatch)
     def fail(*_words):
         raise error
 
-    monkeypatch.setattr("pkmcal.starter.write_session", fail)
+    monkeypatch.setattr("pkmcal.api.new.session_texts", fail)
     monkeypatch.delenv("PKMCAL_DEBUG", raising=False)
     done = run("new", tmp_path)
     assert (done.code, done.out) == (code, "")

@@ -69,7 +69,7 @@ def test_heights_alone_leave_the_size_open_and_distances_determine_it(kit, found
     # in words: what heights leave to the nominal model, and with distances nothing of it
     assert alone.verdict.of("bed.sideways")
     assert not found.verdict.of("bed")
-    assert found.findings.bed is None
+    assert found.identification.bed is None
     # a radius 0.6 mm off makes a bed 0.6 % too small
     before = distance_sessions.stretch(true, found.session.machine)
     after = distance_sessions.stretch(true, found.machine)

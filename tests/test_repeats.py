@@ -427,7 +427,7 @@ def once(looked, checked, monkeypatch):
     """Commands share one measurement of the repeats, as it does not depend on their outputs; the
     rest of the check is the demonstration's, which is not tested here.
     """
-    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.found)
     monkeypatch.setattr(
         "pkmcal.judge.repeatability.study_repeats", lambda *_, **_more: looked.study
     )
@@ -469,7 +469,7 @@ def test_check_repeat_as_json(repeats):
 
 @pytest.mark.slow
 def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.found)
     shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3, "size": (360, 270)}
     folder = simulated(tmp_path / "session", 3, **shaken)
     values = run("check", folder, "--repeat", "--json")
@@ -483,7 +483,7 @@ def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
 
 
 def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.checks.check.check_session", lambda *_, **_more: checked.found)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.found)
     values = run("check", demo.session, "--repeat")
     assert values.code == 2
     assert "the session has no repeated images" in values.err

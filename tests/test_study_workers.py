@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from conftest import run
+from pkmcal.api.study import study
 from pkmcal.errors import InputError, ResultError
 from pkmcal.studies import cluster, engine, tasks, workers
 from pkmcal.studies.calibrations import (
     JOINT_ESTIMATE_KEY,
 )
-from pkmcal.studies.findings import study
 from pkmcal.studies.paper_a import JointByAxes
 from pkmcal.studies.store import Store
 from pkmcal.studies.study_report import runs_bytes, study_document

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Sequence
@@ -64,6 +65,29 @@ function of its name in the module of its name.
 """
 
 
+class _Command(typer.core.TyperCommand):
+    """Command whose help groups options by their panels and ends in examples."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            if record := parameter.get_help_record(ctx):
+                argument = parameter.param_type_name == "argument"
+                panel = getattr(parameter, "rich_help_panel", None)
+                groups.setdefault("Arguments" if argument else panel or "Options", []).append(
+                    record
+                )
+        for title, records in groups.items():
+            with formatter.section(title):
+                formatter.write_dl(records)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        del ctx
+        if self.epilog:
+            formatter.write_paragraph()
+            formatter.write("Examples:\n" + textwrap.indent(self.epilog.strip(), "  ") + "\n")
+
+
 class _Commands(typer.core.TyperGroup):
     """Group of commands, each imported when it is used."""
 
@@ -82,7 +106,10 @@ class _Commands(typer.core.TyperGroup):
 def _typer_command(name: str) -> Any:
     """A command as typer's object; building those of all commands would take 20 ms."""
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
-    alone.command(name)(getattr(import_module(f"pkmcal.commands.{name}"), name))
+    module = import_module(f"pkmcal.commands.{name}")
+    alone.command(name, cls=_Command, epilog=getattr(module, "EXAMPLES", None))(
+        getattr(module, name)
+    )
     return typer.main.get_command(alone)
 
 

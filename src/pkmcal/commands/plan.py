@@ -8,22 +8,16 @@ from typing import Annotated, Literal
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
+from pkmcal.commands.finish import finish
 from pkmcal.errors import InputError
-from pkmcal.planning.defaults import (
-    CONFIGURATIONS_A_CAPTURE,
-    NOMINAL_CORNER_SIGMA,
-    NOMINAL_EDGE_SIGMA,
-    PLANNED_IMAGE_SIZE,
-    UNTOLD_READING_NOISE,
-)
+from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE
+from pkmcal.ranges import default
 
-PLAN_FILES = {
-    "plan.html": PAGE_DESCRIPTION,
-    "plan.csv": "the readings, in the order to be measured",
-    "plan.json": NUMBERS_DESCRIPTION,
-}
-STATION_POSES_FILES = {"stations.yaml": "the places, for session.yaml"}
+EXAMPLES = """\
+pkmcal plan my-machine
+pkmcal plan gough-stewart -n 20 --places 3
+pkmcal plan delta --tracker "20 um" --joint-noise "0.01 mm"
+"""
 
 
 def plan(
@@ -44,7 +38,7 @@ def plan(
             "-n",
             "--configurations",
         ),
-    ] = CONFIGURATIONS_A_CAPTURE,
+    ] = default("plan", "configurations"),
     index: Annotated[
         Literal["tool", "D", "E", "O1"],
         typer.Option(help="Criterion to minimize: the tool's variance, or D, E, O1."),
@@ -94,67 +88,48 @@ def plan(
         console.number_option(
             "plan", "edge_noise", "PX", "Noise of an edge, if no image determines it."
         ),
-    ] = NOMINAL_EDGE_SIGMA,
+    ] = default("plan", "edge_noise"),
     corner_noise: Annotated[
         float,
         console.number_option(
             "plan", "corner_noise", "PX", "Noise of a board's corner, if no image determines it."
         ),
-    ] = NOMINAL_CORNER_SIGMA,
+    ] = default("plan", "corner_noise"),
     joint_noise: Annotated[
         float,
         console.number_option(
             "plan", "joint_noise", "M", "Noise of a reading, m or rad, for a MACHINE."
         ),
-    ] = UNTOLD_READING_NOISE,
+    ] = default("plan", "joint_noise"),
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
     """The next configurations worth measuring."""
-    from pkmcal.api.plan import plan as run
-    from pkmcal.commands.simulate import parsed_size
-    from pkmcal.files import check_own_folder, default_output
-    from pkmcal.report.plan import outcome_of
+    import pkmcal
+    from pkmcal.api.plan import PlanResult
     from pkmcal.session.load import session_folder
-    from pkmcal.simulation.demo import camera_of_size
 
     session = session_folder(subject)
-    folder = out or default_output((session or Path()) / "plan")
-    files = {**PLAN_FILES, **(STATION_POSES_FILES if places or best_of else {})}
-    over = check_own_folder(
-        folder, {**PLAN_FILES, **STATION_POSES_FILES}, "what plan writes", "an earlier plan"
-    )
-    sized = None if session is not None or camera else camera_of_size(parsed_size(size))
+    folder = console.output_folder(out, (session or Path()) / "plan", PlanResult)
+    assumed = None if session is not None else console.parsed_size(size)
     with console.progress(as_json) as progress:
-        progress("Looking at what there is", 0.0)
-        planned = run(
-            subject,
-            count=configurations,
-            index=index,
-            places=places,
-            best_of=best_of,
-            after=after,
-            from_drawing=from_drawing,
-            same_place=same_place,
-            together=together,
-            camera=camera or sized,
-            board=board,
-            tracker=None if tracker is None else _tracker(tracker),
-            edge_noise=edge_noise,
-            corner_noise=corner_noise,
-            joint_noise=joint_noise,
-            seed=seed,
-            progress=lambda share: progress("Choosing configurations", 0.1 + 0.85 * share),
-        )
-    return finish(outcome_of(planned), folder, files, over=over, as_json=as_json)
+        result = pkmcal.plan(
+            subject, count=configurations, index=index, places=places, best_of=best_of,
+            after=after, from_drawing=from_drawing, same_place=same_place, together=together,
+            camera=camera or assumed, board=board,
+            tracker=None if tracker is None else _tracker(tracker), edge_noise=edge_noise,
+            corner_noise=corner_noise, joint_noise=joint_noise, seed=seed, progress=progress,
+        )  # fmt: skip
+    return finish(result, folder, as_json=as_json)
 
 
 def _tracker(text: str) -> tuple[float, float | None]:
     """Noise of a tracker, m and rad, from a text such as 2e-5 or 2e-5,1e-4."""
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = list[float]()
+    parts, kinds = text.split(","), ("m", "rad")
+    numbers = [
+        console.quantity(part, kind, "--tracker") for part, kind in zip(parts, kinds, strict=False)
+    ]
+    numbers = numbers if len(parts) == len(numbers) else []
     if len(numbers) not in (1, 2) or not all(0 < x < 1 for x in numbers):
         raise InputError(
             "a tracker's noise cannot be this",

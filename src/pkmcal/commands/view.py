@@ -8,7 +8,14 @@ from typing import Annotated
 
 import typer
 
+from pkmcal import terminal
 from pkmcal.commands import console
+
+EXAMPLES = """\
+pkmcal view my-machine
+pkmcal view my-machine --calibration out
+pkmcal view my-machine --no-browser --port 8000
+"""
 
 
 def view(
@@ -58,7 +65,7 @@ def view(
         if as_json:
             console.print_json({"url": address})
         else:
-            out = console.out()
+            out = terminal.out()
             out.print(f"The page is at\n\n  {address}\n", soft_wrap=True)
             out.print("It is served to this computer only, until you press Ctrl-C.")
         sys.stdout.flush()

@@ -159,7 +159,7 @@ def pose_of_text(text: str, where: str) -> Array:
 
 
 def legs_of_text(text: str) -> tuple[int, ...]:
-    """Legs, counted from 0, from a text that counts them from 1, such as 1,3,5."""
+    """Numbers of legs, from 1, from a text such as 1,3,5."""
     try:
         numbers = [int(part) for part in text.split(",")]
     except ValueError:
@@ -171,4 +171,4 @@ def legs_of_text(text: str) -> tuple[int, ...]:
             found=text,
             expected="numbers from 1, each once, such as 1,3,5",
         )
-    return tuple(number - 1 for number in numbers)
+    return tuple(numbers)
