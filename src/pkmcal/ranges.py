@@ -22,8 +22,8 @@ class Range:
     ``above``.
 
     whole : integers only. unit : of a number without one, ``m``, ``rad``, ``deg`` or ``m or rad``,
-    where one may be written; empty for numbers that take no unit. default : value of the option that is not given; None if that is another
-    rule than a number.
+    where one may be written; empty for numbers that take no unit. default : value of the option
+    that is not given; None if that is another rule than a number.
     """
 
     least: float
