@@ -24,6 +24,7 @@ from document_keys import assert_keys
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras import load_camera
+from pkmcal.commands import cli
 from pkmcal.commands.cli import main
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
@@ -34,6 +35,7 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 from pkmcal.starter import TO_FILL, session_texts, untouched_files
+from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED
 from test_pose_sessions import make
 from test_report_page import Found
 
@@ -92,6 +94,48 @@ def test_every_command_has_help_and_json(command):
     assert done.code == 0
     assert "--json" in done.out
     assert max(map(len, done.out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_has_three_examples_that_parse(command):
+    examples = run(command, "--help").out.split("Examples:\n")[1].split("\n\n")[0].splitlines()
+    assert len(examples) == 3
+    for line in examples:
+        program, name, *words = shlex.split(line)
+        assert (program, name) == ("pkmcal", command)
+        assert cli._typer_command(command).make_context(command, words).params
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["servo", "h4", "--hand-rotation", "90 arcmin"], "hand_rotation", 1.5),
+        (["servo", "h4", "--hand-rotation", "2"], "hand_rotation", 2.0),
+        (["servo", "h4", "--hand-position", "12.5 mm"], "hand_position", 0.0125),
+        (["plan", "h4", "--joint-noise", "3 um"], "joint_noise", 3e-6),
+        (["simulate", "s", "--joint-noise", "0.18 deg"], "joint_noise", np.pi / 1000),
+    ],
+)
+def test_numbers_of_options_take_units_as_in_files(words, name, value):
+    command, *rest = words
+    params = cli._typer_command(command).make_context(command, rest).params
+    assert params[name] == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [("--hand-rotation", "1 mm"), ("--hand-position", "1 deg"), ("--joint-noise", "1 kg"),
+     ("--start", "1 deg,0,0,0,0,0"), ("--goal", "0,0,0.3")],
+)  # fmt: skip
+def test_a_unit_of_another_kind_is_refused(option, text, tmp_path):
+    done = run("servo", "3-rpr", option, text, "-o", tmp_path / "out", "--json")
+    assert done.code == 2
+    assert (done.json["where"], done.json["found"]) == (option, text)
+
+
+def test_the_help_of_a_study_names_what_can_be_varied():
+    text = run("study", "--help").out
+    assert {*DESIGN_NAMES_VARIED, *PAPER_NAMES_VARIED} <= set(re.findall(r"^  (\w+) ", text, re.M))
 
 
 def test_the_documentation_tells_of_all_commands_and_options():

@@ -43,15 +43,26 @@ def calibrate(
     ] = default("calibrate", "holdout"),
     force: Annotated[
         bool,
-        typer.Option("--force", help="Replace an earlier result; otherwise it is kept, dated."),
+        typer.Option(
+            "--force",
+            help="Replace an earlier result; otherwise it is kept, dated.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = False,
     rrd: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write a recording for rerun's viewer as well."),
+        typer.Option(
+            metavar="FILE",
+            help="Write a recording for rerun's viewer as well.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = None,
     as_json: console.Json = False,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")
+        bool,
+        typer.Option(
+            "--quiet", "-q", help="Say nothing if it is well.", rich_help_panel=console.OUTPUT_GROUP
+        ),
     ] = False,
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""

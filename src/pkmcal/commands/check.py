@@ -24,7 +24,11 @@ def check(
     out: Annotated[Path | None, console.folder("Write a page with images there.")] = None,
     pictures: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write the nominal model over each image, as PNG."),
+        typer.Option(
+            metavar="DIR",
+            help="Write the nominal model over each image, as PNG.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = None,
     repeat: Annotated[
         bool,

@@ -25,7 +25,7 @@ import typer
 import typer.core
 import typer.main
 
-from pkmcal.commands.console import print_error
+from pkmcal.commands.console import OUTPUT_GROUP, print_error
 from pkmcal.commands.streams import LostOutput, withstanding
 from pkmcal.errors import InputError, PkmcalError, legible
 
@@ -69,13 +69,16 @@ class _Command(typer.core.TyperCommand):
     """Command whose help groups options by their panels and ends in examples."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        groups: dict[str, list[tuple[str, str]]] = {}
+        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         for parameter in self.get_params(ctx):
             if record := parameter.get_help_record(ctx):
                 panel = getattr(parameter, "rich_help_panel", None) or "Options"
                 title = "Arguments" if parameter.param_type_name == "argument" else panel
                 groups.setdefault(title, []).append(record)
-        for title, records in groups.items():
+        last = groups.pop(OUTPUT_GROUP, [])
+        for title, records in {**groups, OUTPUT_GROUP: last}.items():
+            if not records:
+                continue
             with formatter.section(title):
                 formatter.write_dl(records)
 
@@ -83,7 +86,7 @@ class _Command(typer.core.TyperCommand):
         del ctx
         if self.epilog:
             formatter.write_paragraph()
-            formatter.write("Examples:\n" + textwrap.indent(self.epilog.strip(), "  ") + "\n")
+            formatter.write(self.epilog)
 
 
 class _Commands(typer.core.TyperGroup):
@@ -105,9 +108,11 @@ def _typer_command(name: str) -> Any:
     """A command as typer's object; building those of all commands would take 20 ms."""
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     module = import_module(f"pkmcal.commands.{name}")
-    alone.command(name, cls=_Command, epilog=getattr(module, "EXAMPLES", None))(
-        getattr(module, name)
-    )
+    examples = textwrap.indent(getattr(module, "EXAMPLES", ""), "  ")
+    epilog = f"Examples:\n{examples}" if examples else ""
+    if further := getattr(module, "FURTHER_HELP", ""):
+        epilog += f"\n{further}"
+    alone.command(name, cls=_Command, epilog=epilog)(getattr(module, name))
     return typer.main.get_command(alone)
 
 

@@ -34,7 +34,11 @@ def diff(
     ] = None,
     force: Annotated[
         bool,
-        typer.Option("--force", help="Replace an earlier one; otherwise it is kept, dated."),
+        typer.Option(
+            "--force",
+            help="Replace an earlier one; otherwise it is kept, dated.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = False,
     as_json: console.Json = False,
 ) -> int:

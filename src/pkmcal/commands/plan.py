@@ -49,18 +49,33 @@ def plan(
     ] = None,
     best_of: Annotated[
         int | None,
-        console.number_option("plan", "best_of", "N", "Choose N of the session's stations."),
+        console.number_option(
+            "plan", "best_of", "N", "Choose N of the session's stations.", group="For a SESSION"
+        ),
     ] = None,
     after: Annotated[
         Path | None,
-        typer.Option(metavar="CALIBRATION", help="Calibration to continue from."),
+        typer.Option(
+            metavar="CALIBRATION",
+            help="Calibration to continue from.",
+            rich_help_panel="For a SESSION",
+        ),
     ] = None,
     from_drawing: Annotated[
-        bool, typer.Option("--from-drawing", help="Ignore the calibration in the session.")
+        bool,
+        typer.Option(
+            "--from-drawing",
+            help="Ignore the calibration in the session.",
+            rich_help_panel="For a SESSION",
+        ),
     ] = False,
     same_place: Annotated[
         bool,
-        typer.Option("--same-place", help="The cameras stand as they stood in the calibration."),
+        typer.Option(
+            "--same-place",
+            help="The cameras stand as they stood in the calibration.",
+            rich_help_panel="For a SESSION",
+        ),
     ] = False,
     together: Annotated[
         bool | None,
@@ -69,18 +84,31 @@ def plan(
         ),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Camera file, for a MACHINE.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Camera file.", rich_help_panel="For a MACHINE"),
     ] = None,
     size: Annotated[
-        str, typer.Option(metavar="WxH", help="Image size without a camera file, for a MACHINE.")
+        str,
+        typer.Option(
+            metavar="WxH",
+            help="Image size without a camera file.",
+            rich_help_panel="For a MACHINE",
+        ),
     ] = "{}x{}".format(*PLANNED_IMAGE_SIZE),
     board: Annotated[
-        bool, typer.Option("--board", help="Observe a board on the platform, for a MACHINE.")
+        bool,
+        typer.Option(
+            "--board",
+            help="Observe a board on the platform.",
+            rich_help_panel="For a MACHINE",
+        ),
     ] = False,
     tracker: Annotated[
         str | None,
         typer.Option(
-            metavar="M[,RAD]", help="Noise of a tracker or probe used instead, for a MACHINE."
+            metavar="M[,RAD]",
+            help="Noise of a tracker or probe used instead.",
+            rich_help_panel="For a MACHINE",
         ),
     ] = None,
     edge_noise: Annotated[
@@ -98,7 +126,11 @@ def plan(
     joint_noise: Annotated[
         float,
         console.number_option(
-            "plan", "joint_noise", "M", "Noise of a reading, m or rad, for a MACHINE."
+            "plan",
+            "joint_noise",
+            "M",
+            "Noise of a reading, m or rad.",
+            group="For a MACHINE",
         ),
     ] = default("plan", "joint_noise"),
     seed: console.Seed = 0,

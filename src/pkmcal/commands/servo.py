@@ -30,16 +30,28 @@ def servo(
     ],
     session: console.CamerasOf = None,
     station: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The camera that controls; the first.")
+        str | None,
+        typer.Option(
+            metavar="NAME", help="The camera that controls; the first.", rich_help_panel="Camera"
+        ),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Another camera file than the station's.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Another camera file than the station's.", rich_help_panel="Camera"
+        ),
     ] = None,
     law: Annotated[
-        str, typer.Option(metavar="LAW", help="edges or directions of the legs.")
+        str,
+        typer.Option(
+            metavar="LAW", help="edges or directions of the legs.", rich_help_panel="Loop"
+        ),
     ] = "edges",
     legs: Annotated[
-        str | None, typer.Option(metavar="1,2,3", help="Legs that the camera sees; all.")
+        str | None,
+        typer.Option(
+            metavar="1,2,3", help="Legs that the camera sees; all.", rich_help_panel="Camera"
+        ),
     ] = None,
     runs: Annotated[
         int, console.number_option("servo", "runs", "N", "Number of motions, for every estimate.")
@@ -47,24 +59,33 @@ def servo(
     gain: Annotated[
         float,
         console.number_option(
-            "servo", "gain", "G", "Part of the error that is corrected in a second."
+            "servo", "gain", "G", "Part of the error that is corrected in a second.", group="Loop"
         ),
     ] = default("servo", "gain"),
     rate: Annotated[
-        float, console.number_option("servo", "rate", "HZ", "Images a second.")
+        float, console.number_option("servo", "rate", "HZ", "Images a second.", group="Loop")
     ] = default("servo", "rate"),
     delay: Annotated[
-        int, console.number_option("servo", "delay", "N", "Images from exposure to motion.")
+        int,
+        console.number_option(
+            "servo", "delay", "N", "Images from exposure to motion.", group="Loop"
+        ),
     ] = default("servo", "delay"),
     noise: Annotated[
-        float, console.number_option("servo", "noise", "PX", "Noise of an edge, shift and tilt.")
+        float,
+        console.number_option(
+            "servo", "noise", "PX", "Noise of an edge, shift and tilt.", group="Loop"
+        ),
     ] = default("servo", "noise"),
     joint_noise: Annotated[
-        float, console.number_option("servo", "joint_noise", "M", "Noise of a reading, m or rad.")
+        float,
+        console.number_option(
+            "servo", "joint_noise", "M", "Noise of a reading, m or rad.", group="Loop"
+        ),
     ] = default("servo", "joint_noise"),
     speed: Annotated[
         float | None,
-        console.number_option("servo", "speed", "V", "Fastest drive, m/s or rad/s."),
+        console.number_option("servo", "speed", "V", "Fastest drive, m/s or rad/s.", group="Loop"),
     ] = None,
     duration: Annotated[
         float | None,
@@ -72,12 +93,18 @@ def servo(
     ] = None,
     hand_position: Annotated[
         float,
-        console.number_option("servo", "hand_position", "M", "Error of the hand-placed camera, m."),
+        console.number_option(
+            "servo", "hand_position", "M", "Error of the hand-placed camera, m.", group="Camera"
+        ),
     ] = default("servo", "hand_position"),
     hand_rotation: Annotated[
         float,
         console.number_option(
-            "servo", "hand_rotation", "DEG", "Error of the hand-placed camera's direction, degrees."
+            "servo",
+            "hand_rotation",
+            "DEG",
+            "Error of the hand-placed camera's direction, degrees.",
+            group="Camera",
         ),
     ] = default("servo", "hand_rotation"),
     start: Annotated[

@@ -24,9 +24,14 @@ def simulate(
         str, typer.Option(metavar="NAME|FILE", help="A built-in machine, or a mechanism file.")
     ] = "gough-stewart",
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A camera file, instead of --size.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="A camera file, instead of --size.", rich_help_panel="Images"
+        ),
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image.")] = "800x600",
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Pixels of an image.", rich_help_panel="Images")
+    ] = "800x600",
     stations: Annotated[
         int, console.number_option("simulate", "stations", "N", "Places of the camera.")
     ] = default("simulate", "stations"),
@@ -51,26 +56,44 @@ def simulate(
         console.number_option("simulate", "joint_noise", "M", "Noise of a reading, m or rad."),
     ] = default("simulate", "joint_noise"),
     noise: Annotated[
-        float, console.number_option("simulate", "noise", "GREY", "Noise of a pixel, grey levels.")
+        float,
+        console.number_option(
+            "simulate", "noise", "GREY", "Noise of a pixel, grey levels.", group="Images"
+        ),
     ] = default("simulate", "noise"),
     blur: Annotated[
-        float, console.number_option("simulate", "blur", "PX", "Blur of the lens, pixels.")
+        float,
+        console.number_option(
+            "simulate", "blur", "PX", "Blur of the lens, pixels.", group="Images"
+        ),
     ] = default("simulate", "blur"),
     board: Annotated[
-        bool, typer.Option("--board", help="A board on the base, which joins the stations.")
+        bool,
+        typer.Option(
+            "--board",
+            help="A board on the base, which joins the stations.",
+            rich_help_panel="Board",
+        ),
     ] = False,
     on_platform: Annotated[
-        bool, typer.Option("--on-platform", help="The board on the platform instead.")
+        bool,
+        typer.Option(
+            "--on-platform", help="The board on the platform instead.", rich_help_panel="Board"
+        ),
     ] = False,
     finish: Annotated[
         Literal["mixed", "matte", "dark", "metal"],
-        typer.Option(help="Surface of the legs; metal is polished."),
+        typer.Option(help="Surface of the legs; metal is polished.", rich_help_panel="Images"),
     ] = "mixed",
     light: Annotated[
-        Literal["usual", "soft", "hard"], typer.Option(help="From all sides, or hard.")
+        Literal["usual", "soft", "hard"],
+        typer.Option(help="From all sides, or hard.", rich_help_panel="Images"),
     ] = "usual",
     as_built: Annotated[
-        bool, typer.Option("--as-built", help="Motors, rings and cables on the legs.")
+        bool,
+        typer.Option(
+            "--as-built", help="Motors, rings and cables on the legs.", rich_help_panel="Images"
+        ),
     ] = False,
     handheld: Annotated[
         bool,

@@ -11,6 +11,7 @@ from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
 from pkmcal.ranges import default
+from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED
 
 STUDY_FOLDER = Path("study")
 
@@ -19,6 +20,21 @@ pkmcal study gough-stewart
 pkmcal study h4 --vary configurations=4,15 --vary edge_noise=0.1,0.3
 pkmcal study my-machine --vary stations=1,2,3 --runs 200 -o study
 """
+
+FURTHER_HELP = """\
+Names of --vary, of a machine or a session:
+{}
+Names of --vary, of a:
+{}
+""".format(
+    *(
+        "\n".join(
+            f"  {name:<15} {varied.cell_text}{', ' if varied.unit else ''}{varied.unit}"
+            for name, varied in names.items()
+        )
+        for names in (DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED)
+    )
+)
 
 
 def study(
@@ -42,7 +58,8 @@ def study(
     seed: console.Seed = 0,
     out: Annotated[Path, console.folder("Folder for results and finished batches.")] = STUDY_FOLDER,
     table: Annotated[
-        Literal["csv", "parquet"], typer.Option(help="Format of the table of runs.")
+        Literal["csv", "parquet"],
+        typer.Option(help="Format of the table of runs.", rich_help_panel=console.OUTPUT_GROUP),
     ] = "csv",
     scheduler: Annotated[
         str | None,

@@ -15,6 +15,7 @@ from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.machine_view import machine_view
 from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
+from pkmcal.files.quantities import read_quantity
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.outcome.finding import doubtful
 from pkmcal.simulation.demo import demo_camera
@@ -143,9 +144,14 @@ def _of_nominal(
 
 
 def pose_of_text(text: str, where: str) -> Array:
-    """Pose (4, 4) from six numbers x,y,z,rx,ry,rz: metres and a rotation vector in radians."""
+    """Pose (4, 4) from six numbers x,y,z,rx,ry,rz: a position in metres and a rotation vector in
+    radians, or with units.
+    """
+    kinds = ("m", "m", "m", "rad", "rad", "rad")
     try:
-        numbers = np.array([float(part) for part in text.split(",")])
+        numbers = np.array(
+            [read_quantity(part, kind) for part, kind in zip(text.split(","), kinds, strict=True)]
+        )
     except ValueError:
         numbers = np.zeros(0)
     if numbers.shape != (6,) or not np.isfinite(numbers).all():
@@ -153,7 +159,7 @@ def pose_of_text(text: str, where: str) -> Array:
             "no pose of the platform",
             where=where,
             found=text,
-            expected="x,y,z,rx,ry,rz: metres and a rotation vector in radians",
+            expected="x,y,z,rx,ry,rz: metres and a rotation vector in radians, or with units",
         )
     return pose(rotation(numbers[3:]), numbers[:3])
 
