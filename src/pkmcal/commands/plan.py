@@ -156,17 +156,20 @@ def plan(
 
 
 def _tracker(text: str) -> tuple[float, float | None]:
-    """Noise of a tracker, m and rad, from a text such as 2e-5 or 2e-5,1e-4."""
-    parts, kinds = text.split(","), ("m", "rad")
-    numbers = [
-        console.quantity(part, kind, "--tracker") for part, kind in zip(parts, kinds, strict=False)
-    ]
-    numbers = numbers if len(parts) == len(numbers) else []
-    if len(numbers) not in (1, 2) or not all(0 < x < 1 for x in numbers):
+    """Noise of a tracker, m and rad, from a text such as 2e-5 or 20 um,0.005 deg."""
+    from pkmcal.files.quantities import read_quantity
+
+    parts = text.split(",")
+    try:
+        numbers = [read_quantity(*pair) for pair in zip(parts, ("m", "rad"), strict=False)]
+    except ValueError:
+        numbers = list[float]()
+    if len(numbers) != len(parts) or not all(0 < x < 1 for x in numbers):
         raise InputError(
             "a tracker's noise cannot be this",
             where="--tracker",
             found=text,
-            expected="metres, and radians where it measures turns: 2e-5 or 2e-5,1e-4",
+            expected="metres, and radians where it measures turns: 2e-5 or 2e-5,1e-4, or with"
+            " units: 20 um",
         )
     return numbers[0], numbers[1] if len(numbers) == 2 else None
