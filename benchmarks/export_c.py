@@ -21,8 +21,8 @@ import numpy as np
 
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
-from pkmcal.export.c import C_SOURCE_FILE, CSource, c_array
-from pkmcal.export.samples import samples
+from pkmcal.exporters.c import C_SOURCE_FILE, CSource, c_array
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue
 

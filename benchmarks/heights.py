@@ -31,7 +31,7 @@ import printers
 from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.contract import make_export
+from pkmcal.exporters.contract import make_export
 from pkmcal.mechanisms import Machine
 from pkmcal.printers.klipper import sections
 from pkmcal.printers.session import write_printer_session
@@ -163,7 +163,7 @@ def calibrated(
 
 def exported(calibration: Calibration) -> printers.Settings:
     """Values exported for the firmware."""
-    bed = calibration.findings.bed
+    bed = calibration.identification.bed
     source = MachineSource(calibration.machine, bed=bed.z if bed else None)
     (text,) = make_export(source, "klipper").files.values()
     values = sections(text, "printer.cfg")
@@ -242,7 +242,7 @@ def _row(count: int, of_a_kit: bool, noise: float, n: int, wrong: float) -> None
         stated_tolerance = KIT if of_a_kit else IDEAL
         calibration = calibrated(truth.firmware_settings, readings, noise, stated_tolerance)
         ours, usable = exported(calibration), calibration.verdict.usable
-        bed = calibration.findings.bed
+        bed = calibration.identification.bed
         pasted = {
             "before": truth.firmware_settings,
             "Klipper": by_klipper(truth.firmware_settings, readings),

@@ -40,7 +40,7 @@ IMPORTS = (
 PARTS = """
 import sys, time, resource
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.commands.finish import contents
+from pkmcal.api.result import Result
 from pkmcal.report.calibration import outcome_of
 def status(key):
     for line in open("/proc/self/status"):
@@ -61,7 +61,7 @@ found = calibrate(sys.argv[1], progress=told)
 told("Putting the report together", 0)
 outcome = outcome_of(found)
 told("Writing it", 0)
-files = contents(outcome, {"report.html": "", "mechanism.yaml": "", "calibration.json": ""})
+files = Result.contents_of(outcome, ["report.html", "mechanism.yaml", "calibration.json"])
 told("", 0)
 print({name: len(text) for name, text in files.items()})
 """

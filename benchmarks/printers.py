@@ -125,7 +125,7 @@ def judged(
         value = calibrated(truth.says, readings, centre_tolerance=tolerance)
     except PkmcalError as fault:
         return "refused", str(fault)
-    bed = value.findings.bed
+    bed = value.identification.bed
     if not value.verdict.usable or bed is None:
         return "refused", " ".join(value.verdict.reasons)
     bent = moved(truth, exported(value), 1e3 * bed.radius)[1]

@@ -30,7 +30,7 @@ settings.load_profile("quick")
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.check.results import SessionCheck
+    from pkmcal.checks.results import SessionCheck
 
 Result = TypeVar("Found")
 
@@ -174,7 +174,7 @@ def calibrated(calibrating) -> Calibration:
 @pytest.fixture(scope="session")
 def checked(demo, common) -> WithProgress[SessionCheck]:
     """The demonstration's session, checked from Python."""
-    from pkmcal.check.check import check_session
+    from pkmcal.checks.check import check_session
 
     def make() -> WithProgress[SessionCheck]:
         progress: list[tuple[str, float]] = []

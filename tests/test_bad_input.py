@@ -261,14 +261,12 @@ def test_no_work_is_spent_before_the_output_is_known_to_be_writable(session, mon
     def worked(*_, **__):
         pytest.fail("calibrated before looking at the output folder")
 
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", worked)
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", worked)
     unwritten(session, session / "joints.csv", "outputs cannot go here")
 
 
 def test_a_disk_that_fills_up_leaves_nothing(session, calibrated, monkeypatch):
-    monkeypatch.setattr(
-        "pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: calibrated
-    )
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: calibrated)
 
     def full(_self, _content):
         raise OSError(28, "No space left on device")

@@ -23,7 +23,7 @@ from pkmcal.calibration.localization import (
     platform_poses,
     read_images,
 )
-from pkmcal.check.check import check_session
+from pkmcal.checks.check import check_session
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
@@ -211,7 +211,7 @@ def test_check_reports_the_board(folder, monkeypatch):
         assert station.board.rms < 0.03
         assert station.board.scatter < 0.03
         assert 0.5 < station.board.distance < 3
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked)
     display = run("check", folder).out
     assert "4 of 4" in display
     assert "Wander" in display

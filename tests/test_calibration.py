@@ -11,11 +11,11 @@ import pkmcal
 from conftest import FEW_IMPUTATIONS
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.cameras import camera_models
-from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.gauge import ThreeCentres, in_gauge
 from pkmcal.identify.state import State
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session

@@ -377,7 +377,7 @@ def test_an_image_without_a_board_is_not_dropped_silently(wide_views):
     calibration = calibrate_camera([*wide_views, nothing], BOARD, "unified", alone("unified"))
     assert calibration.views == tuple(d.name for d in wide_views)
     assert "1 of 11 images are not used: dark.png (too dark)." in calibration.warnings
-    assert calibration.document()["not_used"] == {"dark.png": "too dark"}
+    assert calibration.as_dict()["not_used"] == {"dark.png": "too dark"}
 
 
 def test_the_strong_correlation_of_xi_is_named():

@@ -14,13 +14,13 @@ import pytest
 import pkmcal
 from conftest import slow_but
 from pkmcal.cameras import camera_models
-from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.identify.state import State
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import (
     MechanismDocument,

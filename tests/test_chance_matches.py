@@ -16,7 +16,7 @@ from pkmcal.calibration.chance_matches import (
     chance_of_count,
 )
 from pkmcal.calibration.refinement import RefinementResult
-from pkmcal.commands.comparison import compare_with_truth
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
 from pkmcal.observe.legs import measure
 from pkmcal.observe.profiles import PROFILE_OPTIONS

@@ -10,9 +10,9 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.leg_numbering import equal_numberings, numbering_note
-from pkmcal.check.check import BROKEN_IMAGES_NAMED, _kinematics, check_session
-from pkmcal.check.results import JointCheck, StationCheck
-from pkmcal.check.sentences import joint_findings, station_findings
+from pkmcal.checks.check import BROKEN_IMAGES_NAMED, _kinematics, check_session
+from pkmcal.checks.results import JointCheck, StationCheck
+from pkmcal.checks.sentences import joint_findings, station_findings
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in

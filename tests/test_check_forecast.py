@@ -13,10 +13,10 @@ import yaml
 
 import pkmcal.pages
 from conftest import run
-from pkmcal.check import advice as words
-from pkmcal.check.check import check_session
-from pkmcal.check.forecast import Forecast, LegForecast, forecast
-from pkmcal.check.pictures import (
+from pkmcal.checks import advice as words
+from pkmcal.checks.check import check_session
+from pkmcal.checks.forecast import Forecast, LegForecast, forecast
+from pkmcal.checks.pictures import (
     CAPTION_BAR_HEIGHT,
     PANE_GAP,
     leg_colours,
@@ -25,7 +25,7 @@ from pkmcal.check.pictures import (
     with_pictures,
     write_pictures,
 )
-from pkmcal.check.sentences import outcome_of
+from pkmcal.checks.sentences import outcome_of
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
@@ -267,7 +267,7 @@ def test_pictures_of_large_images_are_binned(checked_session):
 
 def test_the_nominal_model_lies_on_the_legs_by_the_pose_found(checked_session, calibrated):
     """Under its lines the image changes; under those at the rough pose, which are off, less."""
-    from pkmcal.check.pictures import nominal_over_image
+    from pkmcal.checks.pictures import nominal_over_image
 
     def strength(T_camera_base, k):
         image = station.images.images[k].astype(np.float32)
@@ -285,7 +285,7 @@ def test_the_nominal_model_lies_on_the_legs_by_the_pose_found(checked_session, c
 
 
 def test_each_number_stands_once_and_apart(checked_session):
-    from pkmcal.check.pictures import nominal_over_image
+    from pkmcal.checks.pictures import nominal_over_image
 
     station = checked_session.look.stations[0]
     eye = station.images.camera
@@ -315,7 +315,7 @@ def test_a_page_with_pictures(checked_session):
 @pytest.fixture
 def check_once(alone_checked, monkeypatch):
     """The command has the session checked already."""
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: alone_checked)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: alone_checked)
 
 
 def test_the_command_writes_page_and_pictures(alone, check_once, tmp_path):

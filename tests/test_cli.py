@@ -24,6 +24,7 @@ from document_keys import assert_keys
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras import load_camera
+from pkmcal.commands import cli
 from pkmcal.commands.cli import main
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
@@ -32,7 +33,9 @@ from pkmcal.identify.verdict import assess
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.session.load import load_session
+from pkmcal.simulation import load_truth
 from pkmcal.starter import TO_FILL, session_texts, untouched_files
+from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED
 from test_pose_sessions import make
 from test_report_page import PageParts
 
@@ -93,6 +96,48 @@ def test_every_command_has_help_and_json(command):
     assert max(map(len, done.out.splitlines())) <= 80
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_has_three_examples_that_parse(command):
+    examples = run(command, "--help").out.split("Examples:\n")[1].split("\n\n")[0].splitlines()
+    assert len(examples) == 3
+    for line in examples:
+        program, name, *words = shlex.split(line)
+        assert (program, name) == ("pkmcal", command)
+        assert cli._typer_command(command).make_context(command, words).params
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["servo", "h4", "--hand-rotation", "90 arcmin"], "hand_rotation", 1.5),
+        (["servo", "h4", "--hand-rotation", "2"], "hand_rotation", 2.0),
+        (["servo", "h4", "--hand-position", "12.5 mm"], "hand_position", 0.0125),
+        (["plan", "h4", "--joint-noise", "3 um"], "joint_noise", 3e-6),
+        (["simulate", "s", "--joint-noise", "0.18 deg"], "joint_noise", np.pi / 1000),
+    ],
+)
+def test_numbers_of_options_take_units_as_in_files(words, name, value):
+    command, *rest = words
+    params = cli._typer_command(command).make_context(command, rest).params
+    assert params[name] == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [("--hand-rotation", "1 mm"), ("--hand-position", "1 deg"), ("--joint-noise", "1 kg"),
+     ("--start", "1 deg,0,0,0,0,0"), ("--goal", "0,0,0.3")],
+)  # fmt: skip
+def test_a_unit_of_another_kind_is_refused(option, text, tmp_path):
+    done = run("servo", "3-rpr", option, text, "-o", tmp_path / "out", "--json")
+    assert done.code == 2
+    assert (done.json["where"], done.json["found"]) == (option, text)
+
+
+def test_the_help_of_a_study_names_what_can_be_varied():
+    text = run("study", "--help").out
+    assert {*DESIGN_NAMES_VARIED, *PAPER_NAMES_VARIED} <= set(re.findall(r"^  (\w+) ", text, re.M))
+
+
 def test_the_documentation_covers_all_commands_and_options():
     text = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
     options = {
@@ -107,12 +152,13 @@ def test_the_documentation_covers_all_commands_and_options():
 
 TELLS = """
 import sys
+from pkmcal import terminal
 from pkmcal.commands import cli, console
 
 @cli.app.command("tell")
 def tell() -> int:
     for _ in range(3_000):
-        console.out().print("some thing that was found")
+        terminal.out().print("some thing that was found")
     console.print_json({"verdict": "not to be used"})
     return 1
 
@@ -189,10 +235,11 @@ def test_demo(demo):
 
 
 def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
-    monkeypatch.setattr("pkmcal.simulation.simulate_session", lambda *_, **_more: None)
     monkeypatch.setattr(
-        "pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: calibrated
+        "pkmcal.api.simulate.simulate_session",
+        lambda folder, machine, *_, **_more: load_truth(folder, machine),
     )
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: calibrated)
     monkeypatch.setattr("pkmcal.commands.demo.DEMO_SESSION_NAME", str(demo.session))
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
@@ -345,7 +392,7 @@ def test_new_in_a_folder_that_is_not_empty(demo):
 
 
 def test_check_of_a_good_session(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
     done = run("check", session)
     assert done.code == 0
     assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
@@ -366,7 +413,7 @@ def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path
 
 
 def test_check_as_json(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
     count = run("check", session, "--json").json
     assert count["exit_code"] == 0
     assert_keys("check --json", count)
@@ -415,7 +462,7 @@ def test_calibrate(session, demo):
 
 def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "pkmcal.calibration.calibrate.calibrate_session",
+        "pkmcal.api.calibrate.calibrate_session",
         lambda *_, seed, **_more: replace(calibrated, seed=seed),
     )
     out = shutil.copytree(demo.calibration, tmp_path / "result")
@@ -465,9 +512,9 @@ def test_the_four_steps_on_four_configurations_a_station(session):
 def test_an_unusable_result_is_reported_and_written(session, calibrated, monkeypatch):
     value = calibrated
     others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
-    verdict = assess(value.observation, value.estimate, value.findings, others=others)
+    verdict = assess(value.observation, value.estimate, value.identification, others=others)
     value = replace(value, verdict=verdict)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", lambda *_, **_more: value)
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: value)
     done = run("calibrate", session)
     assert done.code == 1
     assert "This calibration should not be used" in done.out
@@ -615,7 +662,7 @@ def test_no_traceback_whatever_happens(error, code, message, tmp_path, monkeypat
     def fail(*_words):
         raise error
 
-    monkeypatch.setattr("pkmcal.starter.write_session", fail)
+    monkeypatch.setattr("pkmcal.api.new.session_texts", fail)
     monkeypatch.delenv("PKMCAL_DEBUG", raising=False)
     done = run("new", tmp_path)
     assert (done.code, done.out) == (code, "")

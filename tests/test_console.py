@@ -71,7 +71,7 @@ def test_a_calibration_reports_its_steps(demo, calibrating, tmp_path, monkeypatc
         return calibrating.result
 
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", again)
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", again)
     text = run("calibrate", demo.session, "-o", tmp_path / "told")
     assert text.code == 0
     steps = dict.fromkeys(re.sub(r" \(\d+%, \d+ s\)", "", x) for x in text.err.splitlines())
@@ -87,7 +87,7 @@ def test_what_is_to_be_silent_is(demo, calibrated, tmp_path, monkeypatch):
         return calibrated
 
     monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.01)
-    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate_session", long)
+    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", long)
     words = ("calibrate", demo.session, "-o", tmp_path / "out")
     assert "Finding the legs" in run(*words).err
     for silent in ("--json", "--quiet"):

@@ -227,7 +227,7 @@ def test_two_nominal_models():
     assert value.ordered[0] == k
     assert value.verdict.headline.startswith("The nominal models differ: the tool differs by ")
     assert np.isnan(value.chances).all()
-    document = value.document()
+    document = value.as_dict()
     assert document["chi2"] is None
     assert document["parameters"][k]["change"] == pytest.approx(1e-3, rel=0.2)
 
@@ -326,5 +326,5 @@ def test_a_machine_without_a_map_is_compared_all_the_same(tmp_path):
     value = difference(str(path), str(path))
     outcome = outcome_of(value)
     assert "There is no map of the workspace: " in outcome.parts[0].text[0]
-    assert value.document()["tool"]["why_not"]
+    assert value.as_dict()["tool"]["why_not"]
     assert "There is no map" in page_html(outcome)

@@ -19,7 +19,7 @@ from pkmcal.calibration.localization import prior_station_poses
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.refinement import identify_poses
 from pkmcal.errors import InputError
-from pkmcal.export.contract import make_export
+from pkmcal.exporters.contract import make_export
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.session.load import load_session
 from test_heights import flat, pasted
@@ -71,7 +71,7 @@ def test_heights_alone_leave_the_size_open_and_distances_determine_it(
     # in words: what heights leave to the nominal model, and with distances nothing of it
     assert alone.verdict.of("bed.sideways")
     assert not measured.verdict.of("bed")
-    assert measured.findings.bed is None
+    assert measured.identification.bed is None
     # a radius 0.6 mm off makes a bed 0.6 % too small
     before = distance_sessions.stretch(true, measured.session.machine)
     after = distance_sessions.stretch(true, measured.machine)

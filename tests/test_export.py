@@ -16,9 +16,9 @@ from pkmcal.calibration.machine_source import load_source
 from pkmcal.cameras.files import load_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
-from pkmcal.export import ros
-from pkmcal.export.contract import Difference, exporters, make_export
-from pkmcal.export.samples import samples
+from pkmcal.exporters import ros
+from pkmcal.exporters.contract import Difference, exporters, make_export
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import apply, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers

@@ -16,9 +16,9 @@ from conftest import run
 from export_sources import built, calibration, source_of
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
-from pkmcal.export.c import C_SOURCE_FOLDER, MACHINE_NUMBERS_END, CSource
-from pkmcal.export.contract import exporters, make_export
-from pkmcal.export.samples import samples
+from pkmcal.exporters.c import C_SOURCE_FOLDER, MACHINE_NUMBERS_END, CSource
+from pkmcal.exporters.contract import exporters, make_export
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
 

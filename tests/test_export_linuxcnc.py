@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from export_sources import built, source_of
-from pkmcal.export.contract import make_export
-from pkmcal.export.linuxcnc import LINUXCNC_INI_FILE, ini_words, world
-from pkmcal.export.samples import samples
+from pkmcal.exporters.contract import make_export
+from pkmcal.exporters.linuxcnc import LINUXCNC_INI_FILE, ini_words, world
+from pkmcal.exporters.samples import samples
 from pkmcal.mechanisms import load_mechanism, machine_from_document
 from test_export_firmware import ideal_linear, put
 

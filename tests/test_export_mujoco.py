@@ -13,10 +13,10 @@ import pytest
 from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, Simulated, machine_of, made
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.export.contract import exporters
-from pkmcal.export.home import home_state
-from pkmcal.export.mujoco_read import read_mujoco
-from pkmcal.export.samples import samples
+from pkmcal.exporters.contract import exporters
+from pkmcal.exporters.home import home_state
+from pkmcal.exporters.mujoco_read import read_mujoco
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import catalogue
 from pkmcal.mechanisms.carriers.crank import Crank

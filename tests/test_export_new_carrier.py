@@ -18,7 +18,7 @@ import pytest
 
 import pkmcal
 from mujoco_machines import Simulated
-from pkmcal.export.c import numbers_of
+from pkmcal.exporters.c import numbers_of
 
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 CARRIER = '''

@@ -16,10 +16,10 @@ from scipy.linalg import expm
 from export_sources import built, calibration
 from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, machine_of, made
 from pkmcal.calibration.machine_source import MachineSource, load_source
-from pkmcal.export import sdf_read, urdf_read
-from pkmcal.export.contract import exporters
-from pkmcal.export.home import home_state
-from pkmcal.export.samples import samples
+from pkmcal.exporters import sdf_read, urdf_read
+from pkmcal.exporters.contract import exporters
+from pkmcal.exporters.home import home_state
+from pkmcal.exporters.samples import samples
 from pkmcal.geometry.rigid import from_roll_pitch_yaw, pose, roll_pitch_yaw, rotation, skew
 from pkmcal.mechanisms import catalogue
 

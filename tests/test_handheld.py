@@ -31,7 +31,7 @@ from pkmcal.calibration.pose_scoring import (
     rescore_poses,
 )
 from pkmcal.calibration.results import calibration_document
-from pkmcal.check.check import check_session
+from pkmcal.checks.check import check_session
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import Exif, open_image, read_exif, with_exif
 from pkmcal.geometry.rigid import angle_between, apply, perturb, pose, pose_difference, rotation

@@ -16,9 +16,9 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.machine_source import MachineSource, load_source
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
-from pkmcal.export import reprap
-from pkmcal.export.contract import make_export
-from pkmcal.export.klipper import Klipper
+from pkmcal.exporters import reprap
+from pkmcal.exporters.contract import make_export
+from pkmcal.exporters.klipper import Klipper
 from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import load_mechanism
@@ -147,7 +147,7 @@ def test_deviations_of_the_bed_hold(tmp_path):
         (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
         write_printer_session(tmp_path / str(run_), tmp_path / "printer.cfg")
         calibration = calibrate_session(tmp_path / str(run_))
-        bed = calibration.findings.bed
+        bed = calibration.identification.bed
         (text,) = Klipper().files(MachineSource(calibration.machine, bed=bed.z)).values()
         z = 1e-3 * flat(true, pasted(text))
         bend.append(np.std(z) / bed.sigma)
@@ -170,7 +170,7 @@ def test_a_crumb_under_the_nozzle_does_not_bend_the_bed(true, tmp_path):
     write_printer_session(tmp_path / "kit", tmp_path / "printer.cfg")
     calibration = calibrate_session(tmp_path / "kit")
     assert np.flatnonzero(calibration.estimate.pose_weights < 0.5).tolist() == [9]
-    bed = calibration.findings.bed
+    bed = calibration.identification.bed
     (text,) = Klipper().files(MachineSource(calibration.machine, bed=bed.z)).values()
     assert np.std(flat(true, pasted(text))) < 2.2e3 * bed.sigma
     assert calibration.verdict.usable
@@ -291,13 +291,13 @@ def test_an_uneven_bed_is_no_population_of_outliers(tmp_path):
     assert np.mean(calibration.estimate.pose_weights < 0.5) < 0.05
     assert calibration.estimate.statistics.pose_scale > 2
     bent = np.std(flat_of_small(-1.0, calibration))
-    assert not calibration.verdict.usable or bent < 3e3 * calibration.findings.bed.sigma
+    assert not calibration.verdict.usable or bent < 3e3 * calibration.identification.bed.sigma
 
 
 def flat_of_small(off, value):
     """Heights (n,) mm over the bed of such a printer with the exported values of a result."""
     true = printers.machine(replace(SMALL, radius=SMALL.radius + off))
-    (text,) = Klipper().files(MachineSource(value.machine, bed=value.findings.bed.z)).values()
+    (text,) = Klipper().files(MachineSource(value.machine, bed=value.identification.bed.z)).values()
     points = np.column_stack([printers.bed(60, 75.0), np.zeros(60)])
     values = pasted(text)
     readings = SMALL.homed - (values.homed - values.carriages(points))
@@ -318,7 +318,7 @@ def test_so_few_that_a_wrong_one_would_not_show_say_so(tmp_path):
         calibration = calibrate_session(tmp_path / str(n))
         (text,) = (
             Klipper()
-            .files(MachineSource(calibration.machine, bed=calibration.findings.bed.z))
+            .files(MachineSource(calibration.machine, bed=calibration.identification.bed.z))
             .values()
         )
         bent[n] = float(np.std(flat(true, pasted(text))))

@@ -10,7 +10,7 @@ import pytest
 from kit_sessions import Kit, board_kit, flatness, places, probe_kit, tool
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.export.contract import make_export
+from pkmcal.exporters.contract import make_export
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.calibration import report_of
@@ -71,7 +71,7 @@ def test_heights_flatten_the_bed_and_are_accepted_for_that(by_heights):
     assert 0.2 < error.after / error.expected < 2.2
     assert error.sideways > 0.7 * error.after
     assert value.verdict.usable
-    bed = value.findings.bed
+    bed = value.identification.bed
     assert 0.2 < flatness(kit, value.machine) / bed.sigma < 2.2
     assert f"height above it to {bed.sigma * 1e3:.2g} mm" in value.verdict.headline
     assert "Along x and y nothing is promised" in value.verdict.headline
@@ -84,13 +84,13 @@ def test_heights_do_not_separate_rods_from_radius_and_a_finding_states_it(tmp_pa
     value = probe_kit(tmp_path / "session", n=7).calibrated()
     assert value.verdict.usable
     assert value.verdict.of("bed.height_unnoticed")
-    assert value.findings.bed.unnoticed is None or (
-        value.findings.bed.unnoticed > 0.5 * value.findings.bed.by_drawing
+    assert value.identification.bed.unnoticed is None or (
+        value.identification.bed.unnoticed > 0.5 * value.identification.bed.by_drawing
     )
-    ranks = value.findings.identifiability
+    ranks = value.identification.identifiability
     assert ranks.rank == 4
     assert ranks.rank + len(ranks.unidentified) == ranks.n_parameters - ranks.n_frames
-    open_ = (*value.findings.unidentified, *value.findings.weak)
+    open_ = (*value.identification.unidentified, *value.identification.weak)
     text = " ".join(f"{s.text} {s.advice}" for s in open_)
     assert max(open_, key=lambda s: s.moves_platform).text in " ".join(value.verdict.advice)
     assert "The base radius and the rod length" in text
@@ -107,7 +107,7 @@ def test_what_looks_as_flat_is_what_the_sentence_states(by_heights):
     _, value = by_heights
     text = next(
         s.text
-        for s in value.findings.unidentified
+        for s in value.identification.unidentified
         if "and the rod length, of all legs alike" in s.text
     )
     numbers = re.search(
@@ -163,7 +163,7 @@ def test_the_firmwares_model_holds_what_no_firmware_can(tmp_path):
     assert np.array_equal(calibration.machine.values[held], table.nominal[held])
     assert calibration.verdict.usable
     assert flatness(kit, calibration.machine) < 0.2 * flatness(kit, kit.nominal)
-    source = MachineSource(calibration.machine, bed=calibration.findings.bed.z)
+    source = MachineSource(calibration.machine, bed=calibration.identification.bed.z)
     (note, *_) = make_export(source, "klipper").notes
     off = re.search(r"off by ([\d.]+) mm at most", note.text)
     assert off
@@ -174,7 +174,7 @@ def test_more_heights_of_one_bed_do_not_help(tmp_path):
     """25 points: the same sentence."""
     kit = probe_kit(tmp_path / "session", n=25)
     results = kit.calibrated()
-    texts = [s.text for s in (*results.findings.unidentified, *results.findings.weak)]
+    texts = [s.text for s in (*results.identification.unidentified, *results.identification.weak)]
     assert any("of all legs alike, cannot be told apart by heights" in text for text in texts)
 
 

@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from conftest import run
 from export_sources import built, calibration, source_of
 from fuzz import bases
+from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.errors import InputError, legible
-from pkmcal.export.contract import exporters
+from pkmcal.exporters.contract import exporters
 from pkmcal.files import json_text, read_json, read_yaml
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
@@ -65,13 +66,13 @@ def test_a_terminal_gets_rich_colours_and_no_others(monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm-256color")
     with redirect_stdout(StringIO()) as heard:
-        out = console.out()
-        console.print_points(out, [(console.MARK_SIGNS["wrong"], HOSTILE)])
-        console.print_files(out, [(HOSTILE, "a file")])
+        out = terminal.out()
+        terminal.print_points(out, [(terminal.MARK_SIGNS["wrong"], HOSTILE)])
+        terminal.print_files(out, [(HOSTILE, "a file")])
         row = Row(HOSTILE, (HOSTILE,), mark="good")
-        console.print_table(out, Table(HOSTILE, (HOSTILE, HOSTILE), (row,), legend=(HOSTILE,)))
+        terminal.print_table(out, Table(HOSTILE, (HOSTILE, HOSTILE), (row,), legend=(HOSTILE,)))
         out.print(HOSTILE, markup=False)
-        out.print(console.escaped(HOSTILE))
+        out.print(terminal.escaped(HOSTILE))
     text = heard.getvalue()
     assert COLOURS.search(text)
     assert "\x1b[31m\x9b" not in text
@@ -79,10 +80,10 @@ def test_a_terminal_gets_rich_colours_and_no_others(monkeypatch):
 
 
 def test_progress_is_legible_and_takes_no_markup(monkeypatch, capsys):
-    for terminal in ("1", ""):
+    for value in ("1", ""):
         monkeypatch.setattr(console, "PROGRESS_LINE_INTERVAL", 0.001)
-        monkeypatch.setenv("FORCE_COLOR", terminal)
-        monkeypatch.setenv("TTY_COMPATIBLE", terminal)
+        monkeypatch.setenv("FORCE_COLOR", value)
+        monkeypatch.setenv("TTY_COMPATIBLE", value)
         with console.progress() as progress:
             progress(f"Looking at {HOSTILE}[/]", 0.5)
     spoken = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)

@@ -18,7 +18,7 @@ import test_carriers
 import test_catalogue
 from export_sources import source_of
 from pkmcal.errors import InputError
-from pkmcal.export.contract import make_export
+from pkmcal.exporters.contract import make_export
 from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of

@@ -130,7 +130,7 @@ PNG, JPEG = encoded(".png"), encoded(".jpg")
     ],
 )
 def test_files_that_cannot_be_decoded(tmp_path, data, reason):
-    assert sentence(tmp_path, data) == CUT.format(reason=reason)
+    assert sentence(tmp_path, data) == CUT.format(found=reason)
 
 
 @pytest.mark.parametrize("data", [
@@ -161,7 +161,7 @@ def test_messages_of_decoders_become_one_sentence(tmp_path, capfd):
         (cut, "a PNG file that ends early"),
         (short, "a JPEG file that is damaged (its scan ends early)"),
     ):
-        assert sentence(tmp_path, data) == CUT.format(reason=item)
+        assert sentence(tmp_path, data) == CUT.format(found=item)
     assert capfd.readouterr() == ("", "")
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate_session
-from pkmcal.check.check import check_session
+from pkmcal.checks.check import check_session
 from pkmcal.errors import PkmcalError
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Level

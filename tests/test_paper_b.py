@@ -9,9 +9,9 @@ import pytest
 
 import pkmcal
 from pkmcal.cameras import camera_models
-from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.papers import linear
 from pkmcal.placement.stations import StationPose
 from pkmcal.simulation import Settings

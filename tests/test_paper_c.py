@@ -176,9 +176,7 @@ def test_another_seed_draws_anew():
 
 
 def test_the_command(tmp_path, monkeypatch, reproduced):
-    monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: reproduced
-    )
+    monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda _paper, _options: reproduced)
     done = run("reproduce", "c", "-o", tmp_path, "--json")
     assert (done.code, done.err) == (0, "")
     c = done.json["papers"]["c"]

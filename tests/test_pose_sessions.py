@@ -15,7 +15,7 @@ from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.faults import richer_model
 from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.calibration.saved_calibration import load
-from pkmcal.check.check import check_session, pose_findings
+from pkmcal.checks.check import check_session, pose_findings
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.geometry.rigid import (

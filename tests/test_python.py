@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import subprocess
 import sys
-from dataclasses import MISSING, fields, is_dataclass
-from importlib import import_module
+from dataclasses import is_dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pkmcal
-from conftest import run
 from pkmcal.arrays import short_repr
 from pkmcal.calibration import plots
 from pkmcal.errors import InputError
-from pkmcal.files import read_csv
 from pkmcal.identify.tool import ToolError
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.placement.default_camera import camera_of_size, default_camera
 from pkmcal.placement.edges import EdgeNoise
 from pkmcal.planning.defaults import NOMINAL_EDGE_SIGMA, PLANNED_IMAGE_SIZE
-from pkmcal.simulation import Sensor, Settings
-from printers import calibrated_cfg
 
 ROOT = Path(__file__).parents[1]
 LONGEST = 500
@@ -37,7 +31,7 @@ LONGEST = 500
 def result(demo, calibrated) -> pkmcal.api.calibrate.CalibrationResult:
     """Python's result of the calibration that these tests share."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.api.calibrate.run", lambda *_, **_more: calibrated)
+        patch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: calibrated)
         return pkmcal.calibrate(demo.session)
 
 
@@ -68,17 +62,6 @@ def test_everything_named_is_there_and_nothing_heavy_before_it_is_used():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
-
-
-@pytest.mark.parametrize("name", ["calibrate", "load_result", "simulate", "plan"])
-def test_help_names_every_argument_with_its_type(name):
-    function = getattr(pkmcal, name)
-    text = inspect.getdoc(function)
-    for argument in inspect.signature(function).parameters.values():
-        assert argument.name in text
-        assert argument.annotation is not inspect.Parameter.empty
-    if name == "calibrate":
-        assert "'bundle', 'four-step'" in str(inspect.signature(function)).replace('"', "'")
 
 
 # what shows itself
@@ -317,91 +300,10 @@ def test_configurations_are_planned(demo, result, planned):
         pkmcal.plan("gough-stewart", after=demo.calibration)
 
 
-# commands, and functions of the same name
-
-
-RENAMED = {("plan", "configurations"): "count"}
-"""Options whose argument has another name."""
-FOR_FILES = {"out", "as_json", "quiet", "force", "rrd", "table", "model"}
-"""Options of outputs, or of loaded files."""
-OTHERWISE = {
-    ("plan", "size"): ("camera", "1280x960"),
-    ("simulate", "size"): ("camera", "800x600"),
-    ("simulate", "noise"): ("sensor", Sensor().read_noise),
-    ("simulate", "blur"): ("sensor", Sensor().blur),
-    ("simulate", "board"): ("board", False),
-    ("simulate", "on_platform"): ("board_on", False),
-    ("simulate", "plan"): ("asked", None),
-}
-"""Options that a person types otherwise: the argument that they become, and their default."""
-
-
-@pytest.mark.parametrize("verb", ["calibrate", "plan", "simulate", "study"])
-def test_a_command_and_its_function_have_the_same_defaults(verb):
-    command = inspect.signature(getattr(import_module(f"pkmcal.commands.{verb}"), verb)).parameters
-    function = inspect.signature(getattr(pkmcal, verb)).parameters
-    defaults = {name: one.default for name, one in function.items()}
-    if verb == "simulate":
-        defaults |= {
-            one.name: one.default_factory() if one.default is MISSING else one.default
-            for one in fields(Settings)
-        }
-    for name, option in command.items():
-        if name in FOR_FILES or option.default is option.empty:
-            continue
-        if (verb, name) in OTHERWISE:
-            argument, default = OTHERWISE[verb, name]
-            assert argument in defaults
-            assert option.default == default, name
-            continue
-        argument = RENAMED.get((verb, name), name)
-        assert argument in defaults, name
-        assert option.default == defaults[argument] or not (option.default or defaults[argument])
+# defaults
 
 
 def test_images_are_of_the_size_that_the_options_say():
     assert default_camera().image_size == (800, 600)
     assert PLANNED_IMAGE_SIZE == (1280, 960)
     assert EdgeNoise().shift == NOMINAL_EDGE_SIGMA
-
-
-@pytest.mark.parametrize(
-    ("subject", "n"), [("3-rpr", 4), pytest.param("session", 3, marks=pytest.mark.slow)]
-)
-def test_the_command_plans_what_the_function_plans(demo, quick_plans, tmp_path, subject, n):
-    subject = demo.session if subject == "session" else subject
-    done = run("plan", subject, "-n", n, "-o", tmp_path / "out", "--json")
-    value = pkmcal.plan(subject, count=n)
-    assert done.json["promised"]["position"] == value.promised.position
-    table = read_csv(tmp_path / "out" / "plan.csv")
-    assert table.names == value.names
-    np.testing.assert_allclose(table.values, value.joints, atol=1e-6)
-
-
-def test_the_command_simulates_what_the_function_simulates(tmp_path):
-    some = ("--stations", 1, "--configurations", 2, "--size", "96x72", "--mechanism", "3-rpr")
-    assert run("simulate", tmp_path / "a", *some, "--json").code == 0
-    camera = camera_of_size((96, 72))
-    pkmcal.simulate(tmp_path / "b", "3-rpr", camera=camera, stations=1, configurations=2)
-    names = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*.*"))
-    assert len(names) > 5
-    for name in names:
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-
-
-def test_the_command_studies_what_the_function_studies(tmp_path, one_process):
-    done = run("study", "a", "--runs", 2, "-o", tmp_path / "out", "--json")
-    (combination,) = done.json["combinations"]
-    (value,) = pkmcal.study("a", runs=2).found
-    assert combination["position"]["value"] == value.position.value
-    assert combination["chi2"] == value.chi2
-
-
-def test_the_command_calibrates_what_the_function_calibrates(tmp_path):
-    (tmp_path / "printer.cfg").write_text(calibrated_cfg())
-    assert run("new", tmp_path / "kit", "--printer", tmp_path / "printer.cfg").code == 0
-    done = run("calibrate", tmp_path / "kit", "--json")
-    value = pkmcal.calibrate(tmp_path / "kit")
-    saved = pkmcal.load_result(tmp_path / "kit" / "calibration")
-    np.testing.assert_array_equal(saved.machine.values, value.machine.values)
-    assert done.json["verdict"]["headline"] == value.verdict.headline

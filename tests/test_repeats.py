@@ -10,11 +10,11 @@ import pytest
 
 from conftest import FEW_IMPUTATIONS, run
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
-from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
 from pkmcal.identify.axis_measurements import to_coordinates
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.judge.repeatability import (
     Cylinders,
     RepeatStudy,
@@ -419,7 +419,7 @@ def once(measured_repeats, checked, monkeypatch):
     """Commands share one measurement of the repeats, as it does not depend on their outputs; the
     rest of the check is the demonstration's, which is not tested here.
     """
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
     monkeypatch.setattr(
         "pkmcal.judge.repeatability.study_repeats", lambda *_, **_more: measured_repeats.study
     )
@@ -461,7 +461,7 @@ def test_check_repeat_as_json(repeats):
 
 @pytest.mark.slow
 def test_a_shaken_camera_is_reported(tmp_path, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
     shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3, "size": (360, 270)}
     folder = simulated(tmp_path / "session", 3, **shaken)
     values = run("check", folder, "--repeat", "--json")
@@ -475,7 +475,7 @@ def test_a_shaken_camera_is_reported(tmp_path, checked, monkeypatch):
 
 
 def test_check_repeat_without_repeats_states_what_to_write(demo, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.result)
+    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
     values = run("check", demo.session, "--repeat")
     assert values.code == 2
     assert "the session has no repeated images" in values.err

@@ -79,9 +79,7 @@ def test_the_command(tmp_path):
 
 
 def test_in_words(tmp_path, monkeypatch, reproduced):
-    monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: reproduced
-    )
+    monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda _paper, _options: reproduced)
     done = run("reproduce", "-o", tmp_path)
     assert done.code == 0
     assert max(map(len, done.out.replace(str(tmp_path), "").splitlines())) <= 80
@@ -112,9 +110,7 @@ def test_what_is_not_reproduced_is_no_green_sign(reproduced, page, tmp_path, mon
         "Not reproduced: 0.08 mm by the paper's four steps as printed",
         "Not reproduced: 1 mm before calibration",
     ]
-    monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: reproduced
-    )
+    monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda _paper, _options: reproduced)
     done = run("reproduce", "-o", tmp_path)
     assert "\n! Reproduced: the end-effector" in done.out
     assert "\n! Not reproduced: 0.08 mm" in done.out
@@ -152,13 +148,11 @@ def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, reproduc
     checks = reproduced.parts[-1].checks
     bad = replace(checks[1], passed=False)
     part = replace(reproduced.parts[-1], checks=(checks[0], bad))
-    missed = wrong("study.missed", bad.what, reproduced=bad.found, expected=bad.expected)
+    missed = wrong("study.missed", bad.what, found=bad.found, expected=bad.expected)
     verdict = replace(reproduced.verdict, usable=False, findings=(missed,))
     failed = replace(reproduced, verdict=verdict, stamp="Not reproduced", parts=(part,))
     failed.document["passed"] = False
-    monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda _paper, _options: failed
-    )
+    monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda _paper, _options: failed)
     done = run("reproduce", "-o", tmp_path)
     assert done.code == 1
     assert "✗ " + bad.sentence[:40] in done.out
@@ -180,9 +174,7 @@ def test_refuses(words, reason, tmp_path):
 
 
 def test_a_folder_that_cannot_be_written_is_reported_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda *_: pytest.fail("worked")
-    )
+    monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda *_: pytest.fail("worked"))
     (tmp_path / "file").touch()
     done = run("reproduce", "-o", tmp_path / "file" / "out")
     assert done.code == 2
@@ -191,7 +183,7 @@ def test_a_folder_that_cannot_be_written_is_reported_before_the_work(tmp_path, m
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, reproduced):
     monkeypatch.setattr(
-        "pkmcal.studies.reproduction.reproduce_paper", lambda *_: pytest.fail("worked first")
+        "pkmcal.api.reproduce.reproduce_paper", lambda *_: pytest.fail("worked first")
     )
     (tmp_path / "thesis.tex").write_text("mine")
     done = run("reproduce", "a", "-o", tmp_path)
@@ -199,7 +191,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, reproduc
     assert "something other than reproductions; found thesis.tex" in done.err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     (tmp_path / "thesis.tex").rename(tmp_path / "paper-c.json")  # an earlier one of another paper
-    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce_paper", lambda *_: reproduced)
+    monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda *_: reproduced)
     assert run("reproduce", "a", "-o", tmp_path).code == 0
 
 

@@ -15,7 +15,7 @@ from pkmcal.calibration.faults import scale_notes
 from pkmcal.calibration.machine_identity import _check_machine
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
-from pkmcal.export.contract import exporters
+from pkmcal.exporters.contract import exporters
 from pkmcal.judge.causes import single_causes
 from pkmcal.mechanisms import catalogue, load_mechanism, machine_from_document, mechanism_text
 from pkmcal.mechanisms.closure import closure, dense

@@ -440,7 +440,7 @@ def test_a_study_that_is_well(eye):
     assert words.usable
     assert "6 of 6 runs" in words.headline
     assert not words.reasons
-    settled = results.outcome("identified").settling
+    settled = results.trials("identified").settling
     assert np.all(np.abs(settled - np.log(50)) < 1.0)
 
 
@@ -454,7 +454,7 @@ def test_how_far_a_platform_leaves_its_way(eye):
     assert 1e-3 < np.median(hand) < 10e-3
     assert np.median(identified) < np.median(hand) / 10
     # of a run by itself: the farthest of its samples from all of the true one's
-    runs, ideal = (value.outcome(name).runs.T_base_platform[0] for name in ("hand", "true"))
+    runs, ideal = (value.trials(name).runs.T_base_platform[0] for name in ("hand", "true"))
     machine = eye.true.machine
     here, there = (platform_joints(machine, T) for T in (runs, ideal))
     nearest = [min(np.sqrt(np.mean(np.sum((p - q) ** 2, axis=-1))) for q in there) for p in here]

@@ -11,9 +11,9 @@ import yaml
 
 import pkmcal
 from conftest import run
-from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.drives import drives_of, reaches, side_bars

@@ -14,6 +14,7 @@ import pytest
 
 from conftest import run
 from document_keys import assert_keys
+from pkmcal.api.study import study
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.studies import engine
@@ -25,7 +26,7 @@ from pkmcal.studies.calibrations import (
 )
 from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
-from pkmcal.studies.findings import SweepResult, clustered, study
+from pkmcal.studies.findings import SweepResult, clustered
 from pkmcal.studies.statistics import Summary, covered
 from pkmcal.studies.study_report import study_document
 from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from conftest import have_cores, run
+from pkmcal.api.study import study
 from pkmcal.errors import InputError, ResultError
 from pkmcal.studies import cluster, engine, tasks
 from pkmcal.studies.calibrations import (
     JOINT_ESTIMATE_KEY,
 )
-from pkmcal.studies.findings import study
 from pkmcal.studies.store import Store
 from pkmcal.studies.study_report import runs_bytes, study_document
 from pkmcal.studies.sweep import cells_of, subject_of

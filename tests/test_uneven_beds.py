@@ -13,7 +13,7 @@ from pkmcal.calibration.discrepancy_basis import UNEVEN_BED
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.results import calibration_document
 from pkmcal.calibration.saved_calibration import load
-from pkmcal.check.check import check_session
+from pkmcal.checks.check import check_session
 from pkmcal.files import json_value
 from pkmcal.geometry.rigid import pose
 from pkmcal.outcome import Level
@@ -61,7 +61,7 @@ def flatness(value):
     machine's readings along a plane, without the plane's own tilt and height.
     """
     k = np.arange(200)
-    r, a = value.findings.bed.radius * np.sqrt((k + 0.5) / 200), k * np.pi * (3 - np.sqrt(5))
+    r, a = value.identification.bed.radius * np.sqrt((k + 0.5) / 200), k * np.pi * (3 - np.sqrt(5))
     xy = np.column_stack([r * np.cos(a), r * np.sin(a)])
     there = pose(np.eye(3), np.column_stack([xy, np.zeros(200)]))
     z = printers.machine(SAYS).forward(value.machine.inverse(there))[:, 2, 3]
@@ -83,7 +83,7 @@ def test_an_uneven_bed_is_accepted_and_blamed_on_no_motor(uneven):
 def test_deviations_contain_the_unevenness(uneven):
     """Errors of the future bed, and of the parameters, all of which are right from the first."""
     _, _, value = uneven
-    assert flatness(value) < 3 * value.findings.bed.sigma
+    assert flatness(value) < 3 * value.identification.bed.sigma
     sigma = np.sqrt(np.diag(value.estimate.covariance))
     off = np.abs(value.machine.values - value.session.machine.values)
     assert np.all(off <= 3 * sigma + 1e-12)

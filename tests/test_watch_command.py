@@ -138,8 +138,8 @@ def test_configurations_that_the_calibration_used_are_left_out(demo, later, cali
 
     spoiled(calibration, listed)
     value = watch_machine(calibration, session)
-    assert value.document()["known_configurations"] == reference_values
-    assert value.document()["configurations"] == list(session.configurations[2:])
+    assert value.as_dict()["known_configurations"] == reference_values
+    assert value.as_dict()["configurations"] == list(session.configurations[2:])
     assert (
         f"made from configuration {reference_values[0]} and {reference_values[1]}"
         in value.verdict.warnings[0]

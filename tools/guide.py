@@ -20,8 +20,8 @@ import numpy as np
 
 import pkmcal
 from pkmcal.calibration.calibrate import Calibration
-from pkmcal.check import pictures
-from pkmcal.check.check import check_session
+from pkmcal.checks import pictures
+from pkmcal.checks.check import check_session
 from pkmcal.judge.validate import validate_calibration
 from pkmcal.outcome import Outcome
 from pkmcal.pages import page

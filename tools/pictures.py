@@ -23,10 +23,10 @@ import numpy as np
 
 import pkmcal
 from pkmcal.arrays import Array
-from pkmcal.commands.comparison import compare_with_truth
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
+from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Measurements
 from pkmcal.pages import page
 from pkmcal.placement.default_camera import default_camera

@@ -1,4 +1,5 @@
-"""Ranges of all numeric options of the commands and numeric arguments of the public functions.
+"""Ranges and defaults of all numeric options of the commands, which are those of the functions of
+the same names.
 
 Ranges of numbers in files are part of the files' schemas; ranges of the quantities that a study
 varies are in :mod:`pkmcal.studies.sweep`.
@@ -10,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import MappingProxyType
+from typing import Any
 
 from pkmcal.errors import InputError
 
@@ -19,13 +21,17 @@ class Range:
     """Interval from ``least`` to ``most``. Both ends are included, but ``least`` is excluded with
     ``above``.
 
-    whole : integers only.
+    whole : integers only. unit : of a number without one, ``m``, ``rad``, ``deg`` or ``m or rad``,
+    where one may be written; empty for numbers that take no unit. default : value of the option
+    that is not given; None if that is another rule than a number.
     """
 
     least: float
     most: float
     above: bool = False
     whole: bool = False
+    default: float | None = None
+    unit: str = ""
 
     def __str__(self) -> str:
         return f"{'over ' if self.above else ''}{self.least:g} to {self.most:g}"
@@ -46,9 +52,9 @@ class Range:
         )
 
 
-def _whole(least: int, most: int) -> Range:
+def _whole(least: int, most: int, default: int | None = None) -> Range:
     """Range of integers."""
-    return Range(least, most, whole=True)
+    return Range(least, most, whole=True, default=default)
 
 
 MOST_CONFIGURATIONS = 1000
@@ -56,46 +62,46 @@ MOST_CONFIGURATIONS = 1000
 MOST_PLANNED_CONFIGURATIONS = 200
 """Most configurations for each station of a plan; there are twenty times as many candidates, and
 memory grows with their number."""
-_SEED = _whole(0, 2**63 - 1)
-_COUNT = _whole(1, 100)
-_READING_NOISE = Range(0, 1, above=True)
-_PIXEL_NOISE = Range(0, 100, above=True)
+GOOD_ENCODER_SIGMA = 3e-6
+"""Standard deviation of a reading of a good encoder, m or rad."""
+_SEED = _whole(0, 2**63 - 1, 0)
 RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
     {
-        "calibrate": {"seed": _SEED, "holdout": _whole(0, 100_000)},
+        "calibrate": {"seed": _SEED, "holdout": _whole(0, 100_000, 0)},
         "check": {"seed": _SEED},
         "new": {"places": _whole(1, 20)},
         "plan": {
-            "configurations": _whole(2, MOST_PLANNED_CONFIGURATIONS),
+            "configurations": _whole(2, MOST_PLANNED_CONFIGURATIONS, 15),
             "places": _whole(1, 12),
-            "best_of": _COUNT,
-            "edge_noise": _PIXEL_NOISE,
-            "corner_noise": _PIXEL_NOISE,
-            "joint_noise": _READING_NOISE,
+            "best_of": _whole(1, 100),
+            # of painted legs and bare rods, by what shading leaves; polished legs are worse
+            "edge_noise": Range(0, 100, above=True, default=0.1),
+            "corner_noise": Range(0, 100, above=True, default=0.05),
+            "joint_noise": Range(0, 1, above=True, default=GOOD_ENCODER_SIGMA, unit="m or rad"),
             "seed": _SEED,
         },
-        "reproduce": {"runs": _whole(2, 100_000), "seed": _SEED},
+        "reproduce": {"runs": _whole(2, 100_000, 100), "seed": _SEED},
         "servo": {
-            "runs": _whole(1, 1000),
-            "gain": Range(0, 1000, above=True),
-            "rate": Range(0, 10_000, above=True),
-            "delay": _whole(0, 50),
-            "noise": Range(0, 100),
-            "joint_noise": Range(0, 1),
+            "runs": _whole(1, 1000, 60),
+            "gain": Range(0, 1000, above=True, default=1.0),
+            "rate": Range(0, 10_000, above=True, default=25.0),
+            "delay": _whole(0, 50, 1),
+            "noise": Range(0, 100, default=0.02),
+            "joint_noise": Range(0, 1, default=GOOD_ENCODER_SIGMA, unit="m or rad"),
             "speed": Range(0, 1e6, above=True),
             "duration": Range(0, 3600, above=True),
-            "hand_position": Range(0, 100),
-            "hand_rotation": Range(0, 180),
+            "hand_position": Range(0, 100, default=0.03, unit="m"),
+            "hand_rotation": Range(0, 180, default=3.0, unit="deg"),
             "seed": _SEED,
         },
         "simulate": {
-            "stations": _COUNT,
-            "configurations": _whole(2, MOST_CONFIGURATIONS),
-            "repeats": _COUNT,
-            "tolerance": Range(0, 100),
-            "joint_noise": _READING_NOISE,
-            "noise": Range(0, 255),
-            "blur": Range(0, 20),
+            "stations": _whole(1, 100, 3),
+            "configurations": _whole(2, MOST_CONFIGURATIONS, 15),
+            "repeats": _whole(1, 100, 1),
+            "tolerance": Range(0, 100, default=1.0),
+            "joint_noise": Range(0, 1, above=True, default=GOOD_ENCODER_SIGMA, unit="m or rad"),
+            "noise": Range(0, 255, default=0.9),
+            "blur": Range(0, 20, default=0.6),
             "rough_position": Range(0, 100),
             "rough_angle": Range(0, 3.2),
             "extreme": Range(0, 1),
@@ -103,15 +109,19 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "shake": Range(0, 1),
             "seed": _SEED,
         },
-        "study": {"runs": _whole(2, 1_000_000), "seed": _SEED},
-        "validate": {"regions": _whole(0, 1000), "seed": _SEED},
-        "show": {"port": _whole(0, 65_535)},
-        "view": {"port": _whole(0, 65_535)},
-        "watch": {"alpha": Range(1e-6, 0.2), "seed": _SEED},
+        "study": {"runs": _whole(2, 1_000_000, 100), "seed": _SEED},
+        "validate": {"regions": _whole(0, 1000, 0), "seed": _SEED},
+        "view": {"port": _whole(0, 65_535, 0)},
+        "watch": {"alpha": Range(1e-6, 0.2, default=0.01), "seed": _SEED},
     }
 )
 """Ranges by command and option. Lengths in m, angles in the option's own unit, noise of images in
 px or grey levels, speed in m/s or rad/s, rates in 1/s, durations in s."""
+
+
+def default(command: str, name: str) -> Any:
+    """Default of a numeric option."""
+    return RANGES[command][name].default
 
 
 def check_number(command: str, name: str, value: float | None, where: str | None = None) -> None:

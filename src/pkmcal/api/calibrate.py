@@ -2,27 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
-from pkmcal.calibration.calibrate import Calibration
-from pkmcal.calibration.calibrate import calibrate_session as run
+from pkmcal.api.result import PAGE_DESCRIPTION, Progress, Result
+from pkmcal.calibration.calibrate import Calibration, calibrate_session
+from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
-from pkmcal.report.calibration import save
+from pkmcal.outcome import Outcome
+from pkmcal.ranges import default
+from pkmcal.report.calibration import outcome_of, save
 from pkmcal.report.rrd import write_rrd
 from pkmcal.session.load import Session
 
+Method = Literal["bundle", "four-step", "linear", "inverse-kinematic"]
 
-@dataclass(frozen=True, repr=False)
-class CalibrationResult(Calibration):
-    """Calibration that can be saved.
+
+@dataclass(frozen=True, repr=False, eq=False)
+class CalibrationResult(Calibration, Result):
+    """Calibration with its files.
 
     ``summary()``, ``parameters``, ``machine``, ``verdict``, ``tool_error(poses)``,
-    ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()``, ``save(folder)`` and
+    ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()``, ``save(folder)``, ``show()`` and
     ``record(path)``. Covariances and residuals are in ``estimate``.
     """
+
+    own_files = MappingProxyType(
+        {
+            "report.html": PAGE_DESCRIPTION,
+            "mechanism.yaml": "the calibrated machine",
+            "calibration.json": "everything, with covariances",
+        }
+    )
+    kind = ("a calibration", None)
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """Verdict, cards and sections of the report, and the texts of the files."""
+        return outcome_of(self)
+
+    @classmethod
+    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
+        """Names of an earlier calibration's files in a folder; InputError for anything else."""
+        return check_output(folder, force=force)
 
     def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
         """Write the files of ``pkmcal calibrate``: report.html, mechanism.yaml, calibration.json.
@@ -31,7 +56,7 @@ class CalibrationResult(Calibration):
         folder beside it unless ``force`` replaces it. Returns that dated folder, None if nothing
         was kept. Raises InputError if the folder holds anything else, or cannot be written.
         """
-        return save(self, folder, force=force)
+        return save(self, folder, force=force, outcome=self.outcome)
 
     def record(self, path: Path | str) -> None:
         """Write a recording, NAME.rrd, of images, edges, poses and the result for rerun's viewer
@@ -46,11 +71,11 @@ class CalibrationResult(Calibration):
 def calibrate(
     session: Session | Path | str,
     *,
-    method: Literal["bundle", "four-step", "linear", "inverse-kinematic"] = "bundle",
+    method: Method = "bundle",
     seed: int = 0,
     refine_camera: bool = False,
-    holdout: int = 0,
-    progress: Callable[[str, float], None] | None = None,
+    holdout: int = default("calibrate", "holdout"),
+    progress: Progress | None = None,
 ) -> CalibrationResult:
     """Calibrate the machine of a session, without writing files.
 
@@ -85,7 +110,7 @@ def calibrate(
         These data do not allow a result.
 
     """
-    calibration = run(
+    calibration = calibrate_session(
         session,
         method=method,
         seed=seed,
@@ -94,10 +119,7 @@ def calibrate(
         progress=progress,
     )
     # release the images, which a long-lived result need not keep in memory
-    without_images = replace(calibration, images={})
-    return CalibrationResult(
-        **{one.name: getattr(without_images, one.name) for one in fields(without_images)}
-    )
+    return CalibrationResult.of(replace(calibration, images={}))
 
 
 def load_result(source: Path | str) -> SavedCalibration:

@@ -2,53 +2,89 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Literal
 
 from threadpoolctl import threadpool_limits
 
+from pkmcal.api.result import (
+    NUMBERS_DESCRIPTION,
+    PAGE_DESCRIPTION,
+    Progress,
+    Result,
+    no_progress,
+)
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.outcome import Outcome
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
-from pkmcal.planning.defaults import (
-    CONFIGURATIONS_A_CAPTURE,
-    NOMINAL_CORNER_SIGMA,
-    NOMINAL_EDGE_SIGMA,
-    PLANNED_IMAGE_SIZE,
-    STATIONS_AROUND_A_MACHINE,
-    UNTOLD_READING_NOISE,
-)
-from pkmcal.planning.plan import MeasurementPlan
-from pkmcal.planning.plan import plan_measurements as run
-from pkmcal.planning.subject import as_it_stands, of_machine
+from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE, STATIONS_AROUND_A_MACHINE
+from pkmcal.planning.plan import MeasurementPlan, plan_measurements
+from pkmcal.planning.subject import Subject, as_it_stands, of_machine
+from pkmcal.ranges import default
+from pkmcal.report.plan import PLAN_STATIONS_FILE, PLAN_TABLE_FILE, outcome_of
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation import board_for
+
+PlanIndex = Literal["tool", "D", "E", "O1"]
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class PlanResult(Result, MeasurementPlan):
+    """Plan with its files: ``joints``, ``names``, ``promised``, ``now``."""
+
+    own_files = MappingProxyType(
+        {
+            "plan.html": PAGE_DESCRIPTION,
+            PLAN_TABLE_FILE: "the readings, in the order to be measured",
+            "plan.json": NUMBERS_DESCRIPTION,
+            PLAN_STATIONS_FILE: "the places, for session.yaml",
+        }
+    )
+    kind = ("what plan writes", "an earlier plan")
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """Tables, figures and sections of the page."""
+        return outcome_of(self)
+
+    @property
+    def file_list(self) -> Mapping[str, str]:
+        """Files of the plan, with those of its stations if these were chosen."""
+        return {
+            name: what
+            for name, what in self.own_files.items()
+            if name != PLAN_STATIONS_FILE or self.tried
+        }
 
 
 def plan(
     subject: Session | Machine | Path | str,
     *,
-    count: int = CONFIGURATIONS_A_CAPTURE,
-    index: Literal["tool", "D", "E", "O1"] = "tool",
+    count: int = default("plan", "configurations"),
+    index: PlanIndex = "tool",
     places: int | None = None,
     best_of: int | None = None,
     after: SavedCalibration | Path | str | None = None,
     from_drawing: bool = False,
     same_place: bool = False,
     together: bool | None = None,
-    camera: Camera | Path | str | None = None,
+    camera: Camera | Path | str | tuple[int, int] | None = None,
     board: bool = False,
     tracker: tuple[float, float | None] | None = None,
-    edge_noise: float = NOMINAL_EDGE_SIGMA,
-    corner_noise: float = NOMINAL_CORNER_SIGMA,
-    joint_noise: float = UNTOLD_READING_NOISE,
+    edge_noise: float = default("plan", "edge_noise"),
+    corner_noise: float = default("plan", "corner_noise"),
+    joint_noise: float = default("plan", "joint_noise"),
     seed: int = 0,
-    progress: Callable[[float], None] | None = None,
-) -> MeasurementPlan:
+    progress: Progress | None = None,
+) -> PlanResult:
     """Choose the configurations that determine a machine best, without writing files.
 
     Parameters
@@ -75,8 +111,9 @@ def plan(
         Whether all stations measure each configuration, or each its own; by default together if
         there are several cameras, or a tracker.
     camera :
-        Camera or its file, by default a small industrial one of 1280 x 960 px; machines only. It
-        has three stations, or one if a board, a panoramic camera or ``places`` needs no more.
+        Camera or its file, or the image size (width, height) of a small industrial one, by default
+        1280 x 960 px; machines only. It has three stations, or one if a board, a panoramic camera
+        or ``places`` needs no more.
     board :
         Observe a board on the platform instead of the legs; machines only.
     tracker :
@@ -89,13 +126,14 @@ def plan(
     seed :
         Seed for all random numbers.
     progress :
-        Called with the share done, 0 to 1.
+        Called with a text and the share done, 0 to 1.
 
     Returns
     -------
-    MeasurementPlan
+    PlanResult
         ``joints`` (n, m), ``names``, ``T_base_platform`` (n, 4, 4) in the order of measurement;
-        ``now``, ``promised`` and ``by_chance``, standard deviations of the tool.
+        ``now``, ``promised`` and ``by_chance``, standard deviations of the tool;
+        ``summary()``, ``save(folder)``.
 
     Raises
     ------
@@ -103,52 +141,74 @@ def plan(
         The subject or an option does not allow a plan.
 
     """
+    report = progress or no_progress
+    report("Looking at what there is", 0.0)
     folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
-    planned = {
-        "count": count, "index": index, "together": together, "free_stations": places,
-        "best_of": best_of, "seed": seed, "progress": progress,
-    }  # fmt: skip
+    region, where = None, None
     with threadpool_limits(1, "blas"):
-        if folder is not None or isinstance(subject, Session):
+        if isinstance(subject, Session) or folder is not None:
             _check_options(
                 "a machine", {"--camera": camera, "--board": board, "--tracker": tracker}
             )
-            session = subject if isinstance(subject, Session) else None
-            session = session or load_session(folder or "", measured=False)
-            rig_subject = as_it_stands(
+            session = (
+                subject
+                if isinstance(subject, Session)
+                else load_session(folder or "", measured=False)
+            )
+            region = session.workspace
+            planned = as_it_stands(
                 session, after, from_nominal=from_drawing, same_place=same_place,
                 anywhere=places is not None, edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
-            return run(rig_subject, region=session.workspace, **planned)
-        _check_options(
-            "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
-        )
-        machine = subject if isinstance(subject, Machine) else load_mechanism(str(subject))
-        if camera is None:
-            eye = camera_of_size(PLANNED_IMAGE_SIZE)
         else:
-            eye = camera if isinstance(camera, Camera) else load_camera(camera)
-        # Errors are located at the machine's or the camera's name as given.
-        name = machine.name if isinstance(subject, Machine) else str(subject)
-        try:
-            one = board or places or view_angle(eye) > PANORAMIC_HALF_VIEW
-            rig_subject = of_machine(
-                machine,
-                [eye] * (1 if one else STATIONS_AROUND_A_MACHINE),
-                machine.joint_names,
-                board=board_for(machine, "platform") if board else None,
-                tracker=tracker,
-                joint_noise=joint_noise,
-                edge=edge_noise,
-                corner=corner_noise,
-                seed=seed,
+            _check_options(
+                "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
             )
-        except InputError as error:
-            raise error.located(name) from None
+            planned, where = _of_machine(
+                subject, camera, board, bool(places), tracker=tracker, joint_noise=joint_noise,
+                edge=edge_noise, corner=corner_noise, seed=seed,
+            )  # fmt: skip
         try:
-            return run(rig_subject, **planned)
+            value = plan_measurements(
+                planned, count=count, index=index, region=region, together=together,
+                free_stations=places, best_of=best_of, seed=seed,
+                progress=lambda share: report("Choosing configurations", 0.1 + 0.85 * share),
+            )  # fmt: skip
         except InputError as error:
-            raise error.located(str(camera) if isinstance(camera, Path | str) else name) from None
+            raise error if where is None else error.located(where) from None
+        return PlanResult.of(value)
+
+
+def _of_machine(
+    subject: Machine | Path | str,
+    camera: Camera | Path | str | tuple[int, int] | None,
+    board: bool,
+    places: bool,
+    **noise: Any,
+) -> tuple[Subject, str]:
+    """Machine with an assumed camera, and the location of its errors: the camera's or the machine's
+    name as given.
+
+    places : whether stations are chosen. noise : of edges, corners, readings and the tracker.
+    """
+    machine = subject if isinstance(subject, Machine) else load_mechanism(str(subject))
+    name = machine.name if isinstance(subject, Machine) else str(subject)
+    if camera is None or isinstance(camera, tuple):
+        eye = camera_of_size(camera or PLANNED_IMAGE_SIZE)
+    else:
+        eye = camera if isinstance(camera, Camera) else load_camera(camera)
+    one = board or places or view_angle(eye) > PANORAMIC_HALF_VIEW
+    try:
+        planned = of_machine(
+            machine,
+            [eye] * (1 if one else STATIONS_AROUND_A_MACHINE),
+            machine.joint_names,
+            board=board_for(machine, "platform") if board else None,
+            **noise,
+        )
+    except InputError as error:
+        raise error.located(name) from None
+    return planned, str(camera) if isinstance(camera, Path | str) else name
 
 
 def _check_options(owner: str, given: Mapping[str, object]) -> None:

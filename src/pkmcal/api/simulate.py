@@ -2,31 +2,105 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import fields
+import shlex
+import shutil
+import webbrowser
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from pkmcal.api.result import Progress, Result
+from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
-from pkmcal.files import closest
+from pkmcal.files import check_own_folder, closest, resolved, staged_folder
 from pkmcal.mechanisms import Machine, load_mechanism
-from pkmcal.placement.default_camera import default_camera
-from pkmcal.ranges import RANGES, check_number
+from pkmcal.outcome import Outcome, Verdict
+from pkmcal.outcome.finding import note
+from pkmcal.placement.default_camera import camera_of_size, default_camera
+from pkmcal.ranges import RANGES, check_number, default
 from pkmcal.session.load import Session, load_session
-from pkmcal.simulation import Sensor, Settings, simulate_session, to_simulate
-from pkmcal.wording import listed
+from pkmcal.simulation import Sensor, Settings, Truth, board_for, simulate_session, to_simulate
+from pkmcal.simulation.rehearsal import Rehearsal, rehearsal_of
+from pkmcal.wording import count, listed
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class SimulationResult(Session, Result):
+    """Simulated session, as loaded, with its truth.
+
+    ``document`` is that of the session, as of every session; ``outcome.document`` is that of the
+    command.
+
+    truth : true values. cylinders_added : whether the nominal model had no visible cylinders.
+    """
+
+    truth: Truth | None = None
+    cylinders_added: bool = False
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """What was simulated."""
+        images, places = self.images_taken, count(len(self.station_names), "place")
+        findings = (note("session.cylinders_added", self.machine.name),)
+        return Outcome(
+            command="simulate",
+            title=f"Simulated session of {self.machine.name}",
+            verdict=Verdict(
+                True,
+                f"{count(images, 'image')} of {self.machine.name} from {places} in {self.folder};"
+                " the truth is in its truth.json, which no calibration reads.",
+            ),
+            findings=findings if self.cylinders_added else (),
+            document={
+                "photographs": images,
+                "stations": self.station_names,
+                "seed": self.truth.seed if self.truth else 0,
+            },
+        )
+
+    @property
+    def file_list(self) -> Mapping[str, str]:
+        """No list: the files are those of a session."""
+        return {}
+
+    def save(self, folder: Path | str, *, force: bool = False) -> None:
+        """Copy the session into a new or empty folder; InputError for another one."""
+        del force
+        check_own_folder(Path(folder), (), "a new session")
+        with staged_folder(folder) as stage:
+            shutil.copytree(self.folder, stage, dirs_exist_ok=True)
+
+    def show(self) -> Path:
+        """Open the session's folder in a browser, and return it."""
+        webbrowser.open(resolved(self.folder).as_uri())
+        return self.folder
+
+    def path_document(self, folder: Path) -> dict[str, Any]:
+        """The session's folder."""
+        return {"folder": str(folder)}
+
+    def next_step(self, folder: Path) -> str:
+        """The command that is next."""
+        return f"Next: pkmcal calibrate {shlex.quote(str(folder))}"
 
 
 def simulate(
     folder: Path | str,
     mechanism: Machine | Path | str = "gough-stewart",
     *,
-    camera: Camera | Path | str | None = None,
+    camera: Camera | Path | str | tuple[int, int] | None = None,
+    board: Board | bool = False,
+    on_platform: bool = False,
+    noise: float = default("simulate", "noise"),
+    blur: float = default("simulate", "blur"),
+    plan: Path | str | None = None,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     **settings: Any,
-) -> Session:
+) -> SimulationResult:
     """Simulate a session in a new folder: images, readings, and the truth in truth.json.
 
     Parameters
@@ -37,21 +111,32 @@ def simulate(
         A built-in machine's name, a mechanism file, or a loaded machine. A nominal model without
         visible cylinders gets one on each rod.
     camera :
-        A camera's file, or a loaded camera; by default a small industrial one of 800 x 600 px.
+        A camera, its file, or the image size (width, height) of a small industrial one; by default
+        800 x 600 px.
+    board :
+        A board that every station sees; True for one of a size that suits the machine.
+    on_platform :
+        Fix the board, the suitable one by default, to the platform instead of the base.
+    noise, blur :
+        Standard deviations of a pixel's noise, grey levels, and of the lens's blur, px.
+    plan :
+        Folder of a plan, whose machine, cameras, stations and configurations are simulated.
     seed :
         Seed for all random numbers.
     progress :
-        Called with the number of finished images and of all images.
+        Called with a text and the share done, 0 to 1.
     settings :
-        Fields of :class:`pkmcal.simulation.Settings`: ``stations=3``, ``configurations=15``,
-        ``tolerance=1.0`` (standard deviation of the machine in prior sigmas), ``joint_noise=3e-6``,
-        ``board=``, ``finish="metal"`` and so on.
+        Further fields of :class:`pkmcal.simulation.Settings`: ``stations=3``,
+        ``configurations=15``, ``tolerance=1.0`` (standard deviation of the machine in prior
+        sigmas), ``joint_noise=3e-6``, ``finish="metal"``, ``sensor=`` instead of ``noise`` and
+        ``blur``, and so on.
 
     Returns
     -------
-    Session
-        As loaded by :func:`pkmcal.load_session`. ``pkmcal.simulation.load_truth(folder)`` reads the
-        truth; ``pkmcal.compare`` compares a machine with it.
+    SimulationResult
+        The session, as loaded by :func:`pkmcal.load_session`, with its ``truth``, which
+        ``pkmcal.simulation.load_truth(folder)`` reads as well; ``pkmcal.compare`` compares a
+        machine with it.
 
     Raises
     ------
@@ -59,33 +144,66 @@ def simulate(
         The folder is not empty, or the machine, the camera or a setting is invalid.
 
     """
+    given: dict[str, Any] = {"sensor": Sensor(blur=blur, read_noise=noise), **settings}
+    _check_settings({**given, "noise": noise, "blur": blur, "seed": seed})
+    planned = None if plan is None else rehearsal_of(plan)
+    nominal = planned.machine if planned else _nominal(mechanism)
+    machine = to_simulate(nominal, nominal.name if plan is None else str(plan))
+    place = "platform" if on_platform else settings.get("board_on", "base")
+    if isinstance(board, Board):
+        fixed = board
+    else:
+        fixed = board_for(machine, place) if board or on_platform else None
+    given |= {"board": fixed, "board_on": place}
+    setting = Settings(**given)
+    eye = planned.cameras if planned else _camera(camera)
+    truth = simulate_session(
+        folder,
+        machine,
+        eye,
+        _rehearsed(setting, planned) if planned else setting,
+        seed=seed,
+        progress=lambda done, total: (
+            progress(f"Image {done} of {total}", done / total) if progress else None
+        ),
+    )
+    session = load_session(folder)
+    return SimulationResult.of(session, truth=truth, cylinders_added=machine is not nominal)
+
+
+def _nominal(mechanism: Machine | Path | str) -> Machine:
+    """Machine as given, or by its name or file."""
+    return mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
+
+
+def _camera(camera: Camera | Path | str | tuple[int, int] | None) -> Camera:
+    """Camera as given, by its file or image size, or the usual one."""
+    if camera is None or isinstance(camera, Camera):
+        return camera or default_camera()
+    return camera_of_size(camera) if isinstance(camera, tuple) else load_camera(camera)
+
+
+def _rehearsed(settings: Settings, planned: Rehearsal) -> Settings:
+    """Settings with the stations, the configurations and the board of a plan."""
+    settings = replace(settings, stations=planned.places, asked=planned.requested)
+    return (
+        replace(settings, board=planned.board, board_on="platform") if planned.board else settings
+    )
+
+
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    """Raise InputError for an unknown setting, and for a number, also of the sensor, that is out of
+    range.
+    """
     names = [one.name for one in fields(Settings)]
-    for name in settings:
-        if name not in names:
+    for name, value in settings.items():
+        if name not in (*names, *RANGES["simulate"]):
             guess = closest(name, names)
             raise InputError(
                 "this is no setting of a simulation",
                 found=name,
                 expected=guess or listed(names, len(names)),
             )
-    check_number("simulate", "seed", seed)
-    _check_settings(settings)
-    nominal = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
-    eye = (
-        camera
-        if isinstance(camera, Camera)
-        else load_camera(camera)
-        if camera
-        else default_camera()
-    )
-    machine = to_simulate(nominal, nominal.name)
-    simulate_session(folder, machine, eye, Settings(**settings), seed=seed, progress=progress)
-    return load_session(folder)
-
-
-def _check_settings(settings: Mapping[str, Any]) -> None:
-    """Raise InputError for a number of the settings, or of their sensor, that is out of range."""
-    for name, value in settings.items():
         if name == "stations" and not isinstance(value, int | float):
             continue  # poses of the stations instead of their number
         if name in RANGES["simulate"]:

@@ -94,9 +94,10 @@ CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
 class Calibration(CalibrationSummary):
     """The result of a calibration.
 
-    boards : the calibration board, where stations observe one. findings : identifiability of the
-    machine's parameters. timings : seconds by step. holdout : configurations that the estimate does
-    not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them. violations :
+    boards : the calibration board, where stations observe one. identification : identifiability of
+    the machine's parameters. timings : seconds by step. holdout : configurations that the estimate
+    does not use, where requested; :func:`pkmcal.judge.holdouts.holdout_of` predicts them.
+    violations :
     detected model violations. model_errors : smooth model errors without a name, which the
     covariance contains. upside_down : images that were measured by their camera turned by half.
     images : images of stations whose legs were observed, by the station's number; those that
@@ -108,7 +109,7 @@ class Calibration(CalibrationSummary):
     measurements: Measurements
     estimate: Estimate
     verdict: Verdict
-    findings: Findings
+    identification: Findings
     cameras: CameraRefinement
     method: str
     seed: int
@@ -512,7 +513,7 @@ def _judge(
         measurements=turns.measurements,
         estimate=value.estimate,
         verdict=verdict,
-        findings=findings,
+        identification=findings,
         cameras=turns.cameras,
         method=method,
         seed=seed,

@@ -161,7 +161,7 @@ def calibration_document(
     or why there is no map of it. images : digests of the images, computed unless given.
     """
     session, estimate = calibration.session, calibration.estimate
-    bed = calibration.findings.bed
+    bed = calibration.identification.bed
     in_view = digests(session) if images is None else images
     document = {
         FORMAT_KEY: CALIBRATION_FORMAT,
@@ -174,7 +174,7 @@ def calibration_document(
         "parameters": [asdict(row) for row in calibration.parameters],
         "covariance": estimate.covariance,
         "not_identified": not_identified,
-        "identifiability": identifiability_of(calibration.findings),
+        "identifiability": identifiability_of(calibration.identification),
         "stations": _stations(calibration),
         "station_covariance": _station_covariance(calibration),
         "targets": _targets(calibration),

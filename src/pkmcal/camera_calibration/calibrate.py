@@ -147,7 +147,7 @@ class CameraCalibration:
         ]
         return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
 
-    def document(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Calibration as plain data for JSON, with the camera as in its file."""
         names = self.camera.parameter_names
         return {

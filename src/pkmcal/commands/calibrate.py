@@ -8,13 +8,14 @@ from typing import Annotated, Literal
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import PAGE_DESCRIPTION, answer, write_outcome
+from pkmcal.commands.finish import finish
+from pkmcal.ranges import default
 
-CALIBRATION_FILES = {
-    "report.html": PAGE_DESCRIPTION,
-    "mechanism.yaml": "the calibrated machine",
-    "calibration.json": "everything, with covariances",
-}
+EXAMPLES = """\
+pkmcal calibrate my-machine
+pkmcal calibrate my-machine -o out --holdout 5
+pkmcal calibrate my-machine --refine-camera --seed 1 --json
+"""
 
 
 def calibrate(
@@ -39,54 +40,49 @@ def calibrate(
     holdout: Annotated[
         int,
         console.number_option("calibrate", "holdout", "N", "Leave N poses out, and predict them."),
-    ] = 0,
+    ] = default("calibrate", "holdout"),
     force: Annotated[
         bool,
-        typer.Option("--force", help="Replace an earlier result; otherwise it is kept, dated."),
+        typer.Option(
+            "--force",
+            help="Replace an earlier result; otherwise it is kept, dated.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = False,
     rrd: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write a recording for rerun's viewer as well."),
+        typer.Option(
+            metavar="FILE",
+            help="Write a recording for rerun's viewer as well.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = None,
     as_json: console.Json = False,
     quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")
+        bool,
+        typer.Option(
+            "--quiet", "-q", help="Say nothing if it is well.", rich_help_panel=console.OUTPUT_GROUP
+        ),
     ] = False,
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
-    from pkmcal.calibration.archive import keep_earlier
-    from pkmcal.calibration.calibrate import calibrate_session as run
-    from pkmcal.calibration.results import check_output
-    from pkmcal.files import default_output, output_lock
-    from pkmcal.report.calibration import outcome_of
-    from pkmcal.report.rrd import check_rrd, write_rrd
-    from pkmcal.session.load import load_session
+    import pkmcal
+    from pkmcal.api.calibrate import CalibrationResult
+    from pkmcal.report.rrd import check_rrd
 
     if rrd is not None:
         check_rrd(rrd)
-
-    loaded = load_session(session, model)
-    folder = out or default_output(loaded.folder / "calibration")
-    check_output(folder, force=force)
-    with console.progress(quiet or as_json) as progress:
-        calibration = run(
-            loaded,
-            method=method,
-            seed=seed,
-            refine_camera=refine_camera,
-            holdout=holdout,
-            progress=progress,
-        )
-        progress("Writing the report", 0.97)
-        outcome = outcome_of(calibration)
-        with output_lock(folder):  # another process may have written there since the first check
-            over = check_output(folder, force=force)
-            archive_folder = None if force else keep_earlier(folder, outcome.texts)
-            write_outcome(outcome, folder, CALIBRATION_FILES, over)
-        files = dict(CALIBRATION_FILES)
-        if rrd is not None:
-            write_rrd(calibration, rrd)
-            files[str(rrd.absolute())] = "rerun opens it"
-    return answer(
-        outcome, folder, files, archive_folder=archive_folder, as_json=as_json, quiet=quiet
+    loaded = pkmcal.load_session(session, model)
+    folder = console.output_folder(
+        out, loaded.folder / "calibration", CalibrationResult, force=force
     )
+    with console.progress(quiet or as_json) as progress:
+        result = pkmcal.calibrate(
+            loaded, method=method, seed=seed, refine_camera=refine_camera, holdout=holdout,
+            progress=progress,
+        )  # fmt: skip
+        if rrd is not None:
+            progress("Writing the recording", 0.96)
+            result.record(rrd)
+    more = {} if rrd is None else {str(rrd.absolute()): "rerun opens it"}
+    return finish(result, folder, force=force, more=more, as_json=as_json, quiet=quiet)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, write_outcome
+from pkmcal.commands.finish import answer, finish
 
-CHECK_FILES = {"check.html": PAGE_DESCRIPTION, "check.json": NUMBERS_DESCRIPTION}
 OVERLAYS_DESCRIPTION = "the nominal model over each image"
+
+EXAMPLES = """\
+pkmcal check my-machine
+pkmcal check my-machine -o check
+pkmcal check my-machine --pictures drawn --repeat
+"""
 
 
 def check(
@@ -20,7 +24,11 @@ def check(
     out: Annotated[Path | None, console.folder("Write a page with images there.")] = None,
     pictures: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write the nominal model over each image, as PNG."),
+        typer.Option(
+            metavar="DIR",
+            help="Write the nominal model over each image, as PNG.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = None,
     repeat: Annotated[
         bool,
@@ -30,40 +38,21 @@ def check(
     as_json: console.Json = False,
 ) -> int:
     """Find what is wrong with a session before any work is spent."""
-    from pkmcal.check.check import check_session
-    from pkmcal.check.sentences import outcome_of
-    from pkmcal.files import check_own_folder, check_writable
+    import pkmcal
+    from pkmcal.api.check import CheckResult
+    from pkmcal.files import check_writable
 
     if out is not None:
-        check_own_folder(out, CHECK_FILES, "a check")
+        CheckResult.check_folder(out)
     if pictures is not None:
         check_writable(pictures)
-    study = None
     with console.progress(as_json) as progress:
-        check = check_session(session, seed=seed, progress=progress)
-        if repeat and check.exit_code < 2:
-            from pkmcal.judge.repeatability import study_repeats
-
-            study = study_repeats(session, seed=seed, progress=progress)
-        outcome = outcome_of(check, study)
-        if repeat:
-            repeats = study and study.as_dict()
-            outcome = replace(outcome, document={**outcome.document, "repeats": repeats})
-        files: dict[str, str] = {}
-        if pictures is not None and check.look:
-            from pkmcal.check.pictures import picture_names, write_pictures
-
+        result = pkmcal.check(session, repeat=repeat, seed=seed, progress=progress)
+        more: dict[str, str] = {}
+        if pictures is not None:
             progress("Drawing", 0.95)
-            names = picture_names(check.look).values()
-            check_own_folder(pictures, names, "pictures of a check", "an earlier check's")
-            write_pictures(check.look, pictures)
-            files[str(pictures)] = OVERLAYS_DESCRIPTION
-        if out is not None:
-            if check.look:
-                from pkmcal.check.pictures import with_pictures
-
-                progress("Writing the page", 0.97)
-                outcome = replace(outcome, parts=(*outcome.parts, with_pictures(check.look)))
-            write_outcome(outcome, out, CHECK_FILES)
-            files |= {str(out / name): what for name, what in CHECK_FILES.items()}
-    return answer(outcome, Path(), files, as_json=as_json)
+            if result.save_pictures(pictures):
+                more[str(pictures)] = OVERLAYS_DESCRIPTION
+    if out is None:
+        return answer(result, None, more=more, as_json=as_json)
+    return finish(result, out, more=more, as_json=as_json)

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ import typer
 import typer.core
 import typer.main
 
-from pkmcal.commands.console import print_error
+from pkmcal.commands.console import OUTPUT_GROUP, print_error
 from pkmcal.commands.streams import LostOutput, withstanding
 from pkmcal.errors import InputError, PkmcalError, legible
 
@@ -65,6 +66,30 @@ function of its name in the module of its name.
 """
 
 
+class _Command(typer.core.TyperCommand):
+    """Command whose help groups options by their panels and ends in examples."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            if record := parameter.get_help_record(ctx):
+                panel = getattr(parameter, "rich_help_panel", None) or "Options"
+                title = "Arguments" if parameter.param_type_name == "argument" else panel
+                groups.setdefault(title, []).append(record)
+        last = groups.pop(OUTPUT_GROUP, [])
+        for title, records in {**groups, OUTPUT_GROUP: last}.items():
+            if not records:
+                continue
+            with formatter.section(title):
+                formatter.write_dl(records)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        del ctx
+        if self.epilog:
+            formatter.write_paragraph()
+            formatter.write(self.epilog)
+
+
 class _Commands(typer.core.TyperGroup):
     """Group of commands, each imported when it is used."""
 
@@ -83,7 +108,12 @@ class _Commands(typer.core.TyperGroup):
 def _typer_command(name: str) -> Any:
     """A command as typer's object; building those of all commands would take 20 ms."""
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
-    alone.command(name)(getattr(import_module(f"pkmcal.commands.{name}"), name))
+    module = import_module(f"pkmcal.commands.{name}")
+    examples = textwrap.indent(getattr(module, "EXAMPLES", ""), "  ")
+    epilog = f"Examples:\n{examples}" if examples else ""
+    if further := getattr(module, "FURTHER_HELP", ""):
+        epilog += f"\n{further}"
+    alone.command(name, cls=_Command, epilog=epilog)(getattr(module, name))
     return typer.main.get_command(alone)
 
 

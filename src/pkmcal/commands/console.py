@@ -5,45 +5,86 @@ stderr.
 from __future__ import annotations
 
 import os
+import re
 import sys
-import textwrap
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pkmcal.errors import legible
+from pkmcal.errors import InputError, legible
 from pkmcal.ranges import RANGES, check_number
+from pkmcal.terminal import err, print_points
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pkmcal.outcome import Table
+    from pkmcal.api.result import Result
 
 TextProgress = Callable[[str, float], None]
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+OUTPUT_GROUP = "Output"
+"""Heading of the options of outputs in the help."""
+Json = Annotated[
+    bool,
+    typer.Option(
+        "--json",
+        help="Print one JSON object and nothing else.",
+        rich_help_panel=OUTPUT_GROUP,
+    ),
+]
 
 
-def number_option(command: str, name: str, metavar: str, described: str, *flags: str) -> Any:
+def number_option(
+    command: str, name: str, metavar: str, described: str, *flags: str, group: str | None = None
+) -> Any:
     """Numeric option that is validated by its range in :data:`pkmcal.ranges.RANGES`; the help shows
-    the range.
+    the range. Lengths and angles may have a unit, such as ``0.1 deg``, as in files.
 
-    described : help text. flags : names of the option; ``--name`` by default.
+    described : help text. flags : names of the option; ``--name`` by default. group : heading in
+    the help.
     """
     long = flags[-1] if flags else f"--{name.replace('_', '-')}"
+    allowed = RANGES[command][name]
 
     def check(value: Any) -> Any:
         check_number(command, name, value, long)
         return value
 
-    text = f"{described} [{RANGES[command][name]}]"
-    return typer.Option(*(flags or (long,)), metavar=metavar, callback=check, help=text)
+    def number(text: Any) -> float:
+        return quantity(str(text), allowed.unit, long)
+
+    return typer.Option(
+        *(flags or (long,)),
+        metavar=metavar,
+        callback=check,
+        parser=number if allowed.unit else None,
+        help=f"{described} [{allowed}]",
+        rich_help_panel=group,
+    )
+
+
+def quantity(text: str, unit: str, where: str) -> float:
+    """Number of an option, with or without a unit; InputError for another text.
+
+    unit : that of a number without one, m, rad, "m or rad" or deg. where : the option.
+    """
+    from pkmcal.files.quantities import read_quantity
+
+    try:
+        return read_quantity(text, unit)
+    except ValueError:
+        kinds = {"m": "a length", "rad": "an angle", "deg": "an angle"}
+        examples = {"m": "0.001 or 1 mm", "rad": "0.01 or 0.5 deg", "deg": "3 or 3 deg"}
+        raise InputError(
+            "this number cannot be used",
+            where=where,
+            found=text,
+            expected=f"{kinds.get(unit, 'a length or an angle')}, such as"
+            f" {examples.get(unit, '3e-6 or 3 um')}",
+        ) from None
 
 
 def _seed(value: int) -> int:
@@ -64,54 +105,47 @@ CamerasOf = Annotated[
     typer.Option(metavar="DIR", help="The session, for its cameras, where it is not found."),
 ]
 
-MARK_SIGNS = {
-    "good": "[green]✓[/]",
-    "note": "[cyan]·[/]",
-    "doubtful": "[yellow]![/]",
-    "wrong": "[red]✗[/]",
-}
-ROW_SOURCE_STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
-"""Styles of a table's rows by the source of their figures."""
+SMALLEST_PICTURE_SIDE, LARGEST_PICTURE_SIDE = 64, 8192
+"""Limits of an image's width and height in px: below, legs are too narrow to have edges; above,
+memory does not suffice.
+"""
 PROGRESS_LINE_INTERVAL = 10.0
 """Seconds between two lines of progress without a terminal."""
-WIDEST_NAME = 32
-"""Maximum number of characters of a row's name that is not wrapped."""
 
 
 def folder(given: str) -> Any:
     """Option of the output folder. given : help text."""
-    return typer.Option("-o", "--out", metavar="DIR", help=given)
+    return typer.Option("-o", "--out", metavar="DIR", help=given, rich_help_panel=OUTPUT_GROUP)
 
 
-@cache
-def _legible_console() -> type[Console]:
-    """Rich's console with all text made legible; only Rich's own control codes reach a terminal."""
-    from rich.console import Console, ConsoleOptions, RenderableType
-    from rich.segment import Segment
-
-    class LegibleConsole(Console):
-        """Console with legible text."""
-
-        def render(
-            self, renderable: RenderableType, options: ConsoleOptions | None = None
-        ) -> Iterable[Segment]:
-            for segment in super().render(renderable, options):
-                if segment.control:
-                    yield segment
-                else:
-                    yield Segment(legible(segment.text, keep="\n"), segment.style)
-
-    return LegibleConsole
+def parsed_size(text: str) -> tuple[int, int]:
+    """(width, height) from a text such as 800x600."""
+    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text.strip())
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:
+        raise InputError(
+            "no size of an image",
+            where="--size",
+            found=text,
+            expected=f"width x height, each {SMALLEST_PICTURE_SIDE} to {LARGEST_PICTURE_SIDE},"
+            f" such as 800x600",
+        )
+    return size
 
 
-def out() -> Console:
-    """Console for results."""
-    return _legible_console()(highlight=False)
+def output_folder(
+    out: Path | None, usual: Path, kind: type[Result], *, force: bool = False
+) -> Path:
+    """Folder of a result, ``usual`` if none is given, checked before the work.
 
+    Raises InputError where it cannot be written, or holds anything but an earlier result of this
+    kind. force : the earlier result need not be kept.
+    """
+    from pkmcal.files import default_output
 
-def err() -> Console:
-    """Console for progress and errors."""
-    return _legible_console()(stderr=True, highlight=False)
+    folder = out or default_output(usual)
+    kind.check_folder(folder, force=force)
+    return folder
 
 
 def print_error(sentence: str) -> None:
@@ -128,63 +162,6 @@ def print_json(data: Mapping[str, Any]) -> None:
     from pkmcal.files import json_text
 
     sys.stdout.write(json_text(data))
-
-
-def print_points(console: Console, points: Iterable[tuple[str, str]]) -> None:
-    """Print sentences that wrap beside their marks: pairs of mark (in markup) and text."""
-    from rich.text import Text
-
-    for mark, text in points:
-        before = Text.from_markup(f"{mark} " if mark else "")
-        # Paths and numbers are not split; a word that is wider than the terminal runs over.
-        lines = textwrap.wrap(
-            text,
-            max(console.width - before.cell_len, 20),
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
-        rest = ("\n" + " " * before.cell_len).join(lines)
-        console.print(before + Text(rest), soft_wrap=True)
-
-
-def print_files(console: Console, files: Iterable[tuple[str, str]]) -> None:
-    """Print paths with their descriptions."""
-    files = [(legible(path), what) for path, what in files]
-    widest = max(len(path) for path, _ in files)
-    for path, what in files:
-        console.print(f"  {escaped(path):{widest}}  [dim]{what}[/]", soft_wrap=True)
-
-
-def print_table(console: Console, table: Table) -> None:
-    """Print a table without lines: title, the columns that are for the terminal, and legend."""
-    from rich.table import Table as Rich
-
-    columns = table.columns[: table.first]
-    marked = any(row.mark for row in table.rows)
-    grid = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    if marked:
-        grid.add_column()
-    short = max((len(row.name) for row in table.rows), default=0) <= WIDEST_NAME
-    for place, heading in enumerate(columns):
-        left = place == 0 or place in table.words
-        grid.add_column(heading, justify="left" if left else "right", no_wrap=not place and short)
-    for row in table.rows:
-        mark = [MARK_SIGNS[row.mark] if row.mark else ""] if marked else []
-        cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])
-        grid.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
-    console.print()
-    if table.title:
-        console.print(legible(table.title), style="bold", markup=False)
-    console.print(grid)
-    for line in table.legend:
-        console.print(f"   {line}", style="dim", markup=False)
-
-
-def escaped(text: str) -> str:
-    """Text of one line, with brackets escaped so that they are not read as markup."""
-    from rich.markup import escape
-
-    return escape(legible(text))
 
 
 @contextmanager

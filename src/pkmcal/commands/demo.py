@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pkmcal import terminal
 from pkmcal.commands import console
-from pkmcal.commands.calibrate import CALIBRATION_FILES
-from pkmcal.commands.finish import answer, write_outcome
+from pkmcal.commands.finish import answer
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.commands.comparison import AgainstTruth
+    from pkmcal.judge.against_truth import AgainstTruth
 
 DEMO_FOLDER = Path("pkmcal-demo")
 DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME = "session", "calibration"
@@ -24,6 +24,12 @@ FAST_SIZE = (480, 360)
 FAST_CONFIGURATIONS = 4
 SIMULATING_SHARE = 0.85
 """Share of rendering in the progress."""
+
+EXAMPLES = """\
+pkmcal demo
+pkmcal demo --fast --no-open
+pkmcal demo -o my-demo --json
+"""
 
 
 def demo(
@@ -37,56 +43,50 @@ def demo(
     """Simulate, calibrate, compare with the truth, open the report."""
     from dataclasses import asdict, replace
 
-    from pkmcal.calibration.calibrate import calibrate_session
-    from pkmcal.calibration.results import check_output
-    from pkmcal.commands.comparison import compare_with_truth
-    from pkmcal.mechanisms import load_mechanism
+    import pkmcal
+    from pkmcal.judge.against_truth import compare_with_truth
     from pkmcal.placement.default_camera import camera_of_size, default_camera
-    from pkmcal.report.calibration import outcome_of
-    from pkmcal.simulation import simulate_session
     from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 
-    session, result = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
+    session, folder = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
     _make_room(out)
-    check_output(result)
     with console.progress(as_json) as progress:
-        simulate_session(
+        simulated = pkmcal.simulate(
             session,
-            load_mechanism(DEMO_MECHANISM),
-            camera_of_size(FAST_SIZE) if fast else default_camera(),
-            replace(DEMO_SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else DEMO_SETTINGS,
+            DEMO_MECHANISM,
+            camera=camera_of_size(FAST_SIZE) if fast else default_camera(),
+            stations=DEMO_SETTINGS.stations,
+            configurations=FAST_CONFIGURATIONS if fast else DEMO_SETTINGS.configurations,
             seed=DEMO_SEED,
-            progress=console.counted(progress, upto=SIMULATING_SHARE),
+            progress=lambda text, share: progress(text, SIMULATING_SHARE * share),
         )
         rest = 0.97 - SIMULATING_SHARE
-        calibration = calibrate_session(
-            session, progress=lambda text, share: progress(text, SIMULATING_SHARE + rest * share)
+        result = pkmcal.calibrate(
+            simulated, progress=lambda text, share: progress(text, SIMULATING_SHARE + rest * share)
         )
         progress("Writing the report", 0.98)
-        outcome = outcome_of(calibration)
-        write_outcome(outcome, result, CALIBRATION_FILES)
+        result.save(folder)
     # The truth is read only now, when everything is written.
-    comparison = compare_with_truth(calibration, session)
-    n_images = sum(len(station.images) for station in calibration.session.stations)
+    comparison = compare_with_truth(result, session)
     outcome = replace(
-        outcome,
-        subject=f"A {calibration.machine.name} that deviates from its nominal model, in {n_images}"
-        f" simulated images: {session}",
+        result.outcome,
+        subject=f"A {result.machine.name} that deviates from its nominal model, in"
+        f" {simulated.images_taken} simulated images: {session}",
         summary={
-            **(outcome.summary or {}),
+            **(result.outcome.summary or {}),
             "session": session,
             "comparison": asdict(comparison),
         },
     )
-    code = answer(outcome, result, CALIBRATION_FILES, as_json=as_json)
+    code = answer(result, folder, outcome=outcome, as_json=as_json)
     if not as_json:
-        _print_comparison(console.out(), comparison)
+        _print_comparison(terminal.out(), comparison)
         if not no_open and console.can_show():
             import webbrowser
 
             from pkmcal.files import resolved
 
-            webbrowser.open(resolved(result / "report.html").as_uri())
+            webbrowser.open(resolved(folder / "report.html").as_uri())
     return code
 
 
@@ -125,10 +125,10 @@ def _print_comparison(out: Console, value: AgainstTruth) -> None:
         times = f"{old / new:.0f} times nearer" if new > 0 else ""
         rows.append(Row(what, (f"{old:.2f}{unit}", f"{new:.3f}{unit}", times)))
     columns = ("Against the truth", "Nominal model", "Calibrated", "")
-    console.print_table(out, Table("", columns, tuple(rows)))
+    terminal.print_table(out, Table("", columns, tuple(rows)))
     out.print()
     text = (
         f"{value.within} of {value.count} values ({value.within / value.count:.0%}) lie within two"
         " of their standard deviations of the truth; 95 % should."
     )
-    console.print_points(out, [("[cyan]→[/]", text)])
+    terminal.print_points(out, [("[cyan]→[/]", text)])

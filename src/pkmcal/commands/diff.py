@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
+from pkmcal.commands.finish import finish
 
-DIFFERENCE_PAGE, DIFFERENCE_DOCUMENT = "diff.html", "diff.json"
-DIFFERENCE_FILES = {DIFFERENCE_PAGE: PAGE_DESCRIPTION, DIFFERENCE_DOCUMENT: NUMBERS_DESCRIPTION}
+if TYPE_CHECKING:
+    from pkmcal.api.diff import DiffResult
+
+EXAMPLES = """\
+pkmcal diff last-year out
+pkmcal diff gough-stewart out
+pkmcal diff a/mechanism.yaml b/mechanism.yaml -o diff --json
+"""
 
 
 def diff(
@@ -28,38 +34,33 @@ def diff(
     ] = None,
     force: Annotated[
         bool,
-        typer.Option("--force", help="Replace an earlier one; otherwise it is kept, dated."),
+        typer.Option(
+            "--force",
+            help="Replace an earlier one; otherwise it is kept, dated.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = False,
     as_json: console.Json = False,
 ) -> int:
     """Difference of two calibrations or nominal models at the tool."""
-    from threadpoolctl import threadpool_limits
-
-    from pkmcal.calibration.archive import keep_earlier
-    from pkmcal.files import check_own_folder, default_output, json_text, output_lock
-    from pkmcal.judge.difference import difference
-    from pkmcal.report.difference import outcome_of
+    import pkmcal
+    from pkmcal.api.diff import DiffResult
+    from pkmcal.files import default_output
 
     if out is not None:
-        check_own_folder(out, DIFFERENCE_FILES, "a difference")
-    with console.progress(as_json) as progress, threadpool_limits(1, "blas"):
-        progress("Comparing", 0.1)
-        compared = difference(a, b)
-    saved = compared.b.saved or compared.a.saved
-    folder = out or Path("diff")
-    if out is None:
-        if saved is not None:
-            # Links are not followed: they may lead out of the user's folder.
-            beside, here = Path(os.path.normpath(saved.path.absolute())), Path.cwd()
-            beside = beside.parent.parent / "diff"
-            folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
-        check_own_folder(default_output(folder), DIFFERENCE_FILES, "a difference")
-    outcome = outcome_of(compared)
-    texts = {DIFFERENCE_DOCUMENT: json_text(outcome.document)}
-    with output_lock(folder):  # another process may have written there since
-        archive_folder = (
-            None if force else keep_earlier(folder, texts, DIFFERENCE_DOCUMENT, DIFFERENCE_PAGE)
-        )
-        return finish(
-            outcome, folder, DIFFERENCE_FILES, archive_folder=archive_folder, as_json=as_json
-        )
+        DiffResult.check_folder(out)
+    with console.progress(as_json) as progress:
+        result = pkmcal.diff(a, b, progress=progress)
+    folder = out or default_output(_default_folder(result))
+    return finish(result, folder, force=force, as_json=as_json)
+
+
+def _default_folder(result: DiffResult) -> Path:
+    """The folder diff beside the calibration B, or else A, or in the current folder."""
+    saved = result.b.saved or result.a.saved
+    if saved is None:
+        return Path("diff")
+    # Links are not followed: they may lead out of the user's folder.
+    folder = Path(os.path.normpath(saved.path.absolute())).parent.parent / "diff"
+    here = Path.cwd()
+    return folder.relative_to(here) if folder.is_relative_to(here) else folder

@@ -9,6 +9,8 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
+from pkmcal.commands.finish import finish
+from pkmcal.ranges import default
 
 REPRODUCTION_FOLDER = Path("reproduction")
 
@@ -21,12 +23,21 @@ class Paper(StrEnum):
     C = "c"
 
 
+EXAMPLES = """\
+pkmcal reproduce
+pkmcal reproduce a --runs 1000 --long
+pkmcal reproduce b c -o papers --json
+"""
+
+
 def reproduce(
     papers: Annotated[
         list[Paper] | None,
         typer.Argument(metavar="[a|b|c]...", help="Which papers; all unless given."),
     ] = None,
-    runs: Annotated[int, console.number_option("reproduce", "runs", "N", "Simulated runs.")] = 100,
+    runs: Annotated[
+        int, console.number_option("reproduce", "runs", "N", "Simulated runs.")
+    ] = default("reproduce", "runs"),
     seed: console.Seed = 0,
     long: Annotated[
         bool, typer.Option("--long", help="Accuracy by number of poses too; a minute.")
@@ -38,36 +49,14 @@ def reproduce(
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""
-    from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, answer, contents
-    from pkmcal.files import check_own_folder, default_output, write_folder
-    from pkmcal.studies.reproduction import Options
-    from pkmcal.studies.reproduction import reproduce_paper as computed
+    import pkmcal
+    from pkmcal.api.reproduce import ReproductionResult
 
-    files = {
-        paper.value: {
-            f"paper-{paper.value}.html": PAGE_DESCRIPTION,
-            f"paper-{paper.value}.json": NUMBERS_DESCRIPTION,
-        }
-        for paper in Paper
-    }
-    ours = {name for names in files.values() for name in names}
-    if out == REPRODUCTION_FOLDER:
-        default_output(out)
-    check_own_folder(out, ours, "reproductions", "earlier reproductions")
-    wanted = [paper.value for paper in dict.fromkeys(papers or list(Paper))]
+    given = None if out == REPRODUCTION_FOLDER else out
+    folder = console.output_folder(given, REPRODUCTION_FOLDER, ReproductionResult)
+    wanted = [paper.value for paper in papers or Paper]
     with console.progress(as_json) as progress:
-        options = Options(runs, seed, long, images, progress)
-        outcomes = {paper: computed(paper, options) for paper in wanted}
-    texts = {
-        name: text
-        for paper, outcome in outcomes.items()
-        for name, text in contents(outcome, files[paper]).items()
-    }
-    write_folder(out, texts)
-    if not as_json:
-        return max(answer(outcome, out, files[paper]) for paper, outcome in outcomes.items())
-    code = max(outcome.exit_code for outcome in outcomes.values())
-    documents = {paper: outcome.document for paper, outcome in outcomes.items()}
-    written = [str(out / name) for name in texts]
-    console.print_json({"papers": documents, "files": written, "exit_code": code})
-    return code
+        result = pkmcal.reproduce(
+            wanted, runs=runs, seed=seed, long=long, images=images, progress=progress
+        )
+    return finish(result, folder, as_json=as_json)

@@ -10,12 +10,14 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
-from pkmcal.errors import InputError
+from pkmcal.commands.finish import finish
+from pkmcal.ranges import default
 
-SERVO_FILES = {"servo.html": PAGE_DESCRIPTION, "servo.json": NUMBERS_DESCRIPTION}
-MOST_SAMPLES = 5000
-"""Maximum number of samples of a run; more take minutes and hundreds of megabytes."""
+EXAMPLES = """\
+pkmcal servo gough-stewart
+pkmcal servo out --law directions --legs 1,3,5
+pkmcal servo out --gain 2 --rate 50 --hand-rotation "1 deg"
+"""
 
 
 def servo(
@@ -28,39 +30,62 @@ def servo(
     ],
     session: console.CamerasOf = None,
     station: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The camera that controls; the first.")
+        str | None,
+        typer.Option(
+            metavar="NAME", help="The camera that controls; the first.", rich_help_panel="Camera"
+        ),
     ] = None,
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Another camera file than the station's.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Another camera file than the station's.", rich_help_panel="Camera"
+        ),
     ] = None,
     law: Annotated[
-        str, typer.Option(metavar="LAW", help="edges or directions of the legs.")
+        str,
+        typer.Option(
+            metavar="LAW", help="edges or directions of the legs.", rich_help_panel="Loop"
+        ),
     ] = "edges",
     legs: Annotated[
-        str | None, typer.Option(metavar="1,2,3", help="Legs that the camera sees; all.")
+        str | None,
+        typer.Option(
+            metavar="1,2,3", help="Legs that the camera sees; all.", rich_help_panel="Camera"
+        ),
     ] = None,
     runs: Annotated[
         int, console.number_option("servo", "runs", "N", "Number of motions, for every estimate.")
-    ] = 60,
+    ] = default("servo", "runs"),
     gain: Annotated[
         float,
         console.number_option(
-            "servo", "gain", "G", "Part of the error that is corrected in a second."
+            "servo", "gain", "G", "Part of the error that is corrected in a second.", group="Loop"
         ),
-    ] = 1.0,
-    rate: Annotated[float, console.number_option("servo", "rate", "HZ", "Images a second.")] = 25.0,
+    ] = default("servo", "gain"),
+    rate: Annotated[
+        float, console.number_option("servo", "rate", "HZ", "Images a second.", group="Loop")
+    ] = default("servo", "rate"),
     delay: Annotated[
-        int, console.number_option("servo", "delay", "N", "Images from exposure to motion.")
-    ] = 1,
+        int,
+        console.number_option(
+            "servo", "delay", "N", "Images from exposure to motion.", group="Loop"
+        ),
+    ] = default("servo", "delay"),
     noise: Annotated[
-        float, console.number_option("servo", "noise", "PX", "Noise of an edge, shift and tilt.")
-    ] = 0.02,
+        float,
+        console.number_option(
+            "servo", "noise", "PX", "Noise of an edge, shift and tilt.", group="Loop"
+        ),
+    ] = default("servo", "noise"),
     joint_noise: Annotated[
-        float, console.number_option("servo", "joint_noise", "M", "Noise of a reading, m or rad.")
-    ] = 3e-6,
+        float,
+        console.number_option(
+            "servo", "joint_noise", "M", "Noise of a reading, m or rad.", group="Loop"
+        ),
+    ] = default("servo", "joint_noise"),
     speed: Annotated[
         float | None,
-        console.number_option("servo", "speed", "V", "Fastest drive, m/s or rad/s."),
+        console.number_option("servo", "speed", "V", "Fastest drive, m/s or rad/s.", group="Loop"),
     ] = None,
     duration: Annotated[
         float | None,
@@ -68,14 +93,20 @@ def servo(
     ] = None,
     hand_position: Annotated[
         float,
-        console.number_option("servo", "hand_position", "M", "Error of the hand-placed camera, m."),
-    ] = 0.03,
+        console.number_option(
+            "servo", "hand_position", "M", "Error of the hand-placed camera, m.", group="Camera"
+        ),
+    ] = default("servo", "hand_position"),
     hand_rotation: Annotated[
         float,
         console.number_option(
-            "servo", "hand_rotation", "DEG", "Error of the hand-placed camera's direction, degrees."
+            "servo",
+            "hand_rotation",
+            "DEG",
+            "Error of the hand-placed camera's direction, degrees.",
+            group="Camera",
         ),
-    ] = 3.0,
+    ] = default("servo", "hand_rotation"),
     start: Annotated[
         str | None,
         typer.Option(metavar="POSE", help="Start of every run: x,y,z,rx,ry,rz (m, rad)."),
@@ -88,46 +119,21 @@ def servo(
     as_json: console.Json = False,
 ) -> int:
     """Simulate control by the legs in the image."""
-    import numpy as np
+    from math import radians
 
-    from pkmcal.control.laws import law_named
-    from pkmcal.control.simulation import LoopSettings
-    from pkmcal.control.source import legs_of_text, load_plant, pose_of_text
-    from pkmcal.control.study import Plan, study_servoing
-    from pkmcal.files import check_own_folder, default_output
-    from pkmcal.placement.edges import EdgeNoise
-    from pkmcal.report.servo import outcome_of
+    import pkmcal
+    from pkmcal.api.servo import ServoResult
+    from pkmcal.control.source import legs_of_text, pose_of_text
 
-    law_named(law)
-    loop = LoopSettings(
-        law=law,
-        gain=gain,
-        rate=rate,
-        delay=delay,
-        noise=EdgeNoise(shift=noise, tilt=noise),
-        joint_noise=joint_noise,
-        speed=None if speed is None else np.array([speed]),
-        duration=10 / gain if duration is None else duration,
-    )
-    if loop.samples > MOST_SAMPLES:
-        raise InputError(
-            "the runs would have too many samples", where="--duration",
-            found=str(loop.samples), expected=f"at most {MOST_SAMPLES}, a rate times a duration",
+    folder = console.output_folder(out, Path("servo"), ServoResult)
+    with console.progress(as_json) as progress:
+        result = pkmcal.servo(
+            machine, session=session, station=station, camera=camera, law=law,
+            legs=None if legs is None else legs_of_text(legs), runs=runs, gain=gain, rate=rate,
+            delay=delay, noise=noise, joint_noise=joint_noise, speed=speed, duration=duration,
+            hand_position=hand_position, hand_rotation=radians(hand_rotation),
+            start=None if start is None else pose_of_text(start, "--start"),
+            goal=None if goal is None else pose_of_text(goal, "--goal"), seed=seed,
+            progress=progress,
         )  # fmt: skip
-    first, last = (
-        None if text is None else pose_of_text(text, where)
-        for text, where in ((start, "--start"), (goal, "--goal"))
-    )
-    plan = Plan(loop, runs, seed, hand_position, float(np.deg2rad(hand_rotation)), first, last)
-    folder = out or default_output(Path("servo"))
-    check_own_folder(folder, SERVO_FILES, "a study of servoing", "an earlier study")
-    numbers = None if legs is None else legs_of_text(legs)
-    scene = load_plant(
-        machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
-    )
-    try:
-        with console.progress(as_json) as progress:
-            outcome = outcome_of(study_servoing(scene, plan, progress))
-    except InputError as error:  # located at the camera's file, which determines what is in view
-        raise error if error.where or camera is None else error.located(str(camera)) from None
-    return finish(outcome, folder, SERVO_FILES, as_json=as_json)
+    return finish(result, folder, as_json=as_json)

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import re
-import shlex
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from pkmcal.commands import console
-from pkmcal.errors import InputError, legible
+from pkmcal.commands.finish import answer
+from pkmcal.ranges import default
 
-if TYPE_CHECKING:
-    from pkmcal.cameras import Camera
-
-SMALLEST_PICTURE_SIDE, LARGEST_PICTURE_SIDE = 64, 8192
-"""Limits of an image's width and height in px: below, legs are too narrow to have edges; above,
-memory does not suffice.
+EXAMPLES = """\
+pkmcal simulate session
+pkmcal simulate session --mechanism h4 --board --size 640x480
+pkmcal simulate session --plan plan --joint-noise "3 um" --noise 2
 """
 
 
@@ -28,53 +24,76 @@ def simulate(
         str, typer.Option(metavar="NAME|FILE", help="A built-in machine, or a mechanism file.")
     ] = "gough-stewart",
     camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A camera file, instead of --size.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="A camera file, instead of --size.", rich_help_panel="Images"
+        ),
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image.")] = "800x600",
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Pixels of an image.", rich_help_panel="Images")
+    ] = "800x600",
     stations: Annotated[
         int, console.number_option("simulate", "stations", "N", "Places of the camera.")
-    ] = 3,
+    ] = default("simulate", "stations"),
     configurations: Annotated[
         int,
         console.number_option("simulate", "configurations", "N", "Images from each place."),
-    ] = 15,
+    ] = default("simulate", "configurations"),
     shared: Annotated[
         bool, typer.Option("--shared", help="The same configurations from all places.")
     ] = False,
     repeats: Annotated[
         int, console.number_option("simulate", "repeats", "N", "Images of each configuration.")
-    ] = 1,
+    ] = default("simulate", "repeats"),
     tolerance: Annotated[
         float,
         console.number_option(
             "simulate", "tolerance", "X", "True values' deviation, in tolerances."
         ),
-    ] = 1.0,
+    ] = default("simulate", "tolerance"),
     joint_noise: Annotated[
         float,
         console.number_option("simulate", "joint_noise", "M", "Noise of a reading, m or rad."),
-    ] = 3e-6,
+    ] = default("simulate", "joint_noise"),
     noise: Annotated[
-        float, console.number_option("simulate", "noise", "GREY", "Noise of a pixel, grey levels.")
-    ] = 0.9,
+        float,
+        console.number_option(
+            "simulate", "noise", "GREY", "Noise of a pixel, grey levels.", group="Images"
+        ),
+    ] = default("simulate", "noise"),
     blur: Annotated[
-        float, console.number_option("simulate", "blur", "PX", "Blur of the lens, pixels.")
-    ] = 0.6,
+        float,
+        console.number_option(
+            "simulate", "blur", "PX", "Blur of the lens, pixels.", group="Images"
+        ),
+    ] = default("simulate", "blur"),
     board: Annotated[
-        bool, typer.Option("--board", help="A board on the base, which joins the stations.")
+        bool,
+        typer.Option(
+            "--board",
+            help="A board on the base, which joins the stations.",
+            rich_help_panel="Board",
+        ),
     ] = False,
     on_platform: Annotated[
-        bool, typer.Option("--on-platform", help="The board on the platform instead.")
+        bool,
+        typer.Option(
+            "--on-platform", help="The board on the platform instead.", rich_help_panel="Board"
+        ),
     ] = False,
     finish: Annotated[
         Literal["mixed", "matte", "dark", "metal"],
-        typer.Option(help="Surface of the legs; metal is polished."),
+        typer.Option(help="Surface of the legs; metal is polished.", rich_help_panel="Images"),
     ] = "mixed",
     light: Annotated[
-        Literal["usual", "soft", "hard"], typer.Option(help="From all sides, or hard.")
+        Literal["usual", "soft", "hard"],
+        typer.Option(help="From all sides, or hard.", rich_help_panel="Images"),
     ] = "usual",
     as_built: Annotated[
-        bool, typer.Option("--as-built", help="Motors, rings and cables on the legs.")
+        bool,
+        typer.Option(
+            "--as-built", help="Motors, rings and cables on the legs.", rich_help_panel="Images"
+        ),
     ] = False,
     handheld: Annotated[
         bool,
@@ -90,80 +109,15 @@ def simulate(
     as_json: console.Json = False,
 ) -> int:
     """Simulate a session with images and known truth."""
-    from pkmcal.cameras import load_camera
-    from pkmcal.mechanisms import load_mechanism
-    from pkmcal.placement.default_camera import camera_of_size
-    from pkmcal.simulation import Sensor, Settings, board_for, simulate_session, to_simulate
-    from pkmcal.simulation.rehearsal import rehearsal_of
+    import pkmcal
 
-    eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
-    planned = rehearsal_of(plan) if plan else None
-    nominal = planned.machine if planned else load_mechanism(mechanism, label=None)
-    machine = to_simulate(nominal, str(plan or mechanism))
-    place = "platform" if on_platform else "base"
-    settings = Settings(
-        stations=stations,
-        configurations=configurations,
-        shared=shared,
-        tolerance=tolerance,
-        joint_noise=joint_noise,
-        sensor=Sensor(blur=blur, read_noise=noise),
-        board=board_for(machine, place) if board or on_platform else None,
-        board_on=place,
-        repeats=repeats,
-        finish=finish,
-        light=light,
-        as_built=as_built,
-        handheld=handheld,
-    )
-    cameras: Camera | tuple[Camera, ...] = eye
-    if planned:
-        cameras = planned.cameras
-        settings = replace(settings, stations=planned.places, asked=planned.requested)
-        if planned.board:
-            settings = replace(settings, board=planned.board, board_on="platform")
+    eye = camera or console.parsed_size(size)
     with console.progress(as_json) as progress:
-        truth = simulate_session(
-            folder, machine, cameras, settings, seed=seed, progress=console.counted(progress)
-        )
-    count = len(truth.images) * truth.repeats
-    if as_json:
-        console.print_json(
-            {"folder": str(folder), "photographs": count, "stations": truth.stations, "seed": seed}
-        )
-        return 0
-    out = console.out()
-    places = "1 place" if len(truth.stations) == 1 else f"{len(truth.stations)} places"
-    points = [
-        (
-            console.MARK_SIGNS["good"],
-            f"{count} images of {machine.name} from {places} in {folder}; the"
-            " truth is in its truth.json, which no calibration reads.",
-        )
-    ]
-    if machine is not nominal:
-        points.append(
-            (
-                console.MARK_SIGNS["note"],
-                f"The nominal model of {machine.name} gives its rods no visible cylinders, so"
-                " they are drawn as such; see tubes in the session's mechanism.yaml.",
-            )
-        )
-    console.print_points(out, points)
-    out.print(f"\nNext: pkmcal calibrate {legible(shlex.quote(str(folder)))}", markup=False)
-    return 0
-
-
-def parsed_size(text: str) -> tuple[int, int]:
-    """(width, height) from a text such as 800x600."""
-    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text.strip())
-    size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:
-        raise InputError(
-            "no size of an image",
-            where="--size",
-            found=text,
-            expected=f"width x height, each {SMALLEST_PICTURE_SIDE} to {LARGEST_PICTURE_SIDE},"
-            f" such as 800x600",
-        )
-    return size
+        result = pkmcal.simulate(
+            folder, mechanism, camera=eye, board=board, on_platform=on_platform, noise=noise,
+            blur=blur, plan=plan, seed=seed, progress=progress, stations=stations,
+            configurations=configurations, shared=shared, repeats=repeats, tolerance=tolerance,
+            joint_noise=joint_noise, finish=finish, light=light, as_built=as_built,
+            handheld=handheld,
+        )  # fmt: skip
+    return answer(result, folder, as_json=as_json)

@@ -7,12 +7,34 @@ from typing import Annotated, Literal
 
 import typer
 
+from pkmcal import terminal
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
-from pkmcal.errors import InputError
+from pkmcal.commands.finish import finish
+from pkmcal.ranges import default
+from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED
 
 STUDY_FOLDER = Path("study")
-RUN_ROWS_DESCRIPTION = "one row a run"
+
+EXAMPLES = """\
+pkmcal study gough-stewart
+pkmcal study h4 --vary configurations=4,15 --vary edge_noise=0.1,0.3
+pkmcal study my-machine --vary stations=1,2,3 --runs 200 -o study
+"""
+
+FURTHER_HELP = """\
+Names of --vary, of a machine or a session:
+{}
+Names of --vary, of a:
+{}
+""".format(
+    *(
+        "\n".join(
+            f"  {name:<15} {varied.cell_text}{', ' if varied.unit else ''}{varied.unit}"
+            for name, varied in names.items()
+        )
+        for names in (DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED)
+    )
+)
 
 
 def study(
@@ -32,11 +54,12 @@ def study(
     runs: Annotated[
         int,
         console.number_option("study", "runs", "N", "Simulations of each combination."),
-    ] = 100,
+    ] = default("study", "runs"),
     seed: console.Seed = 0,
     out: Annotated[Path, console.folder("Folder for results and finished batches.")] = STUDY_FOLDER,
     table: Annotated[
-        Literal["csv", "parquet"], typer.Option(help="Format of the table of runs.")
+        Literal["csv", "parquet"],
+        typer.Option(help="Format of the table of runs.", rich_help_panel=console.OUTPUT_GROUP),
     ] = "csv",
     scheduler: Annotated[
         str | None,
@@ -45,41 +68,22 @@ def study(
     as_json: console.Json = False,
 ) -> int:
     """Estimate by simulation how accurate calibrations would be."""
-    from importlib.util import find_spec
+    import pkmcal
+    from pkmcal.api.study import StudyResult
 
-    from pkmcal.files import check_own_folder, default_output
-    from pkmcal.studies.findings import study as simulated
-    from pkmcal.studies.store import BATCHES_FOLDER
-    from pkmcal.studies.study_report import outcome_of
-    from pkmcal.wording import install_step
-
-    if table == "parquet" and find_spec("pyarrow") is None:
-        raise InputError(
-            "a Parquet table needs pyarrow, which is not installed",
-            where="--table",
-            next_step=f"{install_step('parquet')}; or leave the option out",
-        )
-    name = f"study.{table}"
-    files = {
-        "study.html": PAGE_DESCRIPTION,
-        "study.json": NUMBERS_DESCRIPTION,
-        name: RUN_ROWS_DESCRIPTION,
-    }
-    ours = {"study.html", "study.json", "study.csv", "study.parquet", BATCHES_FOLDER}
-    if out == STUDY_FOLDER:
-        default_output(out)
-    over = check_own_folder(out, ours, "a study", "an earlier study")
+    given = None if out == STUDY_FOLDER else out
+    folder = console.output_folder(given, STUDY_FOLDER, StudyResult)
     try:
         with console.progress(as_json) as progress:
-            study = simulated(
-                subject, vary or (), runs=runs, seed=seed, out=out, scheduler=scheduler,
-                progress=progress,
+            result = pkmcal.study(
+                subject, vary or (), runs=runs, seed=seed, out=folder, scheduler=scheduler,
+                table=table, progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
         if not as_json:
-            console.print_points(
-                console.err(),
+            terminal.print_points(
+                terminal.err(),
                 [("", f"What is finished lies in {out}; the same command goes on from there.")],
             )
         raise
-    return finish(outcome_of(study, table=name), out, files, over=over, as_json=as_json)
+    return finish(result, folder, as_json=as_json)

@@ -8,9 +8,14 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
+from pkmcal.commands.finish import finish
+from pkmcal.ranges import default
 
-VALIDATION_FILES = {"validation.html": PAGE_DESCRIPTION, "validation.json": NUMBERS_DESCRIPTION}
+EXAMPLES = """\
+pkmcal validate out new-images
+pkmcal validate out my-machine --regions 4
+pkmcal validate out new-images -o validation --json
+"""
 
 
 def validate(
@@ -23,19 +28,16 @@ def validate(
     regions: Annotated[
         int,
         console.number_option("validate", "regions", "N", "Leave out N regions in turn as well."),
-    ] = 0,
+    ] = default("validate", "regions"),
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
     """Errors on data that the calibration did not see."""
-    from pkmcal.files import check_own_folder, default_output
-    from pkmcal.judge.validate import validate_calibration as run
-    from pkmcal.report.validation import outcome_of
-    from pkmcal.session.load import load_session
+    import pkmcal
+    from pkmcal.api.validate import ValidationResult
 
-    loaded = load_session(session)
-    folder = out or default_output(loaded.folder / "validation")
-    check_own_folder(folder, VALIDATION_FILES, "a validation")
+    loaded = pkmcal.load_session(session)
+    folder = console.output_folder(out, loaded.folder / "validation", ValidationResult)
     with console.progress(as_json) as progress:
-        outcome = run(calibration, loaded, regions=regions, seed=seed, progress=progress)
-    return finish(outcome_of(outcome), folder, VALIDATION_FILES, as_json=as_json)
+        result = pkmcal.validate(calibration, loaded, regions=regions, seed=seed, progress=progress)
+    return finish(result, folder, as_json=as_json)

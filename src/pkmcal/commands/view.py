@@ -10,6 +10,12 @@ import typer
 from pkmcal.commands import console
 from pkmcal.commands.serve import serve
 
+EXAMPLES = """\
+pkmcal view my-machine
+pkmcal view my-machine --calibration out
+pkmcal view my-machine --no-browser --port 8000
+"""
+
 
 def view(
     session: console.SessionFolder,

@@ -8,9 +8,14 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, finish
+from pkmcal.commands.finish import finish
+from pkmcal.ranges import default
 
-WATCH_FILES = {"watch.html": PAGE_DESCRIPTION, "watch.json": NUMBERS_DESCRIPTION}
+EXAMPLES = """\
+pkmcal watch out today
+pkmcal watch out today --same-place front
+pkmcal watch out today --alpha 0.001 -o watch
+"""
 
 
 def watch(
@@ -24,7 +29,7 @@ def watch(
     out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
     alpha: Annotated[
         float, console.number_option("watch", "alpha", "P", "Share of false alarms.")
-    ] = 0.01,
+    ] = default("watch", "alpha"),
     same_place: Annotated[
         list[str] | None,
         typer.Option(
@@ -36,21 +41,14 @@ def watch(
     as_json: console.Json = False,
 ) -> int:
     """Is the machine still as calibrated? Tests each leg."""
-    from pkmcal.files import check_own_folder, default_output
-    from pkmcal.judge.watch import watch_machine as run
-    from pkmcal.report.watch import outcome_of
-    from pkmcal.session.load import load_session
+    import pkmcal
+    from pkmcal.api.watch import WatchResult
 
-    loaded = load_session(session)
-    folder = out or default_output(loaded.folder / "watch")
-    check_own_folder(folder, WATCH_FILES, "what watch writes", "an earlier look")
+    loaded = pkmcal.load_session(session)
+    folder = console.output_folder(out, loaded.folder / "watch", WatchResult)
     with console.progress(as_json) as progress:
-        tests = run(
-            calibration,
-            loaded,
-            alpha=alpha,
-            seed=seed,
-            same_place=same_place or (),
+        result = pkmcal.watch(
+            calibration, loaded, alpha=alpha, same_place=same_place or (), seed=seed,
             progress=progress,
-        )
-    return finish(outcome_of(tests), folder, WATCH_FILES, as_json=as_json)
+        )  # fmt: skip
+    return finish(result, folder, as_json=as_json)

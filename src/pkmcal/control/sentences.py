@@ -27,7 +27,7 @@ UNMENTIONED_GOAL_NOISE = 0.02
 
 def judgement(study: Study) -> Verdict:
     """Verdict on a study: headline and findings."""
-    own, good = study.own, study.outcome("identified")
+    own, good = study.own, study.trials("identified")
     reasons = (*_blind(study), *_failures(good))
     share = good.reached / len(good.runs.end)
     usable = not own.blind and share >= ENOUGH_REACHED_SHARE
@@ -112,28 +112,28 @@ def _hidden(study: Study) -> tuple[Finding, ...]:
 
 def _by_hand(study: Study) -> Iterator[Finding]:
     """Findings on the hand-measured geometry: what calibration improves here."""
-    hand, n = study.outcome("hand"), study.plan.runs
+    hand, n = study.trials("hand"), study.plan.runs
     failed = n - hand.reached
-    if failed > study.plan.runs - study.outcome("identified").reached:
+    if failed > study.plan.runs - study.trials("identified").reached:
         worst = next(end for end in hand.ends if not end.good)
         yield doubtful("servo.by_hand_fails", number=failed, of=n, end=worst.what)
     good = hand.runs.reached
     off, own = (
         float(np.median(o.astray[o.runs.reached])) if o.reached else 0.0
-        for o in (hand, study.outcome("identified"))
+        for o in (hand, study.trials("identified"))
     )
     if off > max(UNMENTIONED_DEVIATION * float(np.median(hand.runs.travel[:, 0])), 2 * own):
         most = float(hand.astray[good].max())
         yield doubtful("servo.by_hand_astray", median=off, most=most, identified=own)
     over = float(hand.overshoot[good].max(initial=0.0))
     if over > max(
-        UNMENTIONED_OVERSHOOT, 2 * float(study.outcome("identified").overshoot.max(initial=0.0))
+        UNMENTIONED_OVERSHOOT, 2 * float(study.trials("identified").overshoot.max(initial=0.0))
     ):
         yield doubtful("servo.by_hand_overshoots", share=over)
 
 
 def _noise(study: Study) -> tuple[Finding, ...]:
-    direction = float(np.median(study.outcome("true").runs.travel[:, 0]))
+    direction = float(np.median(study.trials("true").runs.travel[:, 0]))
     held = float(np.sqrt(np.mean(study.held.joints**2)))
     if not direction > 0 or held < UNMENTIONED_GOAL_NOISE * direction:
         return ()

@@ -21,6 +21,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, closure_at, forward
 from pkmcal.mechanisms.velocities import assembly_sign
 from pkmcal.placement.edges import EdgeNoise
+from pkmcal.ranges import default
 
 IMAGES_A_GOAL = 24
 """Images of each goal; the standard deviation over all goals is then accurate to a few percent."""
@@ -201,11 +202,11 @@ class LoopSettings:
     """
 
     law: str = "edges"
-    gain: float = 1.0
-    rate: float = 25.0
-    delay: int = 1
+    gain: float = default("servo", "gain")
+    rate: float = default("servo", "rate")
+    delay: int = default("servo", "delay")
     noise: EdgeNoise = field(default_factory=EdgeNoise)
-    joint_noise: float = 3e-6
+    joint_noise: float = default("servo", "joint_noise")
     speed: Array | None = None
     duration: float = 10.0
     at: MatrixPlace = "measured"

@@ -15,6 +15,7 @@ from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.machine_view import machine_view
 from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
+from pkmcal.files.quantities import read_quantity
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.outcome.finding import doubtful
 from pkmcal.placement.default_camera import default_camera
@@ -143,9 +144,14 @@ def _of_nominal(
 
 
 def pose_of_text(text: str, where: str) -> Array:
-    """Pose (4, 4) from six numbers x,y,z,rx,ry,rz: metres and a rotation vector in radians."""
+    """Pose (4, 4) from six numbers x,y,z,rx,ry,rz: a position in metres and a rotation vector in
+    radians, or with units.
+    """
+    kinds = ("m", "m", "m", "rad", "rad", "rad")
     try:
-        numbers = np.array([float(part) for part in text.split(",")])
+        numbers = np.array(
+            [read_quantity(part, kind) for part, kind in zip(text.split(","), kinds, strict=True)]
+        )
     except ValueError:
         numbers = np.zeros(0)
     if numbers.shape != (6,) or not np.isfinite(numbers).all():
@@ -153,13 +159,13 @@ def pose_of_text(text: str, where: str) -> Array:
             "no pose of the platform",
             where=where,
             found=text,
-            expected="x,y,z,rx,ry,rz: metres and a rotation vector in radians",
+            expected="x,y,z,rx,ry,rz: metres and a rotation vector in radians, or with units",
         )
     return pose(rotation(numbers[3:]), numbers[:3])
 
 
 def legs_of_text(text: str) -> tuple[int, ...]:
-    """Legs, counted from 0, from a text that counts them from 1, such as 1,3,5."""
+    """Numbers of legs, from 1, from a text such as 1,3,5."""
     try:
         numbers = [int(part) for part in text.split(",")]
     except ValueError:
@@ -171,4 +177,4 @@ def legs_of_text(text: str) -> tuple[int, ...]:
             found=text,
             expected="numbers from 1, each once, such as 1,3,5",
         )
-    return tuple(number - 1 for number in numbers)
+    return tuple(numbers)

@@ -37,9 +37,10 @@ from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome.finding import Finding
 from pkmcal.placement.configurations import draw_configurations
+from pkmcal.ranges import default
 
-HAND_POSITION = 0.03
-HAND_ROTATION = float(np.deg2rad(3))
+HAND_POSITION: float = default("servo", "hand_position")
+HAND_ROTATION = float(np.deg2rad(default("servo", "hand_rotation")))
 """Errors, in m and rad, of a camera pose that was measured by ruler and eye."""
 RANGE_END_SHARE = 0.15
 """Share of a reading's range at both ends in which no path begins or ends: a platform that is
@@ -153,7 +154,7 @@ class Plan:
     """
 
     loop: LoopSettings = field(default_factory=LoopSettings)
-    runs: int = 60
+    runs: int = default("servo", "runs")
     seed: int = 0
     hand_position: float = HAND_POSITION
     hand_rotation: float = HAND_ROTATION
@@ -240,7 +241,7 @@ class Study:
         wanted = set(self.eye.true.legs.tolist())
         return next(choice for choice in self.choices if set(choice.legs) == wanted)
 
-    def outcome(self, name: str) -> Trials:
+    def trials(self, name: str) -> Trials:
         """Trials of an estimate by its name."""
         return next(o for o in self.outcomes if o.estimate.name == name)
 

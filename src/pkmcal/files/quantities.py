@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from decimal import Decimal
 from functools import cache, partial
+from math import degrees
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import BeforeValidator
@@ -99,6 +100,16 @@ def _read(kind: str, value: Any) -> Any:
         raise ValueError(no_such(kind, value))
     # decimal arithmetic, so that 269.3 mm equals 0.2693
     return float(Decimal(match[1]) * Decimal(repr(stated_unit.factor)))
+
+
+def read_quantity(text: str, unit_name: str) -> float:
+    """Number of a text, with or without a unit, in ``unit_name``: m, rad, "m or rad" or deg.
+
+    Raises ValueError for other texts.
+    """
+    if unit_name != "deg":
+        return float(_read(unit_name, text))
+    return float(text) if not _QUANTITY.fullmatch(text.strip()) else degrees(_read("rad", text))
 
 
 Metres = Annotated[float, BeforeValidator(partial(_read, "m"))]

@@ -32,8 +32,9 @@ from pkmcal.judge.causes import (
 from pkmcal.judge.fixed_machine import Evidence
 from pkmcal.levels import NEGLIGIBLE
 from pkmcal.mechanisms import Machine
+from pkmcal.ranges import default
 
-CHANGE_ALPHA = 0.01
+CHANGE_ALPHA: float = default("watch", "alpha")
 """False-alarm rate: share of unchanged machines that are reported as changed."""
 LEAST_OBSERVABLE_DEVIATIONS = 1.0
 """Minimum effect, in standard deviations, of a change by one prior sigma, for its direction to be

@@ -91,7 +91,7 @@ class MachineDifference:
         """Indices of the significant parameters; between nominal models, of all that differ."""
         return [k for k in self.ordered if not self.chances[k] >= CHANGE_ALPHA / 2]
 
-    def document(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
         table, change = self.a.machine.parameters, self.change
         before = table.unit_axes(self.a.machine.values)

@@ -63,7 +63,7 @@ class Validation:
 
     __repr__ = short_repr
 
-    def document(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
         names = self.session.configurations
         results = {

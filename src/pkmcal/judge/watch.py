@@ -69,7 +69,7 @@ class Watch:
 
     __repr__ = short_repr
 
-    def document(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""
         names = self.session.configurations
         return json_value(

@@ -188,7 +188,7 @@ class Part:
     menu: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Outcome:
     """Result of a command, for readers and for programs.
 
@@ -228,6 +228,9 @@ class Outcome:
     document: dict[str, Any] = field(default_factory=dict[str, Any])
     summary: dict[str, Any] | None = None
     texts: dict[str, str | bytes] = field(default_factory=dict[str, str | bytes])
+
+    def __repr__(self) -> str:
+        return f"<Outcome of pkmcal {self.command}: {self.verdict.headline}>"
 
     @property
     def mark(self) -> Mark:

@@ -21,7 +21,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.klipper import (
+from pkmcal.exporters.klipper import (
     KLIPPER_LINEAR_FREEDOMS,
     KLIPPER_STEPPERS,
     homed,

@@ -17,7 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.delta import MM_A_METRE
+from pkmcal.exporters.delta import MM_A_METRE
 from pkmcal.files import read_csv, read_text
 from pkmcal.printers.printer import LARGEST_PRINTER_VALUE, Printer, Touches
 from pkmcal.wording import listed

@@ -1,6 +1,6 @@
 """RepRapFirmware's M665 and M666, in config.g or in config-override.g, which M500 writes.
 
-Semantics: see :mod:`pkmcal.export.reprap`.
+Semantics: see :mod:`pkmcal.exporters.reprap`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.reprap import (
+from pkmcal.exporters.reprap import (
     REPRAP_TOWER_ANGLES,
     homed_carriages,
     read_words,

@@ -131,13 +131,21 @@ def write_printer_session(
 
     Raises InputError for files that lack necessary values.
     """
+    return write_texts(folder, printer_session_texts(printer, probed, in_view, places))
+
+
+def printer_session_texts(
+    printer: Path,
+    probed: Path | None = None,
+    in_view: Literal["board"] | None = None,
+    places: int = 1,
+) -> dict[str, str]:
+    """Files of a printer's session by name; arguments as for `write_printer_session`."""
     delta = read_printer(printer)
     if in_view is None:
         touches = delta.touches if probed is None else read_touches(probed, delta)
-        texts = heights_texts(delta, _checked_touches(delta, touches))
-    else:
-        texts = carried_texts(delta, places)
-    return write_texts(folder, texts)
+        return heights_texts(delta, _checked_touches(delta, touches))
+    return carried_texts(delta, places)
 
 
 def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:

@@ -60,7 +60,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     c, held_out, over = calibration, _held_out(calibration), _tool_map(calibration)
     file_digests = digests(c.session)
     report = report_of(c, held_out, over, session_digest(c.session, file_digests))
-    open_ = parameters.unidentified(c.estimate, c.findings)
+    open_ = parameters.unidentified(c.estimate, c.identification)
     predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
         report,
@@ -95,15 +95,23 @@ def _tool_map(calibration: Calibration) -> ToolMap | str:
         return f"There is no map of the workspace: {error}"
 
 
-def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -> Path | None:
+def save(
+    calibration: Calibration,
+    folder: Path | str,
+    *,
+    force: bool = False,
+    outcome: Outcome | None = None,
+) -> Path | None:
     """Write a calibration's three files into ``folder``, all or none.
 
     An earlier result there is moved beside it, into a folder with its date, which is returned;
     ``force`` replaces it. Raises InputError if the folder holds anything else.
+
+    outcome : of the calibration, where it has been made already.
     """
     folder = Path(folder)
     check_output(folder, force=force)
-    outcome = outcome_of(calibration)
+    outcome = outcome or outcome_of(calibration)
     texts = {CALIBRATION_REPORT_FILE: page.page_html(outcome, datetime.now()), **outcome.texts}
     with output_lock(folder):  # another process may have written into it since the first check
         over = check_output(folder, force=force)
@@ -126,7 +134,7 @@ def report_of(
     """
     # data that several sections share: offsets of edges, joint centres, images and links to them
     c, session, observation = calibration, calibration.session, calibration.observation
-    estimate, findings, edges = calibration.estimate, calibration.findings, observation.edges
+    estimate, findings, edges = calibration.estimate, calibration.identification, observation.edges
     shifts = residuals.outward_shift(edges, estimate, session.joints, session.camera_of_station)
     held = None
     if holdout:
@@ -181,7 +189,7 @@ def calibration_cards(
     """Cards in their order; those without data are left out."""
     session, observation = calibration.session, calibration.observation
     # the flatness exists for sessions of heights only
-    estimate, flatness = calibration.estimate, calibration.findings.bed
+    estimate, flatness = calibration.estimate, calibration.identification.bed
     # joint centres: standard deviation, and distance from the nominal model, mm
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))

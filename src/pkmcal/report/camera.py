@@ -104,7 +104,7 @@ def outcome_of(
             ),
             Part("how", "What σ means", (CAMERA_SIGMA_TEXT,)),
         ),
-        document=c.document(),
+        document=c.as_dict(),
         texts={
             "camera.yaml": camera_text(measured),
             **{name: foreign_text(c.camera, name, form) for name, form in others},

@@ -46,7 +46,7 @@ def outcome_of(d: MachineDifference) -> Outcome:
         level=Level.WRONG if d.changed else Level.DOUBTFUL,
         figures=_cards(d),
         parts=parts,
-        document=d.document(),
+        document=d.as_dict(),
     )
 
 

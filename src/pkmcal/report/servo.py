@@ -186,12 +186,12 @@ def example_run(study: Study) -> int:
     farthest from the path.
     """
     everywhere = np.all([o.runs.reached for o in study.outcomes], axis=0)
-    return int(np.argmax(np.where(everywhere, study.outcome("hand").astray, -1.0)))
+    return int(np.argmax(np.where(everywhere, study.trials("hand").astray, -1.0)))
 
 
 def servo_cards(s: Study) -> tuple[Figure, ...]:
     """Main numbers."""
-    good, hand = s.outcome("identified"), s.outcome("hand")
+    good, hand = s.trials("identified"), s.trials("hand")
     n = s.plan.runs
     return (
         Figure(
@@ -514,7 +514,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
 
     Moving traces come first, so that frames refer to them by index.
     """
-    runs = s.outcome("identified").runs
+    runs = s.trials("identified").runs
     start, goal = runs.T_base_platform[run, 0], runs.goals[run]
     observed = set(s.eye.true.legs.tolist())
     # moving traces: observed legs in their colours, then the platform
@@ -537,7 +537,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     dashed["line"]["dash"] = "dash"
     data.append(dashed)
     for name, colour in (("identified", "--muted"), ("hand", "--calibrated")):
-        o = s.outcome(name)
+        o = s.trials(name)
         poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
         middle = _limbs(s, poses)[1].mean(axis=1)
         data.append(line(f"way, {o.estimate.title.lower()}", colour, 5, [middle]))
@@ -562,7 +562,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
 
 def frames(s: Study, run: int) -> tuple[dict[str, Any], ...]:
     """Frames of the animation of :func:`space`."""
-    runs = s.outcome("identified").runs
+    runs = s.trials("identified").runs
     out: list[dict[str, Any]] = []
     for row in _sample_rows(int(runs.last[run]) + 1, ANIMATION_FRAMES):
         moving = _moving(s, runs.T_base_platform[run, row])
@@ -608,7 +608,7 @@ def image(s: Study, run: int) -> dict[str, Any]:
     right, bottom = width - 0.5, height - 0.5
     x, y = [-0.5, right, right, -0.5, -0.5], [-0.5, -0.5, bottom, bottom, -0.5]
     data = [_line_trace("image", x, y, {"color": "--muted", "width": 1.5}, showlegend=False)]
-    runs = s.outcome("identified").runs
+    runs = s.trials("identified").runs
     first, goal = runs.T_base_platform[run, :1], runs.goals[run : run + 1]
     data += _edges(s, first, 1.2, "at the start", "dot")
     data += _edges(s, goal, 2.6, "at the goal", "solid")
@@ -645,7 +645,7 @@ def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[di
 
 def _end_paths(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
     """Traces of the paths of both ends of each leg's first edge."""
-    o = s.outcome(name)
+    o = s.trials(name)
     poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
     pixels, gap = _pixels(s, poses, 3), np.full((1, 2), np.nan)
     data: list[dict[str, Any]] = []

@@ -56,7 +56,7 @@ def outcome_of(v: Validation) -> Outcome:
         figures=_cards(v.judged, v) if v.judged else (),
         parts=tuple(part for part in parts if part),
         findings=v.session.findings,
-        document=v.document(),
+        document=v.as_dict(),
     )
 
 

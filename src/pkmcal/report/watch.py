@@ -60,7 +60,7 @@ def outcome_of(w: Watch) -> Outcome:
         figures=_cards(w),
         parts=tuple(part for part in parts if part),
         findings=w.session.findings,
-        document=w.document(),
+        document=w.as_dict(),
     )
 
 

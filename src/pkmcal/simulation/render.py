@@ -21,6 +21,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
+from pkmcal.ranges import default
 from pkmcal.simulation.shapes import Shape, turned_components
 from pkmcal.simulation.surfaces import Lamp, Lighting, Material, radiance
 
@@ -235,9 +236,9 @@ class Sensor:
     the variance read_noise^2 + shot_noise g.
     """
 
-    blur: float = 0.6
+    blur: float = default("simulate", "blur")
     exposure: float = 230.0
-    read_noise: float = 0.9
+    read_noise: float = default("simulate", "noise")
     shot_noise: float = 0.012
 
 

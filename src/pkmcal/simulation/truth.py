@@ -30,6 +30,7 @@ from pkmcal.placement.stations import (
     rough_pose,
     rough_poses,
 )
+from pkmcal.ranges import default
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
 from pkmcal.session.schema import BoardBody
@@ -78,11 +79,11 @@ class Settings:
     vary by ``breathing``, one standard deviation; ``stations`` is then ignored.
     """
 
-    stations: int | tuple[StationPose, ...] = 3
-    configurations: int = 15
+    stations: int | tuple[StationPose, ...] = default("simulate", "stations")
+    configurations: int = default("simulate", "configurations")
     shared: bool = False
-    tolerance: float = 1.0
-    joint_noise: float = 3e-6
+    tolerance: float = default("simulate", "tolerance")
+    joint_noise: float = default("simulate", "joint_noise")
     rough_position: float = 0.05
     rough_angle: float = float(np.deg2rad(5))
     extreme: float = 0.5
@@ -90,7 +91,7 @@ class Settings:
     board: Board | None = None
     board_on: BoardBody = "base"
     observe: tuple[str, ...] = ("legs", "board")
-    repeats: int = 1
+    repeats: int = default("simulate", "repeats")
     shake: tuple[float, float] = (0.0, 0.0)
     finish: Style = "mixed"
     light: Light = "usual"

@@ -94,19 +94,24 @@ def write_session(
 
 def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
     """Write a session's files, by name, into a new or empty folder, atomically."""
+    check_new_folder(folder)
     folder = Path(folder)
-    if entries(folder):
+    with staged_folder(folder) as stage:
+        for name, text in texts.items():
+            (stage / name).parent.mkdir(parents=True, exist_ok=True)
+            (stage / name).write_bytes(text.encode("utf-8"))
+    return tuple(texts)
+
+
+def check_new_folder(folder: Path | str) -> None:
+    """Raise InputError for a folder that is not empty."""
+    if entries(Path(folder)):
         raise InputError(
             "the folder for the new session is not empty",
             where=str(folder),
             expected="a new or empty folder",
             next_step="Name another folder; nothing was written into this one",
         )
-    with staged_folder(folder) as stage:
-        for name, text in texts.items():
-            (stage / name).parent.mkdir(parents=True, exist_ok=True)
-            (stage / name).write_bytes(text.encode("utf-8"))
-    return tuple(texts)
 
 
 def session_texts(

@@ -7,32 +7,23 @@ excluded from all other figures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, short_repr
-from pkmcal.ranges import check_number
 from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY
-from pkmcal.studies.cluster import on_cluster
-from pkmcal.studies.engine import StudyProgress, StudyResult, batches, run_all
+from pkmcal.studies.engine import StudyResult, batches
 from pkmcal.studies.statistics import Summary, covered
-from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import (
     Cell,
     StudySubject,
     SweptSetting,
     Value,
-    cells_of,
     in_words,
-    parsed,
-    subject_of,
 )
-from pkmcal.studies.tasks import Runner
 from pkmcal.wording import brief, count, number
 
 PROMISED_COVERAGE = 0.95
@@ -189,67 +180,6 @@ class SweepResult:
         square = float(np.mean([s.value**2 for s in own]))
         error = np.sqrt(np.sum([(s.value * s.error) ** 2 for s in own])) / len(own)
         return Summary(float(np.sqrt(square)), float(error / max(np.sqrt(square), 1e-300)))
-
-
-def study(
-    subject: str,
-    vary: Mapping[str, Value | Sequence[Value]] | Sequence[str] = (),
-    *,
-    runs: int = 100,
-    seed: int = 0,
-    out: Path | str | None = None,
-    scheduler: str | None = None,
-    progress: StudyProgress | None = None,
-) -> SweepResult:
-    """Study the accuracy of simulated calibrations; what ``pkmcal study`` computes.
-
-    Parameters
-    ----------
-    subject :
-        A session's folder, a mechanism file, a built-in machine, or ``a``: [A] 4.3.
-    vary :
-        One value or several by name, or texts ``NAME=V1,V2``; every combination is simulated.
-    runs :
-        Simulated calibrations of each combination, at least 2.
-    seed :
-        Seed for all random numbers.
-    out :
-        A folder for finished batches, from which an interrupted study continues.
-    scheduler :
-        The address of a Dask cluster; the local cores are used without one.
-    progress :
-        Called with a text and the share done, 0 to 1.
-
-    Returns
-    -------
-    SweepResult
-        ``found``, one entry for each combination; ``summary()``.
-
-    Raises
-    ------
-    pkmcal.errors.InputError
-        The subject cannot be studied, ``out`` holds another study, or another process works there.
-
-    """
-    if isinstance(vary, Mapping):
-        each = {name: np.atleast_1d(values) for name, values in vary.items()}
-        vary = [f"{name}={','.join(map(str, values))}" for name, values in each.items()]
-    elif isinstance(vary, str):
-        vary = [vary]
-    check_number("study", "runs", runs)
-    check_number("study", "seed", seed)
-    runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
-    studied = subject_of(subject)
-    varied = parsed(studied, vary)
-    cells = cells_of(studied, varied)
-    settings = [cell.setting for cell in cells]
-    title = " ".join([subject, *vary])
-    names = [in_words(cell.values) for cell in cells]
-    opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
-    with opened as store:
-        results = run_all(settings, runs, seed, progress, runner, store, names)
-    found = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
-    return SweepResult(studied, varied, tuple(cells), tuple(results), found, runs, seed)
 
 
 def findings_of(cell: Cell, result: StudyResult[SweptSetting]) -> CellFindings:

@@ -1,0 +1,163 @@
+"""``pkmcal.new``: a session to be filled in, or a whole one of a delta printer."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pkmcal.api.result import Result
+from pkmcal.errors import InputError
+from pkmcal.outcome import Outcome, Verdict
+from pkmcal.printers.session import printer_session_texts
+from pkmcal.ranges import check_number
+from pkmcal.starter import check_new_folder, session_texts, write_texts
+
+SESSION_FILE_DESCRIPTIONS = {
+    "session.yaml": "begin here: what to do, step by step",
+    "mechanism.yaml": "the nominal model of your machine",
+    "cameras/front.yaml": "the calibration of your camera",
+    "board.yaml": "the board on the platform",
+    "joints.csv": "one row of readings for each configuration",
+}
+PRINTER_MECHANISM_DESCRIPTION = "the printer by its firmware: see whether its tolerances are right"
+PROBED_FILE_DESCRIPTIONS = {
+    "session.yaml": "how good the probe is: see whether it is yours",
+    "mechanism.yaml": PRINTER_MECHANISM_DESCRIPTION,
+    "joints.csv": "the carriages when the bed was felt",
+    "poses.csv": "the tool's height above the bed there",
+}
+"""Descriptions of the files of a complete session of a printer."""
+IMAGES_DESCRIPTION = "where the images go"
+
+
+@dataclass(frozen=True)
+class NewResult(Result):
+    """Files of a new session.
+
+    texts : contents by name. of_printer : whether the nominal model is that of a firmware.
+    complete : whether nothing is missing.
+    """
+
+    texts: Mapping[str, str]
+    of_printer: bool = False
+    complete: bool = False
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """One sentence."""
+        return Outcome(
+            command="new",
+            title="New session",
+            verdict=Verdict(True, "A session:" if self.complete else "A session to fill in:"),
+            document={"files": [*self.texts]},
+        )
+
+    @property
+    def file_list(self) -> Mapping[str, str]:
+        """Files in the order in which they are to be read."""
+        words = dict(PROBED_FILE_DESCRIPTIONS if self.complete else SESSION_FILE_DESCRIPTIONS)
+        if self.of_printer:
+            words["mechanism.yaml"] = PRINTER_MECHANISM_DESCRIPTION
+        names = [name for name in words if name in self.texts]
+        names += sorted(set(self.texts) - set(names))
+        return {name: words.get(name, IMAGES_DESCRIPTION) for name in names}
+
+    def contents(self) -> dict[str, str | bytes]:
+        """Contents of the files by name."""
+        return dict(self.texts)
+
+    @classmethod
+    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
+        """Raise InputError for a folder that is not empty."""
+        del force
+        check_new_folder(folder)
+        return []
+
+    def save(self, folder: Path | str, *, force: bool = False) -> None:
+        """Write the files into a new or empty folder; InputError for another one."""
+        del force
+        write_texts(folder, dict(self.texts))
+
+    def path_document(self, folder: Path) -> dict[str, Any]:
+        """The session's folder."""
+        return {"folder": str(folder)}
+
+    def next_step(self, folder: Path) -> str:
+        """The command that is next."""
+        place = shlex.quote(str(folder))
+        return (
+            f"Next: pkmcal calibrate {place}"
+            if self.complete
+            else f"What is still missing: pkmcal check {place}"
+        )
+
+
+def new(
+    machine: Path | str | None = None,
+    *,
+    board: bool = False,
+    legs: bool = False,
+    places: int | None = None,
+    printer: Path | str | None = None,
+    probed: Path | str | None = None,
+) -> NewResult:
+    """A session with comments, to be filled in, or the session of a delta printer; nothing is
+    written.
+
+    Parameters
+    ----------
+    machine :
+        Name of a built-in machine, or a mechanism file; by default a hexapod to be edited.
+    board, legs :
+        What the camera observes; by default the legs, or a board if the nominal model has no
+        cylinders, or nothing if its readings alone determine the geometry.
+    places :
+        Number of stations of the camera; 1 by default.
+    printer :
+        Configuration file of a delta printer, printer.cfg or config.g with M665: the session has
+        its nominal model, and the heights of its bed unless ``board``.
+    probed :
+        Console output of a printer that probed its bed; by default the heights in ``printer``.
+
+    Returns
+    -------
+    NewResult
+        ``texts``, ``save(folder)``.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        The machine or the printer's file is invalid, or the arguments exclude each other.
+
+    """
+    check_number("new", "places", places)
+    if printer is None and probed is None:
+        what = "both" if board and legs else "board" if board else "legs" if legs else None
+        return NewResult(
+            session_texts(None if machine is None else str(machine), what, places or 1)
+        )
+    if printer is None:
+        raise InputError(
+            "points of a bed are read with the printer's own values",
+            where="--probed",
+            expected="--printer FILE besides: its printer.cfg, or its config.g with M665",
+        )
+    others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
+    if extra := [name for name, given in others.items() if given]:
+        raise InputError(
+            "a printer's session is of its heights, or with --board of a board on its tool",
+            where="--printer",
+            found=" and ".join(extra) + " besides",
+            expected="neither --machine nor --legs, and --probed or --board",
+        )
+    texts = printer_session_texts(
+        Path(printer),
+        None if probed is None else Path(probed),
+        "board" if board else None,
+        places or 1,
+    )
+    return NewResult(texts, of_printer=True, complete=not board)

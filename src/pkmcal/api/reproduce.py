@@ -1,0 +1,142 @@
+"""``pkmcal.reproduce``: the papers' figures recomputed, beside the printed ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+from pkmcal.api.result import Progress, Result, no_progress, page_and_numbers
+from pkmcal.errors import InputError
+from pkmcal.files import write_folder
+from pkmcal.outcome import Outcome, Verdict
+from pkmcal.ranges import check_number, default
+from pkmcal.studies.reproduction import Options, reproduce_paper
+from pkmcal.wording import listed
+
+PAPERS = ("a", "b", "c")
+
+
+@dataclass(frozen=True)
+class ReproductionResult(Result):
+    """Reproductions of papers. outcomes : by the paper's letter."""
+
+    outcomes: Mapping[str, Outcome]
+
+    own_files: ClassVar[Mapping[str, str]] = MappingProxyType(
+        {
+            name: what
+            for paper in PAPERS
+            for name, what in page_and_numbers(f"paper-{paper}").items()
+        }
+    )
+    kind: ClassVar[tuple[str, str | None]] = ("reproductions", "earlier reproductions")
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """Verdict on all papers, and their documents."""
+        verdicts = [one.verdict for one in self.outcomes.values()]
+        return Outcome(
+            command="reproduce",
+            title="Reproduction of papers",
+            verdict=Verdict(
+                usable=all(verdict.usable for verdict in verdicts),
+                headline=" ".join(verdict.headline for verdict in verdicts),
+                findings=tuple(one for verdict in verdicts for one in verdict.findings),
+            ),
+            findings=tuple(one for each in self.outcomes.values() for one in each.findings),
+            document={"papers": {paper: one.document for paper, one in self.outcomes.items()}},
+        )
+
+    @property
+    def printed_outcomes(self) -> Sequence[Outcome]:
+        """The outcome of each paper."""
+        return tuple(self.outcomes.values())
+
+    @property
+    def file_list(self) -> Mapping[str, str]:
+        """A page and a document for each paper."""
+        return {
+            name: what
+            for paper in self.outcomes
+            for name, what in page_and_numbers(f"paper-{paper}").items()
+        }
+
+    def contents(self) -> dict[str, str | bytes]:
+        """Pages and documents by name."""
+        return {
+            name: text
+            for paper, outcome in self.outcomes.items()
+            for name, text in self.contents_of(outcome, page_and_numbers(f"paper-{paper}")).items()
+        }
+
+    def save(self, folder: Path | str, *, force: bool = False) -> None:
+        """Write the files; those of other papers stay. As :meth:`pkmcal.api.result.Result.save`."""
+        self.check_folder(folder, force=force)
+        write_folder(Path(folder), self.contents())
+
+    def path_document(self, folder: Path) -> dict[str, Any]:
+        """Paths of the files."""
+        return {"files": [str(folder / name) for name in self.file_list]}
+
+
+def reproduce(
+    papers: str | Sequence[str] = PAPERS,
+    *,
+    runs: int = default("reproduce", "runs"),
+    seed: int = 0,
+    long: bool = False,
+    images: bool = False,
+    progress: Progress | None = None,
+) -> ReproductionResult:
+    """Compute the papers' tables and figures again, without writing files.
+
+    Parameters
+    ----------
+    papers :
+        Letters of the papers: ``a``, ``b``, ``c``.
+    runs :
+        Number of simulated runs.
+    seed :
+        Seed for all random numbers.
+    long :
+        Compute the accuracy by the number of poses as well, which takes a minute.
+    images :
+        Measure Table 1 of [A] on rendered images as well.
+    progress :
+        Called with a text and the share done, 0 to 1.
+
+    Returns
+    -------
+    ReproductionResult
+        ``outcomes`` by paper, ``summary()``, ``save(folder)``.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        There is no such paper, or a number is out of its range.
+
+    """
+    check_number("reproduce", "runs", runs)
+    check_number("reproduce", "seed", seed)
+    wanted = list(dict.fromkeys(papers))
+    if unknown := [paper for paper in wanted if paper not in PAPERS]:
+        raise InputError(
+            "there is no such paper", where="papers", found=unknown[0], expected=listed(PAPERS)
+        )
+    report = progress or no_progress
+    outcomes: dict[str, Outcome] = {}
+    for paper in wanted:
+        first, each = len(outcomes) / len(wanted), 1 / len(wanted)
+        options = Options(
+            runs,
+            seed,
+            long,
+            images,
+            lambda text, share, first=first, each=each: report(text, first + each * share),
+        )
+        outcomes[paper] = reproduce_paper(paper, options)
+    return ReproductionResult(outcomes)

@@ -1,0 +1,265 @@
+"""Predicted accuracy of a full capture, from a station's first images.
+
+The first images are measured as `calibrate` measures them. The information of their edges, in
+pixels and with lost edges as zero, predicts that of others: every edge that is visible in
+configurations drawn over the joints' ranges gets the information of a similar one, drawn at random.
+With these edges the problem of the joint estimate is assembled as for a real session, and its
+covariance is propagated to the platform.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers, numbered
+from pkmcal.checks.inspection import Inspection
+from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.identify.covariance import Information
+from pkmcal.observe.predict import tubes_of
+from pkmcal.placement.configurations import draw_configurations
+from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
+from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
+from pkmcal.planning.first import EdgesOf, FirstEdges, first_edges
+from pkmcal.planning.information import tool_by_free
+from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
+
+NEAR_END = 0.15
+"""Part of a joint's range, at either end, whose readings count as extreme."""
+SECOND_STATION_TURN = np.pi / 2
+"""Angle around the machine of a second station, rad: the direction that one camera determines
+worst, along its line of sight, the other determines best.
+"""
+FORECAST_SEED = 7
+
+
+@dataclass(frozen=True)
+class LegForecast:
+    """Forecast for one leg (from 1) at one station.
+
+    seen : share of its edges' points that are not hidden, in all images. found : share of the
+    expected edges that were measured and are inliers, in the first images; NaN without expected
+    ones. sigma : their median standard deviation, px across. tells : share of the information of
+    all edges of the capture on the machine (in units of the prior sigmas). variance : share of the
+    variance of the platform's position that comes from the errors of its edges: a better view of a
+    leg with a large share gains most.
+    """
+
+    station: str
+    leg: int
+    seen: float
+    found: float
+    sigma: float
+    tells: float
+    variance: float
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Predicted accuracy with ``photographs`` images at each station.
+
+    position, orientation : standard deviations of the platform's pose at given readings, mean over
+    poses, m and rad, as `calibrate` states them. readings, drawing : shares of the position's
+    variance from readings and priors; the rest comes from edges. second : position, m, if half of
+    the images are taken a quarter turn around the machine; NaN with several stations or a panoramic
+    camera. edges : by station, for advice.
+    """
+
+    photographs: int
+    position: float
+    orientation: float
+    readings: float
+    drawing: float
+    second: float
+    legs: tuple[LegForecast, ...]
+    edges: tuple[EdgesOf, ...] = ()
+
+
+def forecast(inspection: Inspection, images: int = CONFIGURATIONS_A_CAPTURE) -> Forecast | None:
+    """Forecast by the first images; None if the machine was not recognized at all stations.
+
+    Only legs are used, not boards and trackers. Raises a `PkmcalError` or a `LinAlgError` if these
+    images do not allow a forecast.
+    """
+    machine, stations = inspection.session.machine, inspection.stations
+    whole = bool(stations) and all(station.recognised for station in stations)
+    # the angles of hinges are not known without measurements
+    if not whole or machine.layout.n_internal:
+        return None
+    first = first_edges(
+        inspection.session,
+        [station.images for station in stations],
+        inspection.measured,
+        np.stack([station.T_camera_base for station in stations]),
+        inspection.poses,
+    )
+    capture = _planned_capture(inspection, first, images)
+    information = _capture_information(capture)
+    second = np.nan
+    one = stations[0].images
+    if len(stations) == 1 and view_angle(one.camera) < PANORAMIC_HALF_VIEW:
+        second = _capture_information(_with_second_station(capture)).position
+    return Forecast(
+        photographs=images,
+        position=information.position,
+        orientation=information.orientation,
+        readings=information.readings,
+        drawing=information.drawing,
+        second=second,
+        legs=_by_leg(inspection, first, information),
+        edges=first.edges,
+    )
+
+
+class _Capture(NamedTuple):
+    """Images by a rig: pairs (M, 2) of station and configuration."""
+
+    rig: Rig
+    T_base_platform: Array
+    joints: Array
+    pairs: Integers
+
+
+class _CaptureInformation(NamedTuple):
+    """Accuracy of the platform by a capture; share, variance : (S, L)."""
+
+    position: float
+    orientation: float
+    share: Array
+    variance: Array
+    readings: float
+    drawing: float
+
+
+def _planned_capture(inspection: Inspection, first: FirstEdges, images: int) -> _Capture:
+    """Capture with configurations over the joints' ranges, with the present share of extreme
+    ones.
+    """
+    machine, stations = first.estimate.machine, inspection.stations
+    # The present share of extreme configurations, and whether stations share configurations.
+    low, high = machine.joint_ranges.T
+    margin = NEAR_END * (high - low)
+    joints = inspection.session.joints
+    ends = np.all((joints < low + margin) | (joints > high - margin), axis=1)
+    rows = [set(s.images.configuration.tolist()) for s in stations]
+    shared = len(rows) > 1 and len(set.union(*rows)) < sum(map(len, rows)) / 2
+    wanted = images * (1 if shared else len(stations))
+    rng = np.random.default_rng(FORECAST_SEED)
+    poses, readings = draw_configurations(machine, wanted, float(ends.mean()), rng)
+    number = np.arange(images)
+    pairs = [all_pairs([s], number + (0 if shared else images * s)) for s in range(len(rows))]
+    T_camera_base = first.estimate.state.T_camera_base
+    cameras = zip(stations, T_camera_base, first.pools, strict=True)
+    rig = Rig(
+        machine,
+        tuple(station.name for station in stations),
+        T_camera_base,
+        numbered(inspection.session.camera_of_station[[s.images.station for s in stations]]),
+        inspection.session.joint_noise,
+        tuple(
+            LegsFrom(k, s.images.camera, T, pools, s.images.binning)
+            for k, (s, T, pools) in enumerate(cameras)
+        ),
+        shading=first.estimate.statistics.shading,
+    )
+    return _Capture(rig, poses[:wanted], readings[:wanted], np.concatenate(pairs))
+
+
+def _with_second_station(capture: _Capture) -> _Capture:
+    """Capture of a single station, with every other image taken a quarter turn around the
+    machine.
+    """
+    rig = capture.rig
+    (one,) = (x for x in rig.instruments if isinstance(x, LegsFrom))
+    middle = np.concatenate([rig.machine.base_centers(), capture.T_base_platform[:, :3, 3]])
+    turn, centre = rotation(np.array([0.0, 0.0, SECOND_STATION_TURN])), middle.mean(axis=0)
+    there = one.T_camera_base @ inverse(pose(turn, centre - turn @ centre))
+    pairs = capture.pairs.copy()
+    pairs[1::2, 0] = 1
+    both = replace(
+        rig,
+        names=rig.names * 2,
+        T_station_base=np.stack([one.T_camera_base, there]),
+        camera_of_station=np.repeat(rig.camera_of_station, 2),
+        instruments=(one, replace(one, station=1, T_camera_base=there)),
+    )
+    return capture._replace(rig=both, pairs=pairs)
+
+
+def _capture_information(capture: _Capture) -> _CaptureInformation:
+    """Accuracy of the platform by a capture.
+
+    With N = sum of N_g the information of all groups of rows (legs at stations, readings, priors)
+    and J the derivative of the platform's position, its covariance J N^-1 J^T is the sum over g of
+    J N^-1 N_g N^-1 J^T, the contributions of each group's errors. The information of edges on the
+    machine is the trace of their N_g, with parameters in units of their prior sigmas.
+    """
+    rig, machine = capture.rig, capture.rig.machine
+    n_stations = len(rig.names)
+    rng = np.random.default_rng(FORECAST_SEED)
+    # The problem of the joint estimate at the true state.
+    measurements = rig.measured(capture.joints, capture.T_base_platform, capture.pairs, rng)
+    edges = measurements.edges
+    assembled, at_truth = rig.assembled(measurements, capture.T_base_platform)
+    problem = assembled.problem
+    info = Information(problem, at_truth)
+    observed = np.flatnonzero(assembled.observed)
+    poses, joints = capture.T_base_platform[observed], capture.joints[observed]
+    # J N^-1, and the variance of the platform's pose.
+    by = tool_by_free(rig, problem, joints, poses)
+    machine_part = problem.unknowns.machine
+    spread = by @ info.covariance[0][machine_part]  # (K, 6, na)
+    variance = np.sum(spread[..., machine_part] * by, axis=-1)
+    # Contributions of the rows of readings and edges, and of priors, to the variance.
+    place = spread[:, 3:].reshape(-1, spread.shape[-1])
+    rows = info.reduced.rows[0][:, : info.linear.value.shape[-1]]
+    part = np.sum((rows @ place.T) ** 2, axis=-1)  # (K, r)
+    prior = float(np.sum((info.linear.shared_by @ place.T) ** 2))
+    # Information of the rows on the machine in prior sigmas.
+    tolerance = machine.parameters.tolerances_free()
+    row_information = np.sum((rows[..., machine_part] * tolerance) ** 2, axis=-1)
+    at = assembled.places.edges
+
+    def by_leg(of_rows: Array) -> Array:
+        own = of_rows[at.row[:, None], 2 * at.place[:, None] + np.arange(2)].sum(axis=1)
+        out = np.zeros((n_stations, machine.n_legs))
+        np.add.at(out, (edges.station, edges.leg), own)
+        return out
+
+    share, shares = by_leg(part), by_leg(row_information)
+    readings = float(part[:, problem.closure_rows].sum())
+    whole = float(share.sum()) + readings + prior
+    return _CaptureInformation(
+        position=float(np.sqrt(variance[:, 3:].sum(axis=1)).mean()),
+        orientation=float(np.sqrt(variance[:, :3].sum(axis=1)).mean()),
+        share=shares / shares.sum(),
+        variance=share / whole,
+        readings=readings / whole,
+        drawing=prior / whole,
+    )
+
+
+def _by_leg(
+    inspection: Inspection, first: FirstEdges, information: _CaptureInformation
+) -> tuple[LegForecast, ...]:
+    tubes, out = tubes_of(inspection.session.machine), list[LegForecast]()
+    for s, (station, edges) in enumerate(zip(inspection.stations, first.edges, strict=True)):
+        hidden = station.quality.hidden.mean(axis=0) if station.quality else None
+        for j in np.unique(tubes.leg):
+            mine = tubes.leg == j
+            expected = int(edges.expected[:, mine].sum())
+            inliers = int(edges.valid[:, mine].sum())
+            out.append(
+                LegForecast(
+                    station=station.name,
+                    leg=int(j) + 1,
+                    seen=float("nan") if hidden is None else float(1 - hidden[j]),
+                    found=inliers / expected if expected else float("nan"),
+                    sigma=float(first.sigma[s, j]),
+                    tells=float(information.share[s, j]),
+                    variance=float(information.variance[s, j]),
+                )
+            )
+    return tuple(out)

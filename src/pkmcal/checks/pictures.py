@@ -1,0 +1,177 @@
+"""Images of a check with the nominal model overlaid, by the given and by the localized pose.
+
+For the page, and as PNG files, in which large images are binned as for the search for edges.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
+from pkmcal.checks.inspection import Inspection, StationInspection
+from pkmcal.files import place_below, staged_folder
+from pkmcal.outcome import Part
+from pkmcal.pages import page
+from pkmcal.pages.jpegs import jpeg
+from pkmcal.pages.overlays import Drawn, Picture, Spot, machine_laid_over
+from pkmcal.pages.page import N_COLOURS
+
+DRAWN_PIXEL_BINARY_DIGITS = 4
+"""Binary digits of the fractions of a pixel in cv2's drawing functions."""
+CAPTION_BAR_HEIGHT = 26
+"""Height (px) of the caption above each image."""
+PANE_GAP = 6
+"""Distance (px) between the two images."""
+
+
+def with_pictures(inspection: Inspection) -> Part:
+    """Section of the page with the stations' first images, each with every available pose."""
+    pairs: list[tuple[Picture, ...]] = []
+    for station in inspection.stations:
+        for k in station.few():
+            configuration = int(station.images.configuration[k])
+            photo = inspection.session.stations[station.images.station].images[k]
+            width, height = station.images.camera.image_size
+            shot = jpeg(photo.path, (width, height))
+            pictures: list[Picture] = []
+            for text, T_camera_base in poses_of(station):
+                eye = station.images.camera
+                edges, spots = nominal_over_image(inspection, station, eye, T_camera_base, int(k))
+                pictures.append(
+                    Picture(
+                        station=station.name,
+                        configuration=inspection.session.configurations[configuration],
+                        why=text,
+                        width=width,
+                        height=height,
+                        jpeg=shot,
+                        edges=edges,
+                        spots=spots,
+                        kind="predicted",
+                    )
+                )
+            pairs.append(tuple(pictures))
+    html = page.filled_template(
+        "overlay.html.j2", n_legs=inspection.session.machine.n_legs, pairs=pairs
+    )
+    return Part("photographs", "The nominal model over the images", html=html, menu="Images")
+
+
+def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
+    """Poses T_camera_base for overlays with their captions; the given pose comes first."""
+    after = "pose found" if station.recognised else "best pose found, not recognised"
+    by_hand = () if station.by_hand is None else (("pose by hand", station.by_hand),)
+    return *by_hand, (after, station.T_camera_base)
+
+
+def nominal_over_image(
+    inspection: Inspection, station: StationInspection, camera: Camera, T_camera_base: Array, k: int
+) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
+    """Visible silhouettes of the nominal tubes in image k, and the joint centres.
+
+    camera : of the station, or of its binned images.
+    """
+    configuration = int(station.images.configuration[k])
+    return machine_laid_over(
+        inspection.session.machine,
+        camera,
+        T_camera_base,
+        inspection.session.joints[configuration],
+        inspection.poses[configuration],
+    )
+
+
+# ------------------------------------------------------------------ as files
+
+
+def picture_names(inspection: Inspection) -> dict[tuple[int, int], str]:
+    """File names by station and image."""
+    out: dict[tuple[int, int], str] = {}
+    for s, station in enumerate(inspection.stations):
+        images = inspection.session.stations[station.images.station].images
+        for k in range(len(images)):
+            out[s, k] = re.sub(r"[/\\]", "-", f"{station.name}-{images[k].path.stem}.png")
+    return out
+
+
+def write_pictures(inspection: Inspection, folder: Path) -> None:
+    """Write all images as PNG, the given pose left and the localized one right; all or none."""
+    import cv2
+
+    with staged_folder(folder) as stage:
+        for (s, k), name in picture_names(inspection).items():
+            done, packed = cv2.imencode(".png", picture(inspection, inspection.stations[s], k))
+            if not done:
+                raise OSError(f"{name} could not be encoded as PNG")
+            place_below(stage, name).write_bytes(packed.tobytes())
+
+
+def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:
+    """Image k in colour with its overlays, (h, w, 3) uint8, in cv2's order BGR."""
+    import cv2
+
+    name = inspection.session.configurations[int(station.images.configuration[k])]
+    small = station.images.select(np.array([k])).binned()
+    panes: list[Any] = []
+    for words, T_camera_base in poses_of(station):
+        pane: Any = cv2.cvtColor(np.asarray(small.images[0]), cv2.COLOR_GRAY2BGR)
+        edges, spots = nominal_over_image(inspection, station, small.camera, T_camera_base, k)
+        _draw(pane, edges, spots)
+        bar = np.full((CAPTION_BAR_HEIGHT, pane.shape[1], 3), 32, dtype=np.uint8)
+        text = f"{station.name} / {name}: {words}"
+        cv2.putText(bar, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA)
+        panes.append(np.concatenate([bar, pane]))
+    gap = np.full((len(panes[0]), PANE_GAP, 3), 32, dtype=np.uint8)
+    joined = [part for pane in panes for part in (gap, pane)][1:]
+    return np.concatenate(joined, axis=1)
+
+
+def _draw(pane: Any, edges: tuple[Drawn, ...], spots: tuple[Spot, ...]) -> None:
+    """Draw lines and joints into an image, each on a dark one for contrast with white."""
+    import cv2
+
+    def fixed(points: Any) -> Any:
+        return np.rint(np.asarray(points) * 2**DRAWN_PIXEL_BINARY_DIGITS).astype(np.int32)
+
+    radius = pane.shape[1] / 110
+    for width, dark in ((3, True), (1, False)):
+        for edge in edges:
+            colour = (0, 0, 0) if dark else _colour(edge.leg)
+            line = [fixed(edge.points)[:, None]]
+            cv2.polylines(pane, line, False, colour, width, cv2.LINE_AA, DRAWN_PIXEL_BINARY_DIGITS)
+        for spot in spots:
+            colour = (0, 0, 0) if dark else _colour(spot.leg)
+            x, y = fixed(spot.calibrated).tolist()
+            size = round(radius * 2**DRAWN_PIXEL_BINARY_DIGITS)
+            cv2.circle(pane, (x, y), size, colour, width, cv2.LINE_AA, DRAWN_PIXEL_BINARY_DIGITS)
+            if spot.labelled:
+                at = (
+                    round(spot.calibrated[0] + 1.4 * radius),
+                    round(spot.calibrated[1] + 2.4 * radius),
+                )
+                font, scale = cv2.FONT_HERSHEY_SIMPLEX, radius / 14
+                cv2.putText(pane, str(spot.leg), at, font, scale, colour, width + 1, cv2.LINE_AA)
+
+
+def _colour(leg: int) -> tuple[int, int, int]:
+    """Colour of a leg on images, BGR."""
+    return leg_colours()[(leg - 1) % N_COLOURS]
+
+
+@cache
+def leg_colours() -> tuple[tuple[int, int, int], ...]:
+    """Colours of legs on images from the page's style sheet, the only place that defines them;
+    BGR.
+    """
+    style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
+    (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)", style, flags=re.MULTILINE)
+    colours = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
+    numbers = [int(colours[str(k + 1)], 16) for k in range(N_COLOURS)]
+    return tuple((n & 255, n >> 8 & 255, n >> 16) for n in numbers)

@@ -1,0 +1,256 @@
+"""Findings of a check, and its outcome."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.checks.advice import forecast_figure, forecast_part
+from pkmcal.checks.results import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
+from pkmcal.files import resolved
+from pkmcal.identify.verdict import VERDICT
+from pkmcal.judge.repeatability import RepeatStudy, part_of
+from pkmcal.levels import MAJORITY
+from pkmcal.measurements.contract import measurement_kinds
+from pkmcal.outcome import Mark, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.finding import Finding, Level, doubtful, note
+from pkmcal.session.load import Session
+from pkmcal.session.readings import same_pose
+from pkmcal.wording import count, listed
+
+OVEREXPOSED_PIXEL_SHARE = 0.25
+"""Share of saturated pixels on the legs beyond which edges are lost; a highlight has a tenth."""
+BLUR_STILL_MEASURED = 1.7
+"""Blur (px) beyond which edges are measured badly: the model of an edge ends at 1.5."""
+POOR_CORNERS = 0.5
+"""Residual of corners (px rms) beyond that of any sharp image of a flat board."""
+STATION_LEGEND = (
+    "By chance: probability of other readings fitting as well (of an image by",
+    "hand, another place); good below 0.001, or 0.01 near a pose or by hand.",
+    "Moved: from the pose by hand to the one found. Legs: found in an image.",
+    "White, black: of the legs' pixels. Blur: of the sharpest edges.",
+)
+BOARD_LEGEND = (
+    "Seen: images that show it. Off: corners from their predicted places.",
+    "Wander: of the board on the base between images; a still one stays below 0.1 px.",
+)
+KINEMATICS_SENTENCE = (
+    "The nominal machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
+    " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
+)
+
+
+def link_findings(session: Session, poses: Array | None) -> list[Finding]:
+    """Notes on the difference between links of configurations and the nominal machine, one for each
+    kind.
+
+    poses : T_base_platform (K, 4, 4) by the nominal machine; None if it has none.
+    """
+    out: list[Finding] = []
+    for links in session.links:
+        kind = measurement_kinds()[links.kind]
+        off: dict[str, float] = {}
+        if poses is not None:
+            first, second = (poses[links.configuration[:, k]][None] for k in (0, 1))
+            still = np.broadcast_to(np.eye(4), (1, len(links), 4, 4))
+            rows = links.rows(first, second, still).value[0] * links.sigma
+            off["rms"] = float(np.sqrt(np.mean(rows**2)))
+        joined = len(np.unique(links.configuration))
+        out.append(
+            note("session.links", links.label, links=count(len(links), kind.one), number=joined,
+                 unit=kind.unit, **off)
+        )  # fmt: skip
+    return out
+
+
+def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
+    """Findings on the images of a station. n_legs : of the machine."""
+    findings: list[Finding] = []
+    at = {"subject": station.name, "station": station.name}
+    where = "legs" if station.recognised else "pictures"
+    if station.saturated > OVEREXPOSED_PIXEL_SHARE:
+        findings.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
+    if station.black > MAJORITY:
+        findings.append(doubtful("images.black", **at, share=station.black, where=where))
+    if station.blur > BLUR_STILL_MEASURED:
+        findings.append(doubtful("images.blurred", **at, blur=station.blur))
+    if station.recognised and station.legs < MAJORITY * n_legs:
+        findings.append(doubtful("images.few_legs", **at, number=station.legs, of=n_legs))
+    return findings
+
+
+def board_findings(session: Session, number: int, check: BoardCheck) -> list[Finding]:
+    """Findings on the board in a station's images. number : of the station, from 0."""
+    station = session.stations[number]
+    at = {"subject": station.name, "station": station.name}
+    findings: list[Finding] = []
+    if check.rms > POOR_CORNERS:
+        findings.append(doubtful("board.corners_off", **at, rms=check.rms))
+    if check.unseen:
+        findings.append(doubtful("board.part_unseen", **at, part=check.unseen.capitalize()))
+    if session.board_body == "base" and check.found == 1 and len(station.images) > 1:
+        findings.append(note("board.seen_once", **at))
+    return findings
+
+
+def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Finding]:
+    """Findings on the ranges and the number of configurations."""
+    findings: list[Finding] = []
+    if session.heights_alone:  # the bed determines the configurations
+        return findings
+    crowded = [joint for joint in joints if joint.used < MAJORITY]
+    if crowded:
+        names = [joint.name for joint in crowded]
+        least = min(joint.used for joint in crowded)
+        findings.append(note("readings.crowded", listed(names), columns=names, share=least))
+    count = len(session.configurations)
+    if count < VERDICT.few_configurations:
+        findings.append(note("configurations.too_few", number=count))
+    return findings + _repeated_pose_findings(session)
+
+
+def _repeated_pose_findings(session: Session) -> list[Finding]:
+    """Note on configurations with the same pose by their readings, and how to declare repeats."""
+    owner = same_pose(session.joints, session.joint_noise)
+    first, names = np.unique(owner, return_counts=True)
+    if len(first) == len(owner):
+        return []
+    same = [session.configurations[k] for k in np.flatnonzero(owner == first[np.argmax(names > 1)])]
+    facts: dict[str, Any] = {
+        "number": len(owner),
+        "poses": len(first),
+        "names": same,
+        "others": ", and so on" if np.sum(names > 1) > 1 else "",
+    }
+    again = {
+        station.entry or station.name
+        for station in session.stations
+        if len({owner[photo.configuration] for photo in station.images})
+        < len({photo.configuration for photo in station.images})
+    }
+    if not session.stations:  # a tracker's table has one row for each configuration
+        return [note("configurations.equal_rows", **facts)]
+    if not again:
+        return [note("configurations.equal_names", **facts, name=same[0])]
+    entry = min(again)
+    pattern = session.document["stations"][entry]["images"]
+    if "{repeat}" not in pattern:
+        pattern = pattern.replace("{configuration}", "{configuration}_{repeat}")
+    files = [pattern.format(configuration=same[0], repeat=k) for k in (1, 2)]
+    facts |= {"stations": sorted(again), "files": files, "pattern": pattern}
+    return [note("configurations.equal_at_stations", **facts)]
+
+
+def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome:
+    """Outcome for people and programs. study : of the session's repeats."""
+    findings = (*check.findings, *(study.findings if study else ()))
+    headlines = (
+        f"Nothing is wrong. Next: pkmcal calibrate {shlex.quote(check.folder)}",
+        "It can be calibrated, but the marked points will cost accuracy.",
+        "It cannot be calibrated yet.",
+    )
+    code = exit_code_of(findings)
+    refused = any(finding.error is not None for finding in findings)
+    name = check.folder
+    if Path(name).name in ("", ".."):  # "." and ".." are no names for a reader
+        name = resolved(Path(name)).name or name
+    parts: tuple[Part, ...] = ()
+    if check.machine:
+        text = KINEMATICS_SENTENCE.format(check) if math.isfinite(check.singularity) else ""
+        tables = (_stations_table(check), _boards_table(check), _joints_table(check.joints))
+        parts = (
+            Part(
+                "session",
+                "What was looked at",
+                terminal_text=(text,) if text else (),
+                tables=tuple(table for table in tables if table.rows),
+            ),
+        )
+    if check.forecast:
+        parts = (*parts, forecast_part(check.forecast))
+    images = sum(station.photographs for station in check.stations)
+    return Outcome(
+        command="check",
+        title=f"Check of {name}",
+        subject=f"{name}: {check.machine}, {check.n_legs} legs,"
+        f" {check.configurations} configurations, {images} images"
+        if check.machine
+        else "",
+        verdict=Verdict(code == 0, headlines[2 if refused else code], check.advice),
+        stamp=("Ready", "Doubtful", "Not yet")[2 if refused else code],
+        level=Level.WRONG if code == 2 else Level.DOUBTFUL,
+        figures=(forecast_figure(check.forecast),) if check.forecast else (),
+        parts=(*parts, part_of(study)) if study else parts,
+        findings=findings,
+        document=check.as_dict(),
+    )
+
+
+def _stations_table(check: SessionCheck) -> Table:
+    rows: list[Row] = []
+    for station in check.stations:
+        levels = {f.level for f in check.findings if f.station == station.name}
+        if not station.recognised:
+            levels.add(Level.WRONG)
+        worst = [level for level in Level if level in levels]
+        mark: Mark = worst[0] if worst else "good"
+        motion = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
+        finite = station.recognised and math.isfinite(station.legs)
+        cells = (
+            str(station.photographs),
+            _number(station.by_chance, "{:.0e}"),
+            motion if math.isfinite(station.moved) else "–",
+            f"{station.legs:.1f}/{check.n_legs}" if finite else "–",
+            _number(station.saturated, "{:.0%}"),
+            _number(station.black, "{:.0%}"),
+            _number(station.blur, "{:.1f} px"),
+        )
+        rows.append(Row(station.name, cells, mark=mark))
+    columns = ("Station", "Photos", "By chance", "Moved", "Legs", "White", "Black", "Blur")
+    return Table("", columns, tuple(rows), " ".join(STATION_LEGEND), legend=STATION_LEGEND)
+
+
+def _boards_table(check: SessionCheck) -> Table:
+    rows = tuple(
+        Row(
+            station.name,
+            (
+                f"{board.found} of {station.photographs}",
+                f"{board.corners:.0f}/{board.corners_of}",
+                f"{board.rms:.3f} px",
+                _number(board.scatter, "{:.3f} px"),
+                f"{board.distance:.2f} m",
+            ),
+            mark="good",
+        )
+        for station in check.stations
+        if (board := station.board) is not None
+    )
+    columns = ("Board", "Seen", "Corners", "Off", "Wander", "Distance")
+    return Table("", columns, rows, legend=BOARD_LEGEND)
+
+
+def _joints_table(joints: tuple[JointCheck, ...]) -> Table:
+    rows = tuple(
+        Row(
+            joint.name,
+            (
+                f"{joint.low:.4f}",
+                f"{joint.high:.4f}",
+                _number(joint.used, "{:.0%}"),
+                f"{joint.ends[0]} + {joint.ends[1]}" if math.isfinite(joint.used) else "–",
+            ),
+            mark=Level.NOTE if joint.used < MAJORITY else "good",
+        )
+        for joint in joints
+    )
+    return Table("", ("Joint", "Lowest", "Highest", "Of its range", "Near the ends"), rows)
+
+
+def _number(value: float, form: str) -> str:
+    return form.format(value) if math.isfinite(value) else "–"

@@ -1,0 +1,668 @@
+"""Delta robots in the parameters of firmwares, fitted over the workspace, and header texts.
+
+Firmwares model ideal deltas: parallel towers on one circle, or arms in vertical planes through one
+axis. A calibrated machine has more degrees of freedom, so a firmware's model deviates from it; the
+export states the deviation. The firmware's frame may differ from the base frame: the fit includes
+the transformation.
+
+Model, in the firmware's frame, mm and degrees: a linear tower j carries its rod's end at ``(R cos
+a_j, R sin a_j, m_j)``, an arm at ``((R + U_j cos m_j) (cos a_j, sin a_j), H_j + U_j sin m_j)``;
+L_j is the length of the rod, and m_j = rate_j * reading_j + zero_j the motor's position.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.machine_source import MachineSource
+from pkmcal.errors import InputError
+from pkmcal.exporters.contract import Difference
+from pkmcal.exporters.limbs import (
+    FLOAT_CARRIER,
+    SLIDE_CARRIER,
+    TURN_CARRIER,
+    Limbs,
+    all_limbs,
+    rod_limbs,
+)
+from pkmcal.geometry.rigid import apply, dot, pose, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.outcome.finding import Finding, doubtful, note
+
+STEPS_FROM_HOME = 8
+"""Continuation steps from home to a pose of the grid."""
+GRID_READINGS_A_MOTOR = 7
+"""Grid readings of each motor: ends, middle, and two on either side."""
+LEAST_DELTA_SINGULARITY = 0.12
+"""Least singular value of the scaled inverse Jacobian: readings' errors grow at most eightfold."""
+FASTEST_MOTOR_RATIO = 4.0
+"""Largest ratio of a carriage's or elbow's speed to the tool's.
+
+Beyond it a rod is nearly perpendicular to the motion of its motor, and firmwares divide by the
+cosine.
+"""
+LEAST_UPRIGHT_PART = 0.8
+"""Least vertical component of a tower, or radial component of an arm's plane: within 37 degrees."""
+MM_A_METRE = 1e3
+DEGREES_A_RADIAN = 180 / np.pi
+UNWARNED_TOOL_ERROR = 0.05
+"""Largest tool error without a warning, mm: the repeatability of a good kit."""
+MOST_TOOL_ERROR = 5.0
+"""Largest tool error, mm; beyond it the parameters describe another machine."""
+UNTOLD_SCALE_DIFFERENCE = 1e-9
+"""Least difference of a scale from 1 that is reported: beyond the digits of the files."""
+SWITCH_READINGS = 11
+"""Readings of each motor at which an end switch's value is compared or tabulated."""
+SWITCH_ROUNDING = 1e-3
+"""Tolerance of a motor's position at its end switch, mm or degrees; of an arm 2 µm.
+
+Values are written to 0.1 µm, and the height depends weakly on the angle of an arm that is nearly
+upright.
+"""
+TOOL_ROUNDING = 2e-6
+"""Tolerance at the tool, m: settings have 0.1 µm and 0.00001 degrees, amplified up to eightfold."""
+_ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
+_STATED = re.compile(r"off by ([0-9.]+) mm at most")
+
+Inverse = Callable[[Array], Array]
+"""Inverse kinematics of a firmware: points (n, 3) mm to motor positions (n, 3)."""
+
+
+# The machine
+
+
+@dataclass(frozen=True)
+class Delta:
+    """Three legs of a machine as a delta, in the order of its file; mm and degrees as in firmwares.
+
+    program : target firmware.
+    kind : linear or rotary.
+    joint : (3,) columns of the readings.
+    hinge : (3, 3) m; a tower's joint at reading zero, or a point of an arm's axis, less the
+        platform's joint: the fixed point of the rod when its far end is moved to the platform's
+        origin.
+    arm, rod : (3,) m.
+    rate, zero : (3,); motor position (carriage height in mm, or angle above the horizontal in
+        degrees) = rate * reading + zero for an ideal machine.
+    ends : (3,) readings at the upper end of the range.
+    poses : (n, 4, 4) over the workspace.
+    readings : (n, 3) by leg.
+    by_reading : (n, 3, 3) derivative of the platform's position, m, by the legs' readings.
+    bed : z of the platform's origin on a probed bed, m; None without.
+    """
+
+    machine: Machine
+    program: str
+    kind: str
+    joint: Integers
+    hinge: Array
+    arm: Array
+    rod: Array
+    rate: Array
+    zero: Array
+    ends: Array
+    poses: Array
+    readings: Array
+    by_reading: Array
+    bed: float | None = None
+
+    @property
+    def positions(self) -> Array:
+        """Platform positions of the grid, (n, 3) m, base frame."""
+        return self.poses[:, :3, 3]
+
+
+def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
+    """Machine as a delta. Raises InputError for a machine that is none, or without ranges.
+
+    program, bed : as in :class:`Delta`.
+    """
+    # a delta: three rods, each on a slide or crank of its own, platform without rotation
+    limbs, motion = all_limbs(machine), machine.document.motion
+    if motion != "translation" or set(limbs.drive) not in ({SLIDE_CARRIER}, {TURN_CARRIER}):
+        joints = sorted({leg.base.joint for leg in machine.document.legs})
+        description = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
+        raise _no_delta(machine, program, description)
+    rods = rod_limbs(machine)
+    if len(rods) != 3 or machine.n_joints != 3 or FLOAT_CARRIER in rods.held:
+        raise _no_delta(machine, program, f"{len(rods)} rods, {machine.n_joints} motors")
+    ranges = machine.joint_ranges[rods.joint]
+    if not np.isfinite(ranges).all():
+        raise InputError(
+            f"mechanism {machine.name!r} gives no range for a motor, so its ends are not known",
+            expected="range: [min, max] at every slider or crank",
+            next_step="Add the ranges: the firmware's end switches are put at their upper ends",
+        )
+    # motor position = rate * reading + zero, for the ideal machine
+    linear = rods.drive[0] == SLIDE_CARRIER
+    rate, zero = _towers(rods) if linear else _arms(rods, rods.scale * ranges.mean(axis=1))
+    rate = rods.scale * rate
+    if np.isnan(zero).any():
+        what = "towers that lean" if linear else "arms that do not swing outwards"
+        raise _no_delta(machine, program, what)
+    arm = np.ones(3) if linear else np.sqrt(dot(rods.arm, rods.arm))
+    poses, readings, by_reading = _workspace(machine, rods.joint, arm)
+    return Delta(
+        machine=machine,
+        program=program,
+        kind="linear" if linear else "rotary",
+        joint=rods.joint,
+        hinge=rods.base - rods.platform @ machine.home()[:3, :3].T,
+        arm=arm,
+        rod=rods.length,
+        rate=rate,
+        zero=zero,
+        ends=np.where(rate > 0, ranges[:, 1], ranges[:, 0]),
+        poses=poses,
+        readings=readings,
+        by_reading=by_reading,
+        bed=bed,
+    )
+
+
+def _no_delta(machine: Machine, program: str, text: str) -> InputError:
+    """Error for a machine that is no delta."""
+    return InputError(
+        f"{program} has settings for linear and rotary deltas, and mechanism {machine.name!r}"
+        " is neither",
+        found=text,
+        expected="motion: translation with three sliders, or three cranks, and rods",
+        next_step="Export it with --to c",
+    )
+
+
+def _towers(rods: Limbs) -> tuple[Array, Array]:
+    """Rate (mm/m) and zero (mm) of ideal towers; NaN where they lean."""
+    up = rods.axis[:, 2]
+    return np.sign(up) * MM_A_METRE, np.where(
+        np.abs(up) > LEAST_UPRIGHT_PART, MM_A_METRE * rods.base[:, 2], np.nan
+    )
+
+
+def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
+    """Rate (degree/rad) and zero (degrees) of ideal arms, exact at the middle of the range.
+
+    middle : (3,) rad. NaN where an arm does not swing in a radial vertical plane.
+    """
+    # direction outwards from the centre, in the horizontal plane
+    radial = (rods.base - rods.base.mean(axis=0)) * [1, 1, 0]
+    radial = radial / np.linalg.norm(radial, axis=1, keepdims=True)
+    size = np.sqrt(dot(rods.arm, rods.arm))[:, None]
+    c, s = np.cos(middle)[:, None], np.sin(middle)[:, None]
+    # arm and its derivative at mid-range, in the plane of radial direction and z
+    at, ahead = (c * rods.arm + s * rods.rate) / size, (c * rods.rate - s * rods.arm) / size
+    out, d_out = dot(at, radial), dot(ahead, radial)
+    sign = np.sign(out * ahead[:, 2] - at[:, 2] * d_out)
+    zero = np.arctan2(at[:, 2], out) - sign * middle
+    return sign * DEGREES_A_RADIAN, np.where(
+        np.hypot(out, d_out) > LEAST_UPRIGHT_PART, DEGREES_A_RADIAN * zero, np.nan
+    )
+
+
+def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Array, Array]:
+    """Grid poses far from singularities, their readings by leg, and derivatives of the position.
+
+    Raises InputError if no grid pose closes.
+    """
+    ends = machine.joint_ranges
+    axes = [np.linspace(low, high, GRID_READINGS_A_MOTOR) for low, high in ends]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(ends))
+    # continuation from home: a start far away may converge to the assembly mode with the tool
+    # above the carriages
+    home = machine.home()
+    begin = machine.inverse(home)
+    begin = np.where(np.isfinite(begin), begin, grid)  # for a motor that cannot reach home
+    fk = machine.forward_result(begin, np.broadcast_to(home, (len(grid), 4, 4)))
+    for share in np.linspace(0, 1, STEPS_FROM_HOME + 1)[1:]:
+        readings = begin + share * (grid - begin)
+        fk = machine.forward_result(readings, fk.T_base_platform)
+    poses = fk.T_base_platform
+    # reachable poses, away from singularities, with the readings that were put in
+    back = machine.inverse(poses)
+    usable = fk.converged & (fk.singularity > LEAST_DELTA_SINGULARITY)
+    usable &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
+    # speed of each carriage or elbow per speed of the tool
+    speed_ratios = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
+    usable &= np.nan_to_num(speed_ratios * arm, nan=np.inf).max(axis=1) < FASTEST_MOTOR_RATIO
+    if not usable.any():
+        raise InputError(
+            f"mechanism {machine.name!r} closes nowhere within its ranges",
+            next_step="Check the ranges in the mechanism file",
+        )
+    poses = poses[usable]
+    by_reading = machine.forward_jacobian(poses)[:, 3:, :][..., joint]
+    return poses, grid[usable][:, joint], by_reading
+
+
+# The fit
+
+
+@dataclass(frozen=True)
+class Freedoms:
+    """Free parameters of a format.
+
+    nominal : (3,) degrees, directions of the towers.
+    angles : directions are free.
+    rods, arms, heights : one value for each leg, else one for all.
+    flat : shoulders are at Z = 0; the frame's Z shift is free instead.
+    """
+
+    nominal: tuple[float, float, float]
+    angles: bool = True
+    rods: bool = True
+    arms: bool = True
+    heights: bool = True
+    flat: bool = False
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters of a firmware, mm and degrees; arrays (3,) in the firmware's order of towers.
+
+    delta : the machine fitted to.
+    order : legs of the mechanism file, from 0.
+    angle : tower directions.
+    T_firmware_base : (4, 4) m.
+    largest, rms : mm; error at the tool over the grid, its poses taken as commands.
+    """
+
+    delta: Delta
+    order: Integers
+    radius: float
+    angle: Array
+    rod: Array
+    arm: Array
+    height: Array
+    rate: Array
+    zero: Array
+    T_firmware_base: Array
+    largest: float = 0.0
+    rms: float = 0.0
+
+    @property
+    def kind(self) -> str:
+        """Linear or rotary."""
+        return self.delta.kind
+
+    @property
+    def end_motors(self) -> Array:
+        """Motor positions (3,) at the end switches."""
+        return self.rate * self.delta.ends[self.order] + self.zero
+
+    @property
+    def following(self) -> Finding:
+        """Finding on the agreement of settings and machine, a warning if it is poor.
+
+        The error is rounded up, so that the statement holds.
+        """
+        facts = {
+            "program": self.delta.program,
+            "largest": math.ceil(self.largest * 1e3) / 1e3,
+            "rms": self.rms,
+        }
+        if self.largest <= UNWARNED_TOOL_ERROR:
+            return note("export.follows", **facts)
+        return doubtful("export.follows_badly", **facts, kind=self.kind)
+
+    def motors(self, points: Array, near: Array) -> Array:
+        """Motor positions (n, 3) at points (n, 3) mm in the firmware's frame.
+
+        near : (n, 3) degrees; of an arm's two solutions the nearest is taken.
+        """
+        angle = self.angle / DEGREES_A_RADIAN
+        # coordinates of the tool in each tower's vertical plane: along, across, up
+        along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle) - self.radius
+        across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
+        square = self.rod**2 - across**2
+        if self.kind == "linear":
+            return points[:, 2:] + np.sqrt(np.maximum(square - along**2, 0.0))
+        up = points[:, 2:] - self.height
+        # law of cosines for the angle between arm and line from shoulder to tool
+        away = np.hypot(along, up)
+        share = (away**2 + self.arm**2 - square) / (2 * self.arm * away)
+        half = np.arccos(np.clip(share, -1.0, 1.0))
+        both = (np.arctan2(up, along) + np.stack([half, -half])) * DEGREES_A_RADIAN
+        both = both + 360 * np.round((near - both) / 360)
+        return np.where(np.abs(both[0] - near) < np.abs(both[1] - near), both[0], both[1])
+
+
+def fit_of(source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms) -> Fit:
+    """Parameters of a firmware for a source's machine, with the free parameters of its kind."""
+    delta = delta_of(source.machine, program, source.bed)
+    return nearest_fit(delta, linear if delta.kind == "linear" else rotary)
+
+
+def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
+    """Parameters that minimise the tool's error over the workspace.
+
+    Raises InputError if the error remains above :data:`MOST_TOOL_ERROR`.
+    """
+    from scipy.optimize import least_squares
+
+    # minimise the tool's error over the grid, from the ideal machine
+    start = _start(delta, freedoms)
+    packed = _ParameterVector(start, freedoms)
+    points = delta.positions
+    readings = delta.readings[:, start.order]
+    by_reading = MM_A_METRE * delta.by_reading[:, :, start.order]
+
+    def off(x: Array) -> Array:
+        return _tool_error(packed.fit(x), points, readings, by_reading).ravel()
+
+    # central differences: at an exact model the error falls below a nanometre
+    solution = least_squares(off, packed.zeros, jac="3-point", method="lm", xtol=1e-14, ftol=1e-14)
+    fit = packed.fit(solution.x)
+    error = np.linalg.norm(_tool_error(fit, points, readings, by_reading), axis=1)
+    fit = replace(fit, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error)))))
+    if not fit.largest <= MOST_TOOL_ERROR:
+        raise InputError(
+            f"{delta.program} cannot follow this machine: its parameters leave the tool off",
+            found=f"{fit.largest:.2f} mm",
+            expected=f"at most {MOST_TOOL_ERROR:g} mm over the workspace",
+            next_step="Set towers or arms nearer to the nominal model, or export the"
+            " machine with --to c",
+        )
+    return fit
+
+
+def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:
+    """Tool error (n, 3) mm, to first order, at positions that the firmware commands."""
+    # motor positions that the firmware commands for the tool's true positions
+    points = MM_A_METRE * apply(fit.T_firmware_base, positions)
+    own = fit.rate * readings + fit.zero
+    wrong = (fit.motors(points, own) - own) / fit.rate
+    return (by_reading @ wrong[..., None])[..., 0]
+
+
+class _ParameterVector:
+    """Changes of the start's parameters as a vector x, mm and degrees; zero at the start."""
+
+    def __init__(self, start: Fit, freedoms: Freedoms) -> None:
+        self.start = start
+        rotary = start.kind == "rotary"
+        parts: list[tuple[str, int]] = [("radius", 1), ("zero", 3), ("tilt", 2), ("shift", 2)]
+        parts.append(("rod", 3 if freedoms.rods else 1))
+        parts.append(("angle", 3) if freedoms.angles else ("yaw", 1))
+        if rotary:
+            parts.append(("arm", 3 if freedoms.arms else 1))
+            if freedoms.flat:
+                parts.append(("lift", 1))
+            else:
+                parts.append(("height", 3 if freedoms.heights else 1))
+        self.parts = parts
+        self.zeros = np.zeros(sum(count for _, count in parts))
+
+    def fit(self, x: Array) -> Fit:
+        """Parameters at x."""
+        cuts = np.cumsum([count for _, count in self.parts])[:-1]
+        names = [name for name, _ in self.parts]
+        changes = dict(zip(names, np.split(x, cuts), strict=True))
+        own = {
+            name: getattr(self.start, name) + changes[name]
+            for name in ("rod", "angle", "arm", "height", "zero")
+            if name in changes
+        }
+        turn = np.concatenate([changes["tilt"], changes.get("yaw", np.zeros(1))]) / DEGREES_A_RADIAN
+        shift = np.concatenate([changes["shift"], changes.get("lift", np.zeros(1))]) / MM_A_METRE
+        placed = self.start.T_firmware_base
+        placed = pose(rotation(turn) @ placed[:3, :3], placed[:3, 3] + shift)
+        radius = self.start.radius + float(changes["radius"][0])
+        return replace(self.start, radius=radius, T_firmware_base=placed, **own)
+
+
+def _start(delta: Delta, freedoms: Freedoms) -> Fit:
+    """Start of the fit: the machine as an ideal delta, with the circle through the three hinges."""
+    hinge = MM_A_METRE * delta.hinge
+    # circle through the hinges, and the order of the legs by their directions
+    centre = _circle(hinge[:, :2])
+    away = hinge[:, :2] - centre
+    azimuth = np.arctan2(away[:, 1], away[:, 0]) * DEGREES_A_RADIAN
+    nominal = np.array(freedoms.nominal)
+    order = _order(azimuth, nominal)
+    off = _wrapped(azimuth[order] - nominal)
+    yaw = 0.0 if freedoms.angles else -float(off.mean())
+    # heights: of each hinge, common, or zero with the frame at the hinges
+    height = hinge[order, 2]
+    lift = _lift(delta)
+    if freedoms.flat and delta.kind == "rotary":
+        lift = -float(height.mean())
+    if not freedoms.heights or freedoms.flat:
+        height = np.full(3, height.mean())
+    height = np.zeros(3) if freedoms.flat else height + lift
+    # frame: origin at the circle's centre, turned to the nominal directions if these are fixed
+    turn = rotation(np.array([0.0, 0.0, yaw / DEGREES_A_RADIAN]))
+    shift = np.array([0.0, 0.0, lift]) - turn @ np.append(centre, 0.0)
+    # lengths: of each leg, or their mean
+    each = (freedoms.rods, freedoms.arms)
+    rod, arm = (
+        v[order] if own else np.full(3, v.mean())
+        for v, own in zip((MM_A_METRE * delta.rod, MM_A_METRE * delta.arm), each, strict=True)
+    )
+    zero = delta.zero[order] + (lift if delta.kind == "linear" else 0.0)
+    return Fit(
+        delta=delta,
+        order=order,
+        radius=float(np.linalg.norm(away, axis=1).mean()),
+        angle=nominal + off if freedoms.angles else nominal,
+        rod=rod,
+        arm=arm,
+        height=height,
+        rate=delta.rate[order],
+        zero=zero,
+        T_firmware_base=pose(turn, shift / MM_A_METRE),
+    )
+
+
+def _lift(delta: Delta) -> float:
+    """Z of the firmware's frame above the base's z, mm.
+
+    A probed bed gets Z = 0. Without one: 0 if home is above z = 0, which then is the bed; for a
+    machine that hangs from its base the least whole number of mm that leaves no Z negative.
+    """
+    if delta.bed is not None:
+        return -MM_A_METRE * delta.bed
+    lowest = float(MM_A_METRE * delta.positions[:, 2].min())
+    above = delta.machine.home()[2, 3] > 0
+    return 0.0 if above or lowest >= 0 else float(np.ceil(-lowest))
+
+
+def _order(azimuth: Array, nominal: Array) -> Integers:
+    """Cyclic order of the legs, anticlockwise, that is nearest to the nominal directions."""
+    around = np.argsort(azimuth % 360)
+    first = np.argsort(nominal % 360)
+    place = np.argsort(first)
+    turns = [np.roll(around, k)[place] for k in range(3)]
+    off = [float(np.sum(_wrapped(azimuth[order] - nominal) ** 2)) for order in turns]
+    return turns[int(np.argmin(off))]
+
+
+def _wrapped(angle: Array) -> Array:
+    """Angle in [-180, 180) degrees."""
+    return (angle + 180) % 360 - 180
+
+
+def _circle(points: Array) -> Array:
+    """Centre (2,) of the circle through three points (3, 2)."""
+    d = points[1:] - points[0]
+    return points[0] + np.linalg.solve(2 * d, np.sum(d**2, axis=1))
+
+
+# Texts of the files
+
+
+def firmware_length(value: float) -> str:
+    """Length in the digits that firmwares read."""
+    return _number(value, 4)
+
+
+def firmware_angle(value: float) -> str:
+    """Angle in the digits that firmwares read."""
+    return _number(value, 5)
+
+
+def _number(value: float, digits: int) -> str:
+    """Number with fixed digits, without a negative zero."""
+    text = f"{value:.{digits}f}"
+    return text[1:] if float(text) == 0 and text.startswith("-") else text
+
+
+def scales_of(fit: Fit) -> Array:
+    """Scales of the readings (3,), in the firmware's order."""
+    return np.abs(fit.rate) / (MM_A_METRE if fit.kind == "linear" else DEGREES_A_RADIAN)
+
+
+def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[str]:
+    """Header lines: conventions, legs of the motors, the frame, and the remaining error.
+
+    names : letters of the motors, in the firmware's order.
+    correcting : instruction for a motor whose reading has a scale other than 1.
+    """
+    delta = fit.delta
+    unit, word = ("mm", "m") if fit.kind == "linear" else ("degrees", "rad")
+    motors = [
+        f"Motor {name} is leg {j + 1}, joint {delta.joint[j] + 1}:"
+        f" motor position ({unit}) = {rate:.9g} * reading ({word}) {round(zero, 6) + 0.0:+.6f}."
+        for name, j, rate, zero in zip(names, fit.order, fit.rate, fit.zero, strict=True)
+    ]
+    in_mm = fit.T_firmware_base * np.array([1.0, 1.0, 1.0, MM_A_METRE])
+    rows = [
+        f"firmware_from_base row {k + 1}: {' '.join(f'{v:.12g}' for v in np.round(row, 12) + 0.0)}"
+        for k, row in enumerate(in_mm[:3])
+    ]
+    factors = [
+        f"Motor {name} goes {factor:.9g} times as far as its reading says."
+        for name, factor in zip(names, scales_of(fit), strict=True)
+        if abs(factor - 1) > UNTOLD_SCALE_DIFFERENCE
+    ]
+    tip = (
+        "The point that moves is the platform frame's origin; a tool's length below it is not in"
+        " these values."
+    )
+    if delta.bed is not None and abs(fit.T_firmware_base[2, 3] + delta.bed) < TOOL_ROUNDING:
+        tip = "Z is 0 where a height of 0 was measured."
+    sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"
+    return [
+        *source.header(),
+        f"For {delta.program}. Units: mm and degrees. {sort}; the rod's length is a value of its"
+        " own.",
+        *motors,
+        *factors,
+        *([correcting] if factors else []),
+        f"The firmware's frame: p_firmware = firmware_from_base p_base, mm. {tip}",
+        *rows,
+        f"{fit.following.text} Compared over {len(delta.poses)} poses of the workspace.",
+    ]
+
+
+def workspace_radius(source: MachineSource) -> str | None:
+    """Print radius of the mechanism file, mm, as firmwares read it; None without one.
+
+    The radius is a limit rather than a property of the machine, so no export invents it.
+    """
+    radius = source.machine.document.workspace_radius
+    return None if radius is None else _digits(MM_A_METRE * radius)
+
+
+def end_switches(fit: Fit) -> str:
+    """Sentence on the assumed readings at the end switches."""
+    word = "m" if fit.kind == "linear" else "rad"
+    ends = ", ".join(f"{q:.9g}" for q in fit.delta.ends[fit.order])
+    return (
+        "End switches are taken to be at the upper end of each motor's range in the mechanism file:"
+        f" readings {ends} {word}. Where a switch triggers at another reading, its value is:"
+    )
+
+
+def proportional_switches(fit: Fit, names: Sequence[str], values: Array) -> list[str]:
+    """Line for each motor: its end switch's value as a linear function of the reading there.
+
+    values : (3,) at the upper ends of the ranges. :func:`switch_values` reads the lines.
+    """
+    ends = fit.delta.ends[fit.order]
+    return [
+        f"{name} = {_digits(value)} {'-' if rate < 0 else '+'} {abs(rate):.9g}"
+        f" * (reading - {end:.9g})"
+        for name, value, rate, end in zip(names, values, fit.rate, ends, strict=True)
+    ]
+
+
+def switch_values(text: str, readings: Array) -> Array:
+    """Values (3,) by the lines of :func:`proportional_switches` at readings (3,)."""
+    lines = (line.partition(" * (reading - ") for line in text.splitlines())
+    terms = [
+        (*head.replace("+ ", "+").replace("- ", "-").split()[-2:], tail.partition(")")[0])
+        for head, times, tail in lines
+        if times
+    ]
+    value, rate, end = np.array(terms, dtype=float).T
+    return value + rate * (readings - end)
+
+
+def readings_elsewhere(fit: Fit) -> Array:
+    """Readings (n, 3) of end switches other than the assumed ones.
+
+    From the upper end of each range down to its middle.
+    """
+    machine = fit.delta.machine
+    ranges = machine.joint_ranges[fit.delta.joint][fit.order]
+    ends = fit.delta.ends[fit.order]
+    shares = np.linspace(0.0, 0.5, SWITCH_READINGS)[:, None]
+    return ends + shares * (ranges.sum(axis=1) - 2 * ends)
+
+
+def _digits(value: float) -> str:
+    """Number with up to six decimals."""
+    return f"{value:.6f}".rstrip("0").rstrip(".") if abs(value) > 5e-7 else "0"
+
+
+def read_firmware_from_base(text: str) -> Array:
+    """``firmware_from_base`` (4, 4) of a text, translation in m."""
+    out = np.eye(4)
+    rows = _ROW.findall(text)
+    out[:3] = [[float(word) for word in row.split()] for row in rows]
+    out[:3, 3] /= MM_A_METRE
+    return out
+
+
+def stated(text: str) -> float:
+    """Tool error that a text states, m; 0 without one."""
+    match = _STATED.search(text)
+    return float(match.group(1)) / MM_A_METRE if match else 0.0
+
+
+def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
+    """Tool error by the firmware's formulas with the text's values, over the workspace.
+
+    The machine's forward kinematics follows the firmware's inverse.
+
+    zero : (3,) motor positions at reading zero by the text's end switches.
+    """
+    delta = fit.delta
+    points = MM_A_METRE * apply(read_firmware_from_base(text), delta.positions)
+    # readings at the commanded motor positions, and the tool there by the machine's kinematics
+    readings = np.zeros_like(delta.readings)
+    readings[:, delta.joint[fit.order]] = (inverse(points) - zero) / fit.rate
+    result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)
+    off = np.linalg.norm(result.T_base_platform[:, :3, 3] - delta.positions, axis=1)
+    largest = float(np.where(result.converged, off, np.inf).max())
+    stated_error = stated(text)
+    return Difference(
+        f"tool over {len(delta.poses)} poses by the firmware's formulas",
+        largest,
+        # the fit's error is of first order, so a large one may be 2 % larger
+        1.02 * stated_error + TOOL_ROUNDING,
+    )
+
+
+def redo(source: MachineSource) -> tuple[Finding, ...]:
+    """Measurements to repeat with these values in a firmware; none for a nominal model."""
+    if not source.calibrated:
+        return ()
+    bed = "unknown" if source.bed is None else "probed"
+    return (note("export.redo", radius=workspace_radius(source), bed=bed),)

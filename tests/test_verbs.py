@@ -1,0 +1,283 @@
+"""Every verb both ways: the command and the function of the same name give the same document and
+the same files, from the same defaults; and what all results have in common.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pkmcal
+from conftest import have_cores, run
+from pkmcal.api.result import Result, printed_document
+from pkmcal.control.study import HAND_ROTATION
+from pkmcal.errors import InputError
+from pkmcal.files import json_text
+from pkmcal.outcome.finding import Finding
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE
+from pkmcal.simulation import Settings
+from printers import calibrated_cfg
+from test_cli_camera import boards  # noqa: F401 - a fixture
+from test_pose_sessions import make
+
+VERBS = (
+    "new", "check", "camera", "board", "plan", "study", "simulate", "calibrate", "validate",
+    "watch", "diff", "export", "servo", "reproduce",
+)  # fmt: skip
+PLACES = {"files", "file", "folder", "kept", "trial"}
+"""Keys of the printed object with paths, which a result that is not saved has not."""
+VOLATILE = {"timings", "seconds", "wall", "cpu", "solving", "workers"}
+"""Keys of durations."""
+OWN_SUMMARY = {"calibrate", "study"}
+"""Verbs whose results have a shorter summary than the command prints."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A small case of a verb: arguments of the command, and a call of the function."""
+
+    words: tuple[Any, ...]
+    call: Callable[..., Result]
+    progress: bool = True
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory, boards):  # noqa: F811 - the fixture
+    """Two sessions of a machine by a tracker, a calibration of the first, images of a board, a new
+    session, and a printer's file.
+    """
+    folder = tmp_path_factory.mktemp("verbs")
+    make(folder / "first", "gough-stewart")
+    make(folder / "second", "gough-stewart", n=12)
+    (folder / "printer.cfg").write_text(calibrated_cfg())
+    pkmcal.new(board=True).save(folder / "mine")
+    pkmcal.calibrate(folder / "first").save(folder / "held")
+    (folder / "boards").mkdir()
+    for name in ("board.yaml", "p0.png", "p1.png", "p2.png", "p3.png"):
+        shutil.copy(boards / name, folder / "boards" / name)
+    return folder
+
+
+def case(verb: str, work: Path) -> Case:
+    first, second, held = work / "first", work / "second", work / "held"
+    quick = {"runs": 2, "rate": 6.0, "noise": 0.0, "joint_noise": 0.0, "duration": 8.0, "delay": 0}
+    return {
+        "new": lambda: Case(
+            ("--printer", work / "printer.cfg"),
+            lambda: pkmcal.new(printer=work / "printer.cfg"),
+            progress=False,
+        ),
+        "check": lambda: Case((first,), lambda **more: pkmcal.check(first, **more)),
+        "camera": lambda: Case(
+            (work / "boards", "--model", "pinhole", "--to", "ros"),
+            lambda **more: pkmcal.camera(work / "boards", model="pinhole", to=["ros"], **more),
+        ),
+        "board": lambda: Case(
+            (work / "mine",), lambda: pkmcal.board(work / "mine"), progress=False
+        ),
+        "plan": lambda: Case(
+            ("3-rpr", "-n", 4),
+            lambda **more: pkmcal.plan("3-rpr", count=4, **more),
+        ),
+        "study": lambda: Case(
+            ("a", "--runs", 2), lambda **more: pkmcal.study("a", runs=2, **more)
+        ),
+        "simulate": lambda: Case(
+            ("--stations", 1, "--configurations", 2, "--size", "96x72", "--mechanism", "3-rpr"),
+            lambda folder, **more: pkmcal.simulate(
+                folder, "3-rpr", camera=(96, 72), stations=1, configurations=2, **more
+            ),
+        ),
+        "calibrate": lambda: Case(
+            (first, "--holdout", 2), lambda **more: pkmcal.calibrate(first, holdout=2, **more)
+        ),
+        "validate": lambda: Case(
+            (held, second), lambda **more: pkmcal.validate(held, second, **more)
+        ),
+        "watch": lambda: Case(
+            (held, second, "--alpha", 0.02),
+            lambda **more: pkmcal.watch(held, second, alpha=0.02, **more),
+        ),
+        "diff": lambda: Case(
+            (held, first / "mechanism.yaml"),
+            lambda **more: pkmcal.diff(held, first / "mechanism.yaml", **more),
+        ),
+        "export": lambda: Case(
+            (held, "--to", "json"), lambda: pkmcal.export(held, "json"), progress=False
+        ),
+        "servo": lambda: Case(
+            ("3-rpr", "--runs", 2, "--rate", 6, "--noise", 0, "--joint-noise", 0,
+             "--duration", 8, "--delay", 0, "--legs", "1,2,3"),
+            lambda **more: pkmcal.servo("3-rpr", legs=[1, 2, 3], **quick, **more),
+        ),
+        "reproduce": lambda: Case(
+            ("a", "--runs", 2), lambda **more: pkmcal.reproduce("a", runs=2, **more)
+        ),
+    }[verb]()  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Both:
+    """A verb's outputs: the command's object, text and folder, and the function's result."""
+
+    verb: str
+    document: dict[str, Any]
+    folder: Path
+    result: Result
+    progress: list[tuple[str, float]]
+
+    @property
+    def has_progress(self) -> bool:
+        return self.verb not in ("new", "board", "export")
+
+
+@pytest.fixture(scope="module", params=VERBS)
+def both(request, work, quick_plans) -> Both:
+    verb, folder = request.param, work / "out" / request.param
+    progress: list[tuple[str, float]] = []
+    one = case(verb, work)
+    first = [folder] if verb in ("new", "simulate") else []
+    last = [] if first else ["-o", folder]
+    with pytest.MonkeyPatch.context() as patch:
+        have_cores(patch, 1)
+        done = run(verb, *first, *one.words, *last, "--json")
+        assert done.err == ""
+        more = {"folder": work / "simulated"} if verb == "simulate" else {}
+        if one.progress:
+            more["progress"] = lambda text, share: progress.append((text, share))
+        result = one.call(**more)
+    assert done.code == result.exit_code
+    return Both(verb, done.json, folder, result, progress)
+
+
+def lasting(value: Any) -> Any:
+    """A document without durations and times of files."""
+    if isinstance(value, dict):
+        return {key: lasting(item) for key, item in value.items() if key not in VOLATILE}
+    return [lasting(item) for item in value] if isinstance(value, list) else value
+
+
+def contents(path: Path) -> Any:
+    """Content of a file that two runs have in common; of a page, that there is one."""
+    if path.suffix == ".html":
+        return path.read_text(encoding="utf-8").startswith("<!doctype html>")
+    if path.suffix == ".json":
+        return lasting(json.loads(path.read_text(encoding="utf-8")))
+    return path.read_bytes()
+
+
+def test_both_ways_give_the_same_document(both):
+    printed = {key: item for key, item in both.document.items() if key not in PLACES}
+    document = printed_document(both.result.outcome)
+    value = {k: v for k, v in json.loads(json_text(document)).items() if k not in PLACES}
+    assert lasting(value) == lasting(printed)
+    assert printed["exit_code"] in (0, 1)
+
+
+def test_both_ways_write_the_same_files(both, tmp_path):
+    both.result.save(tmp_path / "out")
+    for folder, other in ((both.folder, tmp_path / "out"), (tmp_path / "out", both.folder)):
+        for path in folder.rglob("*.*"):
+            if "batches" not in path.parts:
+                assert contents(other / path.relative_to(folder)) == contents(path), path.name
+    assert all((tmp_path / "out" / name).is_file() for name in both.result.file_list)
+
+
+def test_a_result_is_findings_a_document_and_a_summary(both):
+    result = both.result
+    assert isinstance(result, Result)
+    assert all(isinstance(one, Finding) and one.code for one in result.findings)
+    assert json.loads(json_text(result.document))
+    assert result.exit_code == result.outcome.exit_code
+    assert result.summary().strip()
+    assert "\x1b" not in result.summary()
+    if both.verb not in OWN_SUMMARY:
+        assert result.outcome.verdict.headline.split()[0] in result.summary()
+
+
+def test_progress_is_a_text_and_a_share(both):
+    if not both.has_progress:
+        assert "progress" not in inspect.signature(getattr(pkmcal, both.verb)).parameters
+        return
+    assert both.progress
+    assert all(text and 0 <= share <= 1 for text, share in both.progress)
+
+
+def test_a_folder_with_other_files_is_left_alone(both, tmp_path):
+    names = {"thesis.tex", *both.result.file_list}
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError):
+        both.result.save(tmp_path)
+    assert {(tmp_path / name).read_text() for name in names} == {"mine"}
+
+
+def test_a_result_opens_its_page(both, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    place = both.result.show()
+    assert place.exists()
+    assert opened == [place.as_uri()]
+
+
+# ------------------------------------------------------------------ defaults
+
+
+RENAMED = {("plan", "configurations"): "count"}
+"""Options whose argument has another name."""
+FOR_OUTPUT = {"out", "as_json", "quiet", "rrd", "model", "pictures", "folder"}
+"""Options of outputs, or of loaded files."""
+OTHERWISE = {
+    ("plan", "size"): ("camera", PLANNED_IMAGE_SIZE),
+    ("simulate", "size"): ("camera", default_camera().image_size),
+    ("servo", "hand_rotation"): ("hand_rotation", round(np.rad2deg(HAND_ROTATION), 12)),
+    ("reproduce", "papers"): ("papers", None),
+    ("study", "out"): ("out", None),
+}
+"""Options that a person types otherwise: the argument that they become, and their default."""
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
+    command = inspect.signature(getattr(import_module(f"pkmcal.commands.{verb}"), verb)).parameters
+    function = inspect.signature(getattr(pkmcal, verb)).parameters
+    defaults = {name: one.default for name, one in function.items()}
+    if verb == "simulate":
+        settings = {one.name: one for one in fields(Settings)}
+        defaults |= {
+            name: one.default for name, one in settings.items() if one.default is not MISSING
+        }
+    common = set()
+    for name, option in command.items():
+        argument, usual = OTHERWISE.get(
+            (verb, name), (RENAMED.get((verb, name), name), option.default)
+        )
+        if argument not in defaults:
+            assert name in FOR_OUTPUT or (name == "force" and verb in ("calibrate", "diff")), name
+            continue
+        common.add(argument)
+        if (verb, name) in OTHERWISE:
+            typed = option.default
+            size = "{}x{}".format(*usual) if isinstance(usual, tuple) else usual
+            assert typed == size or str(typed) == str(size) or usual is None
+        elif option.default is not option.empty:
+            given = defaults[argument]
+            same = option.default == given or str(option.default) == str(given)
+            assert same or not (option.default or given), name
+    if verb != "simulate":
+        assert set(function) - common <= {"progress"}
+    assert "Parameters" in inspect.getdoc(getattr(pkmcal, verb))
+    for name, argument in function.items():
+        assert name in inspect.getdoc(getattr(pkmcal, verb))
+        assert argument.annotation is not inspect.Parameter.empty
