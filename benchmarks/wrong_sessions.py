@@ -384,7 +384,7 @@ def main() -> None:
         for fact, what in FACTS.items():
             if options.only and not any(word in fact for word in options.only):
                 continue
-            for in_view in [kind for kind in what.seen if kind in kinds]:
+            for in_view in [kind for kind in what.targets if kind in kinds]:
                 jobs = [(fact, in_view, seed, keep) for seed in seeds]
                 value = list(pool.map(outcome, *zip(*jobs, strict=True)))
                 print_outcomes(f"{fact}, {in_view}", value)

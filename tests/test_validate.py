@@ -476,7 +476,7 @@ def saved_result(demo, tmp_path_factory):
     session = of_two_stations(shutil.copytree(demo.session, folder / "session"))
     made = run("calibrate", session, "--holdout", 3, "-o", folder / "c", "--json")
     value = run("validate", folder / "c", session, "-o", folder / "v", "--json")
-    return SimpleNamespace(folder=folder, made=made, found=value)
+    return SimpleNamespace(folder=folder, made=made, result=value)
 
 
 def test_calibrate_with_some_held_out(saved_result):
@@ -501,15 +501,15 @@ def test_calibrate_with_some_held_out(saved_result):
 
 
 def test_validate_on_what_was_held_out(saved_result, demo):
-    assert saved_result.found.err == ""
-    result = saved_result.found.json
+    assert saved_result.result.err == ""
+    result = saved_result.result.json
     assert_keys("validate --json", result)
     out = saved_result.made.json["holdout"]["left_out"]["configurations"]
     assert result["new_data"]["configurations"] == out
     assert set(result["known_configurations"]).isdisjoint(out)
     assert result["repeated_configurations"] == []
     assert (
-        result["exit_code"] == saved_result.found.code == (0 if result["verdict"]["usable"] else 1)
+        result["exit_code"] == saved_result.result.code == (0 if result["verdict"]["usable"] else 1)
     )
     page = (saved_result.folder / "v" / "validation.html").read_text()
     assert result["verdict"]["headline"] in page

@@ -108,7 +108,7 @@ class Watched:
 
     def evidence(self, machine, rng, few=FEW):
         """Watch of one session of ``machine``, against a calibration of the true one."""
-        calibrated, data = self.calibrated(rng), self.seen(machine, rng, few)
+        calibrated, data = self.calibrated(rng), self.observe(machine, rng, few)
         start = start_state(calibrated, data, self.pool.T_camera_base)
         return change_evidence(
             hold(calibrated, data, start, Trust.full(data)), CalibrationPrior(self.covariance)
@@ -204,7 +204,7 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
     every, factor = whole_machine(watched.true), []
     for k in range(8):
         rng = np.random.default_rng([k, 8])
-        calibrated, data = watched.calibrated(rng), watched.seen(watched.true, rng)
+        calibrated, data = watched.calibrated(rng), watched.observe(watched.true, rng)
         start = start_state(calibrated, data, watched.pool.T_camera_base)
         held = hold(calibrated, data, start, Trust.full(data))
         exact = change_evidence(held, CalibrationPrior(0 * watched.covariance))
@@ -216,7 +216,7 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
 def test_other_frames_and_cameras_change_nothing(watched):
     """A test does not depend on the base frame and the camera's pose."""
     rng = np.random.default_rng(2)
-    data, calibrated = watched.seen(watched.true, rng), watched.calibrated(rng)
+    data, calibrated = watched.observe(watched.true, rng), watched.calibrated(rng)
     start = start_state(calibrated, data, watched.pool.T_camera_base)
     first = change_evidence(
         hold(calibrated, data, start, Trust.full(data)), CalibrationPrior(watched.covariance)
@@ -238,7 +238,7 @@ def test_other_frames_and_cameras_change_nothing(watched):
 def test_the_regression_predicts_what_a_change_does(watched, by):
     """The same data with a machine that has changed: w moves by X times the change."""
     rng = np.random.default_rng(6)
-    data = watched.seen(watched.true, rng)
+    data = watched.observe(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     in_view = [
         change_evidence(
@@ -484,7 +484,7 @@ def test_three_poses_of_a_board_do_not_determine_a_hexapod():
 
 def test_poses_that_cannot_be_found(watched, monkeypatch):
     rng = np.random.default_rng(1)
-    data = watched.seen(watched.true, rng)
+    data = watched.observe(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     module = "pkmcal.judge.fixed_machine.minimise"
     monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,), None))

@@ -94,6 +94,7 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
             "hand_rotation": Range(0, 180, default=3.0, unit="deg"),
             "seed": _SEED,
         },
+        "show": {"port": _whole(0, 65_535, 0)},
         "simulate": {
             "stations": _whole(1, 100, 3),
             "configurations": _whole(2, MOST_CONFIGURATIONS, 15),

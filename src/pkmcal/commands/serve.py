@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from pkmcal import terminal
 from pkmcal.commands import console
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def serve(
         if as_json:
             console.print_json({"url": address})
         else:
-            out = console.out()
+            out = terminal.out()
             out.print(f"The page is at\n\n  {address}\n", soft_wrap=True)
             out.print("It is served to this computer only, until you press Ctrl-C.")
         sys.stdout.flush()

@@ -7,8 +7,15 @@ from typing import Annotated
 
 import typer
 
+from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.serve import serve
+
+EXAMPLES = """\
+pkmcal show gough-stewart
+pkmcal show my-machine/mechanism.yaml
+pkmcal show out -o machine.html
+"""
 
 
 def show(
@@ -21,7 +28,13 @@ def show(
     ],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="HTML", help="Write a page instead of serving one."),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="HTML",
+            help="Write a page instead of serving one.",
+            rich_help_panel=console.OUTPUT_GROUP,
+        ),
     ] = None,
     port: Annotated[
         int, console.number_option("show", "port", "N", "A free one unless given.")
@@ -51,11 +64,11 @@ def show(
     if as_json:
         console.print_json({"exit_code": 0, "file": str(out)})
     else:
-        console.print_points(
-            console.out(),
+        terminal.print_points(
+            terminal.out(),
             [
                 (
-                    console.MARK_SIGNS["good"],
+                    terminal.MARK_SIGNS["good"],
                     f"{view.machine.name} is in {out}: open it in a browser.",
                 )
             ],
