@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from pkmcal.calibration.localization import localize_by_legs, platform_poses, read_images
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe import pose_likelihood
+from pkmcal.observe import pose_likelihood, station_localization
 from pkmcal.observe.distance_tables import (
     DISTANCE_TABLE_OPTIONS,
     direction_of,
@@ -243,17 +243,23 @@ def test_the_station_is_found_from_thirty_degrees_and_thirty_centimetres(seed):
 
 
 @pytest.mark.parametrize(("degrees", "distance", "far"), [(5.0, 0.05, False), (14.0, 0.14, True)])
-def test_a_search_goes_further_only_where_the_pose_is_not_near(degrees, distance, far):
+def test_a_search_goes_further_only_where_the_pose_is_not_near(monkeypatch, degrees, distance, far):
     """A confirmed pose is not the station's if it is further away than the search: so near to a
     wrong rough pose nothing is found by chance.
     """
-    rough, view = rough_pose(3, degrees, distance), view_of(images())
-    localization = find_station(view, rough, np.random.default_rng(3))
+    searched, searching = [], station_localization._random_search
+
+    def noted(view, values, *rest):
+        searched.append(values.nearness.tried)
+        return searching(view, values, *rest)
+
+    monkeypatch.setattr(station_localization, "_random_search", noted)
+    rough = rough_pose(3, degrees, distance)
+    localization = find_station(view_of(images()), rough, np.random.default_rng(3))
     assert localization.sure
     assert inconsistent_poses(localization.T_camera_base) < 5
-    # without the wide search only a near pose is found
-    near = replace(LOCALIZATION_OPTIONS, far=LOCALIZATION_OPTIONS.near)
-    assert find_station(view, rough, np.random.default_rng(3), near).sure != far
+    assert searched[0] == LOCALIZATION_OPTIONS.near.tried
+    assert (LOCALIZATION_OPTIONS.far.tried in searched) == far
 
 
 def test_a_near_pose_is_near_by_turn_and_shift_together():
@@ -453,7 +459,7 @@ def test_a_shadow_darkens_and_is_left_out_beside_what_casts_it():
 
 
 @pytest.mark.slow
-def test_a_place_that_half_of_the_images_miss_is_asked_about_again(tmp_path):
+def test_a_place_that_half_of_the_images_miss_is_asked_about_again(tmp_path, monkeypatch):
     """Of three equal legs a search in five images ends beside the pose that all ten lead to: it is
     accepted once the other images are tested at that pose, and not before.
     """
@@ -470,5 +476,5 @@ def test_a_place_that_half_of_the_images_miss_is_asked_about_again(tmp_path):
     eye, there = (inverse(T)[:3, 3] for T in (localization.T_camera_base, true))
     assert localization.good
     assert np.linalg.norm(eye - there) < 0.1 * np.linalg.norm(there)
-    strict = replace(LOCALIZATION_OPTIONS, rival=0.0)
-    assert not find_station(view, None, np.random.default_rng(1), strict).good
+    monkeypatch.setattr(station_localization, "_second_search", lambda *_: 1.0)
+    assert not find_station(view, None, np.random.default_rng(1)).good
