@@ -131,17 +131,17 @@ KILLED = """
 import itertools, json, os, pickle, shutil, signal, sys
 from contextlib import suppress
 from pathlib import Path
-import pkmcal.calibration.calibrate
+from pkmcal.api import calibrate
 from pkmcal.calibration.results import check_output
-from pkmcal.commands import calibrate, cli
-from pkmcal.commands import finish as end
+from pkmcal.commands import cli
 from pkmcal.errors import InputError
 from pkmcal.files import read_text, write_folder
+from pkmcal.report import calibration as report
 
 session, new, keep, made = map(Path, sys.argv[1:])
 found = pickle.loads(made.read_bytes())
-pkmcal.calibration.calibrate.calibrate_session = lambda *_, **_more: found
-write, out = calibrate.write_outcome, session / "calibration"
+calibrate.calibrate_session = lambda *_, **_more: found
+out = session / "calibration"
 old = keep / "old"
 shutil.copytree(out, old)
 
@@ -166,13 +166,11 @@ def readable():
     return False
 
 
-def again_and_again(outcome, folder, files, over):
+def again_and_again(folder, texts, over):
     # Calibration and page are made once, and written again and again, with less and less time.
     global left
     # The page is cut short: megabytes, copied a hundred times.
-    made = end.contents(outcome, files)
-    made["report.html"] = made["report.html"][:10_000]
-    end.contents = lambda *_: made
+    made = {**texts, "report.html": texts["report.html"][:10_000]}
     read = []
     for left in itertools.count():
         shutil.rmtree(out)
@@ -180,7 +178,7 @@ def again_and_again(outcome, folder, files, over):
         child = os.fork()
         if child == 0:
             sys.addaudithook(count_down)
-            write(outcome, folder, files, over)
+            write_folder(folder, made, over)
             os._exit(0)
         if os.waitpid(child, 0)[1] == 0:
             break
@@ -194,12 +192,12 @@ def again_and_again(outcome, folder, files, over):
         shutil.copytree(out, state / "next")
     shutil.rmtree(out)
     shutil.copytree(old, out)
-    write(outcome, folder, files, over)
+    write_folder(folder, made, over)
     shutil.copytree(out, new)
     (keep / "old" / "readable").write_text(json.dumps(read))
 
 
-calibrate.write_outcome = again_and_again
+report.write_folder = again_and_again
 sys.exit(cli.main(["calibrate", str(session), "--quiet"]))
 """
 
