@@ -217,7 +217,9 @@ def quick_plans():
     candidates.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.api.plan.plan_measurements", partial(plan_measurements, options=FEW_CANDIDATES))
+        patch.setattr(
+            "pkmcal.api.plan.plan_measurements", partial(plan_measurements, options=FEW_CANDIDATES)
+        )
         yield
 
 
