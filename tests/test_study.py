@@ -430,17 +430,3 @@ def test_a_file_that_is_spoilt_is_done_again(tmp_path, one_process):
     np.testing.assert_array_equal(
         *(r.results[0].values("position", *JOINT_ESTIMATE_KEY) for r in (one, two))
     )
-
-
-def test_parquet(tmp_path, one_process, monkeypatch):
-    words = ("study", "a", "--runs", 4, "-o", tmp_path / "out", "--table", "parquet")
-    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    done = run(*words)
-    assert done.code == 2
-    assert "pip install '.[parquet]'" in done.err
-    monkeypatch.undo()
-    parquet = pytest.importorskip("pyarrow.parquet")
-    assert run(*words).code == 0
-    table = parquet.read_table(tmp_path / "out" / "study.parquet").to_pydict()
-    assert table["run"] == [0, 1, 2, 3]
-    assert all(np.array(table["position"]) > 0)

@@ -236,7 +236,7 @@ def test_a_result_opens_its_page(both, monkeypatch):
 
 RENAMED = {("plan", "configurations"): "count"}
 """Options whose argument has another name."""
-FOR_OUTPUT = {"out", "as_json", "quiet", "rrd", "model", "pictures", "folder"}
+FOR_OUTPUT = {"out", "as_json", "quiet", "model", "pictures", "folder"}
 """Options of outputs, or of loaded files."""
 OTHERWISE = {
     ("plan", "size"): ("camera", PLANNED_IMAGE_SIZE),

@@ -15,7 +15,6 @@ from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.outcome import Outcome
 from pkmcal.ranges import default
 from pkmcal.report.calibration import outcome_of, save
-from pkmcal.report.rrd import write_rrd
 from pkmcal.session.load import Session
 
 Method = Literal["bundle", "four-step", "linear", "inverse-kinematic"]
@@ -57,15 +56,6 @@ class CalibrationResult(Calibration, Result):
         was kept. Raises InputError if the folder holds anything else, or cannot be written.
         """
         return save(self, folder, force=force, outcome=self.outcome)
-
-    def record(self, path: Path | str) -> None:
-        """Write a recording, NAME.rrd, of images, edges, poses and the result for rerun's viewer
-        (``rerun NAME.rrd``).
-
-        Needs ``pip install '.[rerun]'``. Raises InputError without it, if the file cannot be
-        written, or if an image cannot be read any more.
-        """
-        write_rrd(self, path)
 
 
 def calibrate(

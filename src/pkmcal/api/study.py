@@ -6,15 +6,12 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
 
 from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, Progress, Result
-from pkmcal.errors import InputError
 from pkmcal.outcome import Outcome
 from pkmcal.ranges import check_number, default
 from pkmcal.studies.cluster import on_cluster
@@ -24,24 +21,19 @@ from pkmcal.studies.store import BATCHES_FOLDER, Store
 from pkmcal.studies.study_report import outcome_of
 from pkmcal.studies.sweep import Value, cells_of, in_words, parsed, subject_of
 from pkmcal.studies.tasks import Runner
-from pkmcal.wording import install_step
 
-TableFormat = Literal["csv", "parquet"]
 RUN_ROWS_DESCRIPTION = "one row a run"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class StudyResult(SweepResult, Result):
-    """Study with its files: ``found``, ``gains``. table : format of the table of runs."""
-
-    table: TableFormat = "csv"
+    """Study with its files: ``found``, ``gains``."""
 
     own_files = MappingProxyType(
         {
             "study.html": PAGE_DESCRIPTION,
             "study.json": NUMBERS_DESCRIPTION,
             "study.csv": RUN_ROWS_DESCRIPTION,
-            "study.parquet": RUN_ROWS_DESCRIPTION,
             BATCHES_FOLDER: "the finished batches",
         }
     )
@@ -50,13 +42,13 @@ class StudyResult(SweepResult, Result):
     @property
     def file_list(self) -> Mapping[str, str]:
         """Page, document, and the table of runs."""
-        names = ("study.html", "study.json", f"study.{self.table}")
+        names = ("study.html", "study.json", "study.csv")
         return {name: self.own_files[name] for name in names}
 
     @cached_property
     def outcome(self) -> Outcome:
         """Verdict, tables and sections of the page, and the table of runs."""
-        return outcome_of(self, table=f"study.{self.table}")
+        return outcome_of(self)
 
 
 def study(
@@ -67,7 +59,6 @@ def study(
     seed: int = 0,
     out: Path | str | None = None,
     scheduler: str | None = None,
-    table: TableFormat = "csv",
     progress: Progress | None = None,
 ) -> StudyResult:
     """Study the accuracy of simulated calibrations, without writing results.
@@ -86,8 +77,6 @@ def study(
         A folder for finished batches, from which an interrupted study continues.
     scheduler :
         The address of a Dask cluster; the local cores are used without one.
-    table :
-        Format of the table of runs that ``save`` writes; ``parquet`` needs pyarrow.
     progress :
         Called with a text and the share done, 0 to 1.
 
@@ -107,12 +96,6 @@ def study(
         vary = [f"{name}={','.join(map(str, values))}" for name, values in each.items()]
     elif isinstance(vary, str):
         vary = [vary]
-    if table == "parquet" and find_spec("pyarrow") is None:
-        raise InputError(
-            "a Parquet table needs pyarrow, which is not installed",
-            where="--table",
-            next_step=f"{install_step('parquet')}; or leave the option out",
-        )
     check_number("study", "runs", runs)
     check_number("study", "seed", seed)
     runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
@@ -126,6 +109,4 @@ def study(
     with opened as store:
         results = run_all(settings, runs, seed, progress, runner, store, names)
     found = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
-    return StudyResult(
-        studied, varied, tuple(cells), tuple(results), found, runs, seed, table=table
-    )
+    return StudyResult(studied, varied, tuple(cells), tuple(results), found, runs, seed)

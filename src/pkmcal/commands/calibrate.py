@@ -49,14 +49,6 @@ def calibrate(
             rich_help_panel=console.OUTPUT_GROUP,
         ),
     ] = False,
-    rrd: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Write a recording for rerun's viewer as well.",
-            rich_help_panel=console.OUTPUT_GROUP,
-        ),
-    ] = None,
     as_json: console.Json = False,
     quiet: Annotated[
         bool,
@@ -68,10 +60,7 @@ def calibrate(
     """Calibrate the machine; write model, numbers and report."""
     import pkmcal
     from pkmcal.api.calibrate import CalibrationResult
-    from pkmcal.report.rrd import check_rrd
 
-    if rrd is not None:
-        check_rrd(rrd)
     loaded = pkmcal.load_session(session, model)
     folder = console.output_folder(
         out, loaded.folder / "calibration", CalibrationResult, force=force
@@ -81,8 +70,4 @@ def calibrate(
             loaded, method=method, seed=seed, refine_camera=refine_camera, holdout=holdout,
             progress=progress,
         )  # fmt: skip
-        if rrd is not None:
-            progress("Writing the recording", 0.96)
-            result.record(rrd)
-    more = {} if rrd is None else {str(rrd.absolute()): "rerun opens it"}
-    return finish(result, folder, force=force, more=more, as_json=as_json, quiet=quiet)
+    return finish(result, folder, force=force, as_json=as_json, quiet=quiet)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -57,10 +57,6 @@ def study(
     ] = default("study", "runs"),
     seed: console.Seed = 0,
     out: Annotated[Path, console.folder("Folder for results and finished batches.")] = STUDY_FOLDER,
-    table: Annotated[
-        Literal["csv", "parquet"],
-        typer.Option(help="Format of the table of runs.", rich_help_panel=console.OUTPUT_GROUP),
-    ] = "csv",
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Scheduler of a trusted Dask cluster to use."),
@@ -77,7 +73,7 @@ def study(
         with console.progress(as_json) as progress:
             result = pkmcal.study(
                 subject, vary or (), runs=runs, seed=seed, out=folder, scheduler=scheduler,
-                table=table, progress=progress,
+                progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
         if not as_json:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,11 +50,6 @@ HOW_TOGETHER = (
     " frames that the parameters refer to; what a frame or the file holds is left out, and of"
     " values that are tied one stands for all."
 )
-LATEX_SIGNS = {
-    "%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "−": "$-$", "–": "--", "µ": r"\textmu ",
-    "°": r"$^\circ$", "σ": r"$\sigma$", "\N{NARROW NO-BREAK SPACE}": r"\,",
-}  # fmt: skip
-"""Characters that are special to LaTeX, or unknown to it, and their replacements."""
 PARAMETER_SOURCES = {
     "data": ("data", "the data decide"),
     "drawing": ("nominal", "the nominal model decides more than the data"),
@@ -123,7 +117,6 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
         groups=groups,
         downloads={
             "parameters.csv": _data_url("text/csv", parameters_csv(estimates)),
-            "parameters.tex": _data_url("application/x-tex", parameters_tex(groups)),
             "parameters.json": _data_url(
                 "application/json", json_text({"parameters": estimates.records()})
             ),
@@ -140,19 +133,6 @@ def parameters_csv(estimates: ParameterEstimates) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return stream.getvalue()
-
-
-def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
-    """LaTeX tabular, rounded as on the page."""
-    signs = str.maketrans(LATEX_SIGNS)
-    lines = [
-        r"\begin{tabular}{rlrrrl}",
-        r"Leg & Parameter & Nominal model & Calibrated & $\sigma$ & Unit \\ \hline",
-    ]
-    for row in (row for group in groups for row in group.rows):
-        cells = (str(row.leg or ""), row.label, row.nominal, row.calibrated, row.sigma, row.unit)
-        lines.append(" & ".join(cell.translate(signs) for cell in cells) + r" \\")
-    return "\n".join([*lines, r"\end{tabular}"]) + "\n"
 
 
 def _data_url(kind: str, text: str) -> str:

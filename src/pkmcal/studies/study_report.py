@@ -7,7 +7,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -56,8 +55,8 @@ PAPER_STUDY_METHOD_TEXT = (
 )
 
 
-def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
-    """Outcome of ``pkmcal study``. table : file name of the table of runs."""
+def outcome_of(study: SweepResult) -> Outcome:
+    """Outcome of ``pkmcal study``."""
     gains, bad = study.gains, [c for c in study.found if c.honest is False]
     failing = [cell for cell in study.found if cell.failed.value > MANY_FAILED]
     paper = not hasattr(study.subject.design, "observe")
@@ -88,7 +87,7 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
         findings=study.subject.findings,
         closing=f"{count(study.runs * len(study.found), 'run')} in {seconds}.",
         document=study_document(study),
-        texts={table: runs_bytes(study, table)},
+        texts={"study.csv": runs_csv(study)},
     )
 
 
@@ -444,14 +443,9 @@ def _runs_of(result: StudyResult[SweptSetting], names: list[str]) -> dict[str, l
     return out
 
 
-def runs_bytes(study: SweepResult, name: str) -> str | bytes:
-    """The table of runs as CSV, or as Parquet if its name ends in ``.parquet``."""
+def runs_csv(study: SweepResult) -> str:
+    """The table of runs as CSV."""
     table = runs_table(study)
-    if name.endswith(".parquet"):
-        pyarrow, parquet = (import_module(name) for name in ("pyarrow", "pyarrow.parquet"))
-        sink = io.BytesIO()
-        parquet.write_table(pyarrow.table(table), sink)
-        return sink.getvalue()
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(table)
