@@ -77,10 +77,11 @@ class ImageEvidenceOptions:
     # machine of equal parts looks the same from each. The refusal names the pose as a rival
     pose_by_hand: float = 1000.0
     # share of the mean log-likelihood ratio of a localized machine's images by which another name
-    # has to be likelier: between two nearly equal configurations, errors of the nominal model
-    # decide, of which the likelihood contains the scatter but not that all images of a station
-    # share them. Their effect grows with the evidence, so it is a share and no number of nats. On
-    # simulated machines, exchanged names had 0.2 to 2 times as much, right names up to 0.03
+    # has to be likelier, or another numbering of its legs: between two nearly equal configurations,
+    # and between equal parts of a machine, errors of the nominal model decide, of which the
+    # likelihood contains the scatter but not that all images of a station share them. Their effect
+    # grows with the evidence, so it is a share and no number of nats. On simulated machines,
+    # exchanged names had 0.2 to 2 times as much, right names up to 0.03
     right_name_share: float = 0.1
 
 
@@ -257,9 +258,7 @@ def _mixed_up(
         starts.append(station.by_hand)
     begin = np.array(starts).reshape(-1, 4, 4)
 
-    def searched(
-        images: Integers, begin: Array = begin, at_once: bool = not station.elsewhere
-    ) -> EvidenceLevel[ImageHypothesis]:
+    def searched(images: Integers) -> EvidenceLevel[ImageHypothesis]:
         def ratios(hypotheses: Sequence[ImageHypothesis]) -> Array:
             readings = [view.joints, *(h.readings for h in hypotheses if h.readings is not None)]
             own, *together = likelihood_nearby(
@@ -275,7 +274,7 @@ def _mixed_up(
                 values[k] = likelihood_nearby(other, joints, begin, wide, images, rng)[0]
             values = (values - own) / localization.correlation_length
             # at a confirmed pose another explanation has to be better at once
-            return np.where(values > 0, values, -np.inf) if at_once else values
+            return values if station.elsewhere else np.where(values > 0, values, -np.inf)
 
         return EvidenceLevel(
             f"{len(images)} images", ratios, decides=False, most=SEARCH_OPTIONS.most
@@ -288,17 +287,7 @@ def _mixed_up(
     hypotheses, others = list(_hypotheses(station)), list(_other_images(station, options))
     some = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
     count = len(hypotheses) + len(others)
-    error = _likelier(station, [*others, *some], in_order, rng, options, count)
-    if error is None or not _any_numbering(station):
-        return error
-    # another numbering explains images no worse by itself, since the camera may stand anywhere, but
-    # it may explain as well what seems to be another mistake
-    numberings = list(_numberings(station))
-    anywhere = searched(view.few(FEW_CONFIGURATIONS), np.zeros((0, 4, 4)), at_once=False)
-    alike = [one.hypothesis for one in posterior(numberings, [anywhere], SEARCH_OPTIONS)]
-    count += len(numberings)
-    every = [*others, *some, *alike]
-    return _likelier(station, every, in_order, rng, options, count) or error
+    return _likelier(station, [*others, *some], in_order, rng, options, count)
 
 
 def _likelier(
@@ -341,11 +330,18 @@ def _likelier(
         return out
 
     level = EvidenceLevel("full search", by_full_search)
-    errors = [
-        one.hypothesis.error for one in likely(posterior(hypotheses, [level], SEARCH_OPTIONS))
-    ]
-    if not errors:
+    found = likely(posterior(hypotheses, [level], SEARCH_OPTIONS))
+    if not found:
         return None
+    if _any_numbering(station):
+        # another numbering alone explains the images no better, since the camera may stand
+        # anywhere, but it may explain as well what seems to be another mistake
+        numberings = list(_numberings(station, options))
+        count += len(numberings)
+        alike = posterior(numberings, [_searched_anywhere(station, rng)], SEARCH_OPTIONS)
+        some = [one.hypothesis for one in (*found, *alike)]
+        found = likely(posterior(some, [level], SEARCH_OPTIONS)) or found
+    errors = [one.hypothesis.error for one in found]
     error, also = errors[0], [one.what for one in errors[1:]]
     if station.elsewhere and localization.good:
         also.append("the pose by hand is of another side of the machine")
@@ -356,6 +352,22 @@ def _likelier(
     return error.with_fields(
         found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}"
     )
+
+
+def _searched_anywhere(
+    station: SuspectStation, rng: np.random.Generator
+) -> EvidenceLevel[ImageHypothesis]:
+    """Evidence for other readings by a short search in few images, wherever the camera stands."""
+    view = station.view
+    few, anywhere = view.few(FEW_CONFIGURATIONS), np.zeros((0, 4, 4))
+
+    def ratios(hypotheses: Sequence[ImageHypothesis]) -> Array:
+        readings = np.stack([view.joints, *(h.apply(view).joints for h in hypotheses)])
+        own, *values = likelihood_nearby(view, readings, anywhere, True, few, rng).tolist()
+        return (np.array(values) - own) / station.localization.correlation_length
+
+    name = f"{len(few)} images, anywhere"
+    return EvidenceLevel(name, ratios, decides=False, most=SEARCH_OPTIONS.most)
 
 
 def log_prior_of_each(machine: Machine, joints: Array) -> float:
@@ -419,9 +431,15 @@ def _any_numbering(station: SuspectStation) -> bool:
     return station.localization.good and station.by_hand is None
 
 
-def _numberings(station: SuspectStation) -> Iterator[ImageHypothesis]:
-    """Hypotheses about the numbering of the legs."""
-    return (one for one in _of_readings(station) if one.code.startswith(NUMBERING))
+def _numberings(
+    station: SuspectStation, options: ImageEvidenceOptions
+) -> Iterator[ImageHypothesis]:
+    """Hypotheses about the numbering of the legs of a localized machine."""
+    own = station.localization
+    equal = options.right_name_share * own.log_likelihood_ratio / own.correlation_length
+    for one in _of_readings(station):
+        if one.code.startswith(NUMBERING):
+            yield replace(one, log_prior=one.log_prior - equal)
 
 
 def _with_half_radii(view: StationView) -> StationView:
