@@ -338,8 +338,8 @@ def _likelier(
         # anywhere, but it may explain as well what seems to be another mistake
         numberings = list(_numberings(station, options))
         count += len(numberings)
-        alike = posterior(numberings, [_searched_anywhere(station, rng)], SEARCH_OPTIONS)
-        some = [one.hypothesis for one in (*found, *alike)]
+        equal = posterior(numberings, [_searched_anywhere(station, rng)], SEARCH_OPTIONS)
+        some = [one.hypothesis for one in (*found, *equal)]
         found = likely(posterior(some, [level], SEARCH_OPTIONS)) or found
     errors = [one.hypothesis.error for one in found]
     error, also = errors[0], [one.what for one in errors[1:]]
