@@ -14,9 +14,10 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.localization import platform_poses
 from pkmcal.calibration.pose_hypotheses import (
-    closure_limit,
+    CLOSURE,
     closure_misfits,
     explain_closure,
+    nominal_misfit,
 )
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import perturb
@@ -31,6 +32,7 @@ from pkmcal.outcome.hypotheses import (
     Hypothesis,
     decide,
     estimate_level,
+    harmless_misfit,
     likely,
     log_likelihood,
     parameter_cost,
@@ -173,6 +175,18 @@ def test_the_log_likelihood_has_the_likeliest_scale(misfit):
     assert log_likelihood(np.array(misfit), n) == pytest.approx(each.max(), abs=1e-5)
 
 
+@pytest.mark.parametrize("n", [8.0, 30.0])
+@pytest.mark.parametrize("prior", [0.0, -4.0])
+def test_nothing_can_be_reported_of_a_harmless_misfit(n, prior):
+    least = harmless_misfit(n, prior)
+    for factor, reported in ((0.99, False), (1.01, True)):
+        null, explained = log_likelihood(np.array([factor * least, 1.0]), n)
+        (best,) = posterior(
+            [named("one", log_prior=prior)], [level("residuals", {"one": explained - null})[0]]
+        )
+        assert (decide([best]) is not None) == reported
+
+
 def test_no_misfit_is_worse_than_an_infinite_one():
     np.testing.assert_array_equal(log_likelihood(np.array([np.inf, np.nan]), 9), -np.inf)
 
@@ -261,7 +275,7 @@ def test_closure_finds_the_mistake(tmp_path, name, kind, code):
 def contradicted(machine, measurements, rng):
     """Whether poses and readings contradict each other."""
     (misfit,) = closure_misfits(machine, [measurements])
-    return misfit > closure_limit(machine, measurements, rng)
+    return misfit > CLOSURE.most_nominal_error * nominal_misfit(machine, measurements, rng)
 
 
 @pytest.mark.parametrize("name", ["gough-stewart", "delta"])
@@ -293,13 +307,21 @@ def test_right_readings_contradict_no_poses(tmp_path, name, kind):
     assert not contradicted(session.machine, right, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("name", ["delta", "gough-stewart"])
+@pytest.mark.parametrize("name", ["delta", "gough-stewart", "h4"])
 def test_exchanged_columns_are_refused_before_any_estimate_of_them(tmp_path, name):
     """An estimate from them takes a thousand steps; one from the right order is made."""
     made = make(tmp_path / "session", name, n=24)
     write_joints(made.folder, made.joints[:, [1, 0, *range(2, made.joints.shape[1])]])
     error = explain_closure(load_session(made.folder), Boards()).error
     assert error.code == "readings.exchanged"
+
+
+@pytest.mark.parametrize(("name", "scale"), [("delta", 3.0), ("delta", 10.0), ("h4", 2.0)])
+def test_a_poor_nominal_model_is_no_mistake_in_the_readings(tmp_path, name, scale):
+    """Its errors, of an unknown factor on the prior sigmas, are in all hypotheses alike."""
+    for seed in range(2):
+        made = make(tmp_path / f"session {seed}", name, n=24, seed=100 + seed, scale=scale)
+        assert explain_closure(load_session(made.folder), Boards()).error is None
 
 
 def test_two_mistakes_are_named_together(tmp_path):

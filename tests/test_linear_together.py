@@ -202,7 +202,7 @@ def test_verdict_states_how_far_the_method_goes(scenes):
         np.zeros(0, dtype=int),
         estimate.state.T_camera_base,
     )
-    information = Identifiability(0, 0, 0, (), (), np.zeros(0))
+    information = Identifiability(0, 0, 0, (), (), np.zeros(0), np.zeros((0, 0)))
     verdict = assess(observation, estimate, Findings(information, (), (), 1.0), "linear")
     assert not verdict.usable
     (base,) = verdict.of("estimate.base_only")

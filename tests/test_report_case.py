@@ -39,7 +39,8 @@ class Case:
     estimate: Estimate
 
 
-IDENTIFIABILITY = Findings(Identifiability(54, 12, 42, (), (), np.full(42, 20.0)), (), (), 1e-3)
+RANKS = Identifiability(54, 12, 42, (), (), np.full(42, 20.0), np.zeros((42, 54)))
+IDENTIFIABILITY = Findings(RANKS, (), (), 1e-3)
 """Findings if the data determine everything."""
 
 

@@ -18,8 +18,9 @@ from conftest import FEW_IMPUTATIONS
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_responses import (
     LEAST_RESPONSE_GAIN,
-    ResponseEstimate,
+    ResponseComparison,
     _scored,
+    other_response,
     responses_by_edges,
 )
 from pkmcal.calibration.localization import read_images
@@ -30,6 +31,7 @@ from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import bundle
 from pkmcal.judge.new_data import _as_calibrated
 from pkmcal.observe.legs import measure
+from pkmcal.outcome.hypotheses import Ranked
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from test_calibration import check_calibration
@@ -279,7 +281,7 @@ def test_a_response_by_which_hardly_an_edge_is_found_is_not_the_images(calibrate
         lambda _: few,
         lambda edges: replace(calibrated.measurements, edges=edges),
     )
-    assert values == ()
+    assert values == ResponseComparison()
 
 
 def test_stations_whose_response_is_stated_are_not_asked_about(calibrated):
@@ -293,7 +295,7 @@ def test_stations_whose_response_is_stated_are_not_asked_about(calibrated):
         replace(session, stations=stations), read_images(session), calibrated.measurements,
         calibrated.estimate, query, query, query,
     )  # fmt: skip
-    assert values == ()
+    assert values == ResponseComparison()
 
 
 @pytest.mark.slow
@@ -307,21 +309,18 @@ def test_a_stated_response_is_not_asked_about(session):
 
 @pytest.mark.parametrize(("gain", "sure"), [(30.0, True), (13.0, False), (-5.0, False)])
 def test_undecided_edges_are_a_warning_with_a_next_step(gain, sure):
-    values = ResponseEstimate(("front", "left"), "linear", gain)
-    assert values.sure == sure
-    assert values.response == ("srgb" if sure else "linear")
+    ranked = Ranked(other_response(("front", "left"), "linear"), gain / 2)
+    values = ResponseComparison((ranked,))
+    assert values.by_entry == (dict.fromkeys(("front", "left"), "srgb") if sure else {})
+    (finding,) = values.findings
     if sure:
-        assert "odds of more than 1000 to 1. They are measured so" in values.finding.text
-        assert (
-            "write response: srgb in session.yaml, under the stations front" in values.finding.text
-        )
+        assert finding.code == "image.response"
+        assert "odds of more than 1000 to 1. They are measured so" in finding.text
+        assert "write response: srgb in session.yaml, under the stations front" in finding.text
     else:
-        assert values.finding.code == "image.response_unknown"
-        assert "levels of the images of front and left are linear" in values.finding.text
-        assert (
-            "Write response: linear or response: srgb in session.yaml, under the"
-            in values.finding.text
-        )
+        assert finding.code == "image.response_unknown"
+        assert "levels of the images of front and left are linear" in finding.text
+        assert "Write response: linear or response: srgb in session.yaml, under the" in finding.text
 
 
 @pytest.mark.slow

@@ -7,18 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kit_sessions import probe_kit
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.conditions import conditions
-from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.covariance import ParameterDirection, identifiability
+from pkmcal.identify.motions import UNIDENTIFIED
 from pkmcal.identify.sentences import Sentence
-from pkmcal.identify.tool import platform_sigma
+from pkmcal.identify.tool import platform_by_parameters, platform_sigma
 from pkmcal.identify.unidentified import Findings, explain, observed_legs
 from pkmcal.identify.verdict import VERDICT, VerdictOptions, assess, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.parameters import unidentified
+from pose_sessions import POSE_SIGMA, estimated, measured
 from test_words import heaved, make, moved
 
 
@@ -45,6 +48,50 @@ def judged(scene, *views):
 @pytest.fixture(scope="module")
 def whole():
     return judged(make("gough-stewart"))
+
+
+NAMING = (
+    *({"new_sine": value} for value in (0.05, 0.1, 0.22, 0.5)),
+    {"inside": (0.9999, 0.99)},
+    {"inside": (0.99, 0.8)},
+    {"sparse_steps": 0},
+    {"frame_weight": 1.0},
+)
+"""Limits that choose names of motions."""
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    """Observation, estimate, legs by station, bed, ranks and verdict of sessions that leave much
+    undetermined.
+
+    Of the three-legged ones, other names for motions once refused the first and the third.
+    """
+    out = []
+
+    def add(observation, estimate, bed=None):
+        observed = np.ones((1, estimate.machine.n_legs), bool)
+        ranks = identifiability(estimate.linearized.info, estimate.machine)
+        verdict = assess(observation, estimate, explain(ranks, estimate, observed, bed=bed))
+        out.append((observation, estimate, observed, bed, ranks, usable_and_codes(verdict)))
+
+    legs = (("3-rps", 5, 7), ("3-rps", 8, 3), ("3-rps", 8, 7), ("gough-stewart", 5, 3))
+    for name, n, seed in legs:
+        observation, estimate, _, _ = judged(make(name, n=n, n_stations=1, seed=seed))
+        add(observation, estimate)
+    heights = probe_kit(tmp_path_factory.mktemp("heights") / "session", n=7).calibrated()
+    add(heights.observation, heights.estimate, heights.findings.bed)
+    rng = np.random.default_rng(1)
+    for name, count in (("linear-delta", 8), ("gough-stewart", 12)):
+        machine = load_mechanism(name)
+        case = measured(machine, moved(machine, rng, count), rng)
+        points = np.diag(np.r_[np.zeros(3), 1 / POSE_SIGMA[3:]])
+        whiten = np.broadcast_to(points, (count, 6, 6)).copy()
+        poses = replace(case.measurements.poses, whiten=whiten)
+        tracked = case._replace(measurements=replace(case.measurements, poses=poses))
+        add(heights.observation, estimated(machine, tracked, rng))
+    assert {usable for *_, (usable, _) in out} == {True, False}
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -138,12 +185,18 @@ def sentence(moves, *names, matters=True):
     return Sentence("It is open.", "Do something.", names, 1, moves, matters)
 
 
+def with_open(findings, *open_):
+    """Findings with other undetermined motions, which are independent."""
+    shift = np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters))
+    return replace(findings, unidentified=open_, undetermined_shift=float(shift))
+
+
 def test_the_share_of_the_nominal_error_decides(whole):
     observation, estimate, findings, _ = whole
     least = VERDICT.undetermined_share * findings.by_nominal
 
     def verdict(*open_):
-        return assess(observation, estimate, replace(findings, unidentified=open_))
+        return assess(observation, estimate, with_open(findings, *open_))
 
     below, above = verdict(sentence(0.9 * least)), verdict(sentence(1.1 * least))
     assert below.usable
@@ -161,8 +214,8 @@ def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
     it.
     """
     observation, estimate, findings, _ = whole
-    open_ = (sentence(2 * VERDICT.undetermined_share * findings.by_nominal),)
-    findings = replace(findings, unidentified=open_)
+    open_ = sentence(2 * VERDICT.undetermined_share * findings.by_nominal)
+    findings = with_open(findings, open_)
     assert not assess(observation, estimate, findings).usable
     unsure = replace(estimate, joint_covariance=1e3 * estimate.joint_covariance)
     assert assess(observation, unsure, findings).usable
@@ -189,15 +242,58 @@ def test_without_a_degree_of_freedom_it_is_refused(whole):
         assert assess(observation, other, findings).usable == (dof > 0)
 
 
-def test_what_the_prior_determines_better_counts_where_a_value_is_undecided(whole):
+def test_what_the_prior_determines_better_counts_as_far_as_data_leave_it(whole):
+    """The more the data determine, the less a direction counts; nothing jumps."""
     observation, estimate, findings, _ = whole
-    name = "legs[3].length.offset"
-    weak = replace(findings, weak=(sentence(findings.by_nominal, name),))
-    assert assess(observation, estimate, weak).usable
-    share = estimate.data_share.copy()
-    share[estimate.machine.parameters.index(name)] = 0.3
-    undecided = replace(estimate, data_share=share)
-    assert not assess(observation, undecided, weak).usable
+    ranks, machine = findings.identifiability, estimate.machine
+    effect = platform_by_parameters(machine, estimate.state.T_base_platform)
+    shifts = np.linalg.norm(effect @ ranks.directions.T, axis=0)
+    first = int(np.argmax(shifts))
+    observed = np.ones((3, machine.n_legs), bool)
+
+    def with_information(value):
+        values = ranks.singular_values.copy()
+        values[first] = value
+        direction = ParameterDirection(("",), (1.0,), value, ranks.directions[first])
+        changed = replace(ranks, singular_values=values, weak=(direction,))
+        return explain(changed, estimate, observed)
+
+    def left(value):
+        return with_information(value).undetermined_shift / shifts[first]
+
+    assert left(0.0) == pytest.approx(1.0, rel=1e-4)
+    assert left(1.0) == pytest.approx(0.5, rel=1e-4)
+    assert left(10.0) == pytest.approx(1 / 101, rel=0.1)
+    # noise, which makes the rest of the estimate's variance
+    half = with_information(1.0)
+    for noise, usable in ((0.9, False), (1.1, True)):
+        sigma = half.undetermined_shift / np.sqrt(1 - noise * VERDICT.least_noise_share)
+        scale = (sigma / platform_sigma(estimate)) ** 2
+        other = replace(estimate, joint_covariance=scale * estimate.joint_covariance)
+        assert assess(observation, other, half).usable == usable
+
+
+@pytest.mark.parametrize("option", NAMING)
+def test_no_verdict_depends_on_how_motions_are_named(sessions, option):
+    for observation, estimate, observed, bed, ranks, expected in sessions:
+        findings = explain(
+            ranks, estimate, observed, bed=bed, options=replace(UNIDENTIFIED, **option)
+        )
+        assert usable_and_codes(assess(observation, estimate, findings)) == expected
+
+
+def usable_and_codes(verdict):
+    return verdict.usable, {(one.code, one.level) for one in verdict.findings}
+
+
+def test_other_limits_choose_other_names(sessions):
+    _, estimate, observed, _, ranks, _ = sessions[0]
+    texts = set()
+    for option in NAMING:
+        options = replace(UNIDENTIFIED, **option)
+        findings = explain(ranks, estimate, observed, options=options)
+        texts.add(tuple(s.text for s in (*findings.unidentified, *findings.weak)))
+    assert len(texts) > 2
 
 
 def test_what_is_not_identified_stands_in_the_file(apart):

@@ -16,7 +16,6 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import CameraRefinement, refinement_of
-from pkmcal.calibration.camera_responses import overruled
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.chance_matches import by_chance, chance_match_reason
 from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
@@ -494,7 +493,7 @@ def _judge(
     others = (
         *_findings_of_estimate(session, value, findings, detections, errors, method == "bundle"),
         *numbering_note(session),
-        *(one.finding for one in turns.responses),
+        *turns.responses.findings,
         *found,
     )
     verdict = assess(
@@ -535,14 +534,11 @@ def _as_measured(session: Session, turns: RefinementResult) -> Session:
             replace(station, camera=turns.cameras.at_station(k))
             for k, station in enumerate(stations)
         )
-    if sure := overruled(turns.responses):
-        stations = tuple(
-            replace(station, response=sure[station.entry], response_given=True)
-            if station.entry in sure
-            else station
-            for station in stations
-        )
-    return session if stations is session.stations else replace(session, stations=stations)
+    if stations is not session.stations:
+        session = replace(session, stations=stations)
+    for repair in turns.responses.repairs:
+        session = repair.apply(session)
+    return session
 
 
 def _findings_of_estimate(

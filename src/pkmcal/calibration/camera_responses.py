@@ -12,7 +12,10 @@ less is right.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
+from math import exp
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +30,14 @@ from pkmcal.levels import MAJORITY
 from pkmcal.measurements import Column, EdgeSet, Measurements, concatenate
 from pkmcal.observe.image_batches import StationImages
 from pkmcal.outcome.finding import Finding, doubtful, note
-from pkmcal.outcome.hypotheses import OPTIONS
+from pkmcal.outcome.hypotheses import (
+    OPTIONS,
+    EvidenceLevel,
+    Hypothesis,
+    Ranked,
+    decide,
+    posterior,
+)
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
@@ -41,55 +51,64 @@ _Camera = tuple[str, Response]
 """A camera's file, and the usual response of its images' kind."""
 
 
-@dataclass(frozen=True)
-class ResponseEstimate:
-    """Response of a camera's images by their edges, where it may not be the usual one.
+ResponseHypothesis = Hypothesis[Session]
+"""Facts: ``stations``, entries in session.yaml; ``usual`` response of their images' kind, by which
+they were measured first, and the ``other`` one."""
 
-    entries : names of its stations in session.yaml. usual : response by which their images were
-    measured first. gain : of chi2 by the change to the other response, less the gain of the change
-    back; NaN where the test failed, with the reason in failure.
+
+def other_response(entries: Sequence[str], usual: Response) -> ResponseHypothesis:
+    """Images of a camera's stations, named in session.yaml, with another response than usual."""
+    other = OTHER_RESPONSE[usual]
+    return ResponseHypothesis(
+        "image.response",
+        listed(entries),
+        partial(_with_response, entries=tuple(entries), response=other),
+        action="repair",
+        facts={"usual": usual, "other": other, "stations": tuple(entries)},
+    )
+
+
+def _with_response(session: Session, entries: tuple[str, ...], response: Response) -> Session:
+    stations = tuple(
+        replace(station, response=response, response_given=True)
+        if station.entry in entries
+        else station
+        for station in session.stations
+    )
+    return replace(session, stations=stations)
+
+
+class ResponseComparison(NamedTuple):
+    """Cameras whose images may have another response than usual, with their log-odds, and notes on
+    those that could not be compared.
     """
 
-    entries: tuple[str, ...]
-    usual: Response
-    gain: float
-    failure: str = ""
+    ranked: tuple[Ranked[ResponseHypothesis], ...] = ()
+    untested: tuple[Finding, ...] = ()
 
     @property
-    def log_odds(self) -> float:
-        """For the other response, nats; NaN where the test failed."""
-        return self.gain / 2
+    def repairs(self) -> tuple[ResponseHypothesis, ...]:
+        """Hypotheses by which images are measured."""
+        return tuple(one.hypothesis for one in self.ranked if decide([one]))
 
     @property
-    def sure(self) -> bool:
-        """Whether the images are measured by the other response, against what is usual."""
-        return self.log_odds > OPTIONS.act
+    def by_entry(self) -> dict[str, Response]:
+        """Responses by entry in session.yaml, where they are not the usual ones."""
+        facts = [one.facts for one in self.repairs]
+        return {entry: each["other"] for each in facts for entry in each["stations"]}
 
     @property
-    def response(self) -> Response:
-        """The response by which the images are measured."""
-        return OTHER_RESPONSE[self.usual] if self.sure else self.usual
-
-    @property
-    def finding(self) -> Finding:
-        """A note where the edges decide, else a warning."""
-        facts = {
-            "usual": self.usual,
-            "other": OTHER_RESPONSE[self.usual],
-            "stations": self.entries,
-            "log_odds": self.log_odds,
-        }
-        where = listed(self.entries)
-        if self.failure:
-            return note("image.response_untested", where, **facts, why=self.failure)
-        if self.sure:
-            return note("image.response", where, **facts, odds=round(np.exp(OPTIONS.act)))
-        return doubtful("image.response_unknown", where, **facts)
+    def findings(self) -> tuple[Finding, ...]:
+        """Notes where the edges decide, else warnings; then what was not compared."""
+        return (*map(response_finding, self.ranked), *self.untested)
 
 
-def overruled(responses: Sequence[ResponseEstimate]) -> dict[str, Response]:
-    """Responses by entry in session.yaml, where they are not the usual ones."""
-    return {entry: one.response for one in responses if one.sure for entry in one.entries}
+def response_finding(one: Ranked[ResponseHypothesis]) -> Finding:
+    """A note where the images are measured by the other response, else a warning."""
+    subject, facts = one.hypothesis.subject, {**one.hypothesis.facts, "log_odds": one.log_odds}
+    if decide([one]):
+        return note("image.response", subject, **facts, odds=round(exp(OPTIONS.act)))
+    return doubtful("image.response_unknown", subject, **facts)
 
 
 def responses_by_edges(
@@ -100,9 +119,10 @@ def responses_by_edges(
     roughly: Callable[[list[StationImages]], EdgeSet],
     measured: Callable[[list[StationImages]], EdgeSet],
     of_edges: Callable[[EdgeSet], Measurements],
-) -> tuple[ResponseEstimate, ...]:
+) -> ResponseComparison:
     """Cameras without a response in session.yaml whose edges are against the usual one, or do not
-    decide.
+    decide. The evidence is the gain of chi2 by the change to the other response, less that of the
+    change back.
 
     measurements, estimate : by the usual responses. roughly, measured : edges of images, searched
     where those of ``measurements`` were, with the same blur or with their own. of_edges :
@@ -116,14 +136,14 @@ def responses_by_edges(
     try:
         questionable = _questionable(measurements, estimate, usual, roughly)
         if not questionable:
-            return ()
+            return ResponseComparison()
         edges = measurements.edges
         own = {x: np.isin(edges.station, [p.station for p in usual[x]]) for x in questionable}
         every = {camera: measured(_otherwise(usual[camera])) for camera in questionable}
         # in the dark a wrong response leaves hardly an edge
         every = {x: e for x, e in every.items() if len(e) > MAJORITY * own[x].sum()}
         if not every:
-            return ()
+            return ResponseComparison()
         there, _ = _scored(measurements, estimate, every)
         stay = ~np.any([own[camera] for camera in every], axis=0)
         new = concatenate([edges.select(stay), *every.values()])
@@ -133,19 +153,19 @@ def responses_by_edges(
         back, _ = _scored(otherwise, ended, before)
     except PkmcalError as error:  # such as too few edges by the other response
         why = str(error).rstrip(".")
-        return tuple(
-            ResponseEstimate(_entries(session, usual[camera]), camera[1], np.nan, why)
-            for camera in usual
+        each = (other_response(_entries(session, usual[camera]), camera[1]) for camera in usual)
+        untested = (
+            note("image.response_untested", one.subject, **one.facts, log_odds=np.nan, why=why)
+            for one in each
         )
-    rows = [
-        ResponseEstimate(
-            _entries(session, usual[camera]),
-            camera[1],
-            there[camera] - back[camera],
-        )
-        for camera in every
-    ]
-    return tuple(one for one in rows if one.log_odds > -OPTIONS.report)
+        return ResponseComparison(untested=tuple(untested))
+    ranked: list[Ranked[ResponseHypothesis]] = []
+    for camera in every:  # each camera by itself
+        ratio = 0.5 * (there[camera] - back[camera])
+        level = EvidenceLevel[ResponseHypothesis]("edges", lambda _, ratio=ratio: np.array([ratio]))
+        one = other_response(_entries(session, usual[camera]), camera[1])
+        ranked += posterior([one], [level])
+    return ResponseComparison(tuple(one for one in ranked if one.log_odds > -OPTIONS.report))
 
 
 def _entries(session: Session, images: Sequence[StationImages]) -> tuple[str, ...]:

@@ -6,11 +6,11 @@ Hypotheses about poses that disagree with the machine are in
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pkmcal.arrays import Booleans
+from pkmcal.arrays import Array, Booleans
 from pkmcal.calibration.camera_refinement import CameraRefinement
 from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
@@ -23,9 +23,11 @@ from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.finding import Finding, doubtful, note, wrong
 from pkmcal.outcome.hypotheses import (
+    EvidenceLevel,
     Hypothesis,
     decide,
     estimate_level,
+    log_likelihood,
     parameter_cost,
     posterior,
 )
@@ -40,9 +42,6 @@ BOARD_SIZE_DISAGREEMENT = 2.0
 reports both: by chance one session of twenty."""
 WRONG_SCALE_DEVIATIONS = 3.0
 """Standard deviations from the nominal scale of a reading from which a note reports it."""
-COMMON_FACTOR_CHI2 = 60.0
-"""Reduction of the nominal model's chi2 by a common factor on all lengths from which the factor is
-reported."""
 WRONG_MODEL_READING_SCALE = 100.0
 """Factor on the readings' stated noise from which the scatter is a model error: mounted encoders
 are ten or thirty times as noisy as their data sheets."""
@@ -53,6 +52,9 @@ FEWEST_POSES = 4
 def wrong_scale(estimate: Estimate) -> float:
     """Common factor of all estimated lengths to the nominal lengths; 1 if no common factor explains
     their difference. A board whose squares are larger than stated makes the whole machine larger.
+
+    The factor is a hypothesis about differences in prior sigmas whose true size is unknown, so that
+    a poor nominal model has none.
     """
     machine = estimate.machine
     table = machine.parameters
@@ -64,9 +66,17 @@ def wrong_scale(estimate: Estimate) -> float:
     if not np.any(new):
         return 1.0
     back = float(np.sum(weight * new * old) / np.sum(weight * new**2))
-    gain = np.sum(weight * (new - old) ** 2) - np.sum(weight * (back * new - old) ** 2)
-    remainder = np.sum(weight * (back * new - old) ** 2)
-    return 1 / back if gain > COMMON_FACTOR_CHI2 and gain > remainder else 1.0
+    null, misfit = (np.sqrt(np.mean(weight * (x - old) ** 2)) for x in (new, back * new))
+
+    def ratios(hypotheses: Sequence[Hypothesis[float]]) -> Array:
+        values = log_likelihood(np.array([null, misfit]), new.size)
+        return np.repeat(values[1] - values[0], len(hypotheses))
+
+    factor = Hypothesis[float](
+        "machine.scale", "all lengths", lambda x: x * back, parameter_cost(1, new.size)
+    )
+    best = decide(posterior([factor], [EvidenceLevel("lengths", ratios)]))
+    return 1 / back if best is not None else 1.0
 
 
 def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:

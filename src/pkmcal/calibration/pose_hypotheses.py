@@ -10,15 +10,19 @@ evidence compare them:
 - estimate: the joint estimate from the data without the mistake. Seconds for each hypothesis, so
   only those that closure retains are estimated.
 
-Where poses and readings contradict each other by far more than nominal errors do, an estimate from
-the data as stated takes minutes and is meaningless. Closure is then evaluated before any estimate,
-for two mistakes at once if one is not enough.
+An estimate from readings that contradict the poses takes minutes and is meaningless. So closure is
+evaluated before any estimate: residuals in units of those by nominal errors of the prior's size,
+whose true size is unknown, for the data as stated and under each hypothesis alike; for two
+mistakes at once if one is not enough. An estimate then only confirms what closure prefers.
+
+Hypotheses are compared where one could be reported at all: where the data as stated leave more than
+:func:`~pkmcal.outcome.hypotheses.harmless_misfit`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from math import log
@@ -51,6 +55,7 @@ from pkmcal.outcome.hypotheses import (
     Hypothesis,
     Ranked,
     estimate_level,
+    harmless_misfit,
     likely,
     log_likelihood,
     parameter_cost,
@@ -58,26 +63,32 @@ from pkmcal.outcome.hypotheses import (
 )
 from pkmcal.session.load import Session
 from pkmcal.session.station_movement import FEWEST_BESIDE_MOVEMENT, how_far
-from pkmcal.solver.kernels import INLIER_WEIGHT
 
-SUSPECT_SCALE = 2.0
-"""Factor on the noise of poses, or of edges, from which hypotheses are compared."""
-SUSPECT_REJECTED_SHARE = 0.1
-"""Share of rejected poses from which hypotheses are compared."""
 EXPLAINED_POSES_SHARE = 0.85
 """Share of the poses that a hypothesis has to explain; the rest may be outliers."""
 HOPELESS_POSE_SCALE = 50.0
 """Factor on the poses' noise at which an estimate under a hypothesis is given up after a first
 search: far beyond ``VerdictOptions.too_noisy``."""
-NOMINAL_ERROR_FACTOR = 10.0
-"""Factor by which the errors of a nominal model may exceed its prior sigmas. A motor that stands
-still while its readings move, or the reverse, is off by 20 to 50 times as much."""
-NOMINAL_DRAWS = 4
-"""Machines drawn from the prior sigmas for the size of closure residuals by nominal errors: four
-draws of some thirty parameters each determine it to a tenth."""
-CLOSURE_CONFIGURATIONS = 48
-"""Configurations, spread over all, by which poses and readings are tested for a contradiction, and
-in which pairs of mistakes are compared: a thousand pairs in seconds."""
+
+
+@dataclass(frozen=True)
+class ClosureOptions:
+    """Limits of the comparison by closure."""
+
+    # factor by which the errors of any nominal model may exceed its prior sigmas. It is no
+    # consequence of the prior, which a file may state too small: beyond it neither a hypothesis nor
+    # the data as stated are tenable. A motor that stands still while its readings move, or the
+    # reverse, is off by 20 to 50 times as much
+    most_nominal_error: float = 10.0
+    # machines drawn from the prior sigmas for the size of closure residuals by nominal errors: four
+    # draws of some thirty parameters each determine it to a tenth
+    draws: int = 4
+    # configurations, spread over all, by which poses and readings are tested for a contradiction,
+    # and in which pairs of mistakes are compared: a thousand pairs in seconds
+    configurations: int = 48
+
+
+CLOSURE = ClosureOptions()
 
 
 class PoseCase(NamedTuple):
@@ -112,9 +123,9 @@ class PoseEvidence:
     """Levels of evidence for the mistakes of one machine's measured poses.
 
     machine : nominal. null_misfit : of the poses as stated, by an estimate. closure_unit : misfit
-    by closure below which differences are nominal errors, in stated standard deviations. most :
-    configurations that closure compares; all, if None. estimates, misfits : by an estimate and by
-    closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
+    by closure that nominal errors of the prior's size cause, in stated standard deviations. most :
+    configurations that closure compares; all, if None. estimates, misfits, ratios : by an estimate
+    and by closure, of the hypotheses so far, by identity. untested : see :class:`Diagnosis`.
     """
 
     def __init__(
@@ -130,7 +141,15 @@ class PoseEvidence:
         self.most: int | None = None
         self.estimates: dict[int, Estimate] = {}
         self.misfits: dict[int, float] = {}
+        self.ratios: dict[int, float] = {}
         self.untested: list[tuple[str, str]] = []
+
+    def harmless(self, hypotheses: Sequence[PoseHypothesis], log_odds: float, n: int = 1) -> float:
+        """Misfit up to which none of the hypotheses, or no n of them at once, can have the
+        log-odds.
+        """
+        prior = max(one.log_prior for one in hypotheses)
+        return harmless_misfit(self.n_effective, n * prior, log_odds)
 
     def by_closure(self, hypotheses: Sequence[PoseHypothesis]) -> Array:
         """Log-likelihood ratios by closure, minus infinity for mistakes in the readings that are
@@ -148,6 +167,7 @@ class PoseEvidence:
         # of a motor's constants the best is enough: its offset, estimated, takes up the rest
         retained = np.isin(np.arange(len(values)), list(best.values()))
         ratios = np.array(values) - null
+        self.ratios = {id(one): r for one, r in zip(hypotheses, ratios.tolist(), strict=True)}
         # a mistake in the readings moves the platform by far more than nominal errors do, so
         # closure shows it; a movement or a size may be less, and is estimated in any case
         prior = np.array([one.log_prior for one in hypotheses])
@@ -166,6 +186,21 @@ class PoseEvidence:
             self.untested.append((hypothesis.code, why))
 
         return estimate_level(misfit, self.null_misfit, self.n_effective, VERDICT.too_noisy, failed)
+
+    @property
+    def by_confirmation(self) -> EvidenceLevel[PoseHypothesis]:
+        """Level of evidence by joint estimates where the data as stated have none: an estimate
+        compares hypotheses with each other, and closure the best of them with the null hypothesis.
+        """
+
+        def ratios(hypotheses: Sequence[PoseHypothesis]) -> Array:
+            values = self.by_estimate.log_likelihood_ratios(hypotheses)
+            best = int(np.argmax(values))
+            if not np.isfinite(values[best]):
+                return values
+            return values - values[best] + self.ratios[id(hypotheses[best])]
+
+        return EvidenceLevel("estimate", ratios)
 
     def estimate(self, hypothesis: PoseHypothesis, hopeless: float = np.inf) -> Estimate:
         """The estimate from the data as they would be without the mistake.
@@ -239,35 +274,51 @@ def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -
     if not np.any(measurements.on_platform[measurements.poses.mount]):
         return Diagnosis()  # poses of boards on the base alone
     evidence = PoseEvidence(machine, measurements, pose_misfit(estimate))
+    hypotheses = pose_hypotheses(machine, measurements, estimate)
+    if evidence.null_misfit <= evidence.harmless(hypotheses, OPTIONS.report):
+        return Diagnosis()
     levels = (
         # nominal errors are in these residuals, so closure drops hypotheses and confirms none
         EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most),
         evidence.by_estimate,
     )
-    return evidence.diagnosis(posterior(pose_hypotheses(machine, measurements, estimate), levels))
+    return evidence.diagnosis(posterior(hypotheses, levels))
 
 
 def diagnose_by_closure(
-    machine: Machine, measurements: Measurements, misfit: float, limit: float
+    machine: Machine,
+    measurements: Measurements,
+    misfit: float,
+    unit: float,
+    options: ClosureOptions = CLOSURE,
 ) -> Diagnosis:
     """Mistake in the readings by which poses contradict them, with a second mistake of any kind if
     a single one does not explain the poses.
 
-    Only hypotheses whose closure residuals are as small as nominal errors are estimated. misfit :
-    of the poses as stated, in stated standard deviations. limit : of :func:`closure_limit`.
+    misfit : of the poses as stated by closure, in stated standard deviations. unit : of
+    :func:`nominal_misfit`.
     """
-    evidence = PoseEvidence(machine, measurements, misfit, limit)
+    evidence = PoseEvidence(machine, measurements, misfit, unit)
     closure = EvidenceLevel("closure", evidence.by_closure, decides=False, most=OPTIONS.most)
     single = reading_mistakes(machine, measurements)
-    for hypotheses in (single, _pairs(single, measurements)):
-        closing = [one.hypothesis for one in posterior([*hypotheses], [closure])]
-        tenable = [one for one in closing if evidence.misfits[id(one)] < 1]
-        diagnosis = evidence.diagnosis(posterior(tenable, [evidence.by_estimate]))
-        if diagnosis.hypothesis is None and tenable:
-            diagnosis = evidence.beside(tenable[0])
+    contradicted = misfit > options.most_nominal_error * unit
+    for number in (1, 2):
+        # to skip the estimate from the data as stated is an action
+        if misfit <= evidence.harmless(single, OPTIONS.act, number) * unit:
+            break
+        hypotheses = single if number == 1 else [*_pairs(single, measurements)]
+        closing = [
+            one.hypothesis
+            for one in posterior(hypotheses, [closure])
+            if one.log_odds > OPTIONS.act
+            and evidence.misfits[id(one.hypothesis)] < options.most_nominal_error
+        ]
+        diagnosis = evidence.diagnosis(posterior(closing, [evidence.by_confirmation]))
+        if diagnosis.hypothesis is None and closing and contradicted:
+            diagnosis = evidence.beside(closing[0])
         if diagnosis.hypothesis is not None:
             return diagnosis
-        evidence.most = CLOSURE_CONFIGURATIONS
+        evidence.most = options.configurations
     return Diagnosis()
 
 
@@ -357,20 +408,21 @@ def _laid(body: Array, observed: Array, whiten: Array) -> Array:
     return each[best, np.arange(each.shape[1])]
 
 
-def closure_limit(
+def nominal_misfit(
     machine: Machine,
     measurements: Measurements,
     rng: np.random.Generator,
     enough: float = np.inf,
+    options: ClosureOptions = CLOSURE,
 ) -> float:
-    """Misfit by closure, as of :func:`closure_misfits`, beyond which poses and readings contradict
-    each other: NOMINAL_ERROR_FACTOR times that of machines drawn from the prior sigmas.
+    """Misfit by closure, as of :func:`closure_misfits`, of machines drawn from the prior sigmas, in
+    stated standard deviations; at least 1, that of the noise.
 
-    enough : a lower bound of the limit is returned once it is no less, after one draw as a rule.
+    enough : a lower bound is returned once it is no less, after one draw as a rule.
     """
-    squares, limit = 0.0, NOMINAL_ERROR_FACTOR
-    if limit >= enough:
-        return limit
+    squares, unit = 0.0, 1.0
+    if unit >= enough:
+        return unit
     poses, exact = measurements.poses, measurements.poses.T_station_target.copy()
     fk = machine.forward_result(measurements.joints).T_base_platform[poses.configuration]
     moving = measurements.on_platform[poses.mount]
@@ -380,14 +432,14 @@ def closure_limit(
     exact[whole, :3, :3] = fk[whole, :3, :3]
     nominal = replace(measurements, poses=replace(poses, T_station_target=exact))
     spread = machine.parameters.tolerance
-    for _ in range(NOMINAL_DRAWS):
+    for _ in range(options.draws):
         values = machine.values + spread * rng.normal(size=len(spread))
         drawn = machine.with_values(machine.parameters.unit_axes(values))
-        squares += float(closure_misfits(drawn, [nominal])[0]) ** 2 / NOMINAL_DRAWS
-        limit = NOMINAL_ERROR_FACTOR * max(np.sqrt(squares), 1.0)
-        if limit >= enough:
+        squares += float(closure_misfits(drawn, [nominal])[0]) ** 2 / options.draws
+        unit = max(float(np.sqrt(squares)), 1.0)
+        if unit >= enough:
             break
-    return limit
+    return unit
 
 
 # ------------------------------------------------------------------ hypotheses
@@ -572,17 +624,9 @@ def _sizes(
 # ------------------------------------------------------------------ what follows
 
 
-def poses_disagree(estimate: Estimate) -> bool:
-    """Whether the poses disagree with the machine so much that hypotheses are compared."""
-    rejected = estimate.pose_weights < INLIER_WEIGHT
-    return bool(rejected.size) and (
-        estimate.statistics.pose_scale > SUSPECT_SCALE
-        or rejected.mean() > SUSPECT_REJECTED_SHARE
-        or rejected.sum() >= 2 * FEWEST_BESIDE_MOVEMENT
-    )
-
-
-def explain_closure(session: Session, boards: Boards) -> Explanation:
+def explain_closure(
+    session: Session, boards: Boards, options: ClosureOptions = CLOSURE
+) -> Explanation:
     """Mistake in the readings by which measured poses contradict them, if any.
 
     Evaluated before any estimate: an estimate from such readings takes a thousand steps and does
@@ -593,13 +637,17 @@ def explain_closure(session: Session, boards: Boards) -> Explanation:
     positions = (poses.rows >= 3) & measurements.on_platform[poses.mount]
     if np.count_nonzero(positions) < 2 * FEWEST_BESIDE_MOVEMENT:
         return Explanation()  # a frame and mount of their own explain few
-    machine, few = session.machine, spread_over(measurements, CLOSURE_CONFIGURATIONS)
+    machine, few = session.machine, spread_over(measurements, options.configurations)
     (misfit,) = closure_misfits(machine, [few]).tolist()
-    limit = closure_limit(machine, few, np.random.default_rng(0), enough=misfit)
-    if misfit <= limit:
+    least = PoseEvidence(machine, measurements, misfit).harmless(
+        reading_mistakes(machine, measurements), OPTIONS.act
+    )
+    unit = nominal_misfit(machine, few, np.random.default_rng(0), misfit / least, options)
+    if misfit <= least * unit:
         return Explanation()
-    diagnosis = partial(diagnose_by_closure, machine, measurements, misfit, limit)
-    return _explanation(session, diagnosis, misfit)
+    diagnosis = partial(diagnose_by_closure, machine, measurements, misfit, unit, options)
+    tenable = misfit <= options.most_nominal_error * unit
+    return _explanation(session, diagnosis, misfit, tenable)
 
 
 def explain_poses(
@@ -613,21 +661,32 @@ def explain_poses(
     richer : model of the mechanism file that explains the poses; where they agree with that model,
     no hypothesis is compared.
     """
-    if not poses_disagree(estimate) or (richer is not None and richer.scale < SUSPECT_SCALE):
+    if not estimate.pose_weights.size:
+        return Explanation()
+    misfit = pose_misfit(estimate)
+    if richer is not None and richer.scale <= harmless_misfit(
+        effective_sample_size(session.machine, measurements), 0.0
+    ):
         return Explanation()
     diagnosis = partial(diagnose, session.machine, measurements, estimate)
-    return _explanation(session, diagnosis, pose_misfit(estimate))
+    return _explanation(session, diagnosis, misfit, misfit < VERDICT.too_noisy)
 
 
-def _explanation(session: Session, diagnose: Callable[[], Diagnosis], misfit: float) -> Explanation:
+def _explanation(
+    session: Session, diagnose: Callable[[], Diagnosis], misfit: float, tenable: bool
+) -> Explanation:
     """Explanation with the error that names a diagnosis's mistakes and their rivals.
 
     A reading that never changes precedes all other mistakes, because its effect may equal that of
-    any of them. misfit : of the poses as stated, in stated sigmas.
+    any of them. misfit : of the poses as stated, in stated sigmas. tenable : whether the data as
+    stated may be right in spite of it.
     """
-    if error := frozen_in(session):
-        return Explanation(error, np.inf)
+    frozen = frozen_in(session)
+    if frozen and not tenable:
+        return Explanation(frozen, np.inf)
     diagnosis, untested = diagnose(), tuple[Finding, ...]()
+    if frozen and diagnosis.hypothesis is not None:
+        return Explanation(frozen, np.inf)
     if diagnosis.untested:
         codes, (why, *_) = zip(*diagnosis.untested, strict=True)
         untested = (note("poses.mistakes_untested", number=len(codes), mistakes=codes, why=why),)

@@ -20,7 +20,7 @@ import numpy as np
 from pkmcal.arrays import THREADS, Array, Booleans
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import CameraRefinement, measurements_of
-from pkmcal.calibration.camera_responses import ResponseEstimate, overruled, responses_by_edges
+from pkmcal.calibration.camera_responses import ResponseComparison, responses_by_edges
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.localization import CalibrationProgress
 from pkmcal.errors import InputError, PkmcalError, ResultError
@@ -123,7 +123,7 @@ class RefinementResult(NamedTuple):
     measurements: Measurements
     estimate: Estimate
     cameras: CameraRefinement
-    responses: tuple[ResponseEstimate, ...] = ()
+    responses: ResponseComparison = ResponseComparison()
     images: Sequence[StationImages] = ()
     blur: BlurByStation = MappingProxyType({})
     scatter: float = 1.0
@@ -163,7 +163,7 @@ def refine_alternating(
     blur: BlurByStation = {}
     passes: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
-    responses: tuple[ResponseEstimate, ...] = ()
+    responses = ResponseComparison()
     scatter, start = case.scene.scatter, estimate.state
     change = 0.0
     for turn in range(options.most_passes):
@@ -190,7 +190,7 @@ def refine_alternating(
         if turn == 0:
             progress("Comparing the responses of images", share + 0.1)
             responses = _responses(case, images, measurements, before, estimate, cameras, blur, lap)
-            if results := overruled(responses):
+            if results := responses.by_entry:
                 images = [
                     replace(p, response=results.get(session.stations[p.station].entry, p.response))
                     for p in images
@@ -224,7 +224,7 @@ def _responses(
     cameras: CameraRefinement,
     blur: BlurByStation,
     lap: Callable[[str], None],
-) -> tuple[ResponseEstimate, ...]:
+) -> ResponseComparison:
     """Response of each camera's images to light, by the edges of the first pass.
 
     before : predicted the edges of ``measurements``; estimate : from these edges.

@@ -18,7 +18,6 @@ from pkmcal.calibration.camera_refinement import refinement_of
 from pkmcal.calibration.case import Case
 from pkmcal.calibration.chance_matches import chance_match_reason
 from pkmcal.calibration.handheld import localize_case
-from pkmcal.calibration.pose_hypotheses import SUSPECT_SCALE
 from pkmcal.calibration.refinement import RefinementResult, refine_alternating
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.mechanisms import Machine
@@ -31,6 +30,7 @@ from pkmcal.outcome.hypotheses import (
     Hypothesis,
     decide,
     estimate_level,
+    harmless_misfit,
     posterior,
 )
 from pkmcal.session.load import Session
@@ -48,11 +48,15 @@ def explain_radii(
     cameras are estimated. seed : for the localization of the stations.
     """
     null = _edge_misfit(turns)
-    if not case.images or null <= SUSPECT_SCALE:
-        return Explanation()
-    inliers = 0.0 if turns is None else float(turns.estimate.edge_weights.sum())
     # errors of an imperfect model vary smoothly, so no more are independent than it has parameters
     n_effective = float(case.session.machine.parameters.free_matrix().shape[1])
+    prior = log_prior_of_each(case.session.machine, case.session.joints)
+    # edges that scatter no more than those of right sessions need no hypothesis, the evidence for
+    # which costs a localization and a refinement
+    least = max(harmless_misfit(n_effective, prior), VERDICT.edge_scatter)
+    if not case.images or null <= least:
+        return Explanation()
+    inliers = 0.0 if turns is None else float(turns.estimate.edge_weights.sum())
     untested: list[Finding] = []
 
     def misfit(hypothesis: RadiiHypothesis) -> float:
@@ -64,9 +68,8 @@ def explain_radii(
         untested.append(note(f"{hypothesis.code}_untested", hypothesis.subject, why=why))
 
     mechanism = case.session.document["mechanism"]
-    prior = log_prior_of_each(case.session.machine, case.session.joints)
     half = RadiiHypothesis("tube.diameter", mechanism, _of_half_the_radii, prior)
-    level = estimate_level(misfit, null, n_effective, SUSPECT_SCALE, failed)
+    level = estimate_level(misfit, null, n_effective, VERDICT.too_noisy, failed)
     best = decide(posterior([half], [level]))
     if best is None:
         return Explanation(untested=tuple(untested))

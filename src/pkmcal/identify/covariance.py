@@ -271,6 +271,9 @@ class Identifiability:
     rank : number of directions that the data determine.
     unidentified : directions that no amount of such data determines.
     weak : directions that the nominal model determines better than the data.
+    singular_values : (n,) of the data's information in units of the prior, the largest first.
+    directions : (n, P) their changes of all parameters, m and rad, each of length one in prior
+        sigmas.
     """
 
     n_parameters: int
@@ -279,6 +282,7 @@ class Identifiability:
     unidentified: tuple[ParameterDirection, ...]
     weak: tuple[ParameterDirection, ...]
     singular_values: Array
+    directions: Array
 
     __repr__ = short_repr
 
@@ -323,6 +327,7 @@ def identifiability(info: Information, machine: Machine) -> Identifiability:
         unidentified=tuple(m for m, gone in zip(made, lost, strict=True) if gone),
         weak=tuple(m for m, gone in zip(made, lost, strict=True) if not gone and m.information < 1),
         singular_values=s,
+        directions=vectors,
     )
 
 

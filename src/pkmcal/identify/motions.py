@@ -48,7 +48,9 @@ Advice = Literal[
 
 @dataclass(frozen=True)
 class UnidentifiedOptions:
-    """Constants of the sentences on what the data do not determine."""
+    """Constants of the sentences on what the data do not determine. All but ``weak`` only choose
+    names: no verdict depends on them.
+    """
 
     # shares of a motion (squared) that lie in the open space for it to explain part of that space:
     # first those that fit exactly, since many motions are similar once frames are removed, then
@@ -64,9 +66,8 @@ class UnidentifiedOptions:
     sparse_steps: int = 20
     frame_weight: float = 10.0
 
-    # sine of the angle to the motions so far below which a motion describes nothing new. Larger
-    # angles must count: what no motion describes is reported as one undetermined direction, with
-    # the effect of all of them, and refuses results whose single motions are harmless
+    # sine of the angle to the motions so far below which a motion describes nothing new. What no
+    # motion describes is reported in one sentence, so larger angles must count
     new_sine: float = 0.1
 
 

@@ -13,7 +13,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.motions import AXIS_LETTERS, NamedChanges, Situation, changes
 from pkmcal.levels import NAMED_SHARE, NEGLIGIBLE, ROUNDING, TRANSLATION_TURN
-from pkmcal.mechanisms.parameters import EVERY_LEG
+from pkmcal.mechanisms.parameters import EVERY_LEG, ParameterTable
 from pkmcal.wording import capital, in_full, joined, listed, named, split_name, ways
 
 MOST_SENTENCES = 8
@@ -42,6 +42,13 @@ class Sentence:
     moves_platform: float
     matters: bool
     weak: bool = False
+
+
+def negligible_shift(table: ParameterTable) -> float:
+    """Displacement of the platform (m) that is negligible beside the nominal model's uncertainty,
+    and so beside any calibration's.
+    """
+    return NEGLIGIBLE * float(table.tolerance[table.of_kind("center")].mean())
 
 
 @dataclass(frozen=True)
@@ -89,8 +96,7 @@ def sentence(
     weak : the data contain information about it, but less than the nominal model does.
     """
     table = around.machine.parameters
-    # negligible beside the nominal model's uncertainty is negligible beside any calibration's
-    matters = shifted > NEGLIGIBLE * float(table.tolerance[table.of_kind("center")].mean())
+    matters = shifted > negligible_shift(table)
     # parameters that change most
     size = np.linalg.norm(open_motion.own, axis=0)
     order = np.argsort(-np.round(size, 6), kind="stable")

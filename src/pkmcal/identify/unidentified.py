@@ -21,15 +21,16 @@ from pkmcal.identify.assembly import machine_size
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import (
+    UNIDENTIFIED,
     NamedChanges,
     Situation,
     UnidentifiedOptions,
     all_radii,
     candidates,
 )
-from pkmcal.identify.sentences import OpenMotion, Sentence, few, sentence
+from pkmcal.identify.sentences import OpenMotion, Sentence, few, negligible_shift, sentence
 from pkmcal.identify.tool import platform_by_parameters
-from pkmcal.levels import MAJORITY
+from pkmcal.levels import MAJORITY, NEGLIGIBLE
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.ranks import nonzero
@@ -72,6 +73,8 @@ class Findings:
     weak : sentences on directions of which the nominal model contains more information.
     by_nominal : displacement of the platform by the prior sigmas of all parameters, m, as
         ``Sentence.moves_platform``.
+    undetermined_shift : the same by the errors of the nominal model that the data leave, m.
+    n_harmless : number of independent unidentifiable changes that do not move the platform.
     conditions : [A]'s conditions.
     conventional : fixed parameters for which any value would do.
     also_conventional : number of combinations of other fixed parameters for which any value would
@@ -83,6 +86,8 @@ class Findings:
     unidentified: tuple[Sentence, ...]
     weak: tuple[Sentence, ...]
     by_nominal: float
+    undetermined_shift: float = 0.0
+    n_harmless: int = 0
     conditions: tuple[Condition, ...] = ()
     conventional: tuple[str, ...] = ()
     also_conventional: int = 0
@@ -97,8 +102,12 @@ def explain(
     visible: Booleans,
     conditions: tuple[Condition, ...] = (),
     bed: Bed | None = None,
+    options: UnidentifiedOptions = UNIDENTIFIED,
 ) -> Findings:
     """Findings of an estimate.
+
+    The displacements and numbers of changes, on which a verdict depends, are those of the whole
+    space; motions with names only word it.
 
     visible : (S, L) legs that each station measures; stations that a board on the base joins count
     as one, see :func:`observed_by_boards`.
@@ -108,17 +117,24 @@ def explain(
     # situation of the session, and effect of the parameters on the platform
     poses = estimate.state.T_base_platform[estimate.configurations]
     imaged = estimate.edge_weights.size > 0
-    around = Situation(machine, visible, poses, imaged, only_heights(estimate))
+    around = Situation(machine, visible, poses, imaged, only_heights(estimate), options)
     effect = platform_by_parameters(machine, poses)
     unseen = {id(d) for d in ranks.unidentified}
 
+    def space(directions: tuple[ParameterDirection, ...]) -> tuple[Array, Array]:
+        """Some directions and their information."""
+        reference = [0.0 if id(d) in unseen else d.information for d in directions]
+        return direction_vectors(directions, machine), np.array(reference)
+
     def text(directions: tuple[ParameterDirection, ...]) -> tuple[Sentence, ...]:
         """Sentences on some directions."""
-        reference = [0.0 if id(d) in unseen else d.information for d in directions]
-        return describe(around, direction_vectors(directions, machine), np.array(reference), effect)
+        return describe(around, *space(directions), effect)
 
+    # a direction with information s, in units of the prior, has the posterior variance
+    # 1 / (1 + s^2): 1 / (1 + s^2)^2 by the nominal model's errors, the rest by the data's noise
+    left = ranks.directions / (1 + ranks.singular_values[:, None] ** 2)
     # directions by information
-    least = around.options.weak
+    least = options.weak
     lost = (*ranks.unidentified, *(d for d in ranks.weak if d.information < least))
     weak = tuple(d for d in ranks.weak if d.information >= least)
     # poses and heights mix weakly identified directions with unidentified ones: only both together
@@ -130,6 +146,8 @@ def explain(
         tuple(s for s in sentences if not s.weak),
         tuple(s for s in sentences if s.weak),
         float(np.linalg.norm(effect @ (table.free_matrix() * table.tolerances_free()))),
+        float(np.linalg.norm(effect @ left.T)),
+        int(np.sum(_shifts(_open(around, *space(lost)), effect) <= negligible_shift(table))),
         conditions,
         conventional,
         others,
@@ -235,14 +253,11 @@ def describe(
     knows it better, not that it is free.
     effect : (r, P) as returned by :func:`platform_by_parameters`.
     """
-    machine = around.machine
-    space = _open(machine, null, information)
+    space = _open(around, null, information)
     if not len(space.rows):
         return ()
     if effect is None:
-        effect = platform_by_parameters(machine, around.T_base_platform)
-    if not around.imaged:  # boards and trackers do not measure tubes
-        space = _without(space, _within(all_radii(around).columns, space, around.options.inside[0]))
+        effect = platform_by_parameters(around.machine, around.T_base_platform)
     results = _merged(around, _explained(around, space))
     text = [
         sentence(around, part, space.unit, *_moves(around, part, space, effect)) for part in results
@@ -250,7 +265,24 @@ def describe(
     return few(text)
 
 
-def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
+def _open(around: Situation, null: Array, information: Array | None) -> _Open:
+    """Open space in prior sigmas, without frames and, where no image shows them, without tubes."""
+    space = _open_with_tubes(around.machine, null, information)
+    if around.imaged or not len(space.rows):
+        return space
+    return _without(space, _within(all_radii(around).columns, space, 1 - NEGLIGIBLE))
+
+
+def _shifts(space: _Open, effect: Array) -> Array:
+    """Displacements (n,) of the platform by independent changes in the open space, one standard
+    deviation of their posterior each, m.
+    """
+    root = np.linalg.cholesky(space.covariance)
+    shifts = np.linalg.svd(effect @ (space.unit[:, None] * (space.rows.T @ root)), compute_uv=False)
+    return np.pad(shifts, (0, len(root) - len(shifts)))
+
+
+def _open_with_tubes(machine: Machine, null: Array, information: Array | None) -> _Open:
     """Open space in prior sigmas, frames removed."""
     squares = machine.parameters.free_matrix() ** 2
     # tied parameters share one deviation

@@ -14,8 +14,7 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.parameter_estimates import decided_by
-from pkmcal.identify.sentences import Sentence
+from pkmcal.identify.sentences import negligible_shift
 from pkmcal.identify.tool import platform_sigma
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.levels import (
@@ -33,6 +32,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note, wrong
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.search import Stop
+from pkmcal.wording import in_full
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
@@ -54,16 +54,15 @@ class VerdictOptions:
     too_many_rejected: float = 0.4
     # share of the platform's error by the nominal model that may remain undetermined. A calibration
     # reduces that error by a factor of twenty to fifty; a twentieth of it would be the result's
-    # largest error, and more of the same images do not reduce it. A result whose standard deviation
-    # is larger anyway is no worse for it
+    # largest error, and more of the same images do not reduce it
     undetermined_share: float = 0.05
+    # share of the platform's variance by the noise of the data from which that is no reason: the
+    # result is hardly worse for it. More of the same images reduce noise alone
+    least_noise_share: float = FEW
     # share of configurations near a singular pose from which on the estimate is not reliable
     singular_share: float = MAJORITY
     # share of what is undetermined from which on a single cause becomes a reason of its own
     large_cause_share: float = CAUSE_SHARE
-    # displacement relative to the platform's standard deviation from which on a cause is worth a
-    # warning; one half makes the total larger by an eighth
-    worth_reporting: float = 0.5
     # error relative to that expected by the prior sigmas that a result may leave: below a half the
     # result is almost surely better than the nominal model; above, new values are not worth their
     # risk
@@ -117,33 +116,30 @@ def assess(
     others : findings of any level about the session.
     """
     bed = findings.bed
-    large, small = ((), ()) if bed else _unidentifiable_text(estimate, findings, options)
-    # small parts of the standard deviation are in it already, and in the report
-    matter = [s for s in small if s.matters]
-    if matter:
-        least = options.worth_reporting * platform_sigma(estimate)
-        matter = [s for s in matter if s.moves_platform > least]
-    # reasons against the result by what is undetermined
-    undetermined = [_undetermined(s, Level.WRONG) for s in large]
+    # what the data leave undetermined, then what they determine no better than the nominal model
+    undetermined = () if bed else tuple(_undetermined(estimate, findings, options))
+    refused = any(one.level is Level.WRONG for one in undetermined)
+    no_better: tuple[Finding, ...] = ()
     if bed:
-        undetermined = list(_no_gain("bed", bed.sigma, bed.by_drawing, options))
-    elif not large:
+        no_better = tuple(_no_gain("bed", bed.sigma, bed.by_drawing, options))
+    elif not refused:
         sigma, nominal = platform_sigma(estimate), findings.by_nominal
-        undetermined = list(_no_gain("platform", sigma, nominal, options))
+        no_better = tuple(_no_gain("platform", sigma, nominal, options))
+    negligible = negligible_shift(estimate.machine.parameters)
     # all findings, in the order of the report
     every = (
         *_estimate_misfit(estimate, method, options),
-        *undetermined,
+        *(undetermined if refused else no_better),
         *_singular(estimate, options),
         *_readings_misfit(estimate, options),
         *(() if explained else _poses_misfit(estimate, richer, options)),
         *_warnings(observation, estimate, options),
         *(_touch_unnoticed(bed, options) if bed else ()),
         *_few_configurations(estimate, options),
-        *(_not_by_heights(bed, findings) if bed else ()),
+        *(_not_by_heights(bed, findings, negligible) if bed else ()),
         *others,
-        *(_undetermined(s, Level.DOUBTFUL) for s in matter),
-        *_harmless(small),
+        *(() if refused else undetermined),
+        *(() if bed else _harmless(findings)),
     )
     usable = not any(one.level is Level.WRONG for one in every)
     if not usable:
@@ -157,21 +153,6 @@ def assess(
     else:
         headline = _headline(observation, estimate)
     return Verdict(usable, headline, every)
-
-
-def _undetermined(sentence: Sentence, level: Level) -> Finding:
-    """Finding about a motion of the machine that the data leave unidentified."""
-    return finding(
-        "machine.undetermined",
-        level,
-        ", ".join(sentence.parameters),
-        parameters=sentence.parameters,
-        dimensions=sentence.dimensions,
-        tool_shift=sentence.moves_platform,
-        weak=sentence.weak,
-        what=sentence.text,
-        advice=sentence.advice,
-    )
 
 
 def _headline(observation: Observation, estimate: Estimate) -> str:
@@ -229,19 +210,22 @@ def _touch_unnoticed(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
         )
 
 
-def _not_by_heights(bed: Bed, findings: Findings) -> Iterator[Finding]:
-    """Notes on what heights leave to the nominal model, and on its largest cause."""
+def _not_by_heights(bed: Bed, findings: Findings, negligible: float) -> Iterator[Finding]:
+    """Notes on what heights leave to the nominal model, and on its largest cause.
+
+    negligible : displacement of the platform, m.
+    """
     yield note("bed.sideways", sigma=bed.sideways, size_sigma=bed.size)
-    matter = [s for s in (*findings.unidentified, *findings.weak) if s.matters]
-    if matter:
-        first = max(matter, key=lambda s: s.moves_platform)
+    sentences = (*findings.unidentified, *findings.weak)
+    if sentences and findings.undetermined_shift > negligible:
+        first = max(sentences, key=lambda s: s.moves_platform)
         yield note(
             "bed.undetermined",
             ", ".join(first.parameters),
             what=first.text,
             parameters=first.parameters,
             tool_shift=first.moves_platform,
-            more=len(matter) - 1 or None,
+            more=max(sum(s.matters for s in sentences) - 1, 0) or None,
         )
 
 
@@ -342,51 +326,57 @@ def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
         yield wrong("configurations.singular", number=int(weak.sum()), of=weak.size)
 
 
-def _unidentifiable_text(
-    estimate: Estimate,
-    findings: Findings,
-    options: VerdictOptions,
-) -> tuple[tuple[Sentence, ...], tuple[Sentence, ...]]:
-    """Sentences on what is undetermined: reasons against the result, and those to know of.
+def _undetermined(
+    estimate: Estimate, findings: Findings, options: VerdictOptions
+) -> Iterator[Finding]:
+    """Findings on the largest motions that the data leave undetermined, where most of the tool's
+    variance is due to errors of the nominal model that the data leave.
 
-    Only motions that move the platform count. Weakly identified motions count where the nominal
-    model decides one of their parameters; otherwise the standard deviations show them.
+    They are wrong or doubtful by the displacement of the tool by all such errors together, so that
+    no verdict depends on the names of motions.
     """
-    undecided = set(_undecided(estimate))
-    weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
-    open_ = findings.unidentified + weak
-    total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
-    if total <= options.undetermined_share * findings.by_nominal:
-        return (), open_
-    # where other causes make more of the standard deviation, that deviation suffices
-    if total <= np.sqrt(max(platform_sigma(estimate) ** 2 - total**2, 0.0)):
-        return (), open_
-    least = min(options.large_cause_share * total, max(s.moves_platform for s in open_))
-    large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)
-    return large, tuple(s for s in open_ if s not in large)
-
-
-def _harmless(sentences: tuple[Sentence, ...]) -> Iterator[Finding]:
-    """One note on unidentified motions that do not move the platform; the report has the
-    sentences.
-    """
-    harmless = [s for s in sentences if not s.matters]
-    if harmless:
-        what = re.split(r"\.(?=\s|$)", harmless[0].text)[0]  # not at the point of a number
-        yield note(
-            "machine.undetermined_harmless",
-            ", ".join(harmless[0].parameters),
-            what=f"{what[0].lower()}{what[1:]}",
-            more=len(harmless) - 1 or None,
+    shift, variance = findings.undetermined_shift, platform_sigma(estimate) ** 2
+    # where noise makes enough of the standard deviation, that deviation suffices
+    if variance - shift**2 > options.least_noise_share * variance:
+        return
+    if shift <= negligible_shift(estimate.machine.parameters):
+        return
+    refused = shift > options.undetermined_share * findings.by_nominal
+    sentences = (*findings.unidentified, *findings.weak)
+    most = max((s.moves_platform for s in sentences), default=0.0)
+    least = min(options.large_cause_share * shift, most)
+    for one in (s for s in sentences if s.moves_platform >= least):
+        yield finding(
+            "machine.undetermined",
+            Level.WRONG if refused else Level.DOUBTFUL,
+            ", ".join(one.parameters),
+            parameters=one.parameters,
+            dimensions=one.dimensions,
+            tool_shift=one.moves_platform,
+            weak=one.weak,
+            what=one.text,
+            advice=one.advice,
         )
 
 
-def _undecided(estimate: Estimate) -> list[str]:
-    """Parameters that the nominal model decides, except tube radii, which move nothing."""
-    table = estimate.machine.parameters
-    decided = decided_by(table, estimate.covariance, estimate.data_share)
-    named = zip(table.names, table.kinds, decided, strict=True)
-    return [name for name, kind, by in named if by == "drawing" and kind != "radius"]
+def _harmless(findings: Findings) -> Iterator[Finding]:
+    """One note on unidentified motions that do not move the platform; the report has the
+    sentences.
+    """
+    if not findings.n_harmless:
+        return
+    harmless = [s for s in (*findings.unidentified, *findings.weak) if not s.matters]
+    if harmless:
+        what = re.split(r"\.(?=\s|$)", harmless[0].text)[0]  # not at the point of a number
+        what = f"{what[0].lower()}{what[1:]}"
+    else:  # no name describes these changes without others that move it
+        what = f"{in_full(findings.n_harmless)} of the machine's numbers, or combinations of them"
+    yield note(
+        "machine.undetermined_harmless",
+        ", ".join(harmless[0].parameters) if harmless else "",
+        what=what,
+        more=len(harmless) - 1 if len(harmless) > 1 else None,
+    )
 
 
 def _warnings(

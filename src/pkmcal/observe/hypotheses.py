@@ -50,18 +50,11 @@ SEARCH_OPTIONS = HypothesisOptions(beam=math.inf, most=3)
 OTHER_EXPLANATIONS = 4
 """Explanations of images beside those of the readings: shifted, under other names, mirrored,
 diameters for radii."""
-POSE_BY_HAND_LOG_ODDS = 1000.0
-"""Log-likelihood ratio (nats) of a pose by hand against readings that place the camera on another
-side of the machine: more than that of any images."""
 NEAR_SEARCH_TURN = np.radians(15.0)
 """Turn from the pose by hand beyond which hypotheses are searched about that pose, too."""
 OTHER_POSE_TURN = np.radians(45.0)
 """Turn from the pose by hand beyond which the localized pose contradicts it: a machine of three or
 six equal parts looks the same from there."""
-RIGHT_NAME_SHARE = 0.1
-"""Share of the mean log-likelihood ratio of a localized machine's images by which another name has
-to be likelier: between two nearly equal configurations, errors of the nominal model decide. On
-simulated machines, exchanged names had 0.2 to 2 times as much, right names up to 0.03."""
 NAMING_ROUNDS = 3
 """Rounds of names for images, and of the pose by these names."""
 FEW_CONFIGURATIONS = 4
@@ -73,6 +66,26 @@ NUMBERING = "readings.numbering_"
 """Prefix of the codes of legs that are numbered from another leg, or backwards."""
 STATION_PAIRS_SEARCHED = 15
 """Pairs of stations at most that are searched for each other's pose: all pairs of six stations."""
+
+
+@dataclass(frozen=True)
+class ImageEvidenceOptions:
+    """Evidence that the likelihood of images lacks, which no level of false alarms determines."""
+
+    # log-likelihood ratio (nats) of a pose by hand against readings that place the camera on
+    # another side of the machine: more than that of any images, for a person knows the side, and a
+    # machine of equal parts looks the same from each. The refusal names the pose as a rival
+    pose_by_hand: float = 1000.0
+    # share of the mean log-likelihood ratio of a localized machine's images by which another name
+    # has to be likelier, or another numbering of its legs: between two nearly equal configurations,
+    # and between equal parts of a machine, errors of the nominal model decide, of which the
+    # likelihood contains the scatter but not that all images of a station share them. Their effect
+    # grows with the evidence, so it is a share and no number of nats. On simulated machines,
+    # exchanged names had 0.2 to 2 times as much, right names up to 0.03
+    right_name_share: float = 0.1
+
+
+IMAGE_EVIDENCE = ImageEvidenceOptions()
 
 
 class SuspectStation(NamedTuple):
@@ -119,7 +132,11 @@ class ImageHypothesis(Hypothesis[StationView]):
     readings: Array | None = None
 
 
-def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputError | None:
+def mistake(
+    stations: list[SuspectStation],
+    rng: np.random.Generator,
+    options: ImageEvidenceOptions = IMAGE_EVIDENCE,
+) -> InputError | None:
     """Error about stations whose images disagree with the session, None if all agree."""
     error = _swapped_stations([s for s in stations if s.elsewhere], rng)
     if error is not None or not stations:
@@ -130,12 +147,12 @@ def mistake(stations: list[SuspectStation], rng: np.random.Generator) -> InputEr
     )
     # a station that is localized near its pose by hand shows that the readings are in order
     in_order = any(s.by_hand is not None and not s.elsewhere for s in stations)
-    error = _mixed_up(worst, in_order, rng)
+    error = _mixed_up(worst, in_order, rng, options)
     if error is not None:
         return error
     if not bad:  # readings are wrong for all stations, but names for one alone
         rest = (station for station in stations if station is not worst)
-        errors = (_likelier(s, list(_other_images(s)), True, rng) for s in rest)
+        errors = (_likelier(s, list(_other_images(s, options)), True, rng, options) for s in rest)
         return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
     at = ", nor in those of " + listed(others) if others else ""
@@ -223,7 +240,10 @@ def _swapped_stations(
 
 
 def _mixed_up(
-    station: SuspectStation, in_order: bool, rng: np.random.Generator
+    station: SuspectStation,
+    in_order: bool,
+    rng: np.random.Generator,
+    options: ImageEvidenceOptions,
 ) -> InputError | None:
     """Error of the hypothesis that explains a station's images better than the session, if any.
 
@@ -264,10 +284,10 @@ def _mixed_up(
     if not station.elsewhere:
         # of few images any other explanation may fit better by chance
         levels.append(searched(view.few(len(view.configuration))))
-    hypotheses, others = list(_hypotheses(station)), list(_other_images(station))
+    hypotheses, others = list(_hypotheses(station)), list(_other_images(station, options))
     some = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
     count = len(hypotheses) + len(others)
-    return _likelier(station, [*others, *some], in_order, rng, count)
+    return _likelier(station, [*others, *some], in_order, rng, options, count)
 
 
 def _likelier(
@@ -275,6 +295,7 @@ def _likelier(
     hypotheses: list[ImageHypothesis],
     in_order: bool,
     rng: np.random.Generator,
+    options: ImageEvidenceOptions,
     count: int | None = None,
 ) -> InputError | None:
     """Error of the likeliest hypothesis, by a full search, that explains a station better than the
@@ -303,17 +324,24 @@ def _likelier(
             # the stated readings contradict the pose by hand, and no other station shows that they
             # are in order
             if station.elsewhere and localization.good and not in_order and h.readings is not None:
-                out[k] = ratio + POSE_BY_HAND_LOG_ODDS
+                out[k] = ratio + options.pose_by_hand
             elif at.by_chance * count < at.limit:
                 out[k] = ratio
         return out
 
     level = EvidenceLevel("full search", by_full_search)
-    errors = [
-        one.hypothesis.error for one in likely(posterior(hypotheses, [level], SEARCH_OPTIONS))
-    ]
-    if not errors:
+    found = likely(posterior(hypotheses, [level], SEARCH_OPTIONS))
+    if not found:
         return None
+    if _any_numbering(station):
+        # another numbering alone explains the images no better, since the camera may stand
+        # anywhere, but it may explain as well what seems to be another mistake
+        numberings = list(_numberings(station, options))
+        count += len(numberings)
+        equal = posterior(numberings, [_searched_anywhere(station, rng)], SEARCH_OPTIONS)
+        some = [one.hypothesis for one in (*found, *equal)]
+        found = likely(posterior(some, [level], SEARCH_OPTIONS)) or found
+    errors = [one.hypothesis.error for one in found]
     error, also = errors[0], [one.what for one in errors[1:]]
     if station.elsewhere and localization.good:
         also.append("the pose by hand is of another side of the machine")
@@ -324,6 +352,22 @@ def _likelier(
     return error.with_fields(
         found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}"
     )
+
+
+def _searched_anywhere(
+    station: SuspectStation, rng: np.random.Generator
+) -> EvidenceLevel[ImageHypothesis]:
+    """Evidence for other readings by a short search in few images, wherever the camera stands."""
+    view = station.view
+    few, anywhere = view.few(FEW_CONFIGURATIONS), np.zeros((0, 4, 4))
+
+    def ratios(hypotheses: Sequence[ImageHypothesis]) -> Array:
+        readings = np.stack([view.joints, *(h.apply(view).joints for h in hypotheses)])
+        own, *values = likelihood_nearby(view, readings, anywhere, True, few, rng).tolist()
+        return (np.array(values) - own) / station.localization.correlation_length
+
+    name = f"{len(few)} images, anywhere"
+    return EvidenceLevel(name, ratios, decides=False, most=SEARCH_OPTIONS.most)
 
 
 def log_prior_of_each(machine: Machine, joints: Array) -> float:
@@ -337,23 +381,13 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
     that was not localized, also diameters in place of radii.
     """
     view, prior = station.view, log_prior_of_each(station.view.machine, station.view.all_joints)
-    # a machine of equal thirds is localized by any of its equal numberings
-    any_numbering = station.localization.good and station.by_hand is None
-    for h in reading_hypotheses(view.all_joints, view.machine.joint_ranges):
-        if h.code == "readings.shifted" or (any_numbering and h.code.startswith(NUMBERING)):
-            continue  # images may be of some configurations: their names shift, below
-        joints = h.apply(view.all_joints)
-        yield ImageHypothesis(
-            h.code,
-            h.subject,
-            lambda view, joints=joints: view.with_joints(joints),
-            prior,
-            facts=h.facts,
-            error=reading_error(
-                h, station.table, station.columns, view.machine.joint_units, "the images fit"
-            ),
-            readings=joints[view.configuration],
-        )
+    # images may be of some configurations: their names shift, below
+    yield from (
+        one
+        for one in _of_readings(station)
+        if one.code != "readings.shifted"
+        and not (_any_numbering(station) and one.code.startswith(NUMBERING))
+    )
     names = view.configuration
     if 2 < len(names) == len(np.unique(names)):
         for step in (1, -1):
@@ -374,13 +408,49 @@ def _hypotheses(station: SuspectStation) -> Iterator[ImageHypothesis]:
         )
 
 
+def _of_readings(station: SuspectStation) -> Iterator[ImageHypothesis]:
+    """Hypotheses about the readings."""
+    view, prior = station.view, log_prior_of_each(station.view.machine, station.view.all_joints)
+    for h in reading_hypotheses(view.all_joints, view.machine.joint_ranges):
+        joints = h.apply(view.all_joints)
+        yield ImageHypothesis(
+            h.code,
+            h.subject,
+            lambda view, joints=joints: view.with_joints(joints),
+            prior,
+            facts=h.facts,
+            error=reading_error(
+                h, station.table, station.columns, view.machine.joint_units, "the images fit"
+            ),
+            readings=joints[view.configuration],
+        )
+
+
+def _any_numbering(station: SuspectStation) -> bool:
+    """Whether a machine of equal thirds would be localized by any of its equal numberings."""
+    return station.localization.good and station.by_hand is None
+
+
+def _numberings(
+    station: SuspectStation, options: ImageEvidenceOptions
+) -> Iterator[ImageHypothesis]:
+    """Hypotheses about the numbering of the legs of a localized machine."""
+    own = station.localization
+    equal = options.right_name_share * own.log_likelihood_ratio / own.correlation_length
+    for one in _of_readings(station):
+        if one.code.startswith(NUMBERING):
+            yield replace(one, log_prior=one.log_prior - equal)
+
+
 def _with_half_radii(view: StationView) -> StationView:
     values = view.machine.values.copy()
     values[np.unique(view.tubes.radius)] /= 2
     return replace(view, machine=view.machine.with_values(values))
 
 
-def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
+def _other_images(
+    station: SuspectStation, options: ImageEvidenceOptions
+) -> Iterator[ImageHypothesis]:
     """Images under the names that fit each of them best; mirrored images where the machine was not
     localized near its pose by hand.
     """
@@ -419,7 +489,7 @@ def _other_images(station: SuspectStation) -> Iterator[ImageHypothesis]:
             "image.exchanged",
             station.name,
             lambda view: replace(view, configuration=right),
-            prior - len(shifted) * (choices + RIGHT_NAME_SHARE * keep_evidence),
+            prior - len(shifted) * (choices + options.right_name_share * keep_evidence),
             error=_misnamed(station, shifted, names[columns[shifted]]),
         )
 

@@ -227,6 +227,17 @@ def parameter_cost(count: int, n_effective: float) -> float:
     return -0.5 * count * log(max(n_effective, 1.0))
 
 
+def harmless_misfit(
+    n_effective: float, log_prior: float, log_odds: float = OPTIONS.report
+) -> float:
+    """Misfit of the data as stated, as of :func:`log_likelihood`, up to which no hypothesis can
+    have the log-odds: not even one that leaves no more than the stated noise.
+
+    log_prior : of the most probable hypothesis.
+    """
+    return math.exp((log_odds - log_prior) / max(n_effective, 1.0))
+
+
 def log_likelihood(misfit: Array, n_effective: float) -> Array:
     """Log-likelihood (nats) of residuals by their root mean square ``misfit``, in stated standard
     deviations, up to a constant.
