@@ -25,6 +25,7 @@ from pkmcal.api.show import show
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.web import serving
+from pkmcal.web.bundle_files import SCRIPT_FILE, bundle_file
 from pkmcal.web.document import ViewerDocument
 from pkmcal.web.machine_page import (
     PoseRequest,
@@ -32,7 +33,7 @@ from pkmcal.web.machine_page import (
     configuration_at,
     machine_document,
 )
-from pkmcal.web.page import SCRIPT_FILE, bundle_file, standalone_page
+from pkmcal.web.page import standalone_page
 from test_report_page import CHROMIUM, HOSTILE, Found
 from test_view import PORT, TOKEN, Answer
 from test_view import Page as ViewPage
