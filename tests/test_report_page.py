@@ -1,5 +1,6 @@
 """The report's page: its text, no requests to other places, and its scripts in browsers."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -107,7 +108,7 @@ def test_charts_lead_to_images_that_are_there(page, case):
 
 
 def test_page_asks_for_nothing_outside(page):
-    assert not re.search(r"https?:|//[a-z]+\.|@import|url\(", page)
+    assert not re.search(r"https?:|//[a-z]+\.|@import|url\((?!#)", page)
     for tag, attributes in PageParts(page).tags:
         assert tag not in ("link", "iframe", "object", "embed", "base")
         for name in ("src", "href", "xlink:href", "srcset", "action"):
@@ -284,6 +285,80 @@ def test_page_runs_in_a_browser(page, tmp_path):
     assert root["data-light"] == "#1a1e24"
     # plots in space have an image for paper, at twice the resolution of a screen
     assert root["data-printed"] == ",".join(["1344"] * page.count('class="panel in-space"'))
+
+
+INSPECTED = """
+  const tell = document.documentElement.dataset;
+  const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+  const buttons = document.querySelectorAll(".enlarge");
+  const $ = (query) => document.querySelector(query);
+  const caption = () => $(".large-caption").textContent;
+  const picture = () => $(".inspected svg");
+  const box = () => picture().getAttribute("viewBox").split(" ").map(Number);
+  const key = (name) => picture().dispatchEvent(
+    new KeyboardEvent("keydown", { key: name, bubbles: true, cancelable: true }));
+  (async () => {
+    buttons[0].click();
+    await wait(200);
+    tell.first = caption();
+    tell.whole = JSON.stringify(box());
+    const host = $(".inspected").getBoundingClientRect();
+    const part = (from, size, share) => Math.round(from + share * size);  // a wheel's are whole
+    const at = {
+      clientX: part(host.left, host.width, 0.7), clientY: part(host.top, host.height, 0.4),
+    };
+    const under = () => {  // pixel of the image under the pointer
+      const point = new DOMPoint(at.clientX, at.clientY);
+      const { x, y } = point.matrixTransform(picture().getScreenCTM().inverse());
+      return [x, y];
+    };
+    const before = under();
+    const turn = { deltaY: -900, cancelable: true, bubbles: true, ...at };
+    $(".inspected").dispatchEvent(new WheelEvent("wheel", turn));
+    tell.under = JSON.stringify([before, under()]);
+    tell.near = JSON.stringify(box());
+    for (let k = 0; k < 9; k += 1) $(".inspected").dispatchEvent(new WheelEvent("wheel", turn));
+    tell.pixel = host.width / box()[2];
+    tell.sharp = getComputedStyle(picture().querySelector("image")).imageRendering;
+    const hidden = (query) => getComputedStyle(picture().querySelector(query)).display === "none";
+    key("e");
+    tell.edges = hidden(".edge");
+    key("n");
+    tell.crosses = [hidden(".cross"), hidden(".ring")].join();
+    const gamma = $(".inspector-gamma input");
+    gamma.value = 0.45;
+    gamma.dispatchEvent(new Event("input"));
+    tell.gamma = picture().querySelector("feFuncG").getAttribute("exponent");
+    key("ArrowRight");
+    tell.second = caption();
+    const exponent = () => picture().querySelector("feFuncG").getAttribute("exponent");
+    tell.again = [hidden(".edge"), exponent()].join();
+    tell.fitted = JSON.stringify(box());
+    key("ArrowLeft"); key("ArrowLeft");
+    tell.last = caption();
+    tell.captions = JSON.stringify([...buttons].map((one) =>
+      one.parentNode.querySelector("figcaption").innerText.replace("\\n", " · ")));
+  })();"""
+
+
+def test_enlarged_images_are_inspected(page, tmp_path):
+    """The wheel zooms about the pointer down to single pixels; keys switch layers and images."""
+    document, console = browse(loaded(page, INSPECTED), tmp_path, 1280)
+    root = {name: str(value) for name, value in fine(document, console).items()}
+    captions = json.loads(root["data-captions"])
+    shown = [root[f"data-{name}"] for name in ("first", "second", "last")]
+    assert shown == [captions[0], captions[1], captions[-1]]
+    before, after = json.loads(root["data-under"])
+    np.testing.assert_allclose(after, before, atol=0.05)
+    whole, near, fitted = (json.loads(root[f"data-{n}"]) for n in ("whole", "near", "fitted"))
+    assert near[2] == pytest.approx(whole[2] * np.exp(-1.8), rel=1e-3)
+    assert fitted == pytest.approx(whole)
+    assert float(root["data-pixel"]) == pytest.approx(80, rel=1e-3)
+    assert root["data-sharp"] == "pixelated"
+    assert root["data-edges"] == "true"
+    assert root["data-crosses"] == "true,false"
+    assert root["data-gamma"] == "0.45"
+    assert root["data-again"] == "true,0.45"
 
 
 @pytest.mark.slow

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.cameras.frustum import frustum
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.cameras.unified import Unified
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb
 from pkmcal.identify.centres import joint_centres
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.pages.plots import frustum
 from pkmcal.report import image_scene, pictures
 from test_report_case import RADIUS, Case, calibration, make_case
 

@@ -25,6 +25,7 @@ from pkmcal.api.show import show
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.web import serving
+from pkmcal.web.bundle_files import SCRIPT_FILE, bundle_file
 from pkmcal.web.document import ViewerDocument
 from pkmcal.web.machine_page import (
     PoseRequest,
@@ -32,7 +33,7 @@ from pkmcal.web.machine_page import (
     configuration_at,
     machine_document,
 )
-from pkmcal.web.page import SCRIPT_FILE, bundle_file, standalone_page
+from pkmcal.web.page import standalone_page
 from test_report_page import CHROMIUM, HOSTILE, PageParts
 from test_view import PORT, TOKEN, Answer
 from test_view import Page as ViewPage
@@ -109,10 +110,10 @@ def test_arrows_point_where_readings_grow(name):
                 old, new = before["legs"][j], after["legs"][j]
                 arrow = np.subtract(*np.array(old["positive"])[[1, 0]])
                 if machine.layout.rod_reads[j]:
-                    way = np.subtract(old["platform"][-1], old["base"][-1])
+                    travel = np.subtract(old["platform"][-1], old["base"][-1])
                 else:
-                    way = np.subtract(new["base"][-1], old["base"][-1])
-                assert arrow @ way > 0.9 * np.linalg.norm(arrow) * np.linalg.norm(way)
+                    travel = np.subtract(new["base"][-1], old["base"][-1])
+                assert arrow @ travel > 0.9 * np.linalg.norm(arrow) * np.linalg.norm(travel)
 
 
 def test_zeros_are_those_of_the_files():

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from pkmcal.web.bundle_files import ENLARGED_FILE, SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.document import schema_text
-from pkmcal.web.page import SCRIPT_FILE, STYLE_FILE, bundle_file
 
 ROOT = Path(__file__).resolve().parents[1]
 VIEWER, WEB = ROOT / "viewer", ROOT / "src" / "pkmcal" / "web"
 SOURCES = ("package.json", "package-lock.json", "tsconfig.json", "vite.config.js", "src")
+FILES = (SCRIPT_FILE, STYLE_FILE, ENLARGED_FILE)
 INSTALL_SECONDS, BUILD_SECONDS = 120, 300
 
 
@@ -31,7 +32,7 @@ def source_hash() -> str:
     return digest.hexdigest()
 
 
-@pytest.mark.parametrize("name", [SCRIPT_FILE, STYLE_FILE])
+@pytest.mark.parametrize("name", FILES)
 def test_the_bundle_is_built_from_the_sources(name):
     """Otherwise run make viewer, and commit what it changes."""
     assert bundle_file(name).startswith(f"/*! pkmcal viewer; sources sha256 {source_hash()} */\n")
@@ -42,7 +43,8 @@ def test_the_schema_is_that_of_the_document():
 
 
 def test_the_bundle_can_stand_inside_a_page():
-    assert not re.search(r"</script|<!--", bundle_file(SCRIPT_FILE), re.I)
+    for name in (SCRIPT_FILE, ENLARGED_FILE):
+        assert not re.search(r"</script|<!--", bundle_file(name), re.I)
     assert "</style" not in bundle_file(STYLE_FILE).lower()
     assert not re.search(r"@import|url\(", bundle_file(STYLE_FILE))
     assert "eval(" not in bundle_file(SCRIPT_FILE)
@@ -92,5 +94,5 @@ def test_a_build_gives_the_same_bytes(project, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     types = Path("src") / "document.ts"
     assert (project / types).read_bytes() == (VIEWER / types).read_bytes()
-    for name in (SCRIPT_FILE, STYLE_FILE):
+    for name in FILES:
         assert (tmp_path / "bundle" / name).read_text() == bundle_file(name)

@@ -35,22 +35,23 @@ const stamped = {
   },
 };
 
-export default defineConfig({
+// `enlarged`: the part of the viewer for pages that are not yet its views
+export default defineConfig(({ mode }) => ({
   root,
   plugins: [stamped],
   build: {
     target: "es2022",
     outDir: process.env.BUNDLE ?? join(root, "../src/pkmcal/web/bundle"),
-    emptyOutDir: true,
+    emptyOutDir: mode === "viewer",
     modulePreload: false,
     reportCompressedSize: false,
     chunkSizeWarningLimit: 2000,
     lib: {
-      entry: join(root, "src/main.ts"),
+      entry: join(root, mode === "viewer" ? "src/main.ts" : "src/enlarged.ts"),
       formats: ["iife"],
       name: "pkmcalViewer",
-      fileName: () => "viewer.js",
+      fileName: () => `${mode}.js`,
       cssFileName: "viewer",
     },
   },
-});
+}));

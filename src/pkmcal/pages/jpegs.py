@@ -14,6 +14,8 @@ from pkmcal.observe.images import Pictures
 
 LARGE_JPEG_WIDTH, SMALL_JPEG_WIDTH = 640, 256
 """Widths, px, of the image shown alone and of its thumbnail."""
+FULL_JPEGS, FULL_JPEG_WIDTH = 12, 2048
+"""Number of the first images that keep their pixels when shown alone, and their largest width."""
 PAGE_JPEG_QUALITY = 70
 """"""
 JPEGS_DECODED_AT_ONCE = 32
@@ -46,9 +48,14 @@ def small_and_large(
     with ThreadPoolExecutor(THREADS) as pool:
         for first in range(0, len(images), JPEGS_DECODED_AT_ONCE):
             some = images[first : first + JPEGS_DECODED_AT_ONCE]
+            larges = [
+                FULL_JPEG_WIDTH if k < FULL_JPEGS else LARGE_JPEG_WIDTH
+                for k in range(first, first + len(some))
+            ]
             for small, large in pool.map(
-                lambda one: _base64_jpegs(one[0], one[1], (SMALL_JPEG_WIDTH, LARGE_JPEG_WIDTH)),
+                lambda one, wide: _base64_jpegs(one[0], one[1], (SMALL_JPEG_WIDTH, wide)),
                 some,
+                larges,
             ):
                 if len(small) > remainder:
                     return

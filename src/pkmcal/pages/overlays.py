@@ -58,7 +58,7 @@ class Drawn:
     @cached_property
     def path(self) -> str:
         """SVG path data."""
-        return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
+        return "M" + "L".join(f"{x:.2f},{y:.2f}" for x, y in self.points)
 
 
 def edge_name(leg: int, tube: int, side: int) -> str:

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import apply
 
 TRANSPARENT_COLOUR = "rgba(0,0,0,0)"
 COMMON_PLOT_LAYOUT: dict[str, Any] = {
@@ -39,8 +37,6 @@ WIDE_SPACE_PICTURE, NARROW_SPACE_PICTURE = (1.5, 0.76), (1.0, 0.66)
 
 Names and numbers stand beside the data, in the same size in a small plot.
 """
-FRUSTUM_POINTS_A_SIDE = 6
-"""Points on each side of the image border in a drawn frustum."""
 
 
 def plane(x: str, y: str) -> dict[str, Any]:
@@ -164,14 +160,6 @@ def coloured(name: str, points: Array, values: Array, unit: str, **more: Any) ->
     return markers(name, points, style, **more)
 
 
-def ring(points: Array) -> Array:
-    """Joints (L, 3) of a body in their order around the middle, closed: (L + 1, 3)."""
-    centred = points - points.mean(axis=0)
-    across = np.linalg.svd(centred, full_matrices=False)[2][:2]
-    around = np.argsort(np.arctan2(*(centred @ across.T).T))
-    return points[[*around, around[0]]]
-
-
 def space_layout(eye: dict[str, float] = EYE_AT_CORNER) -> dict[str, Any]:
     """Layout of a figure in space.
 
@@ -245,32 +233,3 @@ def uncropped(data: list[dict[str, Any]], direction: Array) -> dict[str, Any]:
     return layout | {
         "meta": {"wide": WIDE_SPACE_PICTURE[0], "narrow": camera(*NARROW_SPACE_PICTURE)}
     }
-
-
-def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
-    """Lines (n, 3), m, base frame: border of the image at a depth, and rays to its four corners.
-
-    Where the lens or mirror has no ray at the border, the limit of its field along the line to the
-    image's centre. For fields too wide for a plane at that depth, ``depth`` is the distance along
-    the rays.
-    """
-    right, bottom = camera.image_size[0] - 0.5, camera.image_size[1] - 0.5
-    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])
-    at = np.arange(4 * FRUSTUM_POINTS_A_SIDE + 1) / FRUSTUM_POINTS_A_SIDE
-    # along each ray from the border to the centre take the first that the camera model has
-    border = np.stack([np.interp(at, np.arange(5), corners[:, c]) for c in (0, 1)], axis=-1)
-    centre = (border.max(axis=0) + border.min(axis=0)) / 2
-    share = np.linspace(1, 0, 41)[:, None, None]
-    rays = camera.ray(centre + share * (border - centre))
-    first = np.argmax(np.isfinite(rays).all(axis=-1), axis=0)
-    rays = rays[first, np.arange(len(border))]
-    if not np.isfinite(rays).all():
-        return []
-    deep = rays[:, 2].min()
-    points = rays * depth / (rays[:, 2:] if deep > 0.3 else 1.0)
-    border_points = apply(T_base_camera, points)
-    eye = T_base_camera[:3, 3]
-    return [
-        border_points,
-        *(np.stack([eye, border_points[k * FRUSTUM_POINTS_A_SIDE]]) for k in range(4)),
-    ]

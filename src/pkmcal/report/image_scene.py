@@ -11,12 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.cameras.frustum import frustum
+from pkmcal.geometry.outlines import ring
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.estimate import Estimate
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Plot
 from pkmcal.pages.page import N_COLOURS
-from pkmcal.pages.plots import frustum, line, markers, path_between_cameras, ring, uncropped
+from pkmcal.pages.plots import line, markers, path_between_cameras, uncropped
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count

@@ -19,7 +19,7 @@ from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tu
 from pkmcal.outcome import Part
 from pkmcal.pages import page
 from pkmcal.pages.charts import enlargement
-from pkmcal.pages.jpegs import small_and_large
+from pkmcal.pages.jpegs import FULL_JPEGS, small_and_large
 from pkmcal.pages.overlays import (
     EDGE_CURVE_POINTS,
     INLIER_WEIGHT,
@@ -87,6 +87,7 @@ def section(session: Session, display: Album) -> Part:
         boards=any(p.corners for p in display.pictures),
         missed=any(p.missed for p in display.pictures),
         large=sum(bool(p.large) for p in display.pictures),
+        full=FULL_JPEGS,
     )
     return Part("photographs", "Images", html=html)
 

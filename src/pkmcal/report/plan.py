@@ -10,6 +10,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
+from pkmcal.cameras.frustum import frustum
 from pkmcal.files import csv_text, json_value, yaml_text
 from pkmcal.geometry.rigid import inverse
 from pkmcal.levels import NEGLIGIBLE
@@ -18,7 +19,6 @@ from pkmcal.outcome.finding import Finding, note
 from pkmcal.pages.plots import (
     COMMON_AXIS_LAYOUT,
     COMMON_PLOT_LAYOUT,
-    frustum,
     line,
     markers,
     path_between_cameras,

@@ -14,13 +14,14 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import PkmcalError
+from pkmcal.geometry.outlines import ring
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
 from pkmcal.pages.charts import CHART_WIDTH, enlargement
-from pkmcal.pages.plots import line, markers, ring, space_layout
+from pkmcal.pages.plots import line, markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 

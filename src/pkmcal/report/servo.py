@@ -10,10 +10,11 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, rms
 from pkmcal.control.sentences import chosen_legs, judgement
 from pkmcal.control.study import Study, Trials
+from pkmcal.geometry.outlines import ring
 from pkmcal.geometry.rigid import inverse
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
 from pkmcal.pages.page import N_COLOURS
-from pkmcal.pages.plots import coordinates, line, markers, plane, ring, space_layout
+from pkmcal.pages.plots import coordinates, line, markers, plane, space_layout
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2

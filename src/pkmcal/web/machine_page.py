@@ -16,9 +16,10 @@ from pkmcal.files import Schema
 from pkmcal.mechanisms import Machine
 from pkmcal.web import document as shapes
 from pkmcal.web import serving
+from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.guard import Guard
 from pkmcal.web.motion import Postures, home_posture, moved, sweeps
-from pkmcal.web.page import SCRIPT_FILE, STYLE_FILE, bundle_file, served_page
+from pkmcal.web.page import served_page
 from pkmcal.web.stage import configurations, leg_rows, machine_shape, slider_ranges
 from pkmcal.wording import count
 

@@ -1,7 +1,6 @@
 """HTML of the viewer: a shell with the document, and the bundle inlined or beside it.
 
-The bundle is built from ``viewer/`` by ``make viewer`` and carries the SHA-256 of its sources. A
-self-contained page may fetch nothing: its Content-Security-Policy allows the scripts and styles
+A self-contained page may fetch nothing: its Content-Security-Policy allows the scripts and styles
 with the hashes of the bundle, and no other, whatever a name in a file holds.
 """
 
@@ -9,20 +8,11 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from functools import cache
 from hashlib import sha256
 from html import escape
-from importlib import resources
 
+from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.document import ViewerDocument
-
-SCRIPT_FILE, STYLE_FILE = "viewer.js", "viewer.css"
-
-
-@cache
-def bundle_file(name: str) -> str:
-    """Text of a file of the bundle."""
-    return (resources.files("pkmcal.web") / "bundle" / name).read_text("utf-8")
 
 
 def standalone_page(document: ViewerDocument) -> str:

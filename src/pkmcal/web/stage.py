@@ -14,7 +14,9 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
+from pkmcal.cameras.frustum import frustum
 from pkmcal.errors import InputError
+from pkmcal.geometry.outlines import ring
 from pkmcal.geometry.rigid import apply, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import Chain, base_carriers
@@ -22,7 +24,6 @@ from pkmcal.mechanisms.closure import base_ends, scales
 from pkmcal.mechanisms.document import ActuatedLength
 from pkmcal.mechanisms.layout import CarrierGroup
 from pkmcal.mechanisms.motors import bodies
-from pkmcal.pages.plots import frustum, ring
 from pkmcal.web import document as shapes
 from pkmcal.web.motion import home_posture
 from pkmcal.wording import DISPLAY_UNITS, number, split_name, with_unit

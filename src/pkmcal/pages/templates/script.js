@@ -21,32 +21,3 @@
   addEventListener("pointermove", show);
   addEventListener("scroll", hide, { passive: true });
 })();
-
-// Enlarged images; a click inside comes nearer still.
-(() => {
-  const dialog = document.getElementById("large");
-  const frame = dialog.querySelector(".large-picture");
-  for (const button of document.querySelectorAll(".enlarge")) {
-    button.addEventListener("click", () => {
-      const picture = button.querySelector("svg").cloneNode(true);
-      const { width, height } = picture.viewBox.baseVal;
-      const { large } = button.dataset;
-      if (large) picture.querySelector("image").setAttribute("href", `data:image/jpeg;base64,${large}`);
-      frame.style.setProperty("--ratio", width / height);
-      frame.classList.remove("near");
-      frame.replaceChildren(picture);
-      dialog.querySelector(".large-caption").textContent =
-        button.parentNode.querySelector("figcaption").innerText.replace("\n", " · ");
-      dialog.showModal();
-    });
-  }
-  frame.addEventListener("click", (event) => {
-    const box = frame.getBoundingClientRect();
-    const x = (event.clientX - box.left + frame.scrollLeft) / frame.scrollWidth;
-    const y = (event.clientY - box.top + frame.scrollTop) / frame.scrollHeight;
-    frame.classList.toggle("near");
-    frame.scrollTo(x * frame.scrollWidth - box.width / 2, y * frame.scrollHeight - box.height / 2);
-  });
-  dialog.querySelector(".close").addEventListener("click", () => dialog.close());
-  dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
-})();
