@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+import pkmcal
 from faults import fault
 from pkmcal.cameras import load_camera
 from pkmcal.errors import InputError
@@ -16,13 +17,12 @@ from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.session.image_files import image_header
 from pkmcal.session.load import load_session
 from pkmcal.session.schema import session_schema
-from pkmcal.starter import write_session
 
 
 @pytest.fixture
 def session(tmp_path):
     """An example session."""
-    write_session(tmp_path / "session")
+    pkmcal.new().save(tmp_path / "session")
     return tmp_path / "session"
 
 

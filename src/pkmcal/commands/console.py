@@ -9,7 +9,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,9 +21,7 @@ from pkmcal.ranges import RANGES, check_number
 from pkmcal.terminal import err, print_points
 
 if TYPE_CHECKING:
-    from pkmcal.api.result import Result
-
-TextProgress = Callable[[str, float], None]
+    from pkmcal.api.result import Progress, Result
 
 OUTPUT_GROUP = "Output"
 """Heading of the options of outputs in the help."""
@@ -165,7 +163,7 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def progress(quiet: bool = False) -> Generator[TextProgress]:
+def progress(quiet: bool = False) -> Generator[Progress]:
     """Context with a progress callback, which draws a bar on stderr.
 
     If stderr is not a terminal but a log or a pipe, it prints a plain line every
@@ -193,7 +191,7 @@ def progress(quiet: bool = False) -> Generator[TextProgress]:
 
 
 @contextmanager
-def _progress_lines() -> Generator[TextProgress]:
+def _progress_lines() -> Generator[Progress]:
     """Context with a progress callback that prints lines at intervals; short commands print
     none.
     """
@@ -217,11 +215,6 @@ def _progress_lines() -> Generator[TextProgress]:
     finally:
         over.set()
         thread.join()
-
-
-def counted(progress: TextProgress, upto: float = 1.0) -> Callable[[int, int], None]:
-    """Callback of the numbers of finished and of all images, as progress from 0 to `upto`."""
-    return lambda done, total: progress(f"Image {done} of {total}", upto * done / total)
 
 
 def can_show() -> bool:

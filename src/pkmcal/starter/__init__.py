@@ -75,23 +75,6 @@ DRIVE_NOISE_TEXT = """\
 """
 
 
-def write_session(
-    folder: Path | str,
-    machine: str | None = None,
-    what: ObservedChoice | None = None,
-    places: int = 1,
-) -> tuple[str, ...]:
-    """Write a starter session into a new or empty folder; returns the names of its files.
-
-    machine : a built-in machine's name or a mechanism file; by default a hexapod to be edited.
-    what : what the camera observes; by default the legs, or a board if the nominal model has no
-        tubes, or nothing if readings alone determine the geometry.
-    places : number of stations of the camera.
-    Raises InputError for a folder that is not empty, and for legs without tubes.
-    """
-    return write_texts(folder, session_texts(machine, what, places))
-
-
 def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
     """Write a session's files, by name, into a new or empty folder, atomically."""
     check_new_folder(folder)
@@ -117,7 +100,14 @@ def check_new_folder(folder: Path | str) -> None:
 def session_texts(
     machine: str | None = None, what: ObservedChoice | None = None, places: int = 1
 ) -> dict[str, str]:
-    """Texts of a session's files by name; arguments as for :func:`write_session`."""
+    """Texts of a starter session's files by name.
+
+    machine : a built-in machine's name or a mechanism file; by default a hexapod to be edited.
+    what : what the camera observes; by default the legs, or a board if the nominal model has no
+        tubes, or nothing if readings alone determine the geometry.
+    places : number of stations of the camera.
+    Raises InputError for legs without tubes.
+    """
     files = sorted(path for path in SESSION_TEMPLATE_FOLDER.rglob("*") if path.is_file())
     texts = {
         path.relative_to(SESSION_TEMPLATE_FOLDER).as_posix(): path.read_text("utf-8")
@@ -216,7 +206,7 @@ def _session_text(text: str, hexapod: bool, turns: bool, what: ObservedChoice, p
 
 
 def untouched_files(folder: Path | str) -> tuple[Finding, ...]:
-    """Warnings about files of a session that are still as `write_session` wrote them."""
+    """Warnings about files of a session that are still as `pkmcal new` wrote them."""
     return tuple(
         doubtful("session.example_file", name, what=what)
         for name, what in TO_FILL.items()
