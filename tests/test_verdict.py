@@ -80,7 +80,7 @@ def sessions(tmp_path_factory):
         observation, estimate, _, _ = judged(make(name, n=n, n_stations=1, seed=seed))
         add(observation, estimate)
     heights = probe_kit(tmp_path_factory.mktemp("heights") / "session", n=7).calibrated()
-    add(heights.observation, heights.estimate, heights.findings.bed)
+    add(heights.observation, heights.estimate, heights.identification.bed)
     rng = np.random.default_rng(1)
     for name, count in (("linear-delta", 8), ("gough-stewart", 12)):
         machine = load_mechanism(name)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from plots import CALIBRATED, DRAWING, GOOD, INK, MUTED, Plot, arrow_heads, dot, line, svg, text
+from plots import CALIBRATED, GOOD, INK, MUTED, NOMINAL, Plot, arrow_heads, dot, line, svg, text
 from scipy.interpolate import CubicSpline
 
 from pkmcal.arrays import Array, Integers
@@ -40,7 +40,7 @@ REACH = 1.4
 def frames(truth: Truth) -> str:
     """The machine with base, platform and camera frames, from outside."""
     eye = look_at(np.array([1.6, -1.25, 1.0]), np.array([0.0, -0.02, 0.2]), np.array([0, 0, 1.0]))
-    rgb = (CALIBRATED, GOOD, DRAWING)
+    rgb = (CALIBRATED, GOOD, NOMINAL)
 
     def on_paper(points: Array) -> Array:
         in_view = apply(eye, np.asarray(points, dtype=float))
@@ -105,11 +105,11 @@ def edge_planes() -> str:
     def at(p: Array) -> tuple[float, float]:
         return 130 + scale * float(p[0]), 150 - scale * float(p[1])
 
-    parts = [arrow_heads(CALIBRATED, DRAWING, INK, MUTED)]
+    parts = [arrow_heads(CALIBRATED, NOMINAL, INK, MUTED)]
     o, axis = at(np.zeros(3)), at(centre)
     parts.append(dot(axis, INK, radius * scale, "#eef1f4"))
     parts.append(line([o, axis], MUTED, 1.2, "5 4"))
-    for side, colour in ((0, CALIBRATED), (1, DRAWING)):
+    for side, colour in ((0, CALIBRATED), (1, NOMINAL)):
         touch = centre + radius * n[side]
         parts.append(line([o, at(touch * 1.25)], colour, 1.6))
         parts.append(line([axis, at(touch)], MUTED, 1.2, "5 4"))
@@ -128,7 +128,7 @@ def edge_planes() -> str:
         text((middle[0] + 8, middle[1] - 8), "‖m‖", MUTED, "middle", font_size=15),
         text((axis[0] - 26, axis[1] - 38), "R", MUTED, font_size=15),
         text((o[0] + 84, o[1] - 6), "θ", MUTED, font_size=15),
-        text((330, 30), "side 1", DRAWING, "middle"),
+        text((330, 30), "side 1", NOMINAL, "middle"),
         text((330, 278), "side 0", CALIBRATED, "middle"),
         text((790, 290), "sin θ = R / ‖m‖", MUTED, "end", font_size=15),
     ]  # fmt: skip
@@ -148,8 +148,8 @@ def measurement_passes(case: Case) -> str:
     drawn = session.machine.forward(session.joints[row])
     state = result.estimate.state
     views = [
-        (session.machine, by_hand, drawn, DRAWING, "1  pose by hand, the nominal model's machine"),
-        (session.machine, recognised, drawn, DRAWING, "2  localized, still the nominal model"),
+        (session.machine, by_hand, drawn, NOMINAL, "1  pose by hand, the nominal model's machine"),
+        (session.machine, recognised, drawn, NOMINAL, "2  localized, still the nominal model"),
         (result.machine, state.T_camera_base[s], state.T_base_platform[row], CALIBRATED,
          "3  after identification"),
     ]  # fmt: skip
@@ -282,7 +282,7 @@ def _one_profile(places: Places, n: int, title: str) -> Plot:
         (
             (0.0, "true edge", GOOD, ""),
             (shift, f"profile model {shift:+.2f} px", CALIBRATED, "5 4"),
-            (steep, f"strongest gradient {steep:+.2f} px", DRAWING, "5 4"),
+            (steep, f"strongest gradient {steep:+.2f} px", NOMINAL, "5 4"),
         )
     ):
         plot.upright(x, colour, dash)
@@ -298,9 +298,9 @@ def position_errors(places: Places) -> str:
         label = "error of a position, px outward"
         plot = Plot((-1.5, 1.5), (0, 6.0), (label, "density"), (430, 320), title)
         mine = places.tube == tube
-        plot.histogram(places.gradient_error[mine], borders, DRAWING)
+        plot.histogram(places.gradient_error[mine], borders, NOMINAL)
         plot.histogram(places.model_error[mine], borders, CALIBRATED)
-        plot.words(0.4, 5.3, "strongest gradient", DRAWING)
+        plot.words(0.4, 5.3, "strongest gradient", NOMINAL)
         plot.words(0.4, 4.85, "profile model", CALIBRATED)
         plots.append(plot)
     return _beside(*plots)

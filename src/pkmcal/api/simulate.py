@@ -148,7 +148,9 @@ def simulate(
     _check_settings({**given, "noise": noise, "blur": blur, "seed": seed})
     planned = None if plan is None else rehearsal_of(plan)
     nominal = planned.machine if planned else _nominal(mechanism)
-    machine = to_simulate(nominal, nominal.name if plan is None else str(plan))
+    # errors are located at the plan, at the mechanism's file or at the machine's name
+    source = mechanism if plan is None else plan
+    machine = to_simulate(nominal, nominal.name if isinstance(source, Machine) else str(source))
     place = "platform" if on_platform else settings.get("board_on", "base")
     if isinstance(board, Board):
         fixed = board
