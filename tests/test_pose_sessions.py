@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import yaml
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_refinement import measurements_of
-from pkmcal.calibration.faults import richer_model
+from pkmcal.calibration.faults import richer_model, wrong_scale
 from pkmcal.calibration.outlier_explanations import outlier_explanations
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.checks.check import check_session, pose_findings
@@ -473,6 +474,26 @@ def test_lengths_of_another_scale(folder):
     assert not verdict.usable
     (scale,) = verdict.of("machine.scale")
     assert scale.facts["value"] == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_factor_of_one_kind_of_part_is_no_scale_of_the_machine():
+    """A base 4 mm too wide, two prior sigmas, beside ordinary errors; all lengths 5 % longer."""
+    machine = load_mechanism("gough-stewart")
+    table, rng = machine.parameters, np.random.default_rng(0)
+    values = table.nominal + table.tolerance * rng.normal(size=len(table.nominal))
+    for leg in range(1, machine.n_legs + 1):
+        x, y = (table.index(f"legs[{leg}].base.center.{axis}") for axis in "xy")
+        values[[x, y]] *= 1 + 0.004 / np.hypot(table.nominal[x], table.nominal[y])
+
+    def scale(values):
+        count = len(values)
+        return wrong_scale(
+            SimpleNamespace(machine=machine.with_values(values), covariance=np.eye(count))
+        )
+
+    assert scale(values) == 1.0
+    lengths = np.array([unit == "m" for unit in table.units])
+    assert scale(np.where(lengths, 1.05, 1.0) * table.nominal) == pytest.approx(1.05, rel=1e-6)
 
 
 def test_check_reports_how_the_platform_turns(folder):

@@ -33,6 +33,7 @@ from pkmcal.web.machine_page import (
     configuration_at,
     machine_document,
 )
+from pkmcal.web.motion import Postures, moved
 from pkmcal.web.page import standalone_page
 from test_report_page import CHROMIUM, HOSTILE, PageParts
 from test_view import PORT, TOKEN, Answer
@@ -506,3 +507,29 @@ def test_a_served_page_works_in_a_browser_without_webgl(tmp_path):
     T = machine.forward(np.array([[0.45, *home[1:]]]))[0]
     position = [float(text.replace("\u2212", "-")) for text in json.loads(root["moved"])[:3]]
     np.testing.assert_allclose(position, 1e3 * T[:3, 3], atol=0.2)  # a slider's step
+
+
+def test_another_page_with_the_bundle_is_left_alone(tmp_path):
+    page = tmp_path / "report.html"
+    page.write_text(f"<script>{bundle_file('enlarged.js')}</script>")
+    before = page.read_bytes()
+    done = run("show", "3-rpr", "-o", page)
+    assert done.code == 2
+    assert "not a page of the viewer" in done.err
+    assert page.read_bytes() == before
+
+
+@pytest.mark.parametrize("option", ["--port=8000", "--no-browser"])
+def test_options_of_a_served_page_are_refused_with_a_file(tmp_path, option):
+    done = run("show", "3-rpr", "-o", tmp_path / "page.html", option, "--json")
+    assert (done.code, done.json["where"]) == (2, option.partition("=")[0])
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_motion_far_beyond_the_range_has_no_pose():
+    machine = load_mechanism("3-rpr")
+    home = Postures(machine.inverse(machine.home()[None]), machine.home()[None])
+    assert np.isnan(moved(machine, home, 0, 1e9, 0.1).readings).all()
+    assert np.isfinite(
+        moved(machine, home, 0, float(home.readings[0, 0]) + 0.01, 0.1).readings
+    ).all()

@@ -281,3 +281,18 @@ def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
     for name, argument in function.items():
         assert name in inspect.getdoc(getattr(pkmcal, verb))
         assert argument.annotation is not inspect.Parameter.empty
+
+
+def test_a_simulated_session_is_not_copied_into_itself(tmp_path):
+    made = pkmcal.simulate(tmp_path / "s", "3-rpr", camera=(64, 48), stations=1, configurations=2)
+    with pytest.raises(InputError, match="not copied into itself"):
+        made.save(tmp_path / "s" / "copy")
+    with pytest.raises(InputError, match="not empty"):
+        made.save(tmp_path)
+    made.save(tmp_path / "copy")
+    assert (tmp_path / "copy" / "truth.json").is_file()
+
+
+def test_the_page_of_a_check_and_its_pictures_need_two_folders(demo, tmp_path):
+    done = run("check", demo.session, "-o", tmp_path / "d", "--pictures", tmp_path / "d", "--json")
+    assert (done.code, done.json["where"]) == (2, "--pictures")

@@ -42,7 +42,7 @@ export default defineConfig(({ mode }) => ({
   build: {
     target: "es2022",
     outDir: process.env.BUNDLE ?? join(root, "../src/pkmcal/web/bundle"),
-    emptyOutDir: mode === "viewer",
+    emptyOutDir: false,
     modulePreload: false,
     reportCompressedSize: false,
     chunkSizeWarningLimit: 2000,

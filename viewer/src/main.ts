@@ -6,6 +6,7 @@ import { h } from "./dom";
 import { machineView } from "./views/machine";
 
 const VERSION = 1;
+const VIEWS = { machine: machineView };
 
 function start(): void {
   const host = document.getElementById("viewer");
@@ -17,7 +18,7 @@ function start(): void {
     host.append(h("p", { class: "note" }, "This page was written by another version of pkmcal."));
     return;
   }
-  machineView(host, content);
+  VIEWS[content.kind](host, content);
 }
 
 start();

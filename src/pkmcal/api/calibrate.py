@@ -25,8 +25,8 @@ class CalibrationResult(Calibration, Result):
     """Calibration with its files.
 
     ``summary()``, ``parameters``, ``machine``, ``verdict``, ``tool_error(poses)``,
-    ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()``, ``save(folder)``, ``show()`` and
-    ``record(path)``. Covariances and residuals are in ``estimate``.
+    ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()``, ``save(folder)``, ``show()``.
+    Covariances and residuals are in ``estimate``.
     """
 
     own_files = MappingProxyType(

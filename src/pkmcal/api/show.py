@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 NOTEBOOK_HEIGHT = 760
 """Height of the page in a notebook, px."""
-PAGE_MARK = b"/*! pkmcal viewer;"
-"""Text of every page with the viewer in it."""
+PAGE_MARK = b'<meta name="generator" content="pkmcal viewer">'
+"""Element of the pages that are written here, and of no other page."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from pkmcal.api.result import Progress, Result
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
-from pkmcal.files import check_own_folder, closest, resolved, staged_folder
+from pkmcal.files import closest, resolved, staged_folder
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.outcome import Outcome, Verdict
 from pkmcal.outcome.finding import note
@@ -24,6 +24,7 @@ from pkmcal.ranges import RANGES, check_number, default
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import Sensor, Settings, Truth, board_for, simulate_session, to_simulate
 from pkmcal.simulation.rehearsal import Rehearsal, rehearsal_of
+from pkmcal.starter import check_new_folder
 from pkmcal.wording import count, listed
 
 
@@ -66,10 +67,22 @@ class SimulationResult(Session, Result):
         """No list: the files are those of a session."""
         return {}
 
+    @classmethod
+    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
+        """No names: a session is written into a new or empty folder only."""
+        del force
+        check_new_folder(folder)
+        return []
+
     def save(self, folder: Path | str, *, force: bool = False) -> None:
         """Copy the session into a new or empty folder; InputError for another one."""
-        del force
-        check_own_folder(Path(folder), (), "a new session")
+        self.check_folder(folder, force=force)
+        if resolved(Path(folder)).is_relative_to(resolved(self.folder)):
+            raise InputError(
+                "a session is not copied into itself",
+                where=str(folder),
+                next_step="Name a folder beside it",
+            )
         with staged_folder(folder) as stage:
             shutil.copytree(self.folder, stage, dirs_exist_ok=True)
 

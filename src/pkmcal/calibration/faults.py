@@ -54,7 +54,8 @@ def wrong_scale(estimate: Estimate) -> float:
     their difference. A board whose squares are larger than stated makes the whole machine larger.
 
     The factor is a hypothesis about differences in prior sigmas whose true size is unknown, so that
-    a poor nominal model has none.
+    a poor nominal model has none, and has to explain most of their squares: a factor of one kind of
+    part makes a part of them only.
     """
     machine = estimate.machine
     table = machine.parameters
@@ -76,7 +77,8 @@ def wrong_scale(estimate: Estimate) -> float:
         "machine.scale", "all lengths", lambda x: x * back, parameter_cost(1, new.size)
     )
     best = decide(posterior([factor], [EvidenceLevel("lengths", ratios)]))
-    return 1 / back if best is not None else 1.0
+    explained = null**2 - misfit**2
+    return 1 / back if best is not None and explained > misfit**2 else 1.0
 
 
 def refit_fixed_noise(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:

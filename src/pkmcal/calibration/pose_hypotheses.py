@@ -266,14 +266,20 @@ class PoseEvidence:
         )
 
 
-def diagnose(machine: Machine, measurements: Measurements, estimate: Estimate) -> Diagnosis:
+def diagnose(
+    machine: Machine,
+    measurements: Measurements,
+    estimate: Estimate,
+    richer_misfit: float = np.inf,
+) -> Diagnosis:
     """Mistake by which poses disagree with the machine, by closure and estimates.
 
-    machine : nominal. estimate : of these measurements.
+    machine : nominal. estimate : of these measurements. richer_misfit : of the poses by another
+    model of the mechanism file, in stated sigmas: a mistake has to explain more than that model.
     """
     if not np.any(measurements.on_platform[measurements.poses.mount]):
         return Diagnosis()  # poses of boards on the base alone
-    evidence = PoseEvidence(machine, measurements, pose_misfit(estimate))
+    evidence = PoseEvidence(machine, measurements, min(pose_misfit(estimate), richer_misfit))
     hypotheses = pose_hypotheses(machine, measurements, estimate)
     if evidence.null_misfit <= evidence.harmless(hypotheses, OPTIONS.report):
         return Diagnosis()
@@ -664,11 +670,10 @@ def explain_poses(
     if not estimate.pose_weights.size:
         return Explanation()
     misfit = pose_misfit(estimate)
-    if richer is not None and richer.scale <= harmless_misfit(
-        effective_sample_size(session.machine, measurements), 0.0
-    ):
+    richer_misfit = np.inf if richer is None else richer.scale
+    if richer_misfit <= harmless_misfit(effective_sample_size(session.machine, measurements), 0.0):
         return Explanation()
-    diagnosis = partial(diagnose, session.machine, measurements, estimate)
+    diagnosis = partial(diagnose, session.machine, measurements, estimate, richer_misfit)
     return _explanation(session, diagnosis, misfit, misfit < VERDICT.too_noisy)
 
 

@@ -40,12 +40,20 @@ def check(
     """Find what is wrong with a session before any work is spent."""
     import pkmcal
     from pkmcal.api.check import CheckResult
-    from pkmcal.files import check_writable
+    from pkmcal.errors import InputError
+    from pkmcal.files import check_writable, resolved
 
     if out is not None:
         CheckResult.check_folder(out)
     if pictures is not None:
         check_writable(pictures)
+        if out is not None and resolved(pictures) == resolved(out):
+            raise InputError(
+                "the page and the pictures need folders of their own",
+                where="--pictures",
+                found=str(pictures),
+                next_step=f"Name another folder, such as {out}-pictures",
+            )
     with console.progress(as_json) as progress:
         result = pkmcal.check(session, repeat=repeat, seed=seed, progress=progress)
         more: dict[str, str] = {}

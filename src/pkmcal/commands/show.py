@@ -46,8 +46,14 @@ def show(
 ) -> int:
     """Show a machine in space, with sliders for its readings."""
     from pkmcal.api.show import show as run
-    from pkmcal.errors import GeometryError
+    from pkmcal.errors import GeometryError, InputError
 
+    if out is not None and (port or no_browser):
+        raise InputError(
+            "this option is for a page that is served",
+            where="--port" if port else "--no-browser",
+            next_step="Leave it out, or leave out -o",
+        )
     try:
         view = run(machine)
         if out is None:

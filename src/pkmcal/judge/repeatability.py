@@ -474,8 +474,8 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
 def axis_coordinates(motion: Array, a: Array, b: Array) -> Array:
     """Change (G, 4) of psi, theta (rad), x, z (m) by motions (G, 6) of an axis's ends a, b (G, 3).
 
-    To first order; the coordinates of papers.axis_measurements.to_coordinates. x and z are NaN for
-    a leg that is level in the image, which has no point with y = 0.
+    To first order; the coordinates of identify.axis_measurements.to_coordinates. x and z are NaN
+    for a leg that is level in the image, which has no point with y = 0.
     """
     d = b - a
     length = np.sqrt(dot(d, d))[:, None]

@@ -230,10 +230,11 @@ def parameter_cost(count: int, n_effective: float) -> float:
 def harmless_misfit(
     n_effective: float, log_prior: float, log_odds: float = OPTIONS.report
 ) -> float:
-    """Misfit of the data as stated, as of :func:`log_likelihood`, up to which no hypothesis can
-    have the log-odds: not even one that leaves no more than the stated noise.
+    """Misfit of the data as stated, as of :func:`log_likelihood`, up to which a hypothesis that
+    leaves the stated noise does not reach the log-odds.
 
-    log_prior : of the most probable hypothesis.
+    One that leaves less than the stated noise could; it is not searched, since the data as stated
+    fit nearly as well. log_prior : of the most probable hypothesis.
     """
     return math.exp((log_odds - log_prior) / max(n_effective, 1.0))
 

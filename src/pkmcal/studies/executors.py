@@ -21,6 +21,8 @@ from types import ModuleType
 from pkmcal.errors import ResultError
 from pkmcal.studies.tasks import Finished, Job, SolvedBatch, work
 
+MOST_PROCESSES = 61 if sys.platform == "win32" else 1024
+"""Most processes of a pool; Windows waits for no more."""
 MOST_FRUITLESS_POOLS = 3
 """Number of pools in succession that may break without a finished batch before the study stops."""
 
@@ -37,7 +39,7 @@ def on_cores(tasks: Sequence[Job], finished: Finished, count: int | None = None)
     An interruption kills the processes. Raises the first error of a task, and ResultError where
     processes die at the same batches again and again.
     """
-    count = min(count or cores(), len(tasks))
+    count = min(count or cores(), len(tasks), MOST_PROCESSES)
     if count <= 1:
         for number, task in enumerate(tasks):
             finished(number, work(task))
@@ -90,15 +92,17 @@ def _process_pool(count: int) -> Generator[ProcessPoolExecutor]:
     """
     main, others = sys.modules["__main__"], set(active_children())
     sys.modules["__main__"] = ModuleType("__main__")
-    pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process)
     try:
-        yield pool
-    except BaseException:
-        for process in set(active_children()) - others:
-            process.kill()
-        raise
+        pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process)
+        try:
+            yield pool
+        except BaseException:
+            for process in set(active_children()) - others:
+                process.kill()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
     finally:
-        pool.shutdown(cancel_futures=True)
         sys.modules["__main__"] = main
 
 

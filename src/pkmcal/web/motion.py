@@ -12,6 +12,8 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import listed
 
+MOST_RANGES_A_MOTION = 10.0
+"""Longest motion of a reading, in widths of its range; a served page may be asked for any."""
 STEPS_OVER_RANGE = 40
 """Steps of a continuation over the whole range of a reading."""
 READING_ITERATIONS = 20
@@ -120,6 +122,8 @@ def moved(
     the range's width; NaN if the way there has no pose.
     """
     start, which = float(posture.readings[0, index]), np.array([index])
+    if not abs(value - start) <= MOST_RANGES_A_MOTION * range_width:  # not a slider's motion
+        return posture._replace(readings=np.full_like(posture.readings, np.nan))
     count = max(1, int(np.ceil(abs(value - start) / range_width * STEPS_OVER_RANGE - 1e-9)))
     for at in np.linspace(start, value, count + 1)[1:]:
         posture = stepped(machine, posture, which, np.array([at]))

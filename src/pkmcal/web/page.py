@@ -51,6 +51,7 @@ def _shell(document: ViewerDocument, head: str, end: str) -> str:
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
+<meta name="generator" content="pkmcal viewer">
 <title>{escape(document.title)}</title>
 <link rel="icon" href="data:,">
 {head}

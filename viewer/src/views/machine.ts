@@ -51,7 +51,7 @@ export function machineView(host: HTMLElement, content: ViewerDocument): void {
   };
   const poses: Poses = content.sweeps ? sweptPoses(content.sweeps) : askProgram();
   const move = (k: number, value: number): void => {
-    poses(k, value, configuration, (answer) => {
+    poses(k, value, () => configuration, (answer) => {
       status.textContent = "";
       if ("configuration" in answer && answer.configuration) show(answer.configuration);
       else {

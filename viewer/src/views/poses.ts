@@ -3,11 +3,12 @@
 import type { Configuration, Sweep } from "../document";
 
 export type Answer = { configuration: Configuration | null } | { message: string };
-/** Reading k moves to a value, from a configuration; the last request is the one answered. */
+/** Reading k moves to a value, from the configuration that is shown; of the requests that wait, the
+ * last one is answered. */
 export type Poses = (
   k: number,
   value: number,
-  from: Configuration,
+  from: () => Configuration,
   answer: (answer: Answer) => void,
 ) => void;
 
@@ -26,21 +27,20 @@ export function askProgram(): Poses {
   let waiting: (() => void) | null = null;
   const ask: Poses = (k, value, from, answer) => {
     if (busy) {
-      // continued from the configuration that is then shown, which the answer replaces
-      waiting = () => ask(k, value, latest ?? from, answer);
+      waiting = () => ask(k, value, from, answer);
       return;
     }
     busy = true;
-    void request(k, value, from).then((result) => {
+    const start = from();
+    void request(k, value, start).then((result) => {
       busy = false;
-      if ("configuration" in result && result.configuration) latest = result.configuration;
-      answer(result);
+      // an answer from a configuration that is no longer shown, as after Home, is not either
+      if (from() === start) answer(result);
       const next = waiting;
       waiting = null;
       next?.();
     });
   };
-  let latest: Configuration | null = null;
   return ask;
 }
 
