@@ -388,7 +388,7 @@ def main() -> None:
                 jobs = [(fact, in_view, seed, keep) for seed in seeds]
                 value = list(pool.map(outcome, *zip(*jobs, strict=True)))
                 print_outcomes(f"{fact}, {in_view}", value)
-                if options.print_outcomes:
+                if options.tell:
                     for seed, one in zip(seeds, value, strict=True):
                         print(f"    {seed}: {one.what} {one.z:.2f} {one.said}")
     print(f"{time.perf_counter() - begin:.0f} s")
