@@ -20,6 +20,7 @@ from pkmcal.identify.unidentified import Findings, explain, observed_legs
 from pkmcal.identify.verdict import VERDICT, VerdictOptions, assess, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.outcome.finding import Level
 from pkmcal.report.parameters import unidentified
 from pose_sessions import POSE_SIGMA, estimated, measured
 from test_words import heaved, make, moved
@@ -264,13 +265,19 @@ def test_what_the_prior_determines_better_counts_as_far_as_data_leave_it(whole):
     assert left(0.0) == pytest.approx(1.0, rel=1e-4)
     assert left(1.0) == pytest.approx(0.5, rel=1e-4)
     assert left(10.0) == pytest.approx(1 / 101, rel=0.1)
-    # noise, which makes the rest of the estimate's variance
+    # noise, which makes the rest of the estimate's variance: refused, a warning, no finding
     half = with_information(1.0)
-    for noise, usable in ((0.9, False), (1.1, True)):
-        sigma = half.undetermined_shift / np.sqrt(1 - noise * VERDICT.least_noise_share)
+    few, least = VERDICT.least_noise_share, 1 - VERDICT.worth_reporting**2
+    levels = [Level.WRONG, Level.DOUBTFUL, Level.DOUBTFUL, None]
+    for by_noise, level in zip(
+        (0.9 * few, 1.1 * few, 0.9 * least, 1.1 * least), levels, strict=True
+    ):
+        sigma = half.undetermined_shift / np.sqrt(1 - by_noise)
         scale = (sigma / platform_sigma(estimate)) ** 2
         other = replace(estimate, joint_covariance=scale * estimate.joint_covariance)
-        assert assess(observation, other, half).usable == usable
+        findings = assess(observation, other, half).findings
+        found = {one.level for one in findings if one.code == "machine.undetermined"}
+        assert found == ({level} if level else set())
 
 
 @pytest.mark.parametrize("option", NAMING)

@@ -59,6 +59,9 @@ class VerdictOptions:
     # share of the platform's variance by the noise of the data from which that is no reason: the
     # result is hardly worse for it. More of the same images reduce noise alone
     least_noise_share: float = FEW
+    # share of the platform's standard deviation from which on what remains undetermined is worth a
+    # warning: one half makes the standard deviation larger by an eighth
+    worth_reporting: float = 0.5
     # share of configurations near a singular pose from which on the estimate is not reliable
     singular_share: float = MAJORITY
     # share of what is undetermined from which on a single cause becomes a reason of its own
@@ -329,19 +332,21 @@ def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
 def _undetermined(
     estimate: Estimate, findings: Findings, options: VerdictOptions
 ) -> Iterator[Finding]:
-    """Findings on the largest motions that the data leave undetermined, where most of the tool's
-    variance is due to errors of the nominal model that the data leave.
+    """Findings on the largest motions that the data leave undetermined, where errors of the nominal
+    model that remain make a noticeable part of the tool's variance.
 
     They are wrong or doubtful by the displacement of the tool by all such errors together, so that
     no verdict depends on the names of motions.
     """
-    shift, variance = findings.undetermined_shift, platform_sigma(estimate) ** 2
-    # where noise makes enough of the standard deviation, that deviation suffices
-    if variance - shift**2 > options.least_noise_share * variance:
+    shift, sigma = findings.undetermined_shift, platform_sigma(estimate)
+    if shift <= max(negligible_shift(estimate.machine.parameters), options.worth_reporting * sigma):
         return
-    if shift <= negligible_shift(estimate.machine.parameters):
-        return
-    refused = shift > options.undetermined_share * findings.by_nominal
+    # where noise makes enough of the variance, the standard deviation suffices
+    by_noise = 1 - (shift / sigma) ** 2
+    refused = (
+        by_noise <= options.least_noise_share
+        and shift > options.undetermined_share * findings.by_nominal
+    )
     sentences = (*findings.unidentified, *findings.weak)
     most = max((s.moves_platform for s in sentences), default=0.0)
     least = min(options.large_cause_share * shift, most)
