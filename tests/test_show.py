@@ -26,7 +26,7 @@ from pkmcal.errors import InputError
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.web import serving
 from pkmcal.web.bundle_files import SCRIPT_FILE, bundle_file
-from pkmcal.web.document import ViewerDocument
+from pkmcal.web.document import MachineDocument
 from pkmcal.web.machine_page import (
     PoseRequest,
     application,
@@ -191,16 +191,16 @@ def test_tables_of_legs_have_values_and_sigmas():
 
 def test_the_document_is_strict():
     content = document("3-rpr")
-    assert json.loads(ViewerDocument.model_validate_json(json.dumps(content)).model_dump_json())
+    assert json.loads(MachineDocument.model_validate_json(json.dumps(content)).model_dump_json())
     with pytest.raises(ValidationError):
-        ViewerDocument.model_validate_json(json.dumps({**content, "more": 1}))
+        MachineDocument.model_validate_json(json.dumps({**content, "more": 1}))
 
 
 # ------------------------------------------------------------------ the page
 
 
 def test_the_page_allows_its_own_scripts_and_nothing_else():
-    page = standalone_page(ViewerDocument.model_validate_json(json.dumps(document("3-rpr"))))
+    page = standalone_page(MachineDocument.model_validate_json(json.dumps(document("3-rpr"))))
     tags = PageParts(page).tags
     policy = next(a["content"] for _, a in tags if a.get("http-equiv") == "Content-Security-Policy")
     assert policy.startswith("default-src 'none'; ")
@@ -452,7 +452,7 @@ def test_a_written_page_works_in_a_browser(tmp_path, width, dark):
     content = document("h4")
     k = next(k for k, s in enumerate(content["sweeps"]) if None in s["configurations"])
     empty = content["sweeps"][k]["values"][content["sweeps"][k]["configurations"].index(None)]
-    page = standalone_page(ViewerDocument.model_validate_json(json.dumps(content)))
+    page = standalone_page(MachineDocument.model_validate_json(json.dumps(content)))
     script = f"const MOVED = 0.8, REFUSED = {json.dumps([k, empty])};{ACT}"
     (tmp_path / "page.html").write_text(acting(page, script), encoding="utf-8")
     (tmp_path / "frame.html").write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")

@@ -1,22 +1,21 @@
 // Generated from src/pkmcal/web/schema.json by `npm run types`; do not edit.
 
+export type ViewerDocument = MachineDocument | ReportDocument;
+
 /**
- * Document of a page.
+ * Page of a machine with sliders for its readings.
  *
- * version : of this format.
- * kind : the page; ``machine``: a machine with sliders for its readings.
- * program : name and version of the program that wrote it.
- * title, subtitle : heading of the page.
+ * subtitle : below the heading.
  * notes : sentences below it.
  * machine : the machine of the stage.
  * sweeps : one for each reading; null if the page asks the program for poses.
  * redundant : whether other readings follow if one changes.
  */
-export interface ViewerDocument {
+export interface MachineDocument {
   version: 1;
-  kind: "machine";
   program: string;
   title: string;
+  kind: "machine";
   subtitle: string;
   notes: string[];
   machine: Machine;
@@ -175,4 +174,104 @@ export interface LegConfiguration {
 export interface Sweep {
   values: number[];
   configurations: (Configuration | null)[];
+}
+/**
+ * Report of a command.
+ *
+ * kicker : line above the title. subject : what was examined. origin : date, program, digest.
+ * notes : the user's own text.
+ * warnings, advice, remarks : sentences below the verdict.
+ */
+export interface ReportDocument {
+  version: 1;
+  program: string;
+  title: string;
+  kind: "report";
+  kicker: string;
+  subject: string;
+  origin: string[];
+  notes: string;
+  verdict: Verdict;
+  warnings: string[];
+  advice: string[];
+  remarks: string[];
+  cards: Card[];
+  sections: Section[];
+}
+/**
+ * Judgement at the top of a report.
+ *
+ * tone : good, partial (usable, with exceptions) or bad.
+ * stamp : one to three words.
+ */
+export interface Verdict {
+  tone: "good" | "partial" | "bad";
+  stamp: string;
+  headline: string;
+  reasons: string[];
+}
+/**
+ * Card with the numbers that answer one question.
+ *
+ * values : numbers with their units, as text.
+ */
+export interface Card {
+  question: string;
+  values: [string, string][];
+  note: string;
+}
+/**
+ * Section of a report; menu : its name in the table of contents.
+ */
+export interface Section {
+  name: string;
+  title: string;
+  menu: string;
+  blocks: (Paragraph | Listing | Checks | Downloads)[];
+}
+/**
+ * Paragraph; small : as small print.
+ */
+export interface Paragraph {
+  kind: "paragraph";
+  text: string;
+  small: boolean;
+}
+/**
+ * List with a heading, which may be empty; folded : collapsed until it is opened.
+ */
+export interface Listing {
+  kind: "listing";
+  title: string;
+  items: string[];
+  folded: boolean;
+}
+/**
+ * Comparisons with expected values.
+ */
+export interface Checks {
+  kind: "checks";
+  checks: CheckLine[];
+}
+/**
+ * Comparison with an expected value, in one line.
+ */
+export interface CheckLine {
+  text: string;
+  passed: boolean;
+}
+/**
+ * Files that the page holds.
+ */
+export interface Downloads {
+  kind: "downloads";
+  files: Download[];
+}
+/**
+ * File that the page holds; content : its text.
+ */
+export interface Download {
+  name: string;
+  media_type: string;
+  content: string;
 }

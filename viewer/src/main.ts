@@ -4,9 +4,9 @@ import "./style.css";
 import type { ViewerDocument } from "./document";
 import { h } from "./dom";
 import { machineView } from "./views/machine";
+import { reportView } from "./views/report";
 
 const VERSION = 1;
-const VIEWS = { machine: machineView };
 
 function start(): void {
   const host = document.getElementById("viewer");
@@ -18,7 +18,8 @@ function start(): void {
     host.append(h("p", { class: "note" }, "This page was written by another version of pkmcal."));
     return;
   }
-  VIEWS[content.kind](host, content);
+  if (content.kind === "machine") machineView(host, content);
+  else reportView(host, content);
 }
 
 start();

@@ -93,13 +93,13 @@ class Result(ABC):
     @staticmethod
     def contents_of(outcome: Outcome, names: Iterable[str]) -> dict[str, str | bytes]:
         """Contents of files by name, with the page and the document of an outcome."""
-        from pkmcal.pages.page import page_html
+        from pkmcal.web.report_page import report_page
 
         texts, made = dict(outcome.texts), datetime.now()
         for name in names:
             if name not in texts:
                 page = name.endswith(".html")
-                texts[name] = page_html(outcome, made) if page else json_text(outcome.document)
+                texts[name] = report_page(outcome, made) if page else json_text(outcome.document)
         return texts
 
     @classmethod

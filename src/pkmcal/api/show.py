@@ -17,7 +17,7 @@ from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
-    from pkmcal.web.document import ViewerDocument
+    from pkmcal.web.document import MachineDocument
 
 NOTEBOOK_HEIGHT = 760
 """Height of the page in a notebook, px."""
@@ -52,7 +52,7 @@ class MachineView:
     __repr__ = short_repr
 
     @cached_property
-    def _swept(self) -> ViewerDocument:
+    def _swept(self) -> MachineDocument:
         """Document of a page in one file, with each reading's sweep from home."""
         return self._document(sweeps=True)
 
@@ -82,11 +82,11 @@ class MachineView:
 
         write_text(path, self.html)
 
-    def served(self) -> ViewerDocument:
+    def served(self) -> MachineDocument:
         """Document of a page that asks for its poses."""
         return self._document(sweeps=False)
 
-    def _document(self, *, sweeps: bool) -> ViewerDocument:
+    def _document(self, *, sweeps: bool) -> MachineDocument:
         from pkmcal.web.machine_page import machine_document
 
         return machine_document(

@@ -8,9 +8,12 @@ hold the same tables and figures.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pkmcal.outcome.finding import Finding, Level
+
+if TYPE_CHECKING:
+    from pkmcal.outcome.blocks import Block
 
 FigureSource = Literal["paper", "prototype", "ours"]
 
@@ -171,6 +174,7 @@ class Part:
 
     text : paragraphs.
     terminal_text : sentences that the terminal prints as well.
+    blocks : what the viewer draws of it.
     html : filled template (images, charts), in which all values are escaped.
     notes : small print.
     menu : shorter name for the page's navigation.
@@ -180,6 +184,7 @@ class Part:
     title: str
     text: tuple[str, ...] = ()
     terminal_text: tuple[str, ...] = ()
+    blocks: tuple[Block, ...] = ()
     plots: tuple[Plot, ...] = ()
     html: str = ""
     tables: tuple[Table, ...] = ()

@@ -30,7 +30,6 @@ from pkmcal.levels import ROUNDING
 from pkmcal.measurements import LinkSet, Observation
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome
-from pkmcal.pages import page
 from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.report import (
     bed,
@@ -47,6 +46,7 @@ from pkmcal.report import (
     workspace,
 )
 from pkmcal.session.load import Session, digests, session_digest
+from pkmcal.web.report_page import report_page
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def save(
     folder = Path(folder)
     check_output(folder, force=force)
     outcome = outcome or outcome_of(calibration)
-    texts = {CALIBRATION_REPORT_FILE: page.page_html(outcome, datetime.now()), **outcome.texts}
+    texts = {CALIBRATION_REPORT_FILE: report_page(outcome, datetime.now()), **outcome.texts}
     with output_lock(folder):  # another process may have written into it since the first check
         over = check_output(folder, force=force)
         archive_folder = None if force else keep_earlier(folder, outcome.texts)

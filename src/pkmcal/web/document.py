@@ -2,7 +2,7 @@
 
 Python computes, the viewer draws: points are in metres in the base frame and angles in radians,
 unless a field says otherwise. ``schema.json`` beside this file is the JSON schema of
-:class:`ViewerDocument`; the viewer's types are generated from it. A change of a field's meaning
+``ViewerDocument``; the viewer's types are generated from it. A change of a field's meaning
 raises the document's version.
 """
 
@@ -11,18 +11,11 @@ from __future__ import annotations
 import json
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator
+from pydantic import Field, TypeAdapter
 
-from pkmcal.errors import legible
 from pkmcal.files import Schema
-
-Text = Annotated[str, BeforeValidator(lambda text: legible(text, keep="\n"))]
-"""Text of a user's file: control characters are made visible."""
-Vector = tuple[float, float, float]
-Line = tuple[Vector, ...]
-"""Points of a polyline; empty where there is nothing to draw."""
-PoseRow = tuple[float, float, float, float]
-Pose = tuple[PoseRow, PoseRow, PoseRow, PoseRow]
+from pkmcal.outcome.blocks import Block
+from pkmcal.outcome.blocks.base import Line, Pose, Text, Vector
 
 
 class Row(Schema):
@@ -158,23 +151,30 @@ class Sweep(Schema):
     configurations: tuple[Configuration | None, ...]
 
 
-class ViewerDocument(Schema):
-    """Document of a page.
+class Head(Schema):
+    """What all documents have.
 
     version : of this format.
-    kind : the page; ``machine``: a machine with sliders for its readings.
     program : name and version of the program that wrote it.
-    title, subtitle : heading of the page.
+    title : heading of the page.
+    """
+
+    version: Literal[1] = 1
+    program: str
+    title: Text
+
+
+class MachineDocument(Head):
+    """Page of a machine with sliders for its readings.
+
+    subtitle : below the heading.
     notes : sentences below it.
     machine : the machine of the stage.
     sweeps : one for each reading; null if the page asks the program for poses.
     redundant : whether other readings follow if one changes.
     """
 
-    version: Literal[1]
-    kind: Literal["machine"]
-    program: str
-    title: Text
+    kind: Literal["machine"] = "machine"
     subtitle: Text
     notes: tuple[Text, ...]
     machine: Machine
@@ -182,8 +182,67 @@ class ViewerDocument(Schema):
     redundant: bool
 
 
+class Verdict(Schema):
+    """Judgement at the top of a report.
+
+    tone : good, partial (usable, with exceptions) or bad.
+    stamp : one to three words.
+    """
+
+    tone: Literal["good", "partial", "bad"]
+    stamp: Text
+    headline: Text
+    reasons: tuple[Text, ...]
+
+
+class Card(Schema):
+    """Card with the numbers that answer one question.
+
+    values : numbers with their units, as text.
+    """
+
+    question: Text
+    values: tuple[tuple[Text, Text], ...]
+    note: Text
+
+
+class Section(Schema):
+    """Section of a report; menu : its name in the table of contents."""
+
+    name: str
+    title: Text
+    menu: Text
+    blocks: tuple[Block, ...]
+
+
+class ReportDocument(Head):
+    """Report of a command.
+
+    kicker : line above the title. subject : what was examined. origin : date, program, digest.
+    notes : the user's own text.
+    warnings, advice, remarks : sentences below the verdict.
+    """
+
+    kind: Literal["report"] = "report"
+    kicker: Text
+    subject: Text
+    origin: tuple[Text, ...]
+    notes: Text
+    verdict: Verdict
+    warnings: tuple[Text, ...]
+    advice: tuple[Text, ...]
+    remarks: tuple[Text, ...]
+    cards: tuple[Card, ...]
+    sections: tuple[Section, ...]
+
+
+ViewerDocument = Annotated[MachineDocument | ReportDocument, Field(discriminator="kind")]
+
+
 def schema_text() -> str:
-    """JSON schema of :class:`ViewerDocument`, the content of ``schema.json``."""
-    schema = ViewerDocument.model_json_schema(mode="serialization")
+    """JSON schema of ``ViewerDocument``, the content of ``schema.json``."""
+    schema = TypeAdapter[MachineDocument | ReportDocument](ViewerDocument).json_schema(
+        mode="serialization"
+    )
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     return json.dumps({**dialect, **schema}, indent=2) + "\n"

@@ -14,6 +14,7 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.mechanisms import Machine
+from pkmcal.outcome.blocks.base import Pose
 from pkmcal.web import document as shapes
 from pkmcal.web import serving
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
@@ -43,7 +44,7 @@ def machine_document(
     cameras: Mapping[str, tuple[Camera, Array]] | None = None,
     notes: tuple[str, ...] = (),
     sweeps: bool = True,
-) -> shapes.ViewerDocument:
+) -> shapes.MachineDocument:
     """Document of a machine with sliders for its readings.
 
     origin : of the machine's values, for the heading.
@@ -55,9 +56,7 @@ def machine_document(
     shape = machine_shape(machine, leg_rows(machine, sigma), cameras or {})
     redundant = machine.redundancy > 0
     notes += _notes(machine, shape, redundant)
-    return shapes.ViewerDocument(
-        version=1,
-        kind="machine",
+    return shapes.MachineDocument(
         program=f"pkmcal {version('pkmcal')}",
         title=machine.name,
         subtitle=f"{origin}. {count(machine.n_legs, 'leg')},"
@@ -116,7 +115,7 @@ class PoseRequest(Schema):
     index: int = Field(ge=0)
     value: float
     readings: tuple[float, ...]
-    T_base_platform: shapes.Pose
+    T_base_platform: Pose
 
 
 def configuration_at(machine: Machine, request: PoseRequest) -> dict[str, Any]:
@@ -150,7 +149,7 @@ def configuration_at(machine: Machine, request: PoseRequest) -> dict[str, Any]:
     return {"configuration": shape.model_dump(mode="json")}
 
 
-def application(machine: Machine, document: shapes.ViewerDocument, token: str, port: int) -> Guard:
+def application(machine: Machine, document: shapes.MachineDocument, token: str, port: int) -> Guard:
     """ASGI application: the page at /TOKEN/, its bundle, and the poses that it asks for."""
     from starlette.requests import Request
     from starlette.responses import HTMLResponse, Response

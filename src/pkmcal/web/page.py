@@ -12,10 +12,10 @@ from hashlib import sha256
 from html import escape
 
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
-from pkmcal.web.document import ViewerDocument
+from pkmcal.web.document import MachineDocument, ReportDocument
 
 
-def standalone_page(document: ViewerDocument) -> str:
+def standalone_page(document: MachineDocument | ReportDocument) -> str:
     """Page in one file that opens without a network."""
     script, style = bundle_file(SCRIPT_FILE), bundle_file(STYLE_FILE)
     policy = (
@@ -30,7 +30,7 @@ def standalone_page(document: ViewerDocument) -> str:
     )
 
 
-def served_page(document: ViewerDocument) -> str:
+def served_page(document: MachineDocument | ReportDocument) -> str:
     """Page beside which a server has the bundle; the server's headers hold its policy."""
     return _shell(
         document,
@@ -44,7 +44,7 @@ def _hash_source(text: str) -> str:
     return f"'sha256-{b64encode(sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
 
 
-def _shell(document: ViewerDocument, head: str, end: str) -> str:
+def _shell(document: MachineDocument | ReportDocument, head: str, end: str) -> str:
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -66,7 +66,7 @@ are switched off in this browser.</p></noscript></div>
 """
 
 
-def embedded_json(document: ViewerDocument) -> str:
+def embedded_json(document: MachineDocument | ReportDocument) -> str:
     """JSON inside a script element, which no text in it can end."""
     text = json.dumps(document.model_dump(mode="json"), ensure_ascii=False, allow_nan=False)
     for sign in "<>&\u2028\u2029":

@@ -24,6 +24,7 @@ from pkmcal.mechanisms.closure import base_ends, scales
 from pkmcal.mechanisms.document import ActuatedLength
 from pkmcal.mechanisms.layout import CarrierGroup
 from pkmcal.mechanisms.motors import bodies
+from pkmcal.outcome.blocks.base import Line, PoseRow, Vector
 from pkmcal.web import document as shapes
 from pkmcal.web.motion import home_posture
 from pkmcal.wording import DISPLAY_UNITS, number, split_name, with_unit
@@ -45,19 +46,19 @@ SAME_POINT = 1e-6
 """Distance, m, below which two points of an outline are one."""
 
 
-def point(p: Array) -> shapes.Vector:
+def point(p: Array) -> Vector:
     """Point (3,), rounded to a micrometre."""
     x, y, z = (round(float(c), 6) + 0.0 for c in p)
     return x, y, z
 
 
-def pose_row(row: Array) -> shapes.PoseRow:
+def pose_row(row: Array) -> PoseRow:
     """Row (4,) of a pose, rounded to a nanometre."""
     x, y, z, t = (round(float(c), 9) + 0.0 for c in row)
     return x, y, z, t
 
 
-def line(points: Array) -> shapes.Line:
+def line(points: Array) -> Line:
     """Points (n, 3) of a polyline."""
     return tuple(point(p) for p in points)
 

@@ -1,7 +1,7 @@
 /** Page of a machine: the stage, and sliders for its readings. */
 
 import { Vector3 } from "three";
-import type { Configuration, Reading, ViewerDocument } from "../document";
+import type { Configuration, Reading, MachineDocument } from "../document";
 import { UNITS, h, number, quantity } from "../dom";
 import { LAYERS, type Layer, MachineModel } from "../stage/machine";
 import { Stage } from "../stage/stage";
@@ -20,7 +20,7 @@ const NO_WEBGL =
 const chip = (leg: number): HTMLElement =>
   h("span", { class: `chip leg-${(leg % 8) + 1}` }, String(leg + 1));
 
-export function machineView(host: HTMLElement, content: ViewerDocument): void {
+export function machineView(host: HTMLElement, content: MachineDocument): void {
   const { machine } = content;
   const place = h("div", { class: "stage-host" });
   const status = h("p", { class: "status", role: "status" });
@@ -143,7 +143,7 @@ export function machineView(host: HTMLElement, content: ViewerDocument): void {
 }
 
 /** What the sliders do. */
-function how(content: ViewerDocument): string {
+function how(content: MachineDocument): string {
   if (content.sweeps === null) {
     return content.redundant
       ? "The platform moves as little as the reading needs; the other readings follow."
@@ -167,7 +167,7 @@ class Slider {
   constructor(
     private readonly reading: Reading,
     private readonly index: number,
-    content: ViewerDocument,
+    content: MachineDocument,
   ) {
     const { low, high, name, unit } = reading;
     const { factor, decimals } = UNITS[unit];
@@ -255,7 +255,7 @@ function platformTable(home: Configuration) {
 }
 
 /** Legs as buttons, and the values of the chosen one. */
-function legsList(content: ViewerDocument, onchoice: (leg: number | null) => void) {
+function legsList(content: MachineDocument, onchoice: (leg: number | null) => void) {
   const rows = h("div", { class: "leg-rows" });
   let current: number | null = null;
   const choose = (leg: number | null): void => {
@@ -282,7 +282,7 @@ function legsList(content: ViewerDocument, onchoice: (leg: number | null) => voi
   return { element: h("div", {}, h("div", { class: "leg-buttons" }, ...buttons), rows), choose };
 }
 
-function legTable(content: ViewerDocument, leg: number): HTMLElement {
+function legTable(content: MachineDocument, leg: number): HTMLElement {
   const { rows, number: name } = content.machine.legs[leg];
   return h(
     "table",
@@ -295,7 +295,7 @@ function legTable(content: ViewerDocument, leg: number): HTMLElement {
 /** Tooltip and highlight of the leg under the pointer. */
 function hovering(
   stage: Stage,
-  content: ViewerDocument,
+  content: MachineDocument,
   chosen: () => number[] | null,
   highlight: (legs: number[] | null) => void,
 ) {
@@ -311,7 +311,7 @@ function hovering(
 }
 
 function layerSwitches(
-  content: ViewerDocument,
+  content: MachineDocument,
   onchange: (layer: Layer, visible: boolean) => void,
 ): HTMLElement {
   const { machine } = content;

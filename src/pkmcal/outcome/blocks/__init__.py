@@ -1,0 +1,15 @@
+"""Blocks of a section of a page: what the viewer draws, as plain data.
+
+A new kind of block is a file here with its class, an entry of ``Block``, and a file of the same
+name in ``viewer/src/blocks``, which draws it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from pkmcal.outcome.blocks.text import Checks, Downloads, Listing, Paragraph
+
+Block = Annotated[Paragraph | Listing | Checks | Downloads, Field(discriminator="kind")]

@@ -1,0 +1,54 @@
+"""Blocks of text: paragraphs, lists, checks, and files to download."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pkmcal.files import Schema
+from pkmcal.outcome.blocks.base import Text
+
+
+class Paragraph(Schema):
+    """Paragraph; small : as small print."""
+
+    kind: Literal["paragraph"] = "paragraph"
+    text: Text
+    small: bool = False
+
+
+class Listing(Schema):
+    """List with a heading, which may be empty; folded : collapsed until it is opened."""
+
+    kind: Literal["listing"] = "listing"
+    title: Text
+    items: tuple[Text, ...]
+    folded: bool = False
+
+
+class CheckLine(Schema):
+    """Comparison with an expected value, in one line."""
+
+    text: Text
+    passed: bool
+
+
+class Checks(Schema):
+    """Comparisons with expected values."""
+
+    kind: Literal["checks"] = "checks"
+    checks: tuple[CheckLine, ...]
+
+
+class Download(Schema):
+    """File that the page holds; content : its text."""
+
+    name: str
+    media_type: str
+    content: str
+
+
+class Downloads(Schema):
+    """Files that the page holds."""
+
+    kind: Literal["downloads"] = "downloads"
+    files: tuple[Download, ...]

@@ -1,0 +1,20 @@
+/** Blocks of a section by their kind: each file beside this one draws one or a few of them. */
+
+import type { Section } from "../document";
+import type { Selection } from "../selection";
+import { checks, downloads, listing, paragraph } from "./text";
+
+export type Block = Section["blocks"][number];
+/** What a block may use beside its own data. */
+export interface Context {
+  selection: Selection;
+}
+type Of<K extends Block["kind"]> = Extract<Block, { kind: K }>;
+type Drawers = { [K in Block["kind"]]: (block: Of<K>, context: Context) => HTMLElement };
+
+const DRAWERS: Drawers = { paragraph, listing, checks, downloads };
+
+export function drawBlock(block: Block, context: Context): HTMLElement {
+  const draw = DRAWERS[block.kind] as (block: Block, context: Context) => HTMLElement;
+  return draw(block, context);
+}

@@ -1,0 +1,29 @@
+/** Blocks of text. */
+
+import type { Checks, Downloads, Listing, Paragraph } from "../document";
+import { h } from "../dom";
+
+export const paragraph = (block: Paragraph): HTMLElement =>
+  h("p", block.small ? { class: "small" } : {}, block.text);
+
+export function listing(block: Listing): HTMLElement {
+  const items = h("ul", {}, ...block.items.map((text) => h("li", {}, text)));
+  if (block.folded) return h("details", {}, h("summary", {}, block.title), items);
+  return h("div", {}, ...(block.title ? [h("h3", {}, block.title)] : []), items);
+}
+
+export const checks = (block: Checks): HTMLElement =>
+  h("ul", { class: "checks" },
+    ...block.checks.map((one) => h("li", { class: one.passed ? "passed" : "failed" }, one.text)));
+
+export function downloads(block: Downloads): HTMLElement {
+  const links = block.files.map((file) => {
+    const link = h("a", { download: file.name, href: "#" }, file.name);
+    link.addEventListener("click", () => {
+      link.href = URL.createObjectURL(new Blob([file.content], { type: file.media_type }));
+    });
+    return link;
+  });
+  return h("p", { class: "downloads small" }, "To take along: ",
+    ...links.flatMap((link, k) => (k ? [", ", link] : [link])), ".");
+}

@@ -1,0 +1,58 @@
+/**
+ * Selection that all blocks of a page share: the leg, station, configuration or image under the
+ * pointer, and the chosen one. Elements carry their key as `data-key`; a canvas subscribes.
+ */
+
+export type Key = string;
+type Listener = (hovered: Key | null, chosen: Key | null) => void;
+
+export class Selection {
+  private hovered: Key | null = null;
+  private chosen: Key | null = null;
+  private readonly listeners: Listener[] = [];
+
+  /** Call a listener at each change; it compares with `matches`. */
+  subscribe(listener: Listener): void {
+    this.listeners.push(listener);
+  }
+
+  hover(key: Key | null): void {
+    if (key === this.hovered) return;
+    this.hovered = key;
+    this.tell();
+  }
+
+  choose(key: Key | null): void {
+    this.chosen = key === this.chosen ? null : key;
+    this.tell();
+  }
+
+  private tell(): void {
+    for (const listener of this.listeners) listener(this.hovered, this.chosen);
+  }
+}
+
+/** Whether an element with a key belongs to the selected one: an image to its configuration, too. */
+export function matches(key: Key, selected: Key | null): boolean {
+  if (!key || !selected) return false;
+  if (key === selected) return true;
+  const [image, other] = key.startsWith("image:") ? [key, selected] : [selected, key];
+  if (!image.startsWith("image:")) return false;
+  const slash = image.indexOf("/");
+  return other === `configuration:${image.slice(slash + 1)}` || other === `station:${image.slice(6, slash)}`;
+}
+
+/** Hovering and clicking elements with `data-key` inside a host, and their classes. */
+export function connect(host: HTMLElement, selection: Selection): void {
+  const keyOf = (event: Event): Key | null =>
+    (event.target as Element).closest<HTMLElement>("[data-key]")?.dataset.key || null;
+  host.addEventListener("pointerover", (event) => selection.hover(keyOf(event)));
+  host.addEventListener("pointerleave", () => selection.hover(null));
+  selection.subscribe((hovered, chosen) => {
+    for (const element of host.querySelectorAll<HTMLElement>("[data-key]")) {
+      const key = element.dataset.key ?? "";
+      element.classList.toggle("hovered", matches(key, hovered));
+      element.classList.toggle("chosen", matches(key, chosen));
+    }
+  });
+}
