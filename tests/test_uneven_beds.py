@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import printers
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.discrepancy_basis import UNEVEN_BED
+from pkmcal.calibration.faults import scale_fault
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.calibration.results import calibration_document
 from pkmcal.calibration.saved_calibration import load
@@ -78,6 +80,17 @@ def test_an_uneven_bed_is_accepted_and_blamed_on_no_motor(uneven):
     assert 1e-3 * SIZE / 3 < error.scale < 3e-3 * SIZE
     assert 1e-3 * LENGTH / 3 < error.length < 3e-3 * LENGTH
     assert f"discrepancy.{UNEVEN_BED}" in value.verdict.codes
+
+
+def test_heights_blame_no_scale_of_the_machine(uneven):
+    """They leave sizes to the nominal model; distances on a printed part would determine them."""
+    estimate, table = uneven[2].estimate, uneven[2].estimate.machine.parameters
+    lengths = np.array([unit == "m" for unit in table.units])
+    larger = estimate.machine.with_values(np.where(lengths, 1.05, 1.0) * table.nominal)
+    assert not [*scale_fault(uneven[2].session, replace(estimate, machine=larger))]
+    measured = replace(estimate, machine=larger, link_weights=np.ones(3))
+    (fault,) = scale_fault(uneven[2].session, measured)
+    assert fault.facts["value"] == pytest.approx(0.05, rel=1e-6)
 
 
 def test_deviations_contain_the_unevenness(uneven):

@@ -17,6 +17,7 @@ from pkmcal.cameras.contract import USUAL_ASPECT, USUAL_CENTRE, USUAL_DISTORTION
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
+from pkmcal.identify.unidentified import only_heights
 from pkmcal.identify.verdict import POOR_MODEL_POSE_SCALE, VERDICT, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.measurements.effects import BOARD_SIZE
@@ -151,7 +152,11 @@ def richer_model(
 
 
 def scale_fault(session: Session, estimate: Estimate) -> Iterator[Finding]:
-    """Reason against a result whose lengths all have a common factor."""
+    """Reason against a result whose lengths all have a common factor. Heights alone leave sizes to
+    the nominal model, whatever an uneven bed makes of them.
+    """
+    if only_heights(estimate):
+        return
     scale = wrong_scale(estimate)
     if scale != 1.0 and estimate.pose_weights.size:
         cause = "board" if session.board else "table"
