@@ -57,6 +57,8 @@ if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
     from pkmcal.judge.holdouts import HoldOut
 
+OF_RESULT = frozenset({"geometry", "workspace", "parameters"})
+"""Sections that mean nothing if the result is refused; others show why it was."""
 TOOL_QUESTION = "How well is the platform's pose known?"
 FLATNESS_QUESTION = "How flat will the bed be?"
 CHANGE_QUESTION = "How far is the machine from its nominal model?"
@@ -160,13 +162,15 @@ def report_of(
         provenance.stations(session, observation, estimate, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
-        identifiability.section(findings, estimate.machine.parameters),
-        parameters.correlations_part(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
         *linked.sections(session, _links(c), estimate),
         held,
         bed.section(session, c.model_errors),
+    )
+    expert_parts = (
+        identifiability.section(findings, estimate.machine.parameters),
+        parameters.correlations_part(estimate),
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
@@ -186,7 +190,10 @@ def report_of(
         certificate=provenance.certificate(c, digest),
         partial=any(one.sure for one in c.model_errors),
         figures=calibration_cards(c, centres, tool),
-        parts=tuple(part for part in parts if part),
+        parts=(
+            *(replace(part, of_result=part.name in OF_RESULT) for part in parts if part),
+            *(replace(part, expert=True) for part in expert_parts if part),
+        ),
         findings=session.findings,
         summary={"figures": calibration_numbers(observation, estimate, centres, tool)},
     )

@@ -47,7 +47,6 @@ def section(findings: Findings, table: ParameterTable) -> Part:
             *((_conditions(findings),) if findings.conditions else ()),
         ),
         menu="Identifiability",
-        expert=True,
     )
 
 

@@ -134,7 +134,6 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
         "parameters",
         "Parameters",
         blocks=(parameter_table(estimates, estimate.gauge), files),
-        of_result=True,
     )
 
 

@@ -163,7 +163,7 @@ def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> P
         for title, pairs in lists
         if pairs
     )
-    return Part("how", "How it was computed", (SIGMA_MEANING_TEXT,), blocks=blocks, expert=True)
+    return Part("how", "How it was computed", (SIGMA_MEANING_TEXT,), blocks=blocks)
 
 
 def certificate(calibration: Calibration, digest: str) -> tuple[tuple[str, str], ...]:
@@ -325,7 +325,7 @@ def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estima
     )
     text = () if lists else ("Nothing was rejected.",)
     title = "What was left out, and what stays open"
-    return Part("rejected", title, text, blocks=(*lists, together), menu="Left out", expert=True)
+    return Part("rejected", title, text, blocks=(*lists, together), menu="Left out")
 
 
 def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, ...]:

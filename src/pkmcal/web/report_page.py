@@ -6,11 +6,11 @@ from datetime import datetime
 from importlib.metadata import version
 
 from pkmcal.outcome import Outcome, Part
-from pkmcal.outcome.blocks.table import table_block
 from pkmcal.outcome.blocks.text import CheckLine, Checks, Fact, Paragraph
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.web import document as shapes
 from pkmcal.web.page import standalone_page
+from pkmcal.web.tables import table_block
 
 
 def report_page(outcome: Outcome, made: datetime | None = None) -> str:

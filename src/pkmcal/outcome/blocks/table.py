@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import re
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pkmcal.files import Schema
 from pkmcal.outcome.blocks.base import Key, Text
-from pkmcal.outcome.finding import Level, Mark
-from pkmcal.wording import MINUS_SIGN
-
-if TYPE_CHECKING:
-    from pkmcal import outcome
-
-_LEADING_NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
-_THOUSANDS = str.maketrans({MINUS_SIGN: "-", "\N{NARROW NO-BREAK SPACE}": None})
+from pkmcal.outcome.finding import Mark
 
 
 class Column(Schema):
@@ -76,35 +68,3 @@ class DataTable(Schema):
     note: Text = ""
     folded: bool = False
     filters: tuple[Filter, ...] = ()
-
-
-def table_block(table: outcome.Table) -> DataTable:
-    """Block of a table that the terminal prints as well."""
-    marks = {row.mark for row in table.rows}
-    # rows of one mark are all alike: then no sign is shown
-    marked = len(marks) > 1 or marks == {Level.WRONG}
-    return DataTable(
-        title=table.title,
-        columns=tuple(
-            Column(name=name, form="text" if k == 0 or k in table.words else "number")
-            for k, name in enumerate(table.columns)
-        ),
-        rows=tuple(
-            TableRow(
-                cells=(row.name, *row.cells),
-                values=tuple(map(leading_number, (row.name, *row.cells))),
-                key=row.key,
-                mark=row.mark if marked else None,
-                source=row.source,
-            )
-            for row in table.rows
-        ),
-        note=table.note,
-        folded=table.folded,
-    )
-
-
-def leading_number(text: str) -> float | None:
-    """Number with which a text begins, such as that of ``−0.3 ± 0.1``; None without one."""
-    match = _LEADING_NUMBER.match(text.translate(_THOUSANDS))
-    return float(match[0]) if match else None
