@@ -256,29 +256,26 @@ def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
         levels = {one.level for code in codes for one in verdict.of(code)}
         return next((one for one in (Level.WRONG, Level.DOUBTFUL) if one in levels), "good")
 
-    # what the result is for: the flatness of a bed, else the platform's joints at given readings
-    share = VERDICT.nominal_error_share
-    bed = found.bed
-    if bed:
-        purpose, sigma, nominal = FLATNESS_QUESTION, bed.sigma, bed.by_drawing
-        codes: tuple[str, ...] = ("bed.no_gain", "bed.height_unnoticed")
-    else:
-        purpose, sigma, nominal = TOOL_QUESTION, platform_sigma(estimate), found.by_nominal
-        codes = ("platform.no_gain", "machine.undetermined")
-    what = "" if bed else "platform's joints "
+    far = verdict.of("machine.far_from_nominal")
     limits: dict[str, tuple[str, Mark]] = {
-        purpose: (
-            f"{what}{amount(sigma, 'm')}, limit {amount(share * nominal, 'm')}:"
-            f" {share:.0%} of what the tolerances give",
-            judged(*codes),
-        ),
         CHANGE_QUESTION: (
-            f"no value beyond {CONTRADICTION_SIGMAS:g} tolerances"
-            if not verdict.of("machine.far_from_nominal")
-            else f"values beyond {CONTRADICTION_SIGMAS:g} tolerances",
+            f"{'values' if far else 'no value'} beyond {CONTRADICTION_SIGMAS:g} tolerances",
             judged("machine.far_from_nominal"),
-        ),
+        )
     }
+    # what the result is for: the flatness of a bed, else the platform's joints at given readings
+    share, bed = VERDICT.nominal_error_share, found.bed
+    if bed:
+        limits[FLATNESS_QUESTION] = (
+            f"limit {amount(share * bed.by_drawing, 'm')}: {share:.0%} of what the tolerances give",
+            judged("bed.no_gain", "bed.height_unnoticed"),
+        )
+    elif np.any(estimate.configurations):
+        limits[TOOL_QUESTION] = (
+            f"platform's joints {amount(platform_sigma(estimate), 'm')}, limit"
+            f" {amount(share * found.by_nominal, 'm')}: {share:.0%} of what the tolerances give",
+            judged("platform.no_gain", "machine.undetermined"),
+        )
     weights = np.concatenate([estimate.edge_weights, estimate.pose_weights])
     if weights.size:
         rejected = float(np.mean(weights < INLIER_WEIGHT))
