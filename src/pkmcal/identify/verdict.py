@@ -32,7 +32,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note, wrong
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.search import Stop
-from pkmcal.wording import amount, in_full, number
+from pkmcal.wording import amount, in_full
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
@@ -183,8 +183,8 @@ def _headline(estimate: Estimate, joints: Array | None) -> str:
         if not np.isfinite(before):  # the nominal model takes none of the poses
             changes.append(f"{amount(after, unit)} (1σ)")
             continue
-        times = before / after
-        gain = f" ({number(times, 0 if times >= 9.5 else 1)} times)" if times > 1 else ""
+        times = float(f"{before / after:.2g}")
+        gain = f" ({times:g} times)" if times > 1 else ""
         changes.append(f"{amount(before, unit)} → {amount(after, unit)}{'' if changes else gain}")
     return f"Tool error {', '.join(changes)}." if changes else "Calibrated."
 

@@ -180,7 +180,9 @@ def certificate(calibration: Calibration, digest: str) -> tuple[tuple[str, str],
         (f"Tracker {table.name}", f"{table.kind}, {count(len(table.configuration), 'row')}")
         for table in session.trackers
     )
-    units = dict.fromkeys(session.machine.joint_units)
+    noise = " or ".join(
+        amount(session.joint_noise, unit) for unit in dict.fromkeys(session.machine.joint_units)
+    )
     every = (
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
         ("Session", session.folder.name),
@@ -188,7 +190,7 @@ def certificate(calibration: Calibration, digest: str) -> tuple[tuple[str, str],
         ("Method", calibration.method),
         ("Configurations", str(int(np.sum(calibration.estimate.configurations)))),
         (TOLERANCES_NAME, _tolerances(tolerance)),
-        (READING_NOISE_NAME, f"{session.joint_noise:.3g} {' or '.join(units)}"),
+        (READING_NOISE_NAME, noise),
         *cameras,
         *trackers,
     )
