@@ -291,12 +291,12 @@ def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
         )
         if n
     ]
-    if scales and statistics.dof > 0:
+    if scales and statistics.dof > 0 and calibration.method == "bundle":
         limits[FIT_QUESTION] = (
             f"noise {number(max(scales), 2)} times as stated, limit {VERDICT.too_noisy:g} times",
             judged(
                 "edges.misfit", "edges.scatter", "poses.misfit", "poses.scatter",
-                "estimate", "readings.misfit",
+                "readings.misfit",
             ),
         )  # fmt: skip
     return limits
