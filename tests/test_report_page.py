@@ -23,7 +23,12 @@ from pkmcal.measurements import Rejection
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
 from pkmcal.report.calibration import DATA_QUESTION, TOOL_QUESTION, report_of
-from pkmcal.web.report_page import report_document, report_page
+from pkmcal.web.report_page import (
+    LONGEST_HEADLINE,
+    report_document,
+    report_page,
+    verdict_lines,
+)
 from pkmcal.web.tables import leading_number
 from test_report_case import Case, calibration, case_document, make_case, report_html
 
@@ -202,6 +207,21 @@ def test_downloads_hold_all_parameters(page, case):
     records = json.loads(contents["parameters.json"])["parameters"]
     assert [one["value"] for one in records] == case.estimate.machine.values.tolist()
     assert len(contents["parameters.csv"].splitlines()) == 1 + len(records)
+
+
+@pytest.mark.parametrize(
+    ("sentences", "points"),
+    [(("Short.",), 0), (("Short.", "Also short."), 0), (("Short.", "w" * 300 + ".", "End."), 2),
+     (("W" * 300 + ".", "End."), 2)],
+)  # fmt: skip
+def test_a_verdict_has_two_lines(sentences, points):
+    """What is longer stands below them; nothing is lost."""
+    headline, explanation, listed = verdict_lines(" ".join(sentences), "Usable")
+    assert max(len(headline), len(explanation)) <= LONGEST_HEADLINE
+    assert len(listed) == points
+    assert [one for one in (headline, explanation, *listed) if one and one != "Usable."] == list(
+        sentences
+    )
 
 
 @pytest.mark.parametrize(

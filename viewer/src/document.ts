@@ -210,6 +210,7 @@ export interface ReportDocument {
  * tone : good, partial (usable, with exceptions) or bad.
  * stamp : one to three words.
  * explanation : line below the headline.
+ * reasons : points below both.
  * comparison : magnitudes before and after.
  */
 export interface Verdict {
@@ -351,12 +352,13 @@ export interface DataTable {
  * Column of a table.
  *
  * form : text; number, to the right, ``a ± b`` with the second part small; leg, a chip with the
- *     leg's colour; share, a bar from 0 to 1 beside its text.
+ *     leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
+ *     darker the larger it is among those of all such columns.
  * hint : explanation of the heading.
  */
 export interface Column {
   name: string;
-  form: "text" | "number" | "leg" | "share";
+  form: "text" | "number" | "leg" | "share" | "shade";
   hint: string;
 }
 /**

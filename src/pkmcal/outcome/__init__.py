@@ -120,6 +120,7 @@ class Table:
     first : number of leading columns that a terminal prints, the rows' names included; None for
         all.
     words : indices of the columns that hold text and are aligned to the left.
+    shaded : indices of the columns whose cells are shaded by their numbers on the page.
     legend : lines under the table on a terminal.
     """
 
@@ -131,6 +132,7 @@ class Table:
     folded: bool = False
     first: int | None = None
     words: tuple[int, ...] = ()
+    shaded: tuple[int, ...] = ()
     legend: tuple[str, ...] = ()
 
 

@@ -191,6 +191,7 @@ class Verdict(Schema):
     tone : good, partial (usable, with exceptions) or bad.
     stamp : one to three words.
     explanation : line below the headline.
+    reasons : points below both.
     comparison : magnitudes before and after.
     """
 

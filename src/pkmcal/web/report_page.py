@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
 from importlib.metadata import version
 
@@ -11,6 +12,10 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.web import document as shapes
 from pkmcal.web.page import standalone_page
 from pkmcal.web.tables import table_block
+
+LONGEST_HEADLINE = 240
+"""Characters of two lines."""
+_SENTENCE_END = re.compile(r"(?<=\.) (?=[A-Z])")
 
 
 def report_page(outcome: Outcome, made: datetime | None = None) -> str:
@@ -26,6 +31,8 @@ def report_document(outcome: Outcome, made: datetime | None = None) -> shapes.Re
     verdict, program = outcome.verdict, f"pkmcal {version('pkmcal')}"
     usable, partial = verdict.usable, outcome.partial
     date = (f"{made.day} {made:%B %Y, %H:%M}",) if made else ()
+    stamp = outcome.stamp or ("Usable" if usable else "Do not use")
+    headline, explanation, points = verdict_lines(verdict.headline, stamp)
     # remarks: what needs no action
     remarks = [one for one in verdict.findings if is_remark(one)]
     rest = [one for one in verdict.findings if not is_remark(one)]
@@ -39,11 +46,11 @@ def report_document(outcome: Outcome, made: datetime | None = None) -> shapes.Re
         notes=outcome.notes,
         verdict=shapes.Verdict(
             tone="bad" if not usable else "partial" if partial else "good",
-            stamp=outcome.stamp or ("Usable" if usable else "Do not use"),
-            headline=verdict.headline,
-            explanation=outcome.explanation,
+            stamp=stamp,
+            headline=headline,
+            explanation=outcome.explanation or explanation,
             comparison=outcome.comparison,
-            reasons=verdict.reasons,
+            reasons=(*points, *verdict.reasons),
         ),
         warnings=(
             *(one.text for one in rest if one.level is Level.DOUBTFUL),
@@ -63,6 +70,20 @@ def report_document(outcome: Outcome, made: datetime | None = None) -> shapes.Re
         certificate=tuple(Fact(name=name, value=value) for name, value in outcome.certificate),
         sections=tuple(_section(part, usable) for part in outcome.parts),
     )  # fmt: skip
+
+
+def verdict_lines(text: str, stamp: str) -> tuple[str, str, tuple[str, ...]]:
+    """Headline, line below it, and points, so that no paragraph is set as a headline.
+
+    stamp : headline of a text whose first sentence is too long for one.
+    """
+    first, *rest = _SENTENCE_END.split(text)
+    if len(first) > LONGEST_HEADLINE:
+        return f"{stamp}.", "", (first, *rest)
+    explanation = " ".join(rest)
+    if len(explanation) > LONGEST_HEADLINE:
+        return first, "", tuple(rest)
+    return first, explanation, ()
 
 
 def is_remark(finding: Finding) -> bool:

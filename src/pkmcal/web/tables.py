@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Literal
 
 from pkmcal.outcome import Table
 from pkmcal.outcome.blocks.table import Column, DataTable, TableRow
@@ -21,8 +22,7 @@ def table_block(table: Table) -> DataTable:
     return DataTable(
         title=table.title,
         columns=tuple(
-            Column(name=name, form="text" if k == 0 or k in table.words else "number")
-            for k, name in enumerate(table.columns)
+            Column(name=name, form=_form(table, k)) for k, name in enumerate(table.columns)
         ),
         rows=tuple(
             TableRow(
@@ -37,6 +37,13 @@ def table_block(table: Table) -> DataTable:
         note=table.note,
         folded=table.folded,
     )
+
+
+def _form(table: Table, k: int) -> Literal["text", "number", "shade"]:
+    """Form of a column."""
+    if k == 0 or k in table.words:
+        return "text"
+    return "shade" if k in table.shaded else "number"
 
 
 def leading_number(text: str) -> float | None:

@@ -11,7 +11,9 @@ const FIRST_ROWS = 12, LONG = 18;
 const SORTABLE = 3, COPYABLE = 4;
 
 export function dataTable(block: DataTable): HTMLElement {
-  const drawn = block.rows.map((row) => tableRow(row, block.columns));
+  const most = Math.max(...block.rows.flatMap((row) =>
+    row.values.filter((_, k) => block.columns[k]?.form === "shade").map((value) => value ?? 0)));
+  const drawn = block.rows.map((row) => tableRow(row, block.columns, most));
   const body = h("tbody", {}, ...drawn);
   const sorting = new Sorting(block);
   const pressed = new Set<string>();
@@ -126,11 +128,16 @@ function passes(block: DataTable, row: TableRow, pressed: Set<string>): boolean 
   return [...groups.values()].every((tags) => tags.some((tag) => row.tags.includes(tag)));
 }
 
-function tableRow(row: TableRow, columns: Column[]): HTMLTableRowElement {
+/** Row of a table; `most` is the largest value of the shaded columns. */
+function tableRow(row: TableRow, columns: Column[], most: number): HTMLTableRowElement {
   const cells = columns.map((column, k) => {
     const text = row.cells[k] ?? "", children = cellContent(column, text, row.values[k] ?? null);
     const first = k === columns.findIndex((one) => one.form === "text");
-    if (!first) return h("td", { class: column.form }, ...children);
+    if (!first) {
+      const cell = h("td", { class: column.form }, ...children);
+      if (column.form === "shade") cell.style.setProperty("--share", String((row.values[k] ?? 0) / most));
+      return cell;
+    }
     const attributes = { scope: "row", class: column.form, "data-tip": row.hint || false };
     return h("th", attributes, ...(row.mark ? [sign(row.mark), " "] : []), ...children);
   });

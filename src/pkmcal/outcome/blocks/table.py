@@ -13,12 +13,13 @@ class Column(Schema):
     """Column of a table.
 
     form : text; number, to the right, ``a ± b`` with the second part small; leg, a chip with the
-        leg's colour; share, a bar from 0 to 1 beside its text.
+        leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
+        darker the larger it is among those of all such columns.
     hint : explanation of the heading.
     """
 
     name: Text
-    form: Literal["text", "number", "leg", "share"] = "number"
+    form: Literal["text", "number", "leg", "share", "shade"] = "number"
     hint: Text = ""
 
 
