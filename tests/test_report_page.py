@@ -211,7 +211,7 @@ def test_downloads_hold_all_parameters(page, case):
 
 @pytest.mark.parametrize(
     ("sentences", "points"),
-    [(("Short.",), 0), (("Short.", "Also short."), 0), (("Short.", "w" * 300 + ".", "End."), 2),
+    [(("Short.",), 0), (("Short.", "Also short."), 0), (("Short.", "W" * 300 + ".", "End."), 2),
      (("W" * 300 + ".", "End."), 2)],
 )  # fmt: skip
 def test_a_verdict_has_two_lines(sentences, points):
