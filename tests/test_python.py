@@ -6,12 +6,14 @@ import json
 import subprocess
 import sys
 from dataclasses import is_dataclass
+from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pkmcal
+from page_documents import page_document
 from pkmcal.arrays import short_repr
 from pkmcal.calibration import plots
 from pkmcal.errors import InputError
@@ -307,3 +309,10 @@ def test_images_are_of_the_size_that_the_options_say():
     assert default_camera().image_size == (800, 600)
     assert PLANNED_IMAGE_SIZE == (1280, 960)
     assert EdgeNoise().shift == NOMINAL_EDGE_SIGMA
+
+
+def test_a_notebook_shows_the_report_in_a_frame(result):
+    frame = result._repr_html_()
+    assert frame.startswith('<iframe srcdoc="&lt;!doctype html&gt;')
+    document = page_document(unescape(frame.partition('srcdoc="')[2].partition('"')[0]))
+    assert document["verdict"]["headline"] == result.verdict.headline

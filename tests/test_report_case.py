@@ -21,10 +21,10 @@ from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
-from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
 from pkmcal.session.image_files import Image
 from pkmcal.session.load import Session, Station
+from pkmcal.web.report_page import report_document, report_page
 
 OUTWARD = 0.25
 """Pixels that the case's edges lie outward, besides the camera's own shift."""
@@ -55,7 +55,12 @@ def calibration(
 
 def report_html(*value, **more) -> str:
     """The report's page; as :func:`calibration`."""
-    return page_html(report_of(calibration(*value, **more)))
+    return report_page(report_of(calibration(*value, **more)))
+
+
+def case_document(*value, **more) -> dict:
+    """The report's document; as :func:`calibration`."""
+    return report_document(report_of(calibration(*value, **more))).model_dump(mode="json")
 
 
 def camera() -> Pinhole:

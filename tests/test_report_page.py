@@ -1,5 +1,7 @@
-"""The report's page: its text, no requests to other places, and its scripts in browsers."""
+"""The report's page: its document, no requests to other places, and its scripts in browsers."""
 
+import base64
+import hashlib
 import json
 import re
 import shutil
@@ -13,13 +15,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from page_documents import page_blocks, page_document, page_section, page_text
+from pkmcal.identify.centres import free_of_gauge
+from pkmcal.identify.tool import centres_and_tool, tool_error
+from pkmcal.identify.verdict import VERDICT
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
-from pkmcal.outcome.finding import Finding, Level
-from pkmcal.pages.charts import UprightBar, bar_chart
-from pkmcal.pages.page import page_html
-from pkmcal.report.calibration import report_of
-from test_report_case import Case, calibration, make_case, report_html
+from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
+from pkmcal.report.calibration import DATA_QUESTION, TOOL_QUESTION, report_of
+from pkmcal.web.report_page import (
+    LONGEST_HEADLINE,
+    report_document,
+    report_page,
+    verdict_lines,
+)
+from pkmcal.web.tables import leading_number
+from test_report_case import Case, calibration, case_document, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 CHROMIUM = next(
@@ -69,14 +80,17 @@ class PageParts(HTMLParser):
         self._texts.append(data)
 
 
-# ------------------------------------------------------------------ the page
+# ------------------------------------------------------------------ the document
 
 
 def test_page_has_verdict_numbers_and_model_error(page):
-    text = PageParts(page).text
-    for expected in ("Good to use.", "a little noisy", "more poses", "0.90", "15 of 15",
-                     "multiplied by 1.25", "observe", "1.50 s", "three centres: legs 1, 3, 5",
-                     "what these data show"):  # fmt: skip
+    document = page_document(page)
+    assert document["verdict"]["headline"] == "Good to use."
+    assert document["warnings"] == ["a little noisy"]
+    assert document["advice"] == ["more poses"]
+    text = page_text(document)
+    for expected in ("0.90", "15 of 15", "multiplied by 1.25", "observe", "1.50 s",
+                     "three centres: legs 1, 3, 5", "what these data show"):  # fmt: skip
         assert expected in text, expected
 
 
@@ -84,38 +98,165 @@ def test_page_has_date_and_sources(case):
     noted = replace(case.session, document={"notes": "Machine 2.\nLeg 4 <b>exchanged</b>."})
     fine = Verdict(True, "Fine.")
     value = report_of(calibration(noted, case.observation, case.estimate, fine), digest="3f2a")
-    html = page_html(value, datetime(2026, 3, 4, 15, 2))
-    text = PageParts(html).text
-    assert "4 March 2026, 15:02" in text
-    assert f"pkmcal {version('pkmcal')}" in text
-    assert "digest of the session 3f2a" in text
-    assert "Leg 4 <b>exchanged</b>." in text
-    assert "<h3>Notes</h3>" in html
-    assert "<h3>Notes</h3>" not in report_html(case.session, case.observation, case.estimate, fine)
+    document = page_document(report_page(value, datetime(2026, 3, 4, 15, 2)))
+    assert document["origin"] == [
+        "4 March 2026, 15:02", f"pkmcal {version('pkmcal')}", "digest of the session 3f2a",
+    ]  # fmt: skip
+    assert document["notes"] == "Machine 2.\nLeg 4 <b>exchanged</b>."
+    certificate = {one["name"]: one["value"] for one in document["certificate"]}
+    assert certificate["Digest of the session"] == "3f2a"
+    for station in case.session.stations:
+        assert station.camera_file in certificate[f"Camera, station {station.name}"]
 
 
-def test_charts_lead_to_images_that_are_there(page, case):
-    results = PageParts(page)
-    links = [str(a["href"]) for tag, a in results.tags if tag == "a" and "download" not in a]
-    names = {f"#{a['id']}" for _, a in results.tags if "id" in a}
-    leading = [link for link in links if link.startswith("#image-")]
-    # a bar a configuration, a box a leg, station, joint and kind of edge, and cells
-    assert len(leading) > 5 + 6 + 3 + 6 + 20
-    assert set(leading) <= names
-    bar = re.search(r'<a href="#image-\d-(\d)" aria-label="configuration c(\d):', page)
-    assert bar is not None
-    assert int(bar[1]) == int(bar[2]) + 1
+def test_comparison_is_of_the_same_poses(case):
+    """Tolerances, nominal model and result: the tool's position, means over the poses in use."""
+    value = report_of(calibration(*vars(case).values(), Verdict(True, "Fine.")))
+    machine, estimate = case.session.machine, case.estimate
+    tool = centres_and_tool(machine, estimate, case.session.joints)[1]
+    root = machine.parameters.free_matrix() * machine.parameters.tolerances_free()
+    prior = tool_error(
+        machine, estimate.machine, free_of_gauge(machine, root @ root.T),
+        estimate.state.T_base_platform[estimate.configurations],
+        case.session.joints[estimate.configurations],
+    )  # fmt: skip
+    assert value.comparison is not None
+    shown = {one.label: one.value for one in value.comparison.magnitudes}
+    assert shown["Tolerances"] == pytest.approx(1e3 * prior.position.mean(), rel=1e-2)
+    assert shown["Calibrated"] == pytest.approx(1e3 * tool.position.mean())
+    if "Nominal model" in shown:
+        assert shown["Nominal model"] == pytest.approx(1e3 * tool.off_position.mean())
+
+
+def test_findings_without_effect_are_remarks(case):
+    verdict = Verdict(
+        True,
+        "Fine.",
+        (
+            doubtful("edges.leg_seldom_seen", leg=2),
+            doubtful("machine.undetermined", what="Open.", advice="Nothing.", matters=False),
+            note("machine.undetermined_harmless", what="the size", matters=False),
+            note("configurations.few", number=3),
+        ),
+    )
+    document = case_document(*vars(case).values(), verdict)
+    assert document["warnings"] == list(verdict.warnings[:1])
+    assert document["advice"] == list(verdict.advice[1:])
+    assert document["remarks"] == [verdict.findings[1].text, verdict.findings[2].text]
+
+
+@pytest.mark.parametrize(
+    ("finding", "question"),
+    [
+        (wrong("edges.rejected_share", share=0.5, limit=0.4), DATA_QUESTION),
+        (doubtful("machine.undetermined", what="Open.", advice="More."), TOOL_QUESTION),
+    ],
+)
+def test_cards_are_marked_by_the_verdict(case, finding, question):
+    good = case_document(*vars(case).values(), Verdict(True, "Fine."))
+    assert {card["mark"] for card in good["cards"] if card["limit"]} == {"good"}
+    usable = finding.level is not Level.WRONG
+    document = case_document(*vars(case).values(), Verdict(usable, "Not so fine.", (finding,)))
+    cards = {card["question"]: card for card in document["cards"]}
+    assert cards[question]["mark"] == finding.level
+    assert cards[DATA_QUESTION]["limit"].endswith(f"{VERDICT.too_many_rejected:.0%}")
+
+
+def test_sections_of_a_refused_result_are_void(case):
+    refused = case_document(*vars(case).values(), Verdict(False, "No."))
+    void = {section["name"] for section in refused["sections"] if section["void"]}
+    assert {"geometry", "parameters"} <= void
+    assert not void & {"residuals", "rejected", "how"}
+    assert refused["verdict"]["tone"] == "bad"
+    usable = case_document(*vars(case).values(), Verdict(True, "Yes."))
+    assert not any(section["void"] for section in usable["sections"])
+
+
+def test_sections_for_the_metrologist_are_last(page):
+    sections = page_document(page)["sections"]
+    expert = [section["expert"] for section in sections]
+    assert expert == sorted(expert)
+    assert {"identifiability", "how"} <= {s["name"] for s in sections if s["expert"]}
+
+
+def test_parameters_are_sorted_and_filtered_by_their_numbers(page, case):
+    (table,) = page_blocks(page_document(page), "table", "parameters")
+    names = case.session.machine.parameters.names
+    assert tuple(row["name"] for row in table["rows"]) == names
+    columns = [column["name"] for column in table["columns"]]
+    change, sigma, ratio = (columns.index(name) for name in ("Change", "σ", "Change/σ"))
+    for row in table["rows"]:
+        if row["values"][sigma] is None:
+            assert row["values"][ratio] is None
+            continue
+        expected = row["values"][change] / row["values"][sigma]
+        assert row["values"][ratio] == pytest.approx(expected)
+        assert ("significant" in row["tags"]) == (abs(expected) > 3)
+    hidden = {one["tag"] for one in table["filters"] if one["hides"]}
+    held = [row["name"] for row in table["rows"] if hidden & set(row["tags"])]
+    sigmas = np.sqrt(np.diag(case.estimate.covariance))
+    assert held == [name for name, s in zip(names, sigmas, strict=True) if s == 0]
+    leg = {one["label"]: one["tag"] for one in table["filters"]}["Leg 3"]
+    of_leg = [row["name"] for row in table["rows"] if leg in row["tags"]]
+    assert of_leg == [name for name in names if name.startswith("legs[3].")]
+
+
+def test_downloads_hold_all_parameters(page, case):
+    (block,) = page_blocks(page_document(page), "downloads", "parameters")
+    contents = {file["name"]: file["content"] for file in block["files"]}
+    records = json.loads(contents["parameters.json"])["parameters"]
+    assert [one["value"] for one in records] == case.estimate.machine.values.tolist()
+    assert len(contents["parameters.csv"].splitlines()) == 1 + len(records)
+
+
+@pytest.mark.parametrize(
+    ("sentences", "points"),
+    [(("Short.",), 0), (("Short.", "Also short."), 0), (("Short.", "W" * 300 + ".", "End."), 2),
+     (("W" * 300 + ".", "End."), 2)],
+)  # fmt: skip
+def test_a_verdict_has_two_lines(sentences, points):
+    """What is longer stands below them; nothing is lost."""
+    headline, explanation, listed = verdict_lines(" ".join(sentences), "Usable")
+    assert max(len(headline), len(explanation)) <= LONGEST_HEADLINE
+    assert len(listed) == points
+    assert [one for one in (headline, explanation, *listed) if one and one != "Usable."] == list(
+        sentences
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("−0.3 ± 0.1", -0.3), ("1\N{NARROW NO-BREAK SPACE}712 edges", 1712), ("1e-09", 1e-9),
+     ("+0.5 %", 0.5), ("–", None), ("leg 3", None), ("", None)],
+)  # fmt: skip
+def test_cells_are_sorted_by_their_number(text, value):
+    assert leading_number(text) == value
+
+
+@pytest.mark.parametrize(
+    ("marks", "shown"),
+    [(("good", "good"), 0), ((None, "good"), 1), (("good", "doubtful"), 2), (("wrong",) * 2, 2)],
+)
+def test_rows_that_are_all_good_have_no_marks(marks, shown):
+    marks = [Level(mark) if mark in ("doubtful", "wrong") else mark for mark in marks]
+    rows = tuple(Row(f"row {k}", ("1",), mark=mark) for k, mark in enumerate(marks))
+    part = Part("part", "Part", tables=(Table("Table", ("", "mm"), rows),))
+    outcome = Outcome(command="check", title="Check", verdict=Verdict(True, "Fine."), parts=(part,))
+    (table,) = page_blocks(report_document(outcome).model_dump(mode="json"), "table")
+    assert sum(row["mark"] is not None for row in table["rows"]) == shown
+
+
+# ------------------------------------------------------------------ the page
 
 
 def test_page_asks_for_nothing_outside(page):
-    assert not re.search(r"https?:|//[a-z]+\.|@import|url\((?!#)", page)
     for tag, attributes in PageParts(page).tags:
-        assert tag not in ("link", "iframe", "object", "embed", "base")
+        assert tag not in ("iframe", "object", "embed", "base")
         for name in ("src", "href", "xlink:href", "srcset", "action"):
-            inside = "data:" if "download" in attributes else "data:image/jpeg;base64,"
-            assert (attributes.get(name) or "#").startswith(("#", inside))
+            assert (attributes.get(name) or "#").startswith(("#", "data:,"))
     assert "default-src 'none'" in page
-    assert len(page) < 5e6
+    assert "unsafe" not in re.search(r'Content-Security-Policy" content="([^"]+)"', page)[1]
+    assert len(page) < 3e6
 
 
 def test_hostile_names_stay_text(tmp_path):
@@ -126,33 +267,9 @@ def test_hostile_names_stay_text(tmp_path):
     verdict = Verdict(False, HOSTILE, tuple(Finding("", x, saved_text=HOSTILE) for x in Level))
     estimate = replace(case.estimate, gauge=HOSTILE)
     page = report_html(session, observation, estimate, verdict, timings={HOSTILE: 1.0})
-    value = PageParts(page)
     assert "<script>alert" not in page
-    assert not [a for tag, a in value.tags if "onerror" in a or tag == "img"]
-    assert sum(tag == "script" for tag, _ in value.tags) == 6
-    assert value.text.count("<script>alert('x')") > 10
-
-
-def test_a_scale_of_long_numbers_has_room():
-    """Digits are less than 7 px wide; those of 0.005 px began outside."""
-    bars = [UprightBar("one", "one", 0.0074)]
-    chart = bar_chart("Errors", "images; px", bars, (), "bars")
-    assert chart is not None
-    assert all(7 * len(text) <= chart.left for _, text in chart.ticks)
-    assert chart.x(0) == chart.left
-    assert chart.x(1) == chart.width - 8
-
-
-@pytest.mark.parametrize(
-    ("marks", "bold"),
-    [(("good", "good"), 0), ((None, "good"), 1), (("good", "doubtful"), 1), (("wrong",) * 2, 0)],
-)
-def test_a_row_stands_out_where_others_do_not(marks, bold):
-    marks = [Level(mark) if mark in ("doubtful", "wrong") else mark for mark in marks]
-    rows = tuple(Row(f"row {k}", ("1",), mark=mark) for k, mark in enumerate(marks))
-    part = Part("part", "Part", tables=(Table("Table", ("", "mm"), rows),))
-    outcome = Outcome(command="check", title="Check", verdict=Verdict(True, "Fine."), parts=(part,))
-    assert page_html(outcome).count(' marked"') == bold
+    assert not [a for _, a in PageParts(page).tags if "onerror" in a]
+    assert page_text(page_document(page)).count("<script>alert('x')") > 10
 
 
 def test_a_page_without_a_single_edge(case):
@@ -163,211 +280,121 @@ def test_a_page_without_a_single_edge(case):
         edge_weights=np.zeros(0),
         configurations=np.zeros(5, bool),
     )
-    page = report_html(
+    document = case_document(
         case.session,
         replace(case.observation, edges=none),
         estimate,
         Verdict(False, "Nothing seen."),
     )
-    assert "Do not use" in page
-    assert "nothing in use" in page
-    assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
-
-
-def test_an_image_that_is_gone_is_stated(tmp_path):
-    case = make_case(tmp_path, n_poses=4, n_stations=2)
-    next(tmp_path.glob("*.png")).unlink()
-    page = report_html(case.session, case.observation, case.estimate, Verdict(True, "Fine."))
-    assert "the file could not be read" in page
+    assert document["verdict"]["stamp"] == "Do not use"
+    assert not re.search(r"\bnan\b", page_text(document))
 
 
 # ------------------------------------------------------------------ in a browser
 
-PROBE = """<script>
-const seen = [];
-addEventListener("error", (event) => seen.push(event.message));
-addEventListener("unhandledrejection", (event) => seen.push(String(event.reason)));
-addEventListener("securitypolicyviolation", (event) => seen.push("blocked " + event.blockedURI));
-setInterval(() => {
-  const root = document.documentElement;
-  root.dataset.errors = seen.join("; ");
-  root.dataset.overhang = root.scrollWidth - root.clientWidth;
-}, 50);
-</script>"""
-
-
-def browse(page: str, folder: Path, width: int) -> tuple[str, str]:
-    """The page's document after its scripts ran, and the console's output."""
-    if CHROMIUM is None:
-        message = "NO CHROMIUM: the report was not opened in a browser (apt install chromium)"
-        pytest.skip(message)
-    file = folder / "page.html"
-    file.write_text(page.replace("<style>", PROBE + "<style>", 1), encoding="utf-8")
-    done = subprocess.run(
-        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-         "--no-first-run", f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr",
-         "--v=0", f"--window-size={width},900", "--virtual-time-budget=20000", "--dump-dom",
-         file.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
-
-
-OPENED = """
-  document.querySelector('th[data-sort="2"] button').click();
-  document.querySelector(".enlarge").click();"""
-LED = """
-  const tell = document.documentElement.dataset;
-  const plot = document.getElementById("plot-photographed");
-  const width = () => plot.querySelector(".main-svg").getAttribute("width");
-  const wait = setInterval(() => {
-    if (plot.dataset.drawn !== "yes") return;
-    clearInterval(wait);
-    document.querySelector("#residuals a").dispatchEvent(new MouseEvent("click"));
-    tell.bar = location.hash;
-    plot.emit("plotly_click", { points: [{ customdata: "#image-1-2" }] });
-    tell.point = location.hash;
-    tell.screen = width();
-    dispatchEvent(new Event("beforeprint"));
-    tell.paper = width();
-    tell.low = plot.querySelector(".main-svg").getAttribute("height")
-      / parseFloat(plot.style.getPropertyValue("--tall"));
-    tell.light = getComputedStyle(document.documentElement).getPropertyValue("--ink");
-    dispatchEvent(new Event("afterprint"));
-    setInterval(() => {
-      tell.again = width();
-      tell.printed = [...document.querySelectorAll(".in-space img.printed")]
-        .map((image) => image.naturalWidth).join();
-    }, 100);
-  }, 50);"""
-
-
-def fine(document: str, console: str) -> dict[str, str | None]:
-    """The page's log; nothing failed and nothing exceeds its width."""
-    root = PageParts(document).tags[0][1]
-    assert root["data-errors"] == ""
-    assert root["data-overhang"] == "0"
-    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
-    return root
-
-
-def loaded(page: str, *acts: str) -> str:
-    """The page with a script that runs as soon as it is loaded."""
-    did = "\n".join(f'addEventListener("load", () => {{{act}\n}});' for act in acts)
-    return page.replace("</body>", f"<script>{did}</script></body>")
-
-
-def test_page_runs_in_a_browser(page, tmp_path):
-    """On a phone: plots have their size, the table sorts, an image opens; a bar's link and a plot's
-    point lead to their image; on paper, plots are as wide as it, and light.
-    """
-    document, console = browse(loaded(page, OPENED, LED), tmp_path, 390)
-    root = fine(document, console)
-    tags = PageParts(document).tags
-    assert any(a.get("id") == "plot-space" and a.get("data-drawn") == "yes" for _, a in tags)
-    assert any(tag == "canvas" for tag, _ in tags)
-    changes = [abs(float(v.split()[2])) for v in re.findall(r'data-values="([^"]+)"', document)]
-    assert len(changes) == 60
-    assert changes == sorted(changes, reverse=True)
-    assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 15 + 1
-    dialog = document[document.index('<dialog id="large"') :]
-    assert dialog[: dialog.index(">")].endswith('open=""')
-    display = dialog[: dialog.index("</dialog>")]
-    assert display.count("<svg") == 1
-    large = re.search(r'data-large="([^"]+)"', page)
-    assert large is not None
-    assert f"base64,{large[1]}" in display
-    assert str(root["data-bar"]).startswith("#image-")
-    assert root["data-point"] == "#image-1-2"
-    assert root["data-paper"] == "672"
-    assert float(str(root["data-low"])) == pytest.approx(0.78)  # as the style has it on paper
-    assert root["data-screen"] == root["data-again"] != "672"
-    assert root["data-light"] == "#1a1e24"
-    # plots in space have an image for paper, at twice the resolution of a screen
-    assert root["data-printed"] == ",".join(["1344"] * page.count('class="panel in-space"'))
-
-
-INSPECTED = """
-  const tell = document.documentElement.dataset;
+PROBE = """
+const faults = [];
+addEventListener("error", (event) => { if (event.message) faults.push(event.message); });
+addEventListener("unhandledrejection", (event) => faults.push(String(event.reason)));
+addEventListener("securitypolicyviolation", (event) => faults.push(`blocked ${event.blockedURI}`));
+addEventListener("load", async () => {
+  const out = document.documentElement.dataset;
   const wait = (ms) => new Promise((done) => setTimeout(done, ms));
-  const buttons = document.querySelectorAll(".enlarge");
+  await wait(500);
+  ACT
+  out.faults = faults.join("; ");
+  out.overhang = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+  out.paper = getComputedStyle(document.body).backgroundColor;
+  out.done = "yes";
+  parent.postMessage({ ...out }, "*");
+});
+"""
+FRAME = """<!doctype html><html lang="en"><title>Frame</title>
+<iframe src="page.html" width="WIDTH" height="860"></iframe>
+<script>addEventListener("message", (event) => {
+  Object.assign(document.documentElement.dataset, event.data);
+});</script></html>"""
+"""Browsers have no window as narrow as a phone."""
+DARK = "--blink-settings=preferredColorScheme=0"
+
+
+def browse_report(page: str, folder: Path, width: int, act: str, *options: str) -> dict[str, str]:
+    """Data that a script in the page leaves on its root element; nothing fails, or is too wide."""
+    if CHROMIUM is None:
+        pytest.skip("NO CHROMIUM: the report was not opened in a browser (apt install chromium)")
+    script = PROBE.replace("ACT", act)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    page = page.replace("script-src ", f"script-src 'sha256-{digest}' ", 1)
+    page = page.replace('<div id="viewer">', f'<script>{script}</script><div id="viewer">', 1)
+    (folder / "page.html").write_text(page, encoding="utf-8")
+    (folder / "frame.html").write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")
+    done = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader",
+         "--disable-background-networking", "--no-first-run", "--enable-logging=stderr", "--v=0",
+         f"--user-data-dir={folder / 'profile'}", "--window-size=1500,900",
+         "--virtual-time-budget=60000", "--dump-dom", *options, (folder / "frame.html").as_uri()],
+        capture_output=True, text=True, timeout=240, check=True,
+    )  # fmt: skip
+    console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    assert not re.findall(r"ERROR:CONSOLE|Uncaught|Refused", "\n".join(console)), console
+    root = PageParts(done.stdout).tags[0][1]
+    data = {name.removeprefix("data-"): value or "" for name, value in root.items()}
+    assert data.get("done") == "yes", data
+    assert (data["faults"], data["overhang"]) == ("", "0")
+    return data
+
+
+ACTED = """
   const $ = (query) => document.querySelector(query);
-  const caption = () => $(".large-caption").textContent;
-  const picture = () => $(".inspected svg");
-  const box = () => picture().getAttribute("viewBox").split(" ").map(Number);
-  const key = (name) => picture().dispatchEvent(
-    new KeyboardEvent("keydown", { key: name, bubbles: true, cancelable: true }));
-  (async () => {
-    buttons[0].click();
-    await wait(200);
-    tell.first = caption();
-    tell.whole = JSON.stringify(box());
-    const host = $(".inspected").getBoundingClientRect();
-    const part = (from, size, share) => Math.round(from + share * size);  // a wheel's are whole
-    const at = {
-      clientX: part(host.left, host.width, 0.7), clientY: part(host.top, host.height, 0.4),
-    };
-    const under = () => {  // pixel of the image under the pointer
-      const point = new DOMPoint(at.clientX, at.clientY);
-      const { x, y } = point.matrixTransform(picture().getScreenCTM().inverse());
-      return [x, y];
-    };
-    const before = under();
-    const turn = { deltaY: -900, cancelable: true, bubbles: true, ...at };
-    $(".inspected").dispatchEvent(new WheelEvent("wheel", turn));
-    tell.under = JSON.stringify([before, under()]);
-    tell.near = JSON.stringify(box());
-    for (let k = 0; k < 9; k += 1) $(".inspected").dispatchEvent(new WheelEvent("wheel", turn));
-    tell.pixel = host.width / box()[2];
-    tell.sharp = getComputedStyle(picture().querySelector("image")).imageRendering;
-    const hidden = (query) => getComputedStyle(picture().querySelector(query)).display === "none";
-    key("e");
-    tell.edges = hidden(".edge");
-    key("n");
-    tell.crosses = [hidden(".cross"), hidden(".ring")].join();
-    const gamma = $(".inspector-gamma input");
-    gamma.value = 0.45;
-    gamma.dispatchEvent(new Event("input"));
-    tell.gamma = picture().querySelector("feFuncG").getAttribute("exponent");
-    key("ArrowRight");
-    tell.second = caption();
-    const exponent = () => picture().querySelector("feFuncG").getAttribute("exponent");
-    tell.again = [hidden(".edge"), exponent()].join();
-    tell.fitted = JSON.stringify(box());
-    key("ArrowLeft"); key("ArrowLeft");
-    tell.last = caption();
-    tell.captions = JSON.stringify([...buttons].map((one) =>
-      one.parentNode.querySelector("figcaption").innerText.replace("\\n", " · ")));
-  })();"""
+  const rows = () => [...document.querySelectorAll("#parameters tbody tr")];
+  const button = (text) => [...document.querySelectorAll("#parameters button")]
+    .find((one) => one.textContent === text);
+  const cells = (k) => rows().map((row) => row.cells[k].textContent);
+  out.first = rows().length;
+  button("Leg 3").click();
+  out.legs = JSON.stringify([...new Set(cells(0))]);
+  button("Leg 3").click();
+  $("#parameters .more").click();
+  button("Change").click();
+  out.changes = JSON.stringify(cells(4));
+  let copied = "";
+  document.execCommand = () => { copied = document.activeElement.value; return true; };
+  Object.defineProperty(navigator, "clipboard", { value: undefined });
+  button("TSV").click();
+  await wait(50);
+  out.tsv = copied;
+  button("YAML").click();
+  await wait(50);
+  out.yaml = copied;
+  location.hash = "#how";
+  await wait(300);
+  out.opened = $("#how dl") !== null;
+  rows()[0].dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+  out.selected = document.querySelectorAll("#parameters tr.hovered").length;
+"""
 
 
-def test_enlarged_images_are_inspected(page, tmp_path):
-    """The wheel zooms about the pointer down to single pixels; keys switch layers and images."""
-    document, console = browse(loaded(page, INSPECTED), tmp_path, 1280)
-    root = {name: str(value) for name, value in fine(document, console).items()}
-    captions = json.loads(root["data-captions"])
-    shown = [root[f"data-{name}"] for name in ("first", "second", "last")]
-    assert shown == [captions[0], captions[1], captions[-1]]
-    before, after = json.loads(root["data-under"])
-    np.testing.assert_allclose(after, before, atol=0.05)
-    whole, near, fitted = (json.loads(root[f"data-{n}"]) for n in ("whole", "near", "fitted"))
-    assert near[2] == pytest.approx(whole[2] * np.exp(-1.8), rel=1e-3)
-    assert fitted == pytest.approx(whole)
-    assert float(root["data-pixel"]) == pytest.approx(80, rel=1e-3)
-    assert root["data-sharp"] == "pixelated"
-    assert root["data-edges"] == "true"
-    assert root["data-crosses"] == "true,false"
-    assert root["data-gamma"] == "0.45"
-    assert root["data-again"] == "true,0.45"
+@pytest.mark.parametrize(("width", "dark"), [(1440, False), (390, True)])
+def test_page_works_in_a_browser(page, tmp_path, width, dark):
+    """The table is cut, filtered, sorted and copied; a link opens a section; a leg is selected."""
+    root = browse_report(page, tmp_path, width, ACTED, *((DARK,) if dark else ()))
+    (table,) = page_blocks(page_document(page), "table", "parameters")
+    free = [row for row in table["rows"] if "held" not in row["tags"]]
+    assert len(free) > 30
+    assert int(root["first"]) == 12
+    assert json.loads(root["legs"]) == ["3"]
+    changes = [abs(leading_number(text)) for text in json.loads(root["changes"])]
+    assert changes == sorted(changes, reverse=True)
+    lines = [line.split("\t") for line in root["tsv"].splitlines()]
+    assert lines[0][0] == "Name"
+    assert {line[0] for line in lines[1:]} == {row["name"] for row in free}
+    assert root["yaml"].count("- ") == len(free)
+    assert root["opened"] == "true"
+    assert int(root["selected"]) > 1  # all rows of the leg
+    assert root["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(244, 245, 247)")
 
 
-@pytest.mark.slow
-def test_the_browser_test_sees_errors(page, tmp_path):
-    """And a page whose script fails has its text and its tables, on a wide screen as well."""
-    broken = page.replace('"use strict";', 'fetch("https://example.org/x"); missing();', 1)
-    document, console = browse(broken, tmp_path, 1280)
-    root = PageParts(document).tags[0][1]
-    assert root["data-overhang"] == "0"
-    assert "missing is not defined" in root["data-errors"]
-    assert "blocked https://example.org" in root["data-errors"]
-    assert "missing is not defined" in console
+def test_sections_lead_from_the_contents(page):
+    document = page_document(page)
+    assert page_section(document, "parameters")["menu"] == "Parameters"
+    assert len({section["name"] for section in document["sections"]}) == len(document["sections"])

@@ -335,7 +335,7 @@ def test_a_view_in_python(tmp_path):
     assert view.document["machine"]["name"] == "3-rpr"
     frame = view._repr_html_()
     assert frame.startswith('<iframe srcdoc="&lt;!doctype html&gt;')
-    assert 'sandbox="allow-scripts"' in frame
+    assert 'sandbox="allow-scripts allow-downloads"' in frame
     assert pkmcal.show(load_mechanism("3-rpr")).document["machine"] == view.document["machine"]
     (tmp_path / "mine.html").write_text("mine")
     with pytest.raises(InputError):

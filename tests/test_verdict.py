@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +11,14 @@ import pytest
 from kit_sessions import probe_kit
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
+from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.centres import joint_centres
 from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import ParameterDirection, identifiability
 from pkmcal.identify.motions import UNIDENTIFIED
 from pkmcal.identify.sentences import Sentence
-from pkmcal.identify.tool import platform_by_parameters, platform_sigma
+from pkmcal.identify.tool import centres_and_tool, platform_by_parameters, platform_sigma
 from pkmcal.identify.unidentified import Findings, explain, observed_legs
 from pkmcal.identify.verdict import VERDICT, VerdictOptions, assess, no_gain
 from pkmcal.measurements import Observation
@@ -49,6 +52,31 @@ def judged(scene, *views):
 @pytest.fixture(scope="module")
 def whole():
     return judged(make("gough-stewart"))
+
+
+def test_headline_is_the_tool_error_before_and_after(whole):
+    """Means over the poses: nominal from calibrated at the same readings, and standard deviation;
+    the first by forward kinematics of both machines, with frames laid over each other.
+    """
+    _, estimate, _, verdict = whole
+    numbers = [float(text) for text in re.findall(r"[\d.]*\d", verdict.headline)]
+    before_mm, after_mm, times, before_degrees, after_degrees = numbers
+    machine, used = estimate.machine, estimate.configurations
+    nominal = machine.with_values(machine.parameters.nominal)
+    poses = estimate.state.T_base_platform[used]
+    base, platform = (
+        side.T_calibrated_nominal
+        for side in joint_centres(nominal, machine, np.zeros_like(estimate.covariance))
+    )
+    off = base @ nominal.forward(machine.inverse(poses), poses) @ inverse(platform)
+    change = pose_difference(off, poses)
+    turn, place = (np.linalg.norm(part, axis=-1).mean() for part in (change[:, :3], change[:, 3:]))
+    assert before_mm == pytest.approx(1e3 * place, rel=0.06)  # two digits
+    assert before_degrees == pytest.approx(np.rad2deg(turn), rel=0.06)
+    assert times == pytest.approx(before_mm / after_mm, rel=0.12)
+    tool = centres_and_tool(nominal, estimate, None)[1]
+    assert after_mm == pytest.approx(1e3 * tool.position.mean(), rel=0.06)
+    assert after_degrees == pytest.approx(np.rad2deg(tool.orientation.mean()), rel=0.06)
 
 
 NAMING = (

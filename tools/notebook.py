@@ -100,6 +100,8 @@ def main() -> None:
     for cell in book.cells:
         cell.metadata.pop("execution", None)  # when it ran
         for output in cell.get("outputs", []):
+            if "<iframe" in output.get("data", {}).get("text/html", ""):
+                del output.data["text/html"]  # the report, too large to be kept
             if "image/png" in output.get("data", {}):
                 output.data["image/png"] = smaller(output.data["image/png"])
     book.metadata["language_info"] = {"name": "python"}

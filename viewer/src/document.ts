@@ -1,6 +1,10 @@
 // Generated from src/pkmcal/web/schema.json by `npm run types`; do not edit.
 
 export type ViewerDocument = MachineDocument | ReportDocument;
+/**
+ * Severity of a finding: reason against the result, warning, or note (advice).
+ */
+export type Level = "wrong" | "doubtful" | "note";
 
 /**
  * Page of a machine with sliders for its readings.
@@ -180,7 +184,8 @@ export interface Sweep {
  *
  * kicker : line above the title. subject : what was examined. origin : date, program, digest.
  * notes : the user's own text.
- * warnings, advice, remarks : sentences below the verdict.
+ * warnings, advice, remarks : sentences below the verdict; remarks need no action.
+ * certificate : tolerances and instruments, for the first printed page.
  */
 export interface ReportDocument {
   version: 1;
@@ -196,6 +201,7 @@ export interface ReportDocument {
   advice: string[];
   remarks: string[];
   cards: Card[];
+  certificate: Fact[];
   sections: Section[];
 }
 /**
@@ -203,31 +209,75 @@ export interface ReportDocument {
  *
  * tone : good, partial (usable, with exceptions) or bad.
  * stamp : one to three words.
+ * explanation : line below the headline.
+ * reasons : points below both.
+ * comparison : magnitudes before and after.
  */
 export interface Verdict {
   tone: "good" | "partial" | "bad";
   stamp: string;
   headline: string;
+  explanation: string;
+  comparison: LogBar | null;
   reasons: string[];
+}
+/**
+ * Magnitudes of one quantity, such as the tool's error before and after a calibration.
+ *
+ * unit : of the values. note : small print.
+ */
+export interface LogBar {
+  kind: "log_bar";
+  title: string;
+  unit: string;
+  magnitudes: Magnitude[];
+  note: string;
+}
+/**
+ * Positive magnitude with its text; role decides the colour.
+ */
+export interface Magnitude {
+  label: string;
+  value: number;
+  text: string;
+  role: "prior" | "nominal" | "calibrated" | "test";
 }
 /**
  * Card with the numbers that answer one question.
  *
  * values : numbers with their units, as text.
+ * limit : of a usable result; empty without one. mark : of the number against it.
  */
 export interface Card {
   question: string;
   values: [string, string][];
   note: string;
+  limit: string;
+  mark: "good" | Level | null;
 }
 /**
- * Section of a report; menu : its name in the table of contents.
+ * Name of a quantity or setting, and its value as text.
+ */
+export interface Fact {
+  name: string;
+  value: string;
+}
+/**
+ * Section of a report.
+ *
+ * menu : its name in the table of contents.
+ * mark : the worst of its checks; null without one.
+ * expert : collapsed, among the sections for the metrologist.
+ * void : its figures mean nothing, because the result must not be used.
  */
 export interface Section {
   name: string;
   title: string;
   menu: string;
-  blocks: (Paragraph | Listing | Checks | Downloads)[];
+  mark: "good" | Level | null;
+  expert: boolean;
+  void: boolean;
+  blocks: (Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar)[];
 }
 /**
  * Paragraph; small : as small print.
@@ -238,13 +288,24 @@ export interface Paragraph {
   small: boolean;
 }
 /**
- * List with a heading, which may be empty; folded : collapsed until it is opened.
+ * List with a heading, which may be empty.
+ *
+ * items : texts; what follows a line break is the next step.
+ * folded : collapsed until it is opened.
  */
 export interface Listing {
   kind: "listing";
   title: string;
   items: string[];
   folded: boolean;
+}
+/**
+ * Pairs of name and value with a heading.
+ */
+export interface Facts {
+  kind: "facts";
+  title: string;
+  facts: Fact[];
 }
 /**
  * Comparisons with expected values.
@@ -274,4 +335,63 @@ export interface Download {
   name: string;
   media_type: string;
   content: string;
+}
+/**
+ * Table; folded : collapsed until it is opened.
+ */
+export interface DataTable {
+  kind: "table";
+  title: string;
+  columns: Column[];
+  rows: TableRow[];
+  note: string;
+  folded: boolean;
+  filters: Filter[];
+}
+/**
+ * Column of a table.
+ *
+ * form : text; number, to the right, ``a ± b`` with the second part small; leg, a chip with the
+ *     leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
+ *     darker the larger it is among those of all such columns.
+ * hint : explanation of the heading.
+ */
+export interface Column {
+  name: string;
+  form: "text" | "number" | "leg" | "share" | "shade";
+  hint: string;
+}
+/**
+ * Row of a table.
+ *
+ * cells : text of each column.
+ * values : number of each cell, by which the column is sorted and which a copy holds; null where
+ *     the cell is a text.
+ * name : for copies, before all columns, where the cells have only a short one.
+ * tags : filters that the row passes.
+ * quiet : in a muted colour.
+ */
+export interface TableRow {
+  cells: string[];
+  values: (number | null)[];
+  key: string;
+  name: string;
+  hint: string;
+  mark: "good" | Level | null;
+  source: "paper" | "prototype" | "ours";
+  tags: string[];
+  quiet: boolean;
+}
+/**
+ * Button that filters rows by a tag.
+ *
+ * group : name of the filters of which a row has to pass one, such as legs; filters of several
+ *     groups have to be passed all.
+ * hides : rows with the tag are hidden until the button is pressed.
+ */
+export interface Filter {
+  tag: string;
+  label: string;
+  group: string;
+  hides: boolean;
 }

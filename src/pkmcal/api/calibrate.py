@@ -37,6 +37,7 @@ class CalibrationResult(Calibration, Result):
         }
     )
     kind = ("a calibration", None)
+    _repr_html_ = Result._repr_html_  # a calibration that was loaded has a table instead
 
     @cached_property
     def outcome(self) -> Outcome:

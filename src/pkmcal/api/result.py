@@ -135,6 +135,15 @@ class Result(ABC):
         webbrowser.open((folder / page).as_uri())
         return folder / page
 
+    def _repr_html_(self) -> str | None:
+        """The page in a frame, for notebooks; None for a result without a page."""
+        from pkmcal.web.page import page_frame
+        from pkmcal.web.report_page import report_page
+
+        if not any(name.endswith(".html") for name in self.file_list):
+            return None
+        return page_frame(report_page(self.outcome), self.outcome.title)
+
     def path_document(self, folder: Path) -> dict[str, Any]:
         """Paths of the saved files, for ``--json``."""
         return {"files": {name: str(folder / name) for name in self.file_list}}

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -19,8 +18,6 @@ from pkmcal.mechanisms import Machine
 if TYPE_CHECKING:
     from pkmcal.web.document import MachineDocument
 
-NOTEBOOK_HEIGHT = 760
-"""Height of the page in a notebook, px."""
 PAGE_MARK = b'<meta name="generator" content="pkmcal viewer">'
 """Element of the pages that are written here, and of no other page."""
 
@@ -95,11 +92,9 @@ class MachineView:
 
     def _repr_html_(self) -> str:
         """Page in a frame, for notebooks."""
-        return (
-            f'<iframe srcdoc="{escape(self.html)}" sandbox="allow-scripts" loading="lazy"'
-            f' title="{escape(self.machine.name)}" width="100%" height="{NOTEBOOK_HEIGHT}"'
-            ' style="border: 0"></iframe>'
-        )
+        from pkmcal.web.page import page_frame
+
+        return page_frame(self.html, self.machine.name)
 
 
 def show(source: Machine | Path | str) -> MachineView:

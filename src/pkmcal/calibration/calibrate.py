@@ -504,6 +504,7 @@ def _judge(
         richer=value.richer,
         explained=explains_heights(errors),
         others=others,
+        joints=session.joints,
     )
     clock.lap("identify")
     return Calibration(

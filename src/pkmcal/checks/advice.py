@@ -242,8 +242,9 @@ def forecast_part(forecast: Forecast) -> Part:
         )
         head = ("Leg", *stations, "Together", "Variance")
         shares = Table(
-            "", head, (*rows, all_), " ".join(EDGE_SHARES_LEGEND), legend=EDGE_SHARES_LEGEND
-        )
+            "", head, (*rows, all_), " ".join(EDGE_SHARES_LEGEND), legend=EDGE_SHARES_LEGEND,
+            shaded=tuple(range(1, 1 + len(stations))),
+        )  # fmt: skip
         tables = (shares, details)
     return Part(
         "forecast",

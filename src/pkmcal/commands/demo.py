@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,11 +11,6 @@ from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.finish import answer
 from pkmcal.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pkmcal.judge.against_truth import AgainstTruth
 
 DEMO_FOLDER = Path("pkmcal-demo")
 DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME = "session", "calibration"
@@ -42,11 +36,16 @@ def demo(
 ) -> int:
     """Simulate, calibrate, compare with the truth, open the report."""
     from dataclasses import asdict, replace
+    from datetime import datetime
 
     import pkmcal
+    from pkmcal.calibration.results import CALIBRATION_REPORT_FILE
+    from pkmcal.files import write_text
     from pkmcal.judge.against_truth import compare_with_truth
     from pkmcal.placement.default_camera import camera_of_size, default_camera
+    from pkmcal.report.truth import truth_sentence, truth_table, with_truth
     from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
+    from pkmcal.web.report_page import report_page
 
     session, folder = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
     _make_room(out)
@@ -66,10 +65,12 @@ def demo(
         )
         progress("Writing the report", 0.98)
         result.save(folder)
-    # The truth is read only now, when everything is written.
+    # The truth is read only now, when the result is written; the report gets a section on it.
     comparison = compare_with_truth(result, session)
+    report = with_truth(result.outcome, comparison)
+    write_text(folder / CALIBRATION_REPORT_FILE, report_page(report, datetime.now()))
     outcome = replace(
-        result.outcome,
+        report,
         subject=f"A {result.machine.name} that deviates from its nominal model, in"
         f" {simulated.images_taken} simulated images: {session}",
         summary={
@@ -80,13 +81,16 @@ def demo(
     )
     code = answer(result, folder, outcome=outcome, as_json=as_json)
     if not as_json:
-        _print_comparison(terminal.out(), comparison)
+        out = terminal.out()
+        terminal.print_table(out, truth_table(comparison))
+        out.print()
+        terminal.print_points(out, [("[cyan]→[/]", truth_sentence(comparison))])
         if not no_open and console.can_show():
             import webbrowser
 
             from pkmcal.files import resolved
 
-            webbrowser.open(resolved(folder / "report.html").as_uri())
+            webbrowser.open(resolved(folder / CALIBRATION_REPORT_FILE).as_uri())
     return code
 
 
@@ -108,27 +112,3 @@ def _make_room(out: Path) -> None:
         )
     for name in standing:  # the session last, because it identifies the folder as a demonstration
         remove_folder(out / name)
-
-
-def _print_comparison(out: Console, value: AgainstTruth) -> None:
-    """Print errors before and after, and the share of values within two standard deviations."""
-    from pkmcal.outcome import Row, Table
-
-    before, after = value.drawing, value.calibrated
-    rows: list[Row] = []
-    for what, old, new, unit in (
-        ("joint centres", before.centre * 1e3, after.centre * 1e3, " mm"),
-        ("joint offsets", before.offset * 1e3, after.offset * 1e3, " mm"),
-        ("platform's position", before.position * 1e3, after.position * 1e3, " mm"),
-        ("platform's orientation", degrees(before.orientation), degrees(after.orientation), "°"),
-    ):
-        times = f"{old / new:.0f} times nearer" if new > 0 else ""
-        rows.append(Row(what, (f"{old:.2f}{unit}", f"{new:.3f}{unit}", times)))
-    columns = ("Against the truth", "Nominal model", "Calibrated", "")
-    terminal.print_table(out, Table("", columns, tuple(rows)))
-    out.print()
-    text = (
-        f"{value.within} of {value.count} values ({value.within / value.count:.0%}) lie within two"
-        " of their standard deviations of the truth; 95 % should."
-    )
-    terminal.print_points(out, [("[cyan]→[/]", text)])

@@ -182,16 +182,17 @@ def checked_poses(poses: Array) -> Array:
 
 
 def centres_and_tool(
-    nominal: Machine, estimate: Estimate, joints: Array
+    nominal: Machine, estimate: Estimate, joints: Array | None
 ) -> tuple[tuple[Centres, ...], ToolError]:
     """Joint centres of an estimate, and errors of the poses of the configurations in use,
-    gauge-free; joints (K, m).
+    gauge-free; joints (K, m), None for those of the calibrated machine.
     """
     machine, used = estimate.machine, estimate.configurations
     covariance = free_of_gauge(machine, estimate.covariance)
     in_view = estimate.edge_weights.size > 0
     poses = estimate.state.T_base_platform[used]
-    tool = tool_error(nominal, machine, covariance, poses, joints[used], legs_observed=in_view)
+    readings = None if joints is None else joints[used]
+    tool = tool_error(nominal, machine, covariance, poses, readings, legs_observed=in_view)
     return joint_centres(nominal, machine, covariance), tool
 
 

@@ -15,7 +15,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import negligible_shift
-from pkmcal.identify.tool import platform_sigma
+from pkmcal.identify.tool import centres_and_tool, platform_sigma
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.levels import (
     CAUSE_SHARE,
@@ -32,7 +32,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note, wrong
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.search import Stop
-from pkmcal.wording import in_full
+from pkmcal.wording import amount, in_full
 
 if TYPE_CHECKING:
     from pkmcal.identify.bed import Bed
@@ -108,6 +108,7 @@ def assess(
     richer: RicherModel | None = None,
     explained: bool = False,
     others: Sequence[Finding] = (),
+    joints: Array | None = None,
     options: VerdictOptions = VERDICT,
 ) -> Verdict:
     """Verdict on an estimate of a session.
@@ -117,6 +118,7 @@ def assess(
     explained : whether the model discrepancy surely explains the scatter of heights; the standard
     deviations then contain it.
     others : findings of any level about the session.
+    joints : (K, m) readings; by default those at which the calibrated machine takes the poses.
     """
     bed = findings.bed
     # what the data leave undetermined, then what they determine no better than the nominal model
@@ -154,31 +156,37 @@ def assess(
             " nothing is promised."
         )
     else:
-        headline = _headline(observation, estimate)
+        headline = _headline(estimate, joints)
     return Verdict(usable, headline, every)
 
 
-def _headline(observation: Observation, estimate: Estimate) -> str:
-    """Accuracy of the joint centres where legs were measured, else of the platform.
+def _headline(estimate: Estimate, joints: Array | None) -> str:
+    """Tool error of the nominal and of the calibrated machine, means over the poses in use.
 
-    Boards determine the platform's poses, and leave unidentified what does not move it.
+    Before, the distance of the nominal model's pose from the calibrated one at the same readings;
+    after, the standard deviation.
     """
-    if not len(observation.edges):
-        return (
-            f"Calibrated: the platform's joints to {platform_sigma(estimate) * 1e3:.2g} mm at"
-            " given readings (standard deviation)."
-        )
     machine = estimate.machine
-    covariance = free_of_gauge(machine, estimate.covariance)  # medians that favour no frame
     nominal = machine.with_values(machine.parameters.nominal)
-    bodies = joint_centres(nominal, machine, covariance)
-    centre = float(np.median(np.concatenate([body.sigma for body in bodies])))
-    offsets = np.diag(covariance)[machine.parameters.of_kind("offset")]
-    offset = float(np.sqrt(np.median(offsets))) if offsets.size else 0.0
-    return (
-        f"Calibrated: joint centres to {centre * 1e3:.2g} mm and offsets to {offset * 1e3:.2g} mm"
-        " (standard deviations)."
-    )
+    tool = centres_and_tool(nominal, estimate, joints)[1]
+    changes: list[str] = []
+    for unit, off, sigma in (
+        ("m", tool.off_position, tool.position),
+        ("rad", tool.off_orientation, tool.orientation),
+    ):
+        before, after = (
+            float(values.mean()) if values.size else np.nan
+            for values in (off[np.isfinite(off)], sigma)
+        )
+        if not after > ROUNDING:  # a platform that does not turn
+            continue
+        if not np.isfinite(before):  # the nominal model takes none of the poses
+            changes.append(f"{amount(after, unit)} (1σ)")
+            continue
+        times = float(f"{before / after:.2g}")
+        gain = f" ({times:g} times)" if times > 1 else ""
+        changes.append(f"{amount(before, unit)} → {amount(after, unit)}{'' if changes else gain}")
+    return f"Tool error {', '.join(changes)}." if changes else "Calibrated."
 
 
 def no_gain(sigma: float, nominal_sigma: float, options: VerdictOptions = VERDICT) -> bool:
@@ -359,6 +367,7 @@ def _undetermined(
             dimensions=one.dimensions,
             tool_shift=one.moves_platform,
             weak=one.weak,
+            matters=one.matters,
             what=one.text,
             advice=one.advice,
         )
@@ -380,6 +389,7 @@ def _harmless(findings: Findings) -> Iterator[Finding]:
         "machine.undetermined_harmless",
         ", ".join(harmless[0].parameters) if harmless else "",
         what=what,
+        matters=False,
         more=len(harmless) - 1 if len(harmless) > 1 else None,
     )
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from pkmcal.outcome.finding import Finding, Level
+from pkmcal.outcome.finding import Finding, Level, Mark
 
 if TYPE_CHECKING:
     from pkmcal.outcome.blocks import Block
+    from pkmcal.outcome.blocks.log_bar import LogBar
 
 FigureSource = Literal["paper", "prototype", "ours"]
 
@@ -73,21 +74,21 @@ class Verdict:
         return tuple(one.text for one in self.findings if one.level is level)
 
 
-Mark = Literal["good"] | Level
-"""Sign before a row or a verdict: good, or the level of a finding."""
-
-
 @dataclass(frozen=True)
 class Figure:
     """Card with the number that answers one question.
 
     values : (number, unit) pairs as text.
     note : small print under the number.
+    limit : limit of a usable result, as text; empty without one.
+    mark : sign of the number against its limit; None without one.
     """
 
     question: str
     values: tuple[tuple[str, str], ...]
     note: str
+    limit: str = ""
+    mark: Mark | None = None
 
 
 @dataclass(frozen=True)
@@ -97,12 +98,14 @@ class Row:
     cells : text of each column after the first.
     source : origin of the row's figures.
     mark : sign before the row's name; None for no sign.
+    key : what the row belongs to, for the page's selection (``outcome.blocks.base``).
     """
 
     name: str
     cells: tuple[str, ...]
     source: FigureSource = "ours"
     mark: Mark | None = None
+    key: str = ""
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,7 @@ class Table:
     first : number of leading columns that a terminal prints, the rows' names included; None for
         all.
     words : indices of the columns that hold text and are aligned to the left.
+    shaded : indices of the columns whose cells are shaded by their numbers on the page.
     legend : lines under the table on a terminal.
     """
 
@@ -128,6 +132,7 @@ class Table:
     folded: bool = False
     first: int | None = None
     words: tuple[int, ...] = ()
+    shaded: tuple[int, ...] = ()
     legend: tuple[str, ...] = ()
 
 
@@ -178,6 +183,8 @@ class Part:
     html : filled template (images, charts), in which all values are escaped.
     notes : small print.
     menu : shorter name for the page's navigation.
+    expert : collapsed on the page, among the sections for the metrologist.
+    of_result : figures that mean nothing if the result must not be used; the page then marks them.
     """
 
     name: str
@@ -191,6 +198,8 @@ class Part:
     checks: tuple[Check, ...] = ()
     notes: tuple[str, ...] = ()
     menu: str = ""
+    expert: bool = False
+    of_result: bool = False
 
 
 @dataclass(frozen=True, repr=False)
@@ -204,6 +213,9 @@ class Outcome:
     origin : identification of the data, such as a session's digest; shown on the page.
     notes : the user's own text.
     verdict : whether the result may be used.
+    explanation : line below the headline on the page: what it means, and the next figures.
+    comparison : magnitudes below the headline on the page.
+    certificate : pairs (name, value) of tolerances and instruments, for the first printed page.
     stamp : the verdict in one to three words.
     level : severity of an unusable result.
     partial : usable, but some of the result does not hold.
@@ -223,6 +235,9 @@ class Outcome:
     subject: str = ""
     origin: tuple[str, ...] = ()
     notes: str = ""
+    explanation: str = ""
+    comparison: LogBar | None = None
+    certificate: tuple[tuple[str, str], ...] = ()
     stamp: str = ""
     level: Level = Level.WRONG
     partial: bool = False

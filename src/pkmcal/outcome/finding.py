@@ -36,7 +36,7 @@ from enum import StrEnum
 from functools import cache, cached_property
 from importlib.resources import files
 from string import Formatter
-from typing import Any
+from typing import Any, Literal
 
 from pkmcal.errors import PkmcalError
 from pkmcal.wording import (
@@ -61,6 +61,10 @@ class Level(StrEnum):
     WRONG = "wrong"
     DOUBTFUL = "doubtful"
     NOTE = "note"
+
+
+Mark = Literal["good"] | Level
+"""Sign before a row or a verdict: good, or the level of a finding."""
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,16 @@ from pkmcal.calibration.results import (
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
 from pkmcal.files import output_lock, write_folder
-from pkmcal.identify.centres import Centres
+from pkmcal.identify.centres import Centres, free_of_gauge
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolError, centres_and_tool
-from pkmcal.levels import ROUNDING
+from pkmcal.identify.tool import ToolError, centres_and_tool, platform_sigma
+from pkmcal.identify.verdict import VERDICT
+from pkmcal.levels import CONTRADICTION_SIGMAS, ROUNDING
 from pkmcal.measurements import LinkSet, Observation
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome
-from pkmcal.pages.overlays import INLIER_WEIGHT
+from pkmcal.outcome.blocks.log_bar import LogBar, Magnitude
+from pkmcal.outcome.finding import Level, Mark
 from pkmcal.report import (
     bed,
     field,
@@ -46,13 +48,22 @@ from pkmcal.report import (
     workspace,
 )
 from pkmcal.session.load import Session, digests, session_digest
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.web.report_page import report_page
-from pkmcal.wording import brief, count, number
+from pkmcal.wording import amount, brief, count, number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.bed import Bed
     from pkmcal.judge.holdouts import HoldOut
+
+OF_RESULT = frozenset({"geometry", "workspace", "parameters"})
+"""Sections that mean nothing if the result is refused; others show why it was."""
+TOOL_QUESTION = "How well is the platform's pose known?"
+FLATNESS_QUESTION = "How flat will the bed be?"
+CHANGE_QUESTION = "How far is the machine from its nominal model?"
+DATA_QUESTION = "What is it based on?"
+FIT_QUESTION = "Does the model explain the data?"
 
 
 def outcome_of(calibration: Calibration) -> Outcome:
@@ -151,13 +162,15 @@ def report_of(
         provenance.stations(session, observation, estimate, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
-        identifiability.section(findings, estimate.machine.parameters),
-        parameters.correlations_part(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
         *linked.sections(session, _links(c), estimate),
         held,
         bed.section(session, c.model_errors),
+    )
+    expert_parts = (
+        identifiability.section(findings, estimate.machine.parameters),
+        parameters.correlations_part(estimate),
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
@@ -172,9 +185,15 @@ def report_of(
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
+        explanation=_joint_accuracy(estimate, centres) if len(edges) and c.verdict.usable else "",
+        comparison=_comparison(c, tool, holdout),
+        certificate=provenance.certificate(c, digest),
         partial=any(one.sure for one in c.model_errors),
         figures=calibration_cards(c, centres, tool),
-        parts=tuple(part for part in parts if part),
+        parts=(
+            *(replace(part, of_result=part.name in OF_RESULT) for part in parts if part),
+            *(replace(part, expert=True) for part in expert_parts if part),
+        ),
         findings=session.findings,
         summary={"figures": calibration_numbers(observation, estimate, centres, tool)},
     )
@@ -202,7 +221,7 @@ def calibration_cards(
     change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
     farthest = int(np.argmax(change))
     shifted = Figure(
-        "How far is the machine from its nominal model?",
+        CHANGE_QUESTION,
         ((brief(float(change.mean())), "mm"),),
         "mean distance of the joint centres, nominal model and result laid over each other;"
         f" largest {brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
@@ -216,7 +235,117 @@ def calibration_cards(
         _data(session, observation, estimate, _links(calibration)),
         _fit(session, estimate),
     )
-    return tuple(card for card in cards if card)
+    limits = _limits(calibration)
+    return tuple(
+        replace(card, limit=limits[card.question][0], mark=limits[card.question][1])
+        if card.question in limits
+        else card
+        for card in cards
+        if card
+    )
+
+
+def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
+    """Limits of a usable result by the question of their card, with the verdict's own judgement."""
+    estimate, found, verdict = (
+        calibration.estimate, calibration.identification, calibration.verdict,
+    )  # fmt: skip
+    statistics = estimate.statistics
+
+    def judged(*codes: str) -> Mark:
+        levels = {one.level for code in codes for one in verdict.of(code)}
+        return next((one for one in (Level.WRONG, Level.DOUBTFUL) if one in levels), "good")
+
+    far = verdict.of("machine.far_from_nominal")
+    limits: dict[str, tuple[str, Mark]] = {
+        CHANGE_QUESTION: (
+            f"{'values' if far else 'no value'} beyond {CONTRADICTION_SIGMAS:g} tolerances",
+            judged("machine.far_from_nominal"),
+        )
+    }
+    # what the result is for: the flatness of a bed, else the platform's joints at given readings
+    share, bed = VERDICT.nominal_error_share, found.bed
+    if bed:
+        limits[FLATNESS_QUESTION] = (
+            f"limit {amount(share * bed.by_drawing, 'm')}: {share:.0%} of what the tolerances give",
+            judged("bed.no_gain", "bed.height_unnoticed"),
+        )
+    elif np.any(estimate.configurations):
+        limits[TOOL_QUESTION] = (
+            f"platform's joints {amount(platform_sigma(estimate), 'm')}, limit"
+            f" {amount(share * found.by_nominal, 'm')}: {share:.0%} of what the tolerances give",
+            judged("platform.no_gain", "machine.undetermined"),
+        )
+    weights = np.concatenate([estimate.edge_weights, estimate.pose_weights])
+    if weights.size:
+        rejected = float(np.mean(weights < INLIER_WEIGHT))
+        limits[DATA_QUESTION] = (
+            f"{rejected:.0%} rejected, limit {VERDICT.too_many_rejected:.0%}",
+            judged("edges.rejected_share", "poses.rejected_share", "edges.leg_seldom_seen"),
+        )
+    scales = [
+        one
+        for one, n in (
+            (statistics.noise_scale, statistics.n_edges),
+            (statistics.pose_scale, statistics.n_poses),
+        )
+        if n
+    ]
+    if scales and statistics.dof > 0 and calibration.method == "bundle":
+        limits[FIT_QUESTION] = (
+            f"noise {number(max(scales), 2)} times as stated, limit {VERDICT.too_noisy:g} times",
+            judged(
+                "edges.misfit", "edges.scatter", "poses.misfit", "poses.scatter",
+                "readings.misfit",
+            ),
+        )  # fmt: skip
+    return limits
+
+
+def _joint_accuracy(estimate: Estimate, centres: tuple[Centres, ...]) -> str:
+    """Sentence on the joint centres and offsets, medians that favour no frame."""
+    machine = estimate.machine
+    sigma = float(np.median(np.concatenate([side.sigma for side in centres])))
+    offsets = np.diag(free_of_gauge(machine, estimate.covariance))[
+        machine.parameters.of_kind("offset")
+    ]
+    also = (
+        f" and offsets to {amount(float(np.sqrt(np.median(offsets))), 'm')}" if offsets.size else ""
+    )
+    return f"Joint centres to {amount(sigma, 'm')}{also} (standard deviations)."
+
+
+def _comparison(
+    calibration: Calibration, tool: ToolError, holdout: HoldOut | None
+) -> LogBar | None:
+    """Error of the tool's position by tolerances, as measured, after calibration and held out."""
+    machine = calibration.estimate.machine
+    root = machine.parameters.free_matrix() * machine.parameters.tolerances_free()
+    prior = replace(tool, parameters=free_of_gauge(machine, root @ root.T))
+    tested = holdout.left_out.figures(holdout.left_out.calibrated).position if holdout else None
+    magnitudes = tuple(
+        Magnitude(label=label, value=value * 1e3, text=amount(value, "m"), role=role)
+        for label, value, role in (
+            ("Tolerances", _mean(prior.position), "prior"),
+            ("Nominal model", _mean(tool.off_position), "nominal"),
+            ("Calibrated", _mean(tool.position), "calibrated"),
+            ("Held out", tested, "test"),
+        )
+        if value is not None and np.isfinite(value) and value > ROUNDING
+    )
+    if len(magnitudes) < 2:
+        return None
+    tested_text = " Held out: against configurations that the calibration has not used." * bool(
+        tested
+    )
+    return LogBar(
+        title="Error of the tool's position",
+        unit="mm",
+        magnitudes=magnitudes,
+        note=f"Means over {count(len(tool.position), 'pose')}. Tolerances and calibrated: standard"
+        " deviations. Nominal model: its distance from the calibrated machine at the same"
+        f" readings.{tested_text}",
+    )
 
 
 def calibration_numbers(
@@ -259,7 +388,7 @@ def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure
     used = np.flatnonzero(estimate.configurations)
     where = session.configurations[used[int(np.argmax(tool.position))]]
     return Figure(
-        "How well is the platform's pose known?",
+        TOOL_QUESTION,
         _pose_values(tool.position.mean(), tool.orientation.mean()),
         f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
         f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
@@ -279,7 +408,7 @@ def _flatness(bed: Bed, tool: ToolError) -> Figure:
     off = tool.off[finite, 5]
     bent = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
     return Figure(
-        "How flat will the bed be?",
+        FLATNESS_QUESTION,
         ((brief(bed.sigma * 1e3), "mm"),),
         f"1σ of the tool's height over a disc of {brief(bed.radius * 1e3)} mm radius, the bed's"
         " own tilt and height aside; by the nominal model's tolerances"
@@ -320,7 +449,7 @@ def _data(
     taken = session.images_taken
     if not session.station_names and not session.links:
         return Figure(
-            "What is it based on?",
+            DATA_QUESTION,
             ((str(len(session.configurations)), "poses"),),
             f"{count(session.machine.n_joints, 'reading')} of each, "
             f"{session.machine.redundancy} more than the machine has freedoms; nothing else was"
@@ -333,7 +462,7 @@ def _data(
         kinds = sorted({table.target.label for table in session.trackers})
         kinds += [measurement_kinds()[links.kind].label for links in session.links]
         return Figure(
-            "What is it based on?",
+            DATA_QUESTION,
             ((f"{n - quiet} of {n}", " and ".join(kinds)),),
             f"measured without a camera; {quiet} of them given less than half their weight",
         )
@@ -353,7 +482,7 @@ def _data(
     lost = taken - sum(len(station.images) for station in session.stations)
     remainder = f"; {count(lost, 'image')} left out whole" if lost else ""
     return Figure(
-        "What is it based on?",
+        DATA_QUESTION,
         ((f"{used} of {taken}", "images"),),
         f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected{remainder}",
     )
@@ -374,13 +503,13 @@ def _fit(session: Session, estimate: Estimate) -> Figure:
     ]
     if s.dof <= 0:
         return Figure(
-            "Does the model explain the data?",
+            FIT_QUESTION,
             (("–", "χ² per degree of freedom"),),
             "as many unknowns as measurements: nothing is left over for a test",
         )
     value = s.chi2 / s.dof
     return Figure(
-        "Does the model explain the data?",
+        FIT_QUESTION,
         ((number(s.chi2_as_stated, 2), "χ² per degree of freedom"),),
         f"1 is expected of the noise as stated, over {count(s.dof, 'degree')} of freedom"
         + (f"; {number(value, 2)} after {' and '.join(scaled)}" if scaled else ""),

@@ -9,7 +9,9 @@ import numpy as np
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.outcome import Part
-from pkmcal.pages import page
+from pkmcal.outcome.blocks.table import Column, DataTable, TableRow
+from pkmcal.outcome.blocks.text import Listing, Paragraph
+from pkmcal.outcome.finding import Level
 from pkmcal.pages.charts import BarChart, UprightBar
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, capital, count, joined
@@ -23,15 +25,57 @@ MOST_NAMES_LISTED = 6
 
 def section(findings: Findings, table: ParameterTable) -> Part:
     """Section on the findings of a machine with these parameters."""
-    html = page.filled_template(
-        "identifiability.html.j2",
-        headline=directions_headline(findings),
-        findings=findings,
-        fixed=held_text(findings, table),
-        tied=tied(table),
-        spectrum=spectrum(findings),
+    listings = tuple(
+        Listing(title=title, items=tuple(f"{one.text}\n{one.advice}" for one in sentences))
+        for title, sentences in (
+            ("Not determined by the data", findings.unidentified),
+            ("Better known from the nominal model", findings.weak),
+        )
+        if sentences
     )
-    return Part("identifiability", "What the data determine", html=html, menu="Identifiability")
+    held = " ".join(filter(None, (held_text(findings, table), tied(table))))
+    return Part(
+        "identifiability",
+        "What the data determine",
+        (
+            f"{directions_headline(findings)} This is the rank of the data's own information with"
+            " the nominal model left out, from exact derivatives.",
+        ),
+        blocks=(
+            *listings,
+            *((Paragraph(text=held, small=True),) if held else ()),
+            *((_conditions(findings),) if findings.conditions else ()),
+        ),
+        menu="Identifiability",
+    )
+
+
+def _conditions(findings: Findings) -> DataTable:
+    """Table of [A]'s conditions."""
+    rows = tuple(
+        TableRow(
+            cells=(
+                one.equation, one.text, str(one.needed), str(one.available),
+                "yes" if one.met else "no",
+            ),
+            values=(None, None, one.needed, one.available, None),
+            mark="good" if one.met else Level.WRONG,
+        )
+        for one in findings.conditions
+    )  # fmt: skip
+    return DataTable(
+        title="The paper's counts",
+        columns=(
+            Column(name="Equation", form="text"),
+            Column(name="What is counted", form="text"),
+            Column(name="Needed"),
+            Column(name="There"),
+            Column(name="Met", form="text"),
+        ),
+        rows=rows,
+        note="Equations against unknowns as [A] counts them, for comparison: they are necessary at"
+        " most, and count some equations twice. The rank above is the test.",
+    )
 
 
 def directions_headline(findings: Findings) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 from dataclasses import dataclass
@@ -22,7 +21,10 @@ from pkmcal.identify.unidentified import Findings
 from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part, Plot
-from pkmcal.pages import page
+from pkmcal.outcome.blocks.base import leg_key
+from pkmcal.outcome.blocks.table import Column, DataTable, Filter, TableRow
+from pkmcal.outcome.blocks.text import Download, Downloads
+from pkmcal.outcome.finding import Level
 from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT
 from pkmcal.wording import (
     DISPLAY_UNITS,
@@ -57,6 +59,19 @@ PARAMETER_SOURCES = {
     "fixed": ("fixed", "kept at the nominal model's value"),
 }
 """Mark in the table, and sentence, by the source's key."""
+HELD_SOURCES = ("frame", "fixed")
+HELD_TAG, SIGNIFICANT_TAG = "held", "significant"
+SIGNIFICANT_SIGMAS = 3.0
+"""Change in standard deviations from which on a filter of the table keeps a parameter."""
+PARAMETER_KIND_NAMES = {
+    "center": "centres",
+    "offset": "offsets",
+    "scale": "scales",
+    "radius": "radii",
+    "axis": "axes",
+    "arm": "arms",
+    "angle": "angles",
+}
 
 
 @dataclass(frozen=True)
@@ -98,32 +113,110 @@ class ParameterRow:
         return percent(self.share) if np.isfinite(self.share) else ""
 
 
-@dataclass(frozen=True)
-class ParameterGroup:
-    """Rows of one leg, or of the machine for leg None."""
-
-    leg: int | None
-    rows: tuple[ParameterRow, ...]
-
-
 def section(nominal: Machine, estimate: Estimate) -> Part:
     """Section with the table of parameters."""
     estimates = parameter_estimates(
         nominal.values, estimate.machine, estimate.covariance, estimate.data_share
     )
-    groups = parameter_groups(estimates)
-    html = page.filled_template(
-        "parameters.html.j2",
-        groups=groups,
-        downloads={
-            "parameters.csv": _data_url("text/csv", parameters_csv(estimates)),
-            "parameters.json": _data_url(
-                "application/json", json_text({"parameters": estimates.records()})
+    files = Downloads(
+        files=(
+            Download(
+                name="parameters.csv", media_type="text/csv", content=parameters_csv(estimates)
             ),
-        },
-        gauge=estimate.gauge,
+            Download(
+                name="parameters.json",
+                media_type="application/json",
+                content=json_text({"parameters": estimates.records()}),
+            ),
+        )
     )
-    return Part("parameters", "Parameters", html=html)
+    return Part(
+        "parameters",
+        "Parameters",
+        blocks=(parameter_table(estimates, estimate.gauge), files),
+    )
+
+
+def parameter_table(estimates: ParameterEstimates, gauge: str) -> DataTable:
+    """Table of all parameters in the order of the file; gauge : of the result, in words.
+
+    Values that define the frames or that the file fixes are hidden at first.
+    """
+    rows = [_row(estimates.table, k, one) for k, one in enumerate(estimates)]
+    legs = dict.fromkeys(row.leg for row in rows if row.leg)
+    kinds = dict.fromkeys(estimates.table.kinds)
+    filters = [
+        *(Filter(tag=f"leg {leg}", label=f"Leg {leg}", group="leg") for leg in legs),
+        *(
+            Filter(tag=kind, label=PARAMETER_KIND_NAMES.get(kind, kind), group="kind")
+            for kind in kinds
+        ),
+        Filter(tag=SIGNIFICANT_TAG, label=f"|change| > {SIGNIFICANT_SIGMAS:g} σ"),
+    ]
+    if any(row.source in HELD_SOURCES for row in rows):
+        filters.append(Filter(tag=HELD_TAG, label="also frame and fixed values", hides=True))
+    return DataTable(
+        title="",
+        columns=(
+            Column(name="Leg", form="leg"),
+            Column(name="Parameter", form="text"),
+            Column(name="Nominal"),
+            Column(name="Calibrated"),
+            Column(name="Change"),
+            Column(name="σ", hint="Standard deviation of the calibrated value"),
+            Column(name="Change/σ", hint="Change in standard deviations of the calibrated value"),
+            Column(name="Unit", form="text"),
+            Column(
+                name="Source", form="share", hint="What decides the value, and the data's share"
+            ),
+        ),
+        rows=tuple(
+            _table_row(row, kind) for row, kind in zip(rows, estimates.table.kinds, strict=True)
+        ),
+        note=f"The frames of base and platform are conventions ({gauge}): coordinates that define"
+        " them have no uncertainty of their own. Source nominal: the data determine less than the"
+        " nominal model's tolerance already did. Copies hold all digits, in the units shown, and"
+        " the names of the mechanism file.",
+        filters=tuple(filters),
+    )
+
+
+def _table_row(row: ParameterRow, kind: str) -> TableRow:
+    """Row of the table; kind : of the parameter."""
+    change, sigma = row.numbers[2:]
+    in_sigmas = change / sigma if sigma else None
+    significant = in_sigmas is not None and abs(in_sigmas) > SIGNIFICANT_SIGMAS
+    held = row.source in HELD_SOURCES
+    share = row.share if np.isfinite(row.share) else None
+    return TableRow(
+        cells=(
+            str(row.leg or "–"),
+            f"{row.label} (tied)" if row.note else row.label,
+            row.nominal,
+            row.calibrated,
+            row.change,
+            row.sigma,
+            number(in_sigmas, 1, signed=True) if in_sigmas is not None else "–",
+            row.unit,
+            f"{row.mark_text} {row.share_text}".strip(),
+        ),
+        values=(row.leg, None, *row.numbers[:3], sigma or None, in_sigmas, None, share),
+        key=leg_key(row.leg),
+        name=row.name,
+        hint=f"{row.name}; {row.note}" if row.note else row.name,
+        mark=Level.DOUBTFUL if row.source == "drawing" else None,
+        tags=tuple(
+            tag
+            for tag, has in (
+                (f"leg {row.leg}", row.leg is not None),
+                (kind, True),
+                (SIGNIFICANT_TAG, significant),
+                (HELD_TAG, held),
+            )
+            if has
+        ),
+        quiet=held,
+    )
 
 
 def parameters_csv(estimates: ParameterEstimates) -> str:
@@ -133,19 +226,6 @@ def parameters_csv(estimates: ParameterEstimates) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return stream.getvalue()
-
-
-def _data_url(kind: str, text: str) -> str:
-    """Data URL of a text."""
-    packed = base64.b64encode(text.encode("utf-8")).decode("ascii")
-    return f"data:{kind};charset=utf-8;base64,{packed}"
-
-
-def parameter_groups(estimates: ParameterEstimates) -> tuple[ParameterGroup, ...]:
-    """All parameters, grouped by leg, in the order of the file."""
-    rows = [_row(estimates.table, k, one) for k, one in enumerate(estimates)]
-    legs = list(dict.fromkeys(row.leg for row in rows))
-    return tuple(ParameterGroup(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
 def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:

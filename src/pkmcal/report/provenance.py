@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from markupsafe import Markup
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.results import base_camera_covariance, versions
@@ -18,14 +18,22 @@ from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.outcome import Part, Plot, Row, Table
-from pkmcal.pages import page
-from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
+from pkmcal.outcome.blocks.base import station_key
+from pkmcal.outcome.blocks.text import Fact, Facts, Listing, Paragraph
+from pkmcal.pages.overlays import EDGE_SIDE_NAMES
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import amount, brief, count, decimals, number
 
-SIGMA_MEANING_TEXT = Markup(
-    "<strong>What σ means here.</strong> The standard deviations are those with which the result"
+if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
+    from pkmcal.mechanisms.document import NominalTolerance
+
+TOLERANCES_NAME = "Nominal model's tolerances, 1σ"
+READING_NOISE_NAME = "Noise of a joint reading"
+SIGMA_MEANING_TEXT = (
+    "What σ means here: the standard deviations are those with which the result"
     " would scatter if the same measurements were taken again. They contain the noise of the"
     " measurement, and of what the model leaves out (legs that bend, joints with play, a lens that"
     " its file does not describe, an uneven bed) what these data show. Measurements that the"
@@ -91,12 +99,16 @@ def stations(
             _distance_cell(station.T_camera_base, estimate.state.T_camera_base[s]),
             f"{station.camera_file}, {station.camera.model}, {images}",
         )
-        rows.append(Row(station.name, cells))
+        rows.append(Row(station.name, cells, key=station_key(station.name)))
     # trackers come after the cameras' stations
     for s, table in enumerate(session.trackers, start=len(session.stations)):
         what = f"{table.label}, tracker, {table.kind}, {count(len(table.configuration), 'row')}"
         rows.append(
-            Row(table.name, (*_pose_cells(estimate, s), *(["–"] if edges else []), "–", what))
+            Row(
+                table.name,
+                (*_pose_cells(estimate, s), *(["–"] if edges else []), "–", what),
+                key=station_key(table.name),
+            )
         )
     columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
     columns += ("Edge shift, px",) if edges else ()
@@ -141,16 +153,48 @@ def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> P
 
     timings : seconds by step.
     """
-    html = page.filled_template(
-        "how.html.j2",
-        model_error=SIGMA_MEANING_TEXT,
-        lists=(
-            ("Settings and solver", _settings(session, estimate)),
-            ("Time", [(name, f"{seconds:.2f} s") for name, seconds in timings.items()]),
-            ("Versions", versions().items()),
-        ),
+    lists = (
+        ("Settings and solver", _settings(session, estimate)),
+        ("Time", [(name, f"{seconds:.2f} s") for name, seconds in timings.items()]),
+        ("Versions", versions().items()),
     )
-    return Part("how", "How it was computed", html=html)
+    blocks = tuple(
+        Facts(title=title, facts=tuple(Fact(name=name, value=value) for name, value in pairs))
+        for title, pairs in lists
+        if pairs
+    )
+    return Part("how", "How it was computed", (SIGMA_MEANING_TEXT,), blocks=blocks)
+
+
+def certificate(calibration: Calibration, digest: str) -> tuple[tuple[str, str], ...]:
+    """Pairs (name, value) for the first printed page: machine, data, tolerances, instruments."""
+    session, tolerance = calibration.session, calibration.session.machine.document.tolerance
+    cameras = tuple(
+        (
+            f"Camera, station {station.name}",
+            f"{station.camera_file}, {station.camera.model}, {count(len(station.images), 'image')}",
+        )
+        for station in session.stations
+    )
+    trackers = tuple(
+        (f"Tracker {table.name}", f"{table.kind}, {count(len(table.configuration), 'row')}")
+        for table in session.trackers
+    )
+    noise = " or ".join(
+        amount(session.joint_noise, unit) for unit in dict.fromkeys(session.machine.joint_units)
+    )
+    every = (
+        ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
+        ("Session", session.folder.name),
+        ("Digest of the session", digest),
+        ("Method", calibration.method),
+        ("Configurations", str(int(np.sum(calibration.estimate.configurations)))),
+        (TOLERANCES_NAME, _tolerances(tolerance)),
+        (READING_NOISE_NAME, noise),
+        *cameras,
+        *trackers,
+    )
+    return tuple((name, value) for name, value in every if value)
 
 
 def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...]:
@@ -165,12 +209,8 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
         ("Frames", estimate.gauge),
-        ("Noise of a joint reading", f"{session.joint_noise:.3g} {' or '.join(units)}"),
-        (
-            "Nominal model's tolerances, 1σ",
-            f"centres {tolerance.center * 1e3:g} mm, offsets {tolerance.offset * 1e3:g} mm, "
-            f"radii {tolerance.radius * 1e3:g} mm",
-        ),
+        (READING_NOISE_NAME, f"{session.joint_noise:.3g} {' or '.join(units)}"),
+        (TOLERANCES_NAME, _tolerances(tolerance)),
         ("Solver", f"{count(s.steps, 'step')}; {s.stopped}"),
         *(
             (
@@ -226,6 +266,14 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     )
 
 
+def _tolerances(tolerance: NominalTolerance) -> str:
+    """Prior sigmas of the nominal model in words."""
+    return (
+        f"centres {tolerance.center * 1e3:g} mm, offsets {tolerance.offset * 1e3:g} mm, "
+        f"radii {tolerance.radius * 1e3:g} mm"
+    )
+
+
 def link_labels(session: Session) -> str:
     """Kinds of links in the session, in the plural."""
     return " and ".join(measurement_kinds()[links.kind].label for links in session.links)
@@ -253,13 +301,33 @@ class Reason:
 
 def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estimate) -> Part:
     """Section on rejections, and on tightly correlated parameters."""
-    html = page.filled_template(
-        "rejected.html.j2",
-        reasons=reasons(session, rejected),
-        tight=parameters.TIGHT_CORRELATION,
-        together=parameters.bound_together(estimate),
+    lists = tuple(
+        Listing(
+            title=f"{reason.count} {reason.text}, in {count(reason.images, 'image')}",
+            items=(
+                *(f"{image}: {what}" for image, what in reason.cases),
+                *(
+                    (f"and {reason.unlisted} more, all of them in calibration.json",)
+                    if reason.unlisted
+                    else ()
+                ),
+            ),
+            folded=True,
+        )
+        for reason in reasons(session, rejected)
     )
-    return Part("rejected", "What was left out, and what stays open", html=html, menu="Left out")
+    pairs = parameters.bound_together(estimate)
+    together = (
+        Listing(title="Values that hang together", items=pairs)
+        if pairs
+        else Paragraph(
+            text="No two values have a correlation of more than"
+            f" {parameters.TIGHT_CORRELATION}, so the data distinguish all of them."
+        )
+    )
+    text = () if lists else ("Nothing was rejected.",)
+    title = "What was left out, and what stays open"
+    return Part("rejected", title, text, blocks=(*lists, together), menu="Left out")
 
 
 def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, ...]:

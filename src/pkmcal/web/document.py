@@ -16,6 +16,9 @@ from pydantic import Field, TypeAdapter
 from pkmcal.files import Schema
 from pkmcal.outcome.blocks import Block
 from pkmcal.outcome.blocks.base import Line, Pose, Text, Vector
+from pkmcal.outcome.blocks.log_bar import LogBar
+from pkmcal.outcome.blocks.text import Fact
+from pkmcal.outcome.finding import Mark
 
 
 class Row(Schema):
@@ -187,11 +190,16 @@ class Verdict(Schema):
 
     tone : good, partial (usable, with exceptions) or bad.
     stamp : one to three words.
+    explanation : line below the headline.
+    reasons : points below both.
+    comparison : magnitudes before and after.
     """
 
     tone: Literal["good", "partial", "bad"]
     stamp: Text
     headline: Text
+    explanation: Text
+    comparison: LogBar | None
     reasons: tuple[Text, ...]
 
 
@@ -199,19 +207,31 @@ class Card(Schema):
     """Card with the numbers that answer one question.
 
     values : numbers with their units, as text.
+    limit : of a usable result; empty without one. mark : of the number against it.
     """
 
     question: Text
     values: tuple[tuple[Text, Text], ...]
     note: Text
+    limit: Text
+    mark: Mark | None
 
 
 class Section(Schema):
-    """Section of a report; menu : its name in the table of contents."""
+    """Section of a report.
+
+    menu : its name in the table of contents.
+    mark : the worst of its checks; null without one.
+    expert : collapsed, among the sections for the metrologist.
+    void : its figures mean nothing, because the result must not be used.
+    """
 
     name: str
     title: Text
     menu: Text
+    mark: Mark | None
+    expert: bool
+    void: bool
     blocks: tuple[Block, ...]
 
 
@@ -220,7 +240,8 @@ class ReportDocument(Head):
 
     kicker : line above the title. subject : what was examined. origin : date, program, digest.
     notes : the user's own text.
-    warnings, advice, remarks : sentences below the verdict.
+    warnings, advice, remarks : sentences below the verdict; remarks need no action.
+    certificate : tolerances and instruments, for the first printed page.
     """
 
     kind: Literal["report"] = "report"
@@ -233,6 +254,7 @@ class ReportDocument(Head):
     advice: tuple[Text, ...]
     remarks: tuple[Text, ...]
     cards: tuple[Card, ...]
+    certificate: tuple[Fact, ...]
     sections: tuple[Section, ...]
 
 

@@ -14,6 +14,9 @@ from html import escape
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.document import MachineDocument, ReportDocument
 
+FRAME_HEIGHT = 700
+"""Height of a page in a notebook, px."""
+
 
 def standalone_page(document: MachineDocument | ReportDocument) -> str:
     """Page in one file that opens without a network."""
@@ -36,6 +39,14 @@ def served_page(document: MachineDocument | ReportDocument) -> str:
         document,
         head=f'<link rel="stylesheet" href="{STYLE_FILE}">',
         end=f'<script src="{SCRIPT_FILE}"></script>',
+    )
+
+
+def page_frame(page: str, title: str) -> str:
+    """Frame with a page, for notebooks; its scripts reach nothing of the notebook."""
+    return (
+        f'<iframe srcdoc="{escape(page)}" sandbox="allow-scripts allow-downloads" loading="lazy"'
+        f' title="{escape(title)}" width="100%" height="{FRAME_HEIGHT}" style="border: 0"></iframe>'
     )
 
 

@@ -2,7 +2,9 @@
 
 import type { Section } from "../document";
 import type { Selection } from "../selection";
-import { checks, downloads, listing, paragraph } from "./text";
+import { logBar } from "./log_bar";
+import { dataTable } from "./table";
+import { checks, downloads, facts, listing, paragraph } from "./text";
 
 export type Block = Section["blocks"][number];
 /** What a block may use beside its own data. */
@@ -12,7 +14,15 @@ export interface Context {
 type Of<K extends Block["kind"]> = Extract<Block, { kind: K }>;
 type Drawers = { [K in Block["kind"]]: (block: Of<K>, context: Context) => HTMLElement };
 
-const DRAWERS: Drawers = { paragraph, listing, checks, downloads };
+const DRAWERS: Drawers = {
+  paragraph,
+  listing,
+  facts,
+  checks,
+  downloads,
+  table: dataTable,
+  log_bar: logBar,
+};
 
 export function drawBlock(block: Block, context: Context): HTMLElement {
   const draw = DRAWERS[block.kind] as (block: Block, context: Context) => HTMLElement;

@@ -1,20 +1,30 @@
 /** Blocks of text. */
 
-import type { Checks, Downloads, Listing, Paragraph } from "../document";
+import type { Checks, Downloads, Facts, Listing, Paragraph } from "../document";
 import { h } from "../dom";
+import { sign } from "../marks";
 
 export const paragraph = (block: Paragraph): HTMLElement =>
   h("p", block.small ? { class: "small" } : {}, block.text);
 
 export function listing(block: Listing): HTMLElement {
-  const items = h("ul", {}, ...block.items.map((text) => h("li", {}, text)));
+  const items = h("ul", {}, ...block.items.map((text) => {
+    const [what, ...next] = text.split("\n");
+    return h("li", {}, what!, ...next.map((step) => h("span", { class: "step" }, step)));
+  }));
   if (block.folded) return h("details", {}, h("summary", {}, block.title), items);
   return h("div", {}, ...(block.title ? [h("h3", {}, block.title)] : []), items);
 }
 
+export const facts = (block: Facts): HTMLElement =>
+  h("div", {},
+    ...(block.title ? [h("h3", {}, block.title)] : []),
+    h("dl", { class: "facts" },
+      ...block.facts.flatMap((one) => [h("dt", {}, one.name), h("dd", {}, one.value)])));
+
 export const checks = (block: Checks): HTMLElement =>
   h("ul", { class: "checks" },
-    ...block.checks.map((one) => h("li", { class: one.passed ? "passed" : "failed" }, one.text)));
+    ...block.checks.map((one) => h("li", {}, sign(one.passed ? "good" : "wrong"), " ", one.text)));
 
 export function downloads(block: Downloads): HTMLElement {
   const links = block.files.map((file) => {

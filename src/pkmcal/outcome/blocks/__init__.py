@@ -10,6 +10,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from pkmcal.outcome.blocks.text import Checks, Downloads, Listing, Paragraph
+from pkmcal.outcome.blocks.log_bar import LogBar
+from pkmcal.outcome.blocks.table import DataTable
+from pkmcal.outcome.blocks.text import Checks, Downloads, Facts, Listing, Paragraph
 
-Block = Annotated[Paragraph | Listing | Checks | Downloads, Field(discriminator="kind")]
+Block = Annotated[
+    Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar,
+    Field(discriminator="kind"),
+]

@@ -1,4 +1,4 @@
-"""Blocks of text: paragraphs, lists, checks, and files to download."""
+"""Blocks of text: paragraphs, lists, facts, checks, and files to download."""
 
 from __future__ import annotations
 
@@ -17,12 +17,31 @@ class Paragraph(Schema):
 
 
 class Listing(Schema):
-    """List with a heading, which may be empty; folded : collapsed until it is opened."""
+    """List with a heading, which may be empty.
+
+    items : texts; what follows a line break is the next step.
+    folded : collapsed until it is opened.
+    """
 
     kind: Literal["listing"] = "listing"
     title: Text
     items: tuple[Text, ...]
     folded: bool = False
+
+
+class Fact(Schema):
+    """Name of a quantity or setting, and its value as text."""
+
+    name: Text
+    value: Text
+
+
+class Facts(Schema):
+    """Pairs of name and value with a heading."""
+
+    kind: Literal["facts"] = "facts"
+    title: Text
+    facts: tuple[Fact, ...]
 
 
 class CheckLine(Schema):
