@@ -10,6 +10,9 @@ from typing import Annotated
 
 from pydantic import Field
 
+from pkmcal.outcome.blocks.plot import Panels, Plot
 from pkmcal.outcome.blocks.text import Checks, Downloads, Listing, Paragraph
 
-Block = Annotated[Paragraph | Listing | Checks | Downloads, Field(discriminator="kind")]
+Block = Annotated[
+    Paragraph | Listing | Checks | Downloads | Plot | Panels, Field(discriminator="kind")
+]
