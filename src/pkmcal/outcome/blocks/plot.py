@@ -54,7 +54,7 @@ class Tick(Schema):
     label: Text
 
 
-class Axis(Schema):
+class PlotAxis(Schema):
     """Axis of a plot.
 
     label : quantity and unit, such as "rms, mm"; may be empty.
@@ -70,7 +70,7 @@ class Axis(Schema):
     categories: tuple[Text, ...] = ()
 
 
-def linear_axis(label: str, values: Iterable[float], *, zero: bool = False) -> Axis:
+def linear_axis(label: str, values: Iterable[float], *, zero: bool = False) -> PlotAxis:
     """Axis that holds all finite values.
 
     zero : the axis begins, or ends, at zero if the values have one sign.
@@ -79,20 +79,20 @@ def linear_axis(label: str, values: Iterable[float], *, zero: bool = False) -> A
     margin = AXIS_MARGIN * ((high - low) or abs(high) or 1.0)
     low = low if zero and low == 0 else low - margin
     high = high if zero and high == 0 else high + margin
-    return Axis(label=label, scale="linear", limits=(low, high), ticks=linear_ticks(low, high))
+    return PlotAxis(label=label, scale="linear", limits=(low, high), ticks=linear_ticks(low, high))
 
 
-def log_axis(label: str, values: Iterable[float]) -> Axis:
+def log_axis(label: str, values: Iterable[float]) -> PlotAxis:
     """Logarithmic axis that holds all finite positive values."""
     low, high = (math.log10(v) for v in _ends(v for v in values if v > 0))
     margin = AXIS_MARGIN * (high - low) or AXIS_MARGIN
     low, high = 10 ** (low - margin), 10 ** (high + margin)
-    return Axis(label=label, scale="log", limits=(low, high), ticks=log_ticks(low, high))
+    return PlotAxis(label=label, scale="log", limits=(low, high), ticks=log_ticks(low, high))
 
 
-def category_axis(names: Iterable[str], label: str = "") -> Axis:
+def category_axis(names: Iterable[str], label: str = "") -> PlotAxis:
     """Axis with a place for each name."""
-    return Axis(label=label, scale="categories", categories=tuple(names))
+    return PlotAxis(label=label, scale="categories", categories=tuple(names))
 
 
 def _ends(values: Iterable[float], more: tuple[float, ...] = ()) -> tuple[float, float]:
@@ -284,8 +284,8 @@ class Plot(Schema):
     title: Text
     caption: Text
     alt: Text
-    x: Axis
-    y: Axis
+    x: PlotAxis
+    y: PlotAxis
     marks: tuple[Mark, ...]
     colours: ColourScale | None = None
     equal: bool = False
