@@ -53,9 +53,9 @@ export function plot(block: PlotBlock): HTMLElement {
   };
   // a plot in a closed part of the page has no width yet
   draw(640);
-  new ResizeObserver(() => {
+  new ResizeObserver(() => requestAnimationFrame(() => {
     if (area.clientWidth) draw(area.clientWidth);
-  }).observe(area);
+  })).observe(area);
   const caption = block.caption ? [h("p", { class: "small" }, block.caption)] : [];
   return h("figure", { class: "plot" },
     h("figcaption", {}, h("b", {}, block.title), ...caption), ...legend(block), area, ...values(block));
@@ -128,8 +128,8 @@ function picture(block: PlotBlock, width: number): SVGElement {
   const svg = Plot.plot({
     ...size,
     ariaLabel: block.alt,
-    x: { ...scale(block.x), axis: null },
-    y: { ...scale(block.y), axis: null },
+    x: scale(block.x, "x"),
+    y: scale(block.y, "y"),
     marks: [
       ...axis(block.x, "x", size), ...axis(block.y, "y", size), ...marks,
       Plot.tip(tips, across({ x: "x", y: "y", title: "text", lineWidth: 24, fontSize: 12, maxRadius: 30 })),
@@ -163,9 +163,10 @@ const labels = (axis: Axis): string[] =>
 const span = (axis: Axis): number => (axis.limits ? Math.abs(axis.limits[1] - axis.limits[0]) : axis.categories.length);
 
 /** Scale of numbers; the first category of y is at the top. */
-function scale(axis: Axis): Plot.ScaleOptions {
-  if (axis.limits) return { type: axis.scale === "log" ? "log" : "linear", domain: axis.limits, clamp: true };
-  return { type: "linear", domain: [0, axis.categories.length], clamp: true };
+function scale(axis: Axis, along: Along): Plot.ScaleOptions {
+  const ends = [0, axis.categories.length];
+  const domain = axis.limits ?? (along === "x" ? ends : ends.reverse());
+  return { type: axis.scale === "log" ? "log" : "linear", domain, clamp: true, axis: null };
 }
 
 /** Grid, labels and title of an axis. */
@@ -174,7 +175,8 @@ function axis(axis: Axis, along: Along, size: Size): Plot.Markish[] {
     ? axis.categories.map((label, k) => ({ at: k + 0.5, label })) : axis.ticks;
   const text = new Map(ticks.map((tick) => [tick.at, tick.label]));
   const options = {
-    tickFormat: (at: number) => text.get(at) ?? "", tickSize: axis.scale === "categories" ? 0 : 4,
+    // without a limit on their number, a logarithmic scale would leave out labels of its choice
+    ticks: Infinity, tickFormat: (at: number) => text.get(at) ?? "", tickSize: axis.scale === "categories" ? 0 : 4,
     label: axis.label || null, labelArrow: "none", fontSize: 12, color: "var(--muted)",
   } as const;
   const at = ticks.map((tick) => tick.at);
@@ -308,7 +310,9 @@ function cells(block: PlotBlock, mark: CellsMark, tips: Tip[]): Plot.Markish[] {
     for (const [c, value] of row.entries()) {
       if (value === null) continue;
       const step = Math.round(((value - low) / (high - low)) * 2 * COLOUR_STEPS);
-      grouped.set(step, [...[], ...(grouped.get(step) ?? [])].concat([[c, r]]));
+      const places = grouped.get(step) ?? [];
+      places.push([c, r]);
+      grouped.set(step, places);
       tips.push({
         x: at(mark.x, (c + 0.5) / columns), y: at(mark.y, (r + 0.5) / rows),
         text: `${mark.rows[r]}\n${mark.columns[c]}\n${said({ ...block.x, label: colours.label }, value)}`,

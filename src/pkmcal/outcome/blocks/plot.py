@@ -27,7 +27,9 @@ Position = float | Text
 """Position on an axis: a number, or the name of a category."""
 
 LEAST_TICKS = 4
-"""Least number of labels on an axis of numbers."""
+"""Least number of labels on a linear axis."""
+LEAST_LOG_TICKS = 3
+"""Least number of labels on a logarithmic axis."""
 MOST_DECADES = 8
 """Decades above which not every power of ten has a label."""
 AXIS_MARGIN = 0.04
@@ -114,13 +116,15 @@ def linear_ticks(low: float, high: float, least: int = LEAST_TICKS) -> tuple[Tic
 
 
 def log_ticks(low: float, high: float) -> tuple[Tick, ...]:
-    """Labels at powers of ten; between them, too, where fewer than ``LEAST_TICKS`` lie there."""
+    """Labels at powers of ten; between them, too, where these are fewer than
+    ``LEAST_LOG_TICKS``.
+    """
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     every = -(-len(decades) // MOST_DECADES)
     for factors in ((1,), (1, 3), (1, 2, 5), range(1, 10)):
         values = [m * 10.0**k for k in decades[::every] for m in factors]
         values = [v for v in values if low <= v <= high]
-        if len(values) >= LEAST_TICKS:
+        if len(values) >= LEAST_LOG_TICKS:
             return tuple(Tick(at=v, label=_power_text(v)) for v in values)
     return linear_ticks(low, high)
 
