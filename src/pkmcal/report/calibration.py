@@ -37,6 +37,7 @@ from pkmcal.report import (
     identifiability,
     image_scene,
     linked,
+    parameter_plots,
     parameters,
     pictures,
     poses,
@@ -152,14 +153,14 @@ def report_of(
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         identifiability.section(findings, estimate.machine.parameters),
-        parameters.correlations_part(estimate),
+        parameter_plots.correlations_part(estimate),
         pictures.section(session, album) if session.stations else None,
-        poses.section(session, observation, estimate, links),
+        poses.section(session, observation, estimate),
         *linked.sections(session, _links(c), estimate),
         held,
         bed.section(session, c.model_errors),
         residuals.section(
-            session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
+            session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
         ),
         field.section(session, observation, estimate, album.corners, links),
         provenance.left_out(session, observation.rejected, estimate),

@@ -27,6 +27,11 @@ def leg_key(leg: int | None) -> Key:
     return f"leg:{leg}" if leg else ""
 
 
+def station_key(name: str) -> Key:
+    """Key of a station."""
+    return f"station:{name}"
+
+
 def configuration_key(name: str) -> Key:
     """Key of a configuration."""
     return f"configuration:{name}"
