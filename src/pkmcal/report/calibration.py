@@ -33,11 +33,11 @@ from pkmcal.outcome import Figure, Outcome
 from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.report import (
     bed,
+    correlation_plot,
     field,
     identifiability,
     image_scene,
     linked,
-    parameter_plots,
     parameters,
     pictures,
     poses,
@@ -153,7 +153,7 @@ def report_of(
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         identifiability.section(findings, estimate.machine.parameters),
-        parameter_plots.correlations_part(estimate),
+        correlation_plot.section(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate),
         *linked.sections(session, _links(c), estimate),

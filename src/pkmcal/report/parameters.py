@@ -22,6 +22,7 @@ from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part
 from pkmcal.pages import page
+from pkmcal.report.parameter_changes import changes
 from pkmcal.wording import (
     DISPLAY_UNITS,
     capital,
@@ -112,7 +113,7 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
         },
         gauge=estimate.gauge,
     )
-    return Part("parameters", "Parameters", html=html)
+    return Part("parameters", "Parameters", blocks=changes(estimates), html=html)
 
 
 def parameters_csv(estimates: ParameterEstimates) -> str:

@@ -1,4 +1,4 @@
-"""Plots of the parameters: their changes with their deviations, and their correlations."""
+"""Report section on the correlations of the parameters: a plot of all, and a list of pairs."""
 
 from __future__ import annotations
 
@@ -8,30 +8,19 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.parameter_estimates import ParameterEstimates
 from pkmcal.outcome import Part
-from pkmcal.outcome.blocks.base import leg_key
 from pkmcal.outcome.blocks.plot import (
-    BandMark,
     CellsMark,
     ColourScale,
-    DotsMark,
-    Panels,
     Plot,
     PlotAxis,
-    Point,
     RuleMark,
     Tick,
-    category_axis,
-    leg_colour,
-    linear_axis,
     linear_ticks,
-    panels,
-    rounded,
 )
 from pkmcal.outcome.blocks.text import Listing
 from pkmcal.report.parameters import correlations
-from pkmcal.wording import DISPLAY_UNITS, amount, number, split_name, with_unit
+from pkmcal.wording import number, split_name
 
 MOST_CORRELATIONS = 250
 """Most parameters in the plot of correlations; with more a cell would be below three pixels."""
@@ -40,8 +29,6 @@ LEAST_CORRELATION = 0.05
 STRONG_CORRELATION = 0.8
 """Correlation above which a pair is listed."""
 MOST_PAIRS = 24
-INTERVAL_SIGMAS = 2.0
-"""Standard deviations on either side of a parameter's change."""
 HOW_TOGETHER = (
     "Orange: when one is larger than stated, so is the other; blue: the other is smaller. Only"
     " their sum, or difference, is as sure as the small deviations of other values suggest. In the"
@@ -50,73 +37,7 @@ HOW_TOGETHER = (
 )
 
 
-# ------------------------------------------------------------------ changes
-
-
-def changes(estimates: ParameterEstimates) -> tuple[Panels, ...]:
-    """Change of each estimated parameter in its tolerances, with its standard deviations: one plot
-    for each leg, all on the same scale.
-
-    Parameters that the gauge or the file fixes are left out, as those without a tolerance.
-    """
-    table, rows = estimates.table, list[tuple[int | None, Point]]()
-    for k, one in enumerate(estimates):
-        tolerance = float(table.tolerance[k])
-        if one.decided_by in ("frame", "fixed") or not tolerance > 0:
-            continue
-        leg, _ = split_name(one.name)
-        change, reach = one.change / tolerance, INTERVAL_SIGMAS * one.sigma / tolerance
-        by_data = one.decided_by == "data"
-        tip = (
-            f"{table.in_words(one.name) if leg else one.name}:"
-            f" {number(change, 2, signed=True)} ± {number(reach, 2)} tolerances of"
-            f" {_with_unit(tolerance, one.unit)}"
-            + ("" if by_data else "; the nominal model decides more than the data")
-        )
-        point = Point(
-            x=rounded(change),
-            y=table.labels[k],
-            low=rounded(change - reach),
-            high=rounded(change + reach),
-            tip=tip,
-            key=leg_key(leg),
-            colour=leg_colour(leg) if by_data else "quiet",
-        )
-        rows.append((leg, point))
-    ends = [end for _, point in rows for end in (point.low, point.high) if end is not None]
-    axis = linear_axis("change ± 2σ, in tolerances", (*ends, -1.0, 1.0))
-    groups = groupby(rows, key=lambda row: row[0])
-    return panels(*(_leg_changes(leg, [p for _, p in group], axis) for leg, group in groups))
-
-
-def _leg_changes(leg: int | None, points: list[Point], axis: PlotAxis) -> Plot:
-    """Changes of one leg's parameters, or of those of no leg."""
-    title = f"Leg {leg}" if leg else "Machine"
-    return Plot(
-        name=f"changes-{leg or 'machine'}",
-        title=title,
-        caption="",
-        alt=f"{title}: change of {len(points)} parameters from the nominal model, with two standard"
-        " deviations, in tolerances; the table below has the numbers",
-        x=axis,
-        y=category_axis(str(point.y) for point in points),
-        marks=(
-            BandMark(name="", axis="x", low=-1.0, high=1.0),
-            RuleMark(name="", axis="x", at=0.0, colour="quiet"),
-            DotsMark(name="", colour=leg_colour(leg), points=tuple(points)),
-        ),
-    )
-
-
-def _with_unit(value: float, unit: str) -> str:
-    """Tolerance in the displayed unit; that of a ratio or a direction as a number."""
-    return amount(value, unit) if unit in DISPLAY_UNITS else with_unit(f"{value:.2g}", "")
-
-
-# ------------------------------------------------------------------ correlations
-
-
-def correlations_part(estimate: Estimate) -> Part | None:
+def section(estimate: Estimate) -> Part | None:
     """Section on correlations; None for fewer than two free parameters, or too many to be drawn."""
     table = estimate.machine.parameters
     free, rho, pairs = correlations(estimate)
