@@ -16,7 +16,6 @@ import pytest
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level
-from pkmcal.pages.charts import UprightBar, bar_chart
 from pkmcal.pages.page import page_html
 from pkmcal.report.calibration import report_of
 from test_report_case import Case, calibration, make_case, report_html
@@ -94,19 +93,6 @@ def test_page_has_date_and_sources(case):
     assert "<h3>Notes</h3>" not in report_html(case.session, case.observation, case.estimate, fine)
 
 
-def test_charts_lead_to_images_that_are_there(page, case):
-    results = PageParts(page)
-    links = [str(a["href"]) for tag, a in results.tags if tag == "a" and "download" not in a]
-    names = {f"#{a['id']}" for _, a in results.tags if "id" in a}
-    leading = [link for link in links if link.startswith("#image-")]
-    # a bar a configuration, a box a leg, station, joint and kind of edge, and cells
-    assert len(leading) > 5 + 6 + 3 + 6 + 20
-    assert set(leading) <= names
-    bar = re.search(r'<a href="#image-\d-(\d)" aria-label="configuration c(\d):', page)
-    assert bar is not None
-    assert int(bar[1]) == int(bar[2]) + 1
-
-
 def test_page_asks_for_nothing_outside(page):
     assert not re.search(r"https?:|//[a-z]+\.|@import|url\((?!#)", page)
     for tag, attributes in PageParts(page).tags:
@@ -131,16 +117,6 @@ def test_hostile_names_stay_text(tmp_path):
     assert not [a for tag, a in value.tags if "onerror" in a or tag == "img"]
     assert sum(tag == "script" for tag, _ in value.tags) == 6
     assert value.text.count("<script>alert('x')") > 10
-
-
-def test_a_scale_of_long_numbers_has_room():
-    """Digits are less than 7 px wide; those of 0.005 px began outside."""
-    bars = [UprightBar("one", "one", 0.0074)]
-    chart = bar_chart("Errors", "images; px", bars, (), "bars")
-    assert chart is not None
-    assert all(7 * len(text) <= chart.left for _, text in chart.ticks)
-    assert chart.x(0) == chart.left
-    assert chart.x(1) == chart.width - 8
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,10 @@ MOST_DECADES = 8
 """Decades above which not every power of ten has a label."""
 AXIS_MARGIN = 0.04
 """Free part of an axis beyond its values, at each end."""
+LEAST_SPAN = 1e-6
+"""Span of values, in the largest one, below which they count as equal."""
+LEAST_LOG_MARGIN = 0.01
+"""Least free part of a logarithmic axis, in decades."""
 PLOT_DIGITS = 6
 """Significant digits of values in a plot."""
 
@@ -78,7 +82,8 @@ def linear_axis(label: str, values: Iterable[float], *, zero: bool = False) -> P
     zero : the axis begins, or ends, at zero if the values have one sign.
     """
     low, high = _ends(values, (0.0,) if zero else ())
-    margin = AXIS_MARGIN * ((high - low) or abs(high) or 1.0)
+    size, span = max(abs(low), abs(high)), high - low
+    margin = AXIS_MARGIN * (span if span > LEAST_SPAN * size else size or 1.0)
     low = low if zero and low == 0 else low - margin
     high = high if zero and high == 0 else high + margin
     return PlotAxis(label=label, scale="linear", limits=(low, high), ticks=linear_ticks(low, high))
@@ -87,7 +92,7 @@ def linear_axis(label: str, values: Iterable[float], *, zero: bool = False) -> P
 def log_axis(label: str, values: Iterable[float]) -> PlotAxis:
     """Logarithmic axis that holds all finite positive values."""
     low, high = (math.log10(v) for v in _ends(v for v in values if v > 0))
-    margin = AXIS_MARGIN * (high - low) or AXIS_MARGIN
+    margin = max(AXIS_MARGIN * (high - low), LEAST_LOG_MARGIN)
     low, high = 10 ** (low - margin), 10 ** (high + margin)
     return PlotAxis(label=label, scale="log", limits=(low, high), ticks=log_ticks(low, high))
 
@@ -122,7 +127,7 @@ def log_ticks(low: float, high: float) -> tuple[Tick, ...]:
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     every = -(-len(decades) // MOST_DECADES)
     for factors in ((1,), (1, 3), (1, 2, 5), range(1, 10)):
-        values = [m * 10.0**k for k in decades[::every] for m in factors]
+        values = [m * 10.0**k for k in decades if k % every == 0 for m in factors]
         values = [v for v in values if low <= v <= high]
         if len(values) >= LEAST_LOG_TICKS:
             return tuple(Tick(at=v, label=_power_text(v)) for v in values)
