@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pkmcal.identify.parameter_estimates import parameter_estimates
+from pkmcal.outcome import Verdict
 from pkmcal.outcome.blocks.plot import (
     LEAST_LOG_TICKS,
     LEAST_TICKS,
@@ -23,8 +24,10 @@ from pkmcal.outcome.blocks.plot import (
 from pkmcal.report import charts, residuals
 from pkmcal.report.calibration import report_of
 from pkmcal.report.parameter_changes import changes
+from pkmcal.web.report_page import report_page
 from pkmcal.wording import MINUS_SIGN
 from test_report_case import Case, calibration, make_case
+from test_show import acting, browse
 
 
 @pytest.fixture(scope="module")
@@ -199,3 +202,63 @@ def test_changes_are_in_tolerances_by_leg(case):
     assert point.key == "leg:2"
     # leg 1 holds the frame
     assert ("changes-1", "base centre y") not in points
+
+
+# ------------------------------------------------------------------ in a browser
+
+POINT = """
+const faults = [];
+addEventListener("error", (event) => { if (event.message) faults.push(event.message); });
+document.addEventListener("securitypolicyviolation", (event) => {
+  faults.push(`blocked ${event.blockedURI} ${event.violatedDirective}`);
+});
+const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+addEventListener("load", async () => {
+  const out = document.documentElement.dataset, root = document.documentElement;
+  for (const part of document.querySelectorAll("details")) part.open = true;
+  await wait(500);
+  const pictures = [...document.querySelectorAll(".plot .area > svg")];
+  out.plots = pictures.length;
+  out.described = pictures.every((svg) =>
+    svg.getAttribute("role") === "img" && svg.getAttribute("aria-label").length > 20);
+  const overlaps = (texts) => texts.some((a, k) => texts.slice(0, k).some((b) =>
+    a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom));
+  out.overlaps = pictures.filter((svg) => overlaps(
+    [...svg.querySelectorAll("text")].filter((text) => text.textContent)
+      .map((text) => text.getBoundingClientRect()))).map((svg) => svg.ariaLabel).join();
+  const bar = document.querySelector('.plot rect[data-key="leg:3"]');
+  const { left, right, top, bottom } = bar.getBoundingClientRect();
+  const at = { clientX: (left + right) / 2, clientY: (top + bottom) / 2, bubbles: true,
+               pointerType: "mouse" };
+  bar.dispatchEvent(new PointerEvent("pointermove", at));
+  bar.dispatchEvent(new PointerEvent("pointerover", at));
+  out.tip = [...bar.ownerSVGElement.querySelectorAll('[aria-label="tip"] text')]
+    .map((text) => text.textContent).join(" ");
+  const lit = [...document.querySelectorAll(".plot .hovered")];
+  out.lit = [...new Set(lit.map((element) => element.dataset.key))].join();
+  out.others = new Set(lit.map((element) => element.ownerSVGElement)).size;
+  out.overhang = root.scrollWidth - root.clientWidth;
+  out.faults = faults.join("; ");
+  out.done = "yes";
+});
+"""
+
+
+def test_plots_are_drawn_on_a_phone(case, tmp_path):
+    """Described, without labels over each other; a pointer shows a tooltip and, in all plots, what
+    belongs to the same leg.
+    """
+    verdict = Verdict(True, "Fine.")
+    outcome = report_of(calibration(case.session, case.observation, case.estimate, verdict))
+    plots = [plot for part in outcome.parts for plot in plots_of(part)]
+    file = tmp_path / "page.html"
+    file.write_text(acting(report_page(outcome), POINT), encoding="utf-8")
+    value = browse(file.as_uri(), tmp_path, 390, "--disable-gpu")
+    assert value["faults"] == ""
+    assert int(value["plots"]) == len(plots)
+    assert value["described"] == "true"
+    assert value["overlaps"] == ""
+    assert "leg 3" in value["tip"].lower()
+    assert value["lit"] == "leg:3"
+    assert int(value["others"]) > 1
+    assert value["overhang"] == "0"
