@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pkmcal import wording
+from pkmcal.arrays import enlargement
 from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
@@ -21,7 +22,6 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import wrong
 from pkmcal.pages import overlays
-from pkmcal.pages.charts import enlargement, ticks_between
 from pkmcal.pages.overlays import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
@@ -49,11 +49,6 @@ def test_numbers_have_a_true_minus_and_no_negative_zero():
     assert wording.number(0.5, 1, signed=True) == "+0.5"
     assert wording.number(float("nan"), 2) == "–"
     assert wording.percent(0.9999) == "99 %"
-
-
-def test_ticks_are_round_and_inside():
-    assert [t for t, _ in ticks_between(-2.2, 2.2)] == [-2, -1, 0, 1, 2]
-    assert [text for _, text in ticks_between(0, 0.011, 4)] == ["0.000", "0.005", "0.010"]
 
 
 # ------------------------------------------------------------------ parameters

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pkmcal.report import field, parameters
+from pkmcal.report import correlation_plot, field
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.field import Offsets
 from pkmcal.report.links import Links
@@ -83,15 +83,15 @@ def test_edges_are_off_by_what_they_were_shifted(case):
 
 
 def test_correlations_are_those_of_the_covariance(case):
-    part = parameters.correlations_part(case.estimate)
+    part = correlation_plot.section(case.estimate)
     assert part is not None
-    (heat,) = part.plots[0].figure["data"]
-    rho = np.asarray(heat["z"])
+    cells = next(mark for mark in part.blocks[0].marks if mark.mark == "cells")
+    rho = np.array([[value or 0.0 for value in row] for row in cells.values])
     covariance = case.estimate.covariance
     free = np.flatnonzero(np.diag(covariance) > 0)
     sigma = np.sqrt(np.diag(covariance)[free])
-    np.testing.assert_allclose(
-        rho, covariance[np.ix_(free, free)] / np.outer(sigma, sigma), atol=0.005
-    )
+    expected = covariance[np.ix_(free, free)] / np.outer(sigma, sigma)
+    empty = np.abs(expected) < correlation_plot.LEAST_CORRELATION
+    np.testing.assert_allclose(rho, np.where(empty, 0.0, expected), atol=0.005)
     table = case.estimate.machine.parameters
-    assert heat["x"] == heat["y"] == [table.in_words(table.names[k]) for k in free]
+    assert cells.columns == cells.rows == tuple(table.in_words(table.names[k]) for k in free)

@@ -13,7 +13,7 @@ from pkmcal.identify.unidentified import explain, observed_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.report.identifiability import (
-    STUB_BAR_HEIGHT,
+    STUB_INFORMATION,
     directions_headline,
     held_text,
     spectrum,
@@ -89,15 +89,16 @@ def test_a_whole_session_has_nothing_to_list():
 def test_the_spectrum_shows_lost_directions_as_stubs(apart):
     drawn = spectrum(apart)
     assert drawn is not None
-    bars = drawn.bars
+    bars = next(mark.points for mark in drawn.marks if mark.mark == "bars")
     assert len(bars) == 42
-    assert [bar.value > STUB_BAR_HEIGHT for bar in bars] == [True] * 34 + [False] * 8
+    assert [bar.y > STUB_INFORMATION for bar in bars] == [True] * 34 + [False] * 8
     assert bars[-1].tip == "Direction 42: the data do not determine it"
-    assert not bars[-1].quiet
-    assert bars[0].quiet
+    assert bars[-1].colour is None
+    assert bars[0].colour == "quiet"
     assert "times better than the nominal model" in bars[0].tip
     # the line where data and nominal model have equal information is the tick with 1
-    assert (drawn.curve[0][1], "1") in drawn.ticks
+    (line,) = (mark for mark in drawn.marks if mark.mark == "rule")
+    assert (line.at, "1") in [(tick.at, tick.label) for tick in drawn.y.ticks]
 
 
 def test_what_was_held_is_stated_with_its_reason(apart):

@@ -14,6 +14,7 @@ import pytest
 from conftest import run
 from document_keys import assert_keys
 from faults import replaced
+from page_documents import page_blocks, page_document
 from pkmcal.calibration.holdout import (
     by_region,
     chosen,
@@ -511,9 +512,15 @@ def test_validate_on_what_was_held_out(saved_result, demo):
     assert (
         result["exit_code"] == saved_result.result.code == (0 if result["verdict"]["usable"] else 1)
     )
-    page = (saved_result.folder / "v" / "validation.html").read_text()
-    assert result["verdict"]["headline"] in page
-    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
+    page = page_document((saved_result.folder / "v" / "validation.html").read_text())
+    assert page["verdict"]["headline"] == result["verdict"]["headline"]
+    (panels,) = page_blocks(page, "panels")
+    bars = next(mark["points"] for mark in panels["plots"][0]["marks"] if mark["mark"] == "bars")
+    assert [bar["x"] for bar in bars] == out
+    worst = max(bars, key=lambda bar: bar["y"])
+    assert worst["key"] == f"configuration:{worst['x']}"
+    (sentence, *_) = page_blocks(page, "paragraph", "readings")
+    assert f"Worst is configuration {worst['x']}," in sentence["text"]
     assert json.loads((saved_result.folder / "v" / "validation.json").read_text())["new_data"]
     del demo
 

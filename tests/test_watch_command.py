@@ -12,6 +12,7 @@ import pytest
 
 from conftest import run
 from document_keys import assert_keys
+from page_documents import page_blocks, page_document, page_text
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.cameras import load_camera
@@ -106,10 +107,15 @@ def test_an_unchanged_machine(demo, later):
         assert leg["zero"]["unit"] == "m"
     assert done.json["known_configurations"] == []
     assert len(done.json["configurations"]) == 4
-    page = (later.folder / "w" / "watch.html").read_text()
-    assert done.json["verdict"]["headline"] in page.replace("&#39;", "'")
-    assert "Still as calibrated" in page
-    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
+    page = page_document((later.folder / "w" / "watch.html").read_text())
+    assert page["verdict"]["headline"] == done.json["verdict"]["headline"]
+    assert page["verdict"]["stamp"] == "Still as calibrated"
+    tests, run_chart = (block["plots"] for block in page_blocks(page, "panels"))
+    (bars,) = (mark for mark in tests[0]["marks"] if mark["mark"] == "bars")
+    assert [bar["key"] for bar in bars["points"]] == [f"leg:{k}" for k in range(1, 7)]
+    assert all(bar["y"] < 1 for bar in bars["points"])  # thresholds
+    (dots,) = (mark for mark in run_chart[0]["marks"] if mark["mark"] == "dots")
+    assert [dot["x"] for dot in dots["points"]] == done.json["configurations"]
     retained = json.loads((later.folder / "w" / "watch.json").read_text())
     assert retained["pkmcal_watch"] == 1
     assert retained["legs"] == done.json["legs"]
@@ -122,9 +128,11 @@ def test_a_changed_machine_in_words(demo, later):
     assert "The machine is not as calibrated: leg 3 has changed" in text
     assert "zero of leg 3's reading by +2." in text
     assert "found from" in text
-    page = (later.off / "watch" / "watch.html").read_text()
-    assert "What explains it" in page
-    assert "Changed" in page
+    page = page_document((later.off / "watch" / "watch.html").read_text())
+    assert page["verdict"]["stamp"] == "Changed"
+    tests, _ = (block["plots"] for block in page_blocks(page, "panels"))
+    (bars,) = (mark for mark in tests[0]["marks"] if mark["mark"] == "bars")
+    assert max(bars["points"], key=lambda bar: bar["y"])["key"] == "leg:3"
 
 
 def test_configurations_that_the_calibration_used_are_left_out(demo, later, calibration):
@@ -220,9 +228,11 @@ def test_a_camera_that_was_left_in_place_finds_less(demo, stayed, tmp_path):
     assert results[1].json["moved_stations"] == []
     least = [np.mean([leg["detectable"]["zero"] for leg in done.json["legs"]]) for done in results]
     assert least[1] < 0.8 * least[0]
-    page = (tmp_path / "1" / "watch.html").read_text()
-    assert f"Left in place: {stayed.name}" in page
-    assert "Left in place" not in (tmp_path / "0" / "watch.html").read_text()
+    without, kept = (
+        page_text(page_document((tmp_path / name / "watch.html").read_text())) for name in "01"
+    )
+    assert f"Left in place: {stayed.name}" in kept
+    assert "Left in place" not in without
 
 
 def test_stations_are_numbered_without_images_that_were_not_placed(demo, stayed, monkeypatch):

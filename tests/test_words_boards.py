@@ -22,7 +22,7 @@ from pkmcal.identify.verdict import assess
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.report import parameters
+from pkmcal.report import correlation_plot
 from pkmcal.report.identifiability import held_text as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
 from pkmcal.report.parameters import TIGHT_CORRELATION, bound_together, grouped, tight_pairs
@@ -243,8 +243,8 @@ def test_pairs_that_a_finding_names_are_not_repeated():
 def test_what_the_picture_of_correlations_states_fits_the_sentences_on_pairs(name):
     _, _, estimate = findings_of(name)
     table, text = estimate.machine.parameters, bound_together(estimate)
-    part = parameters.correlations_part(estimate)
-    (heat,) = part.plots[0].figure["data"]
+    part = correlation_plot.section(estimate)
+    cells = next(mark for mark in part.blocks[0].marks if mark.mark == "cells")
     closest = float(re.search(r", ([+−]\d\.\d\d)\.", part.text[0])[1].replace("−", "-"))
     assert bool(text) == (abs(closest) > TIGHT_CORRELATION)
     for i, j, rho in tight_pairs(estimate)[:1]:
@@ -255,7 +255,7 @@ def test_what_the_picture_of_correlations_states_fits_the_sentences_on_pairs(nam
         assert table.in_words(table.names[j]) in text[0]
     # of a tie, one stands for all: another name of it would have a correlation of one
     again = {table.in_words(x) for group in table.tied for x in group[1:]}
-    assert not again & set(heat["x"])
+    assert not again & set(cells.columns)
 
 
 def test_a_sum_that_alone_is_known_is_named_though_its_parts_correlate_fully():

@@ -35,6 +35,7 @@ from pkmcal.outcome.blocks.log_bar import LogBar, Magnitude
 from pkmcal.outcome.finding import Level, Mark
 from pkmcal.report import (
     bed,
+    correlation_plot,
     field,
     identifiability,
     image_scene,
@@ -163,16 +164,16 @@ def report_of(
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         pictures.section(session, album) if session.stations else None,
-        poses.section(session, observation, estimate, links),
+        poses.section(session, observation, estimate),
         *linked.sections(session, _links(c), estimate),
         held,
         bed.section(session, c.model_errors),
     )
     expert_parts = (
         identifiability.section(findings, estimate.machine.parameters),
-        parameters.correlations_part(estimate),
+        correlation_plot.section(estimate),
         residuals.section(
-            session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
+            session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
         ),
         field.section(session, observation, estimate, album.corners, links),
         provenance.left_out(session, observation.rejected, estimate),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from pkmcal.arrays import THREADS
+from pkmcal.arrays import THREADS, enlargement
 from pkmcal.camera_calibration.calibrate import (
     CALIBRATION_CHECK_OPTIONS,
     CameraCalibration,
@@ -19,16 +19,16 @@ from pkmcal.camera_calibration.calibrate import (
 )
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
-from pkmcal.pages import charts, page
+from pkmcal.outcome.blocks.plot import panels
+from pkmcal.pages import page
 from pkmcal.pages.jpegs import jpeg
 from pkmcal.pages.overlays import Arrow, Picture
+from pkmcal.report.camera_plots import field_plots, models_plot
 from pkmcal.report.field import ImageField
 from pkmcal.wording import brief, count, decimals, number
 
 VIEW_RESIDUAL_ARROW_LENGTH = 0.05
 """Length of a large residual's arrow, in image widths."""
-ANGLE_STEP = 5.0
-"""Width of a bar in the histogram of angles from the axis, degrees."""
 FIELD_CELLS = (16, 12)
 INTRINSIC_UNITS = {"focal": "px", "center": "px"}
 INTRINSIC_WORDS = {
@@ -63,7 +63,7 @@ def outcome_of(
     """
     c = calibration
     wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
-    factor = charts.enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
+    factor = enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly distinguished, and so to be used together only: {together}."
     # with its covariance, which is the prior of `calibrate --refine-camera`
@@ -84,13 +84,15 @@ def outcome_of(
                 "models",
                 "Models compared",
                 (CAMERA_MODELS_TEXT,),
+                blocks=panels(models_plot(c)),
                 tables=(_compared(c),),
                 menu="Models",
             ),
             Part(
                 "field",
                 "Field",
-                html=_field(c) + charts.panels(_angles_chart(c), _views_chart(c)),
+                blocks=field_plots(c),
+                html=_field(c),
             ),
             Part(
                 "images",
@@ -270,54 +272,10 @@ def _field(c: CameraCalibration) -> Markup:
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    factor = charts.enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
+    factor = enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
     field = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
         tuple(Arrow(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
     )  # fmt: skip
     return page.filled_template("field.html.j2", field=field, cells=cells, factor=factor)
-
-
-def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
-    """Held-out error of each view; the fit's own error is in the tooltip."""
-    squares = np.where(c.inliers, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
-    fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.inliers.sum(axis=1), 1))
-    middle = float(np.median(c.held_out.by_view))
-    bars = [
-        charts.UprightBar(
-            name,
-            f"{name}: {brief(float(out))} px held out, {brief(float(own))} px when fitted",
-            float(out),
-            quiet=bool(out < 2 * middle),
-        )
-        for name, out, own in zip(c.views, c.held_out.by_view, fitted, strict=True)
-    ]
-    return charts.bar_chart(
-        "Held-out error of each image", "images; root mean square, px", bars, (),
-        f"Bars of {len(bars)} images, the middle one {brief(middle)} px",
-    )  # fmt: skip
-
-
-def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
-    """Histogram of the corners' angles from the optical axis."""
-    rays = c.camera.ray(c.pixels[c.inliers])
-    angle = np.rad2deg(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
-    angle = angle[np.isfinite(angle)]
-    last = int(np.ceil((angle.max() if angle.size else 1.0) / ANGLE_STEP)) + 1
-    counts = np.bincount((angle / ANGLE_STEP).astype(int), minlength=last)
-    bars = [
-        charts.UprightBar(
-            f"{k * ANGLE_STEP:.0f}",
-            f"{k * ANGLE_STEP:.0f} to {(k + 1) * ANGLE_STEP:.0f}°: {count(n, 'corner')}",
-            float(n),
-            quiet=True,
-        )
-        for k, n in enumerate(counts.tolist())
-    ]
-    every = max(1, len(bars) // 8)
-    labels = tuple((float(k), f"{k * ANGLE_STEP:.0f}") for k in range(0, len(bars) + 1, every))
-    return charts.bar_chart(
-        "Corners by their angle from the axis", "degrees; number of corners", bars, labels,
-        f"Corners from {angle.min(initial=180):.0f} to {angle.max(initial=0):.0f} degrees",
-    )  # fmt: skip

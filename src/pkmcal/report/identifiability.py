@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.outcome import Part
+from pkmcal.outcome.blocks.plot import (
+    BarsMark,
+    Plot,
+    Point,
+    RuleMark,
+    category_axis,
+    log_axis,
+    panels,
+    rounded,
+)
 from pkmcal.outcome.blocks.table import Column, DataTable, TableRow
 from pkmcal.outcome.blocks.text import Listing, Paragraph
 from pkmcal.outcome.finding import Level
-from pkmcal.pages.charts import BarChart, UprightBar
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, capital, count, joined
 
 LEAST_BAR_INFORMATION = 1e-3
 """Information below which a bar is only a stub: the nominal model knows a thousand times more."""
-STUB_BAR_HEIGHT = 0.06
-"""Height of a stub, in decades: visible, but not to be read as a value."""
+STUB_INFORMATION = 1.15 * LEAST_BAR_INFORMATION
+"""Value of a stub: visible, but not to be read."""
 MOST_NAMES_LISTED = 6
 
 
@@ -42,6 +49,7 @@ def section(findings: Findings, table: ParameterTable) -> Part:
             " the nominal model left out, from exact derivatives.",
         ),
         blocks=(
+            *panels(spectrum(findings)),
             *listings,
             *((Paragraph(text=held, small=True),) if held else ()),
             *((_conditions(findings),) if findings.conditions else ()),
@@ -95,55 +103,45 @@ def directions_headline(findings: Findings) -> str:
     return f"{start} {capital(joined(parts))}."
 
 
-def spectrum(findings: Findings) -> BarChart | None:
+def spectrum(findings: Findings) -> Plot | None:
     """Bars of the information in all directions, best known first, on a logarithmic scale."""
     information = np.asarray(findings.identifiability.singular_values, dtype=float)
     if information.size == 0:
         return None
-    # logarithmic height above the least information; 1 is that of the nominal model
-    decades = math.log10(1 / LEAST_BAR_INFORMATION)
-    heights = np.maximum(
-        np.log10(np.maximum(information, LEAST_BAR_INFORMATION)) + decades, STUB_BAR_HEIGHT
-    )
-    high = 1.06 * max(float(heights.max()), decades + 1)
-    bars = tuple(
-        UprightBar(
-            str(k + 1),
-            f"Direction {k + 1}: {words}",
-            float(height),
-            quiet=bool(ratio >= 1),
-        )
-        for k, (ratio, height) in enumerate(zip(information, heights, strict=True))
-        for words in [
+    rank = findings.identifiability.rank
+    bars: list[Point] = []
+    for k, ratio in enumerate(information.tolist()):
+        words = (
             "the data do not determine it"
-            if k >= findings.identifiability.rank
+            if k >= rank
             else f"the nominal model knows it {brief(1 / ratio)} times better"
             if ratio < 1
             else f"the data know it {brief(ratio)} times better than the nominal model"
-        ]
-    )
-    # a tick for each decade
-    tops = range(math.floor(high) + 1)
-    ticks = tuple((float(t), _power(t - round(decades))) for t in tops)
-    places = sorted({0, len(bars) - 1} | set(range(9, len(bars) - 4, 10)))
-    return BarChart(
+        )
+        bars.append(
+            Point(
+                x=str(k + 1),
+                y=rounded(max(ratio, STUB_INFORMATION)),
+                tip=f"Direction {k + 1}: {words}",
+                colour="quiet" if ratio >= 1 else None,
+            )
+        )
+    return Plot(
+        name="spectrum",
         title="How well each direction is known",
-        unit="directions of the parameters, best known first",
-        alt=f"{len(bars)} directions; {findings.identifiability.rank} are fixed by the data and "
+        caption="At the line, data and nominal model know as much.",
+        alt=f"{len(bars)} directions; {rank} are fixed by the data and "
         f"{len(findings.identifiability.weak)} of those are known better by the nominal model",
-        bars=bars,
-        high=high,
-        ticks=ticks,
-        labels=tuple((k + 0.5, str(k + 1)) for k in places),
-        curve=((0.0, decades), (float(len(bars)), decades)),
+        x=category_axis((str(bar.x) for bar in bars), "directions, best known first"),
+        y=log_axis(
+            "singular value, in tolerances",
+            (LEAST_BAR_INFORMATION, 10.0, float(information.max())),
+        ),
+        marks=(
+            BarsMark(name="", colour="calibrated", points=tuple(bars)),
+            RuleMark(name="", axis="y", at=1.0),
+        ),
     )
-
-
-def _power(exponent: int) -> str:
-    """Power of ten: ``1``, ``10``, ``1000`` in full, others as ``10⁻²``."""
-    if 0 <= exponent <= 3:
-        return str(10**exponent)
-    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def held_text(findings: Findings, table: ParameterTable) -> str:

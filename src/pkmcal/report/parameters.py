@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -20,12 +19,12 @@ from pkmcal.identify.parameter_estimates import (
 from pkmcal.identify.unidentified import Findings
 from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.outcome import Part, Plot
+from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import leg_key
 from pkmcal.outcome.blocks.table import Column, DataTable, Filter, TableRow
 from pkmcal.outcome.blocks.text import Download, Downloads
 from pkmcal.outcome.finding import Level
-from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT
+from pkmcal.report.parameter_changes import changes
 from pkmcal.wording import (
     DISPLAY_UNITS,
     capital,
@@ -43,15 +42,6 @@ TIGHT_CORRELATION = 0.95
 At this value their combination is known 3.2 times better than each alone.
 """
 MOST_TIGHT_PAIRS = 6
-MOST_CORRELATIONS = 250
-"""Most parameters in the plot of correlations; with more a cell would be below three pixels."""
-RHO_COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
-HOW_TOGETHER = (
-    "Orange: when one is larger than stated, so is the other; blue: the other is smaller. Only"
-    " their sum, or difference, is as sure as the small deviations of other values suggest. In the"
-    " frames that the parameters refer to; what a frame or the file holds is left out, and of"
-    " values that are tied one stands for all."
-)
 PARAMETER_SOURCES = {
     "data": ("data", "the data decide"),
     "drawing": ("nominal", "the nominal model decides more than the data"),
@@ -133,7 +123,7 @@ def section(nominal: Machine, estimate: Estimate) -> Part:
     return Part(
         "parameters",
         "Parameters",
-        blocks=(parameter_table(estimates, estimate.gauge), files),
+        blocks=(*changes(estimates), parameter_table(estimates, estimate.gauge), files),
     )
 
 
@@ -325,68 +315,3 @@ def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
     i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT_CORRELATION))
     order = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return [(int(free[i[n]]), int(free[j[n]]), float(rho[i[n], j[n]])) for n in order]
-
-
-def correlations_part(estimate: Estimate) -> Part | None:
-    """Section on correlations; None for fewer than two free parameters, or too many to be drawn."""
-    table = estimate.machine.parameters
-    free, rho, pairs = correlations(estimate)
-    if not 1 < len(free) <= MOST_CORRELATIONS:
-        return None
-    names = [table.in_words(table.names[k]) for k in free]
-    off = np.abs(rho) * pairs
-    a, b = np.unravel_index(np.argmax(off), off.shape)
-    text = (
-        f"Of {np.count_nonzero(pairs)} pairs, {np.count_nonzero(off > 0.8)} have a correlation of"
-        f" more than 0.8; the closest are {names[a]} and {names[b]}, {rho[a, b]:+.2f}."
-    ).replace("-", "−")
-    if np.count_nonzero(pairs) < len(free) * (len(free) - 1) // 2:
-        text += " Components of one axis, which its length binds, are not counted."
-    plot = Plot(
-        "correlations",
-        "Correlations of the parameters",
-        "Point at a cell for its two parameters.",
-        f"A square of {len(free)} by {len(free)} cells, coloured by the correlation of two"
-        " parameters each.",
-        _heat_map(rho, names),
-        height=600,
-        width=600,
-    )
-    return Part(
-        "correlations",
-        "What is known together",
-        (f"{text} {HOW_TOGETHER}",),
-        plots=(plot,),
-        menu="Correlations",
-    )
-
-
-def _heat_map(rho: Any, names: list[str]) -> dict[str, Any]:
-    """Heat map of correlations."""
-    common = {
-        **COMMON_AXIS_LAYOUT, "showgrid": False, "zeroline": False, "ticks": "",
-        "tickfont": {"size": 9}, "automargin": True, "constrain": "domain",
-    }  # fmt: skip
-    data = [
-        {
-            "type": "heatmap",
-            "x": names,
-            "y": names,
-            "z": np.round(rho, 2),
-            "zmin": -1,
-            "zmax": 1,
-            "colorscale": RHO_COLOURS,
-            "xgap": 0.5,
-            "ygap": 0.5,
-            "hovertemplate": "%{y}<br>%{x}<br>ρ = %{z:.2f}<extra></extra>",
-            "colorbar": {"thickness": 12, "outlinewidth": 0, "len": 0.6, "title": {"text": "ρ"},
-                         "tickvals": [-1, -0.5, 0, 0.5, 1]},
-        }
-    ]  # fmt: skip
-    layout = {
-        **COMMON_PLOT_LAYOUT,
-        "margin": {"l": 20, "r": 10, "t": 8, "b": 20},
-        "xaxis": {**common, "tickangle": -90},
-        "yaxis": {**common, "autorange": "reversed", "scaleanchor": "x"},
-    }
-    return {"data": data, "layout": layout, "config": {}}

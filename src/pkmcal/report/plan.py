@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +15,6 @@ from pkmcal.levels import NEGLIGIBLE
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.pages.plots import (
-    COMMON_AXIS_LAYOUT,
-    COMMON_PLOT_LAYOUT,
     line,
     markers,
     path_between_cameras,
@@ -27,6 +23,7 @@ from pkmcal.pages.plots import (
 from pkmcal.placement.stations import StationPose
 from pkmcal.planning.plan import Accuracy, MeasurementPlan, TriedStation
 from pkmcal.planning.rig import BoardFrom, LegsFrom
+from pkmcal.report.plan_curve import curve_plot
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, number
 
 PLAN_TABLE_FILE, PLAN_STATIONS_FILE = "plan.csv", "stations.yaml"
@@ -61,12 +58,13 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
             plan.subject.columns, plan.names, plan.joints.round(PLAN_READING_DECIMALS)
         )
     }
-    parts = [_order(plan), _curve(plan)]
+    parts = [_curve(plan)]
     if plan.tried:
         texts[PLAN_STATIONS_FILE] = yaml_text(stations_document(plan))
         parts.append(_camera_poses(plan))
     if _cameras(plan):
         parts.append(_space(plan))
+    parts.append(_order(plan))
     parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
     machine = plan.subject.rig.machine
     gain = plan.by_chance.position / plan.promised.position
@@ -89,9 +87,15 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
                 "How well will the tool be known?",
                 (
                     (brief(plan.promised.position * 1e3), "mm"),
-                    (brief(np.rad2deg(plan.promised.orientation)), "°"),
+                    *(
+                        ((brief(np.rad2deg(plan.promised.orientation)), "°"),)
+                        if plan.promised.orientation
+                        else ()
+                    ),
                 ),
-                f"now {amount(plan.now.position, 'm')} and {amount(plan.now.orientation, 'rad')}",
+                "now "
+                + amount(plan.now.position, "m")
+                + (f" and {amount(plan.now.orientation, 'rad')}" if plan.now.orientation else ""),
             ),
             Figure(
                 "How much better than by chance?",
@@ -179,51 +183,7 @@ def _order(plan: MeasurementPlan) -> Part:
 
 def _curve(plan: MeasurementPlan) -> Part:
     """Section on the tool's standard deviation against the number of configurations."""
-    x = [a.count for a in plan.curve]
-    y = [a.position * 1e3 for a in plan.curve]
-    here, axis = plan.promised, {**COMMON_AXIS_LAYOUT, "type": "log"}
-    figure = {
-        "data": [
-            {
-                "type": "scatter",
-                "mode": "lines+markers",
-                "name": "the best of the plan; beyond it, each again",
-                "x": x,
-                "y": y,
-                "line": {"color": "--calibrated"},
-                "marker": {"color": "--calibrated", "size": 5},
-                "hovertemplate": "%{x} from each place: %{y:.3g} mm<extra></extra>",
-            },
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "name": "by chance",
-                "x": [here.count],
-                "y": [plan.by_chance.position * 1e3],
-                "marker": {"color": "--drawing", "size": 9, "symbol": "x"},
-                "hovertemplate": "%{x} by chance: %{y:.3g} mm<extra></extra>",
-            },
-        ],
-        "layout": {
-            **COMMON_PLOT_LAYOUT,
-            "margin": {"l": 60, "r": 10, "t": 10, "b": 45},
-            "xaxis": {**axis, **_ticks(x), "title": {"text": "configurations from each place"}},
-            "yaxis": {**axis, **_ticks(y), "title": {"text": "σ of the tool's position (mm)"}},
-            "legend": {
-                "orientation": "h", "y": 1.02, "yanchor": "bottom", "bgcolor": "rgba(0,0,0,0)",
-            },
-        },
-        "config": {"displayModeBar": False},
-    }  # fmt: skip
-    plot = Plot(
-        "curve",
-        "How σ falls with the number of configurations",
-        "Mean over the workspace, both axes logarithmic: by chance alone, four times as many halve"
-        " it.",
-        "The tool's standard deviation against the number of configurations from each place",
-        figure,
-        height=340,
-    )
+    here = plan.promised
     wanted = {3, 5, 8, 10, 15, 20, 30, 50}
     turns = here.orientation > 0
     few = [a for a in plan.curve if a.count in wanted or a.count >= here.count]
@@ -242,16 +202,7 @@ def _curve(plan: MeasurementPlan) -> Part:
         "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"
         " ranks. More: these again, as often.",
     )
-    return Part("curve", "How many", plots=(plot,), tables=(table,))
-
-
-def _ticks(values: Sequence[float]) -> dict[str, Any]:
-    """Round ticks of a logarithmic axis, without exponents."""
-    low, high = min(values), max(values)
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    places = [m * 10.0**k for k in decades for m in (1, 2, 5)]
-    places = [p for p in places if 0.5 * low <= p <= 2 * high]
-    return {"tickvals": places, "ticktext": [f"{p:g}" for p in places]}
+    return Part("curve", "How many", blocks=(curve_plot(plan),), tables=(table,))
 
 
 def _cameras(plan: MeasurementPlan) -> list[tuple[str, Camera, Array]]:

@@ -11,9 +11,10 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
-from pkmcal.pages import charts
-from pkmcal.report.links import Links
-from pkmcal.report.residuals import SIGMAS_IN_WORDS, level_bar
+from pkmcal.outcome.blocks.base import configuration_key
+from pkmcal.outcome.blocks.plot import Plot, Point, panels, rounded
+from pkmcal.report.charts import NORMAL_90, bar_plot, box, row_plot
+from pkmcal.report.residuals import SIGMAS_IN_WORDS, level_bar, level_plot
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, count, decimals, number
@@ -26,13 +27,8 @@ POSE_JUMPS_TEXT = (
 )
 
 
-def section(
-    session: Session, observation: Observation, estimate: Estimate, links: Links
-) -> Part | None:
-    """Section of the report; None for a session without measured poses.
-
-    links : to the images on the page.
-    """
+def section(session: Session, observation: Observation, estimate: Estimate) -> Part | None:
+    """Section of the report; None for a session without measured poses."""
     poses = observation.poses
     if not len(poses):
         return None
@@ -42,10 +38,10 @@ def section(
         "poses",
         "Board" if session.board else "Measured poses",
         (f"{' '.join([*_summary(poses, estimate, error), *turns])} {POSE_JUMPS_TEXT}",),
-        html=charts.panels(
-            _by_configuration(session, poses, estimate, links),
-            _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm", links),
-            _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned, degrees", links),
+        blocks=panels(
+            _by_configuration(session, poses, estimate),
+            _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off"),
+            _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned"),
         ),
         tables=(_mounts(session, estimate), _worst(session, poses, estimate, error)),
     )
@@ -126,65 +122,55 @@ def _texts(values: Array, sigma: Array, valid: Booleans, factor: float) -> list[
     return out
 
 
-def _by_configuration(
-    session: Session, poses: PoseSet, estimate: Estimate, links: Links
-) -> charts.BarChart | None:
+def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> Plot | None:
     """Root mean square residual of each configuration's poses, in standard deviations."""
     number = np.bincount(poses.configuration, weights=poses.rows)
     square = np.bincount(
         poses.configuration, weights=np.sum(estimate.pose_residuals**2, axis=1)
     ).tolist()
     bars = [
-        level_bar(
-            session.configurations[k],
-            float(np.sqrt(square[k] / n)),
-            n,
-            lead=links.to_configuration(k),
-        )
+        level_bar(session.configurations[k], float(np.sqrt(square[k] / n)), n)
         for k, n in enumerate(number.tolist())
         if n
     ]
-    alt = "Bars of the poses' residuals by configuration"
-    title, unit = "Poses, by configuration", f"configurations; root mean square, {SIGMAS_IN_WORDS}"
-    return charts.bar_chart(title, unit, bars, charts.six_labels(bars), alt)
+    return level_plot("poses-by-configuration", "Poses, by configuration", bars)
 
 
-def _bars(
-    session: Session, poses: PoseSet, error: Array, unit: str, title: str, links: Links
-) -> charts.BarChart | None:
+def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str) -> Plot | None:
     """Largest error of each configuration's poses."""
     size = np.linalg.norm(np.nan_to_num(error), axis=-1)
     if not np.isfinite(error).any():
         return None
     largest = np.zeros(len(session.configurations))
     np.maximum.at(largest, poses.configuration, size)
-    bars = [
-        charts.UprightBar(
-            session.configurations[k],
-            f"configuration {session.configurations[k]}: {brief(float(largest[k]))} {unit}",
-            float(largest[k]),
-            quiet=True,
-            lead=links.to_configuration(k),
-        )
-        for k in np.unique(poses.configuration).tolist()
-    ]
-    alt = f"Bars of the poses' errors in {unit}"
-    under = f"configurations; largest of each, {unit}"
-    return charts.bar_chart(title, under, bars, charts.six_labels(bars), alt)
+    bars: list[Point] = []
+    for k in np.unique(poses.configuration).tolist():
+        name, value = session.configurations[k], float(largest[k])
+        tip = f"configuration {name}: {brief(value)} {unit}"
+        key = configuration_key(name)
+        bars.append(Point(x=name, y=rounded(value), tip=tip, key=key, colour="quiet"))
+    slug = title.lower().replace(" ", "-")
+    alt = f"{title}: bars of the poses' errors in {unit}"
+    return bar_plot(slug, title, "configurations", f"largest of each, {unit}", bars, alt)
 
 
-def axes(poses: PoseSet, estimate: Estimate) -> charts.RowChart | None:
+def axes(poses: PoseSet, estimate: Estimate) -> Plot | None:
     """Box plots of the whitened residuals of the poses' six numbers."""
     names = ("turn 1", "turn 2", "turn 3", "place 1", "place 2", "place 3")
     measured = np.any(poses.whiten != 0, axis=-1)
     boxes = [
-        charts.box(name, estimate.pose_residuals[measured[:, k], k], "σ", 2)
+        box(name, estimate.pose_residuals[measured[:, k], k], "σ", 2)
         for k, name in enumerate(names)
     ]
-    alt = "Boxes of the poses' residuals by their six numbers"
-    title = "Poses, by the six numbers"
-    note = "about and along the station's x, y and z"
-    return charts.row_chart(title, SIGMAS_IN_WORDS, boxes, charts.NORMAL_90, alt, note)
+    return row_plot(
+        "poses-by-number",
+        "Poses, by the six numbers",
+        SIGMAS_IN_WORDS,
+        boxes,
+        "Boxes of the poses' residuals by their six numbers",
+        NORMAL_90,
+        "About and along the station's x, y and z.",
+    )
 
 
 def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -> Table:

@@ -14,9 +14,23 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
-from pkmcal.pages import charts
+from pkmcal.outcome.blocks.base import Key, configuration_key, leg_key, station_key
+from pkmcal.outcome.blocks.plot import (
+    BarsMark,
+    Box,
+    Colour,
+    LineMark,
+    Plot,
+    Point,
+    leg_colour,
+    line_points,
+    linear_axis,
+    panels,
+    rounded,
+)
+from pkmcal.outcome.blocks.text import Listing
 from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
-from pkmcal.report.links import Links
+from pkmcal.report.charts import NORMAL_90, bar_plot, box, row_plot
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
@@ -30,6 +44,7 @@ Shading moves edges by this and more.
 SIGMAS_IN_WORDS = "standard deviations"
 HISTOGRAM_HALF_SPAN = 5.0
 """Standard deviations that the histogram spans on either side."""
+HISTOGRAM_BAR_WIDTH = 0.5
 RESIDUALS_READING_TEXT = (
     "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
     " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."
@@ -43,26 +58,25 @@ def section(
     edges: EdgeSet,
     estimate: Estimate,
     shifts: Array,
-    links: Links,
-    poses: charts.RowChart | None = None,
+    poses: Plot | None = None,
 ) -> Part:
-    """Section with charts, below sentences on groups that stand out.
+    """Section with plots, below sentences on groups that stand out.
 
     shifts : (N,) px, of :func:`outward_shift`.
-    links : to the images on the page.
-    poses : chart of the poses' residuals, None without poses.
+    poses : plot of the poses' residuals, None without poses.
     """
-    panels = charts.panels(
-        by_leg(session, edges, estimate, links),
-        _edge_boxes("station", session.station_names, edges.station, edges, estimate, links),
-        _joints(session, estimate, links),
+    sentences = remarks(session, edges, estimate, shifts)
+    plots = panels(
+        by_leg(session, edges, estimate),
+        _by_station(session, edges, estimate),
+        _joints(session, estimate),
         poses,
         histogram(estimate.edge_residuals),
-        _configurations(session, edges, estimate, links),
-        _outward(edges, shifts, links),
-        remarks=remarks(session, edges, estimate, shifts),
+        _configurations(session, edges, estimate),
+        _outward(session, edges, shifts),
     )
-    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), html=panels)
+    listing = (Listing(title="", items=sentences),) if sentences else ()
+    return Part("residuals", "Residuals", (RESIDUALS_READING_TEXT,), blocks=(*listing, *plots))
 
 
 def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Integers) -> Array:
@@ -101,57 +115,92 @@ def weighted_edge_rms(white: Array, weights: Array) -> float:
     return float(np.sqrt(np.sum(weights[:, None] * white**2) / total)) if total else float("nan")
 
 
-def by_leg(
-    session: Session, edges: EdgeSet, estimate: Estimate, links: Links
-) -> charts.RowChart | None:
+def by_leg(session: Session, edges: EdgeSet, estimate: Estimate) -> Plot | None:
     """Box plots of the edges' residuals by leg, in the legs' colours."""
-    legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
-    return _edge_boxes("leg", legs, edges.leg, edges, estimate, links)
+    boxes = [
+        _edge_box(
+            session,
+            f"leg {j + 1}",
+            edges.leg == j,
+            edges,
+            estimate,
+            leg_colour(j + 1),
+            leg_key(j + 1),
+        )
+        for j in range(session.machine.n_legs)
+    ]
+    return _edge_plot("leg", boxes)
 
 
-def _edge_boxes(
-    by: str,
-    names: Sequence[str],
-    group: Integers,
+def _by_station(session: Session, edges: EdgeSet, estimate: Estimate) -> Plot | None:
+    """Box plots of the edges' residuals by station."""
+    boxes = [
+        _edge_box(session, name, edges.station == s, edges, estimate, "quiet", station_key(name))
+        for s, name in enumerate(session.station_names)
+    ]
+    return _edge_plot("station", boxes)
+
+
+def _edge_box(
+    session: Session,
+    name: str,
+    mine: Booleans,
     edges: EdgeSet,
     estimate: Estimate,
-    links: Links,
-) -> charts.RowChart | None:
-    """Box plot of both residual components for each group with edges.
+    colour: Colour,
+    key: Key,
+) -> Box | None:
+    """Box plot of both residual components of the edges in a mask (N,).
 
-    Each row links to the image of its largest residual.
+    The tooltip names the image of the largest residual.
     """
-    white = estimate.edge_residuals
-    boxes: list[charts.Spread | None] = []
-    for g, name in enumerate(names):
-        mine = group == g
-        size = np.linalg.norm(white[mine], axis=1)
-        lead = links.to_largest(edges.station[mine], edges.configuration[mine], size)
-        boxes.append(charts.box(name, white[mine], "σ", 2, g + 1 if by == "leg" else None, lead))
-    alt = f"Boxes of the whitened edge residuals by {by}"
-    return charts.row_chart(f"Edges, by {by}", SIGMAS_IN_WORDS, boxes, charts.NORMAL_90, alt)
+    white = estimate.edge_residuals[mine]
+    row = box(name, white, "σ", 2, colour, key)
+    return row and _with_image(session, edges, mine, np.linalg.norm(white, axis=1), row)
 
 
-def _configurations(
-    session: Session, edges: EdgeSet, estimate: Estimate, links: Links
-) -> charts.BarChart | None:
+def _with_image(session: Session, edges: EdgeSet, mine: Booleans, sizes: Array, row: Box) -> Box:
+    """Box whose tooltip names the image of the largest of the sizes (n,); NaN counts least."""
+    k = np.flatnonzero(mine)[int(np.argmax(np.nan_to_num(sizes, nan=-np.inf)))]
+    station, configuration = edges.station[k], edges.configuration[k]
+    image = f"{session.station_names[station]}/{session.configurations[configuration]}"
+    return row.model_copy(update={"tip": f"{row.tip}; the largest in {image}"})
+
+
+def _edge_plot(by: str, boxes: Sequence[Box | None]) -> Plot | None:
+    """Box plots of whitened residuals of edges, grouped by something."""
+    return row_plot(
+        f"edges-by-{by}",
+        f"Edges, by {by}",
+        SIGMAS_IN_WORDS,
+        boxes,
+        f"Boxes of the whitened edge residuals by {by}",
+        NORMAL_90,
+    )
+
+
+def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> Plot | None:
     """Root mean square of each configuration's edges, with the interval expected of noise alone."""
-    bars: list[charts.UprightBar] = []
+    bars: list[Point] = []
     for k, name in enumerate(session.configurations):
         mine = edges.configuration == k
         weights = estimate.edge_weights[mine]
         level = weighted_edge_rms(estimate.edge_residuals[mine], weights)
-        if not np.isfinite(level):
-            continue
-        of = f" over {count(len(weights), 'edge')}"
-        lead = links.to_configuration(k)
-        bars.append(level_bar(name, level, 2 * float(weights.sum()), of, lead))
-    title, unit = "Edges, by configuration", f"configurations; root mean square, {SIGMAS_IN_WORDS}"
-    alt = "Bars of the residuals by configuration"
-    return charts.bar_chart(title, unit, bars, charts.six_labels(bars), alt)
+        if np.isfinite(level):
+            of = f" over {count(len(weights), 'edge')}"
+            bars.append(level_bar(name, level, 2 * float(weights.sum()), of))
+    return level_plot("edges-by-configuration", "Edges, by configuration", bars)
 
 
-def level_bar(name: str, level: float, n: float, of: str = "", lead: str = "") -> charts.UprightBar:
+def level_plot(name: str, title: str, bars: Sequence[Point]) -> Plot | None:
+    """Plot of :func:`level_bar` of configurations."""
+    alt = f"{title}: bars of the residuals' root mean squares"
+    label = f"root mean square, {SIGMAS_IN_WORDS}"
+    caption = "Lines: expected of noise alone, 95 %."
+    return bar_plot(name, title, "configurations", label, bars, alt, caption=caption)
+
+
+def level_bar(name: str, level: float, n: float, of: str = "") -> Point:
     """Bar of a configuration's root mean square, in standard deviations, over n numbers.
 
     With the interval that n numbers of pure noise have.
@@ -161,7 +210,15 @@ def level_bar(name: str, level: float, n: float, of: str = "", lead: str = "") -
         f"configuration {name}: {number(level, 2)} σ{of}, {number(low, 2)} to {number(high, 2)}"
         " expected of noise alone"
     )
-    return charts.UprightBar(name, tip, level, (low, high), level <= high, lead)
+    return Point(
+        x=name,
+        y=rounded(level),
+        low=rounded(low),
+        high=rounded(high),
+        tip=tip,
+        key=configuration_key(name),
+        colour="quiet" if level <= high else None,
+    )
 
 
 def expected_rms(n: float) -> tuple[float, float]:
@@ -172,48 +229,55 @@ def expected_rms(n: float) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def histogram(white: Array) -> charts.BarChart | None:
+def histogram(white: Array) -> Plot | None:
     """Histogram of all residuals with the normal density; the outermost bars include all beyond."""
     values = white[np.isfinite(white)]
     if not values.size:
         return None
-    borders = np.arange(-HISTOGRAM_HALF_SPAN, HISTOGRAM_HALF_SPAN + 0.25, 0.5)
-    counts = np.histogram(np.clip(values, -HISTOGRAM_HALF_SPAN, HISTOGRAM_HALF_SPAN), borders)[0]
-    bars: list[charts.UprightBar] = []
+    end, width = HISTOGRAM_HALF_SPAN, HISTOGRAM_BAR_WIDTH
+    borders = np.arange(-end, end + width / 2, width)
+    counts = np.histogram(np.clip(values, -end, end), borders)[0]
+    bars: list[Point] = []
     for low, high, n in zip(borders[:-1], borders[1:], counts.tolist(), strict=True):
         where = f"{number(low, 1)} to {number(high, 1)} σ"
-        if low == -HISTOGRAM_HALF_SPAN or high == HISTOGRAM_HALF_SPAN:
+        if low == -end or high == end:
             where += " or beyond"
-        bars.append(
-            charts.UprightBar(where, f"{where}: {count(n, 'residual')}", float(n), None, True)
-        )
-    x = np.linspace(-HISTOGRAM_HALF_SPAN, HISTOGRAM_HALF_SPAN, 81)
-    density = np.exp(-x * x / 2) / np.sqrt(2 * np.pi) * values.size * 0.5
-    curve = tuple(zip(((x + HISTOGRAM_HALF_SPAN) * 2).tolist(), density.tolist(), strict=True))
-    labels = tuple(
-        ((v + HISTOGRAM_HALF_SPAN) * 2, number(v, 0)) for v in (-4.0, -2.0, 0.0, 2.0, 4.0)
-    )
-    alt = "Histogram of the residuals with the normal density over it"
-    return charts.bar_chart(
-        "All edge residuals", f"{SIGMAS_IN_WORDS}; number of residuals", bars, labels, alt, curve
-    )
+        middle = float(low + width / 2)
+        bars.append(Point(x=middle, y=float(n), tip=f"{where}: {count(n, 'residual')}"))
+    x = np.linspace(-end, end, 81)
+    density = np.exp(-x * x / 2) / np.sqrt(2 * np.pi) * values.size * width
+    return Plot(
+        name="histogram",
+        title="All edge residuals",
+        caption="",
+        alt="Histogram of the residuals with the normal density over it",
+        x=linear_axis(SIGMAS_IN_WORDS, (-end, end)),
+        y=linear_axis("number of residuals", (*counts.tolist(), density.max()), zero=True),
+        marks=(
+            BarsMark(name="residuals", colour="quiet", points=tuple(bars), width=width),
+            LineMark(
+                name="normal distribution", colour="ink",
+                points=line_points(x.tolist(), density.tolist()),
+            ),
+        ),
+    )  # fmt: skip
 
 
-def _outward(edges: EdgeSet, shifts: Array, links: Links) -> charts.RowChart | None:
+def _outward(session: Session, edges: EdgeSet, shifts: Array) -> Plot | None:
     """Box plots of outward shifts by leg, tube and side, which show shading and wrong radii."""
-    boxes = [
-        charts.box(
-            f"leg {j + 1}, tube {t + 1}, {EDGE_SIDE_NAMES[s]}", shifts[mine], "px", 3, j + 1, lead
-        )
-        for (j, t, s), mine in _edge_kinds(edges)
-        for lead in [
-            links.to_largest(edges.station[mine], edges.configuration[mine], np.abs(shifts[mine]))
-        ]
-    ]
-    alt = "Boxes of the outward shift in pixels by leg, tube and side"
-    title = "Edges too far out (+) or in (−), by leg, tube and side"
-    note = "looking along the leg from base to platform"
-    return charts.row_chart(title, "pixels", boxes, None, alt, note)
+    boxes: list[Box | None] = []
+    for (j, t, s), mine in _edge_kinds(edges):
+        label = f"leg {j + 1}, tube {t + 1}, {EDGE_SIDE_NAMES[s]}"
+        row = box(label, shifts[mine], "px", 3, leg_colour(j + 1), leg_key(j + 1))
+        boxes.append(row and _with_image(session, edges, mine, np.abs(shifts[mine]), row))
+    return row_plot(
+        "outward",
+        "Edges too far out (+) or in (−), by leg, tube and side",
+        "pixels",
+        boxes,
+        "Boxes of the outward shift in pixels by leg, tube and side",
+        caption="Looking along the leg from base to platform.",
+    )
 
 
 def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
@@ -225,26 +289,32 @@ def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
     ]
 
 
-def _joints(session: Session, estimate: Estimate, links: Links) -> charts.RowChart | None:
-    """Box plots of the readings' residuals by joint, linked to the image of the largest."""
+def _joints(session: Session, estimate: Estimate) -> Plot | None:
+    """Box plots of the readings' residuals by joint; tooltips name the worst configurations."""
     motor = session.machine.layout.actuated
     used = np.flatnonzero(estimate.configurations)
     white = estimate.joint_residuals[used]
-    shifted = [np.flatnonzero(motor == column).tolist() for column in range(white.shape[1])]
-    worst = used[np.abs(white).argmax(axis=0)] if len(white) else np.zeros(len(shifted), dtype=int)
-    boxes = [
-        charts.box(
-            named(legs), white[:, column], "σ", 2, legs[0] + 1, links.to_configuration(int(k))
-        )
-        for column, (legs, k) in enumerate(zip(shifted, worst, strict=True))
-    ]
-    alt = "Boxes of the readings' residuals by joint"
+    boxes: list[Box | None] = []
+    for column in range(white.shape[1]):
+        legs = np.flatnonzero(motor == column).tolist()
+        leg = legs[0] + 1
+        row = box(named(legs), white[:, column], "σ", 2, leg_colour(leg), leg_key(leg))
+        if row:
+            worst = session.configurations[used[int(np.argmax(np.abs(white[:, column])))]]
+            row = row.model_copy(update={"tip": f"{row.tip}; the largest in {worst}"})
+        boxes.append(row)
     # readings that determine the poses have small residuals whatever their noise; the degrees of
     # freedom show that
     s = estimate.statistics
-    note = f"{count(s.n_joints, 'reading')}, {count(s.dof_joints, 'degree')} of freedom"
-    return charts.row_chart(
-        "Joint readings, by leg", SIGMAS_IN_WORDS, boxes, charts.NORMAL_90, alt, note
+    caption = f"{count(s.n_joints, 'reading')}, {count(s.dof_joints, 'degree')} of freedom."
+    return row_plot(
+        "joints",
+        "Joint readings, by leg",
+        SIGMAS_IN_WORDS,
+        boxes,
+        "Boxes of the readings' residuals by joint",
+        NORMAL_90,
+        caption,
     )
 
 

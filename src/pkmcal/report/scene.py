@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, enlargement
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.outlines import ring
 from pkmcal.geometry.rigid import apply
@@ -20,7 +20,6 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
-from pkmcal.pages.charts import CHART_WIDTH, enlargement
 from pkmcal.pages.plots import line, markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
@@ -29,6 +28,7 @@ ELLIPSE_SIGMAS = 2.0
 """Standard deviations of ellipses and ellipsoids."""
 ENLARGED_ERROR_SHARE = 0.22
 """Length of large errors after enlargement, in radii of the machine."""
+CHART_WIDTH = 360.0
 PLANE_VIEW_MARGIN = 30.0
 LABELS_MERGED_WITHIN = 9.0
 """Distance, in SVG units, below which two labels become one."""

@@ -10,7 +10,16 @@ from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.sentences import against, better, factor
 from pkmcal.judge.validate import Validation
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table
-from pkmcal.pages import charts
+from pkmcal.outcome.blocks.base import configuration_key, leg_key
+from pkmcal.outcome.blocks.plot import (
+    DotsMark,
+    Plot,
+    Point,
+    leg_colour,
+    panels,
+    rounded,
+)
+from pkmcal.report.charts import NORMAL_90, bar_plot, box, row_plot
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, decimals, number
@@ -144,8 +153,26 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
         "Root mean squares, frames laid over each other for the nominal model. The images' own"
         " noise is in both.",
     )
-    pictures = charts.panels(_by_configuration(judged, session), _by_joint(judged, session))
-    return Part("readings", "Readings and tool", html=pictures, tables=(residuals, tool))
+    return Part(
+        "readings",
+        "Readings and tool",
+        _worst(judged, session),
+        blocks=panels(_by_configuration(judged, session), _by_joint(judged, session)),
+        tables=(residuals, tool),
+    )
+
+
+def _worst(judged: NominalComparison, session: Session) -> tuple[str, ...]:
+    """Sentence on the configuration with the largest residuals; empty for readings of two units."""
+    unit = _unit(session)
+    if unit is None or not np.isfinite(judged.after).any():
+        return ()
+    k = int(np.nanargmax(judged.after))
+    name = session.configurations[judged.rows[k]]
+    return (
+        f"Worst is configuration {name}, {amount(float(judged.after[k]), unit)}; the root mean"
+        f" square of all is {amount(finite_rms(judged.after), unit)}.",
+    )
 
 
 def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
@@ -277,49 +304,52 @@ def _magnitude(value: float, unit: str) -> str:
     return brief(value * DISPLAY_UNITS[unit][0])
 
 
-def _by_configuration(judged: NominalComparison, session: Session) -> charts.BarChart | None:
-    """Residuals of readings by configuration.
-
-    Bars for the calibrated machine, a line for the nominal model.
+def _by_configuration(judged: NominalComparison, session: Session) -> Plot | None:
+    """Residuals of readings by configuration: bars for the calibrated machine, and dots for the
+    nominal model; None for readings of two units.
     """
     unit = _unit(session)
     if unit is None:
         return None
-    scale, name = DISPLAY_UNITS[unit]
-    bars = [
-        charts.UprightBar(
-            session.configurations[row],
-            f"{session.configurations[row]}: {amount(new, unit)}; nominal model"
-            f" {amount(old, unit)}",
-            new * scale,
-        )
-        for row, new, old in zip(
-            judged.rows, judged.after.tolist(), judged.before.tolist(), strict=True
-        )
-    ]
-    return charts.bar_chart(
+    scale, unit_name = DISPLAY_UNITS[unit]
+    bars, nominal = list[Point](), list[Point]()
+    for row, new, old in zip(
+        judged.rows.tolist(), judged.after.tolist(), judged.before.tolist(), strict=True
+    ):
+        name = session.configurations[row]
+        key = configuration_key(name)
+        tip = f"{name}: {amount(new, unit)}; nominal model {amount(old, unit)}"
+        if np.isfinite(new):
+            bars.append(Point(x=name, y=rounded(new * scale), tip=tip, key=key))
+            if np.isfinite(old):
+                nominal.append(Point(x=name, y=rounded(old * scale), key=key))
+    alt = f"Residuals of {count(len(bars), 'configuration')}, calibrated and by the nominal model"
+    return bar_plot(
+        "readings-by-configuration",
         "Residuals of the readings by configuration",
-        f"configurations; root mean square, {name}",
+        "configurations",
+        f"root mean square, {unit_name}",
         bars,
-        charts.ends_and_middle(bars),
-        f"Residuals of {count(len(bars), 'configuration')}, calibrated and by the nominal model",
-        tuple((k + 0.5, old * scale) for k, old in enumerate(judged.before.tolist())),
-        "bars: calibrated; line: by the nominal model",
+        alt,
+        more=(DotsMark(name="nominal model", colour="nominal", points=tuple(nominal), radius=3),),
+        high=max((float(point.y) for point in nominal), default=0.0),
+        series="calibrated",
     )
 
 
-def _by_joint(judged: NominalComparison, session: Session) -> charts.RowChart | None:
+def _by_joint(judged: NominalComparison, session: Session) -> Plot | None:
     """Residuals of the calibrated machine, in predicted standard deviations."""
     normalized = judged.calibrated.residuals / judged.promise.expected
     boxes = [
-        charts.box(name, normalized[:, k], "σ", 1, k + 1)
+        box(name, normalized[:, k], "σ", 1, leg_colour(k + 1), leg_key(k + 1))
         for k, name in enumerate(session.document["joints"]["columns"])
     ]
-    return charts.row_chart(
+    return row_plot(
+        "readings-by-joint",
         "Residuals by joint",
         "promised standard deviations",
         boxes,
-        charts.NORMAL_90,
         "Residuals of the readings by joint, in the standard deviations that are promised",
-        "shaded: where nine tenths are expected",
+        NORMAL_90,
+        "Shaded: where nine tenths are expected.",
     )

@@ -9,7 +9,21 @@ from pkmcal.judge.changes import DETECTION_POWER, LegTest
 from pkmcal.judge.sentences import cause_words, least_size, signed
 from pkmcal.judge.watch import Watch, names_of
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
-from pkmcal.pages import charts
+from pkmcal.outcome.blocks.base import configuration_key, leg_key
+from pkmcal.outcome.blocks.plot import (
+    DotsMark,
+    LineMark,
+    Plot,
+    Point,
+    RuleMark,
+    category_axis,
+    leg_colour,
+    line_points,
+    linear_axis,
+    panels,
+    rounded,
+)
+from pkmcal.report.charts import NORMAL_90, bar_plot
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, named, number
 
 NO_VALUE_SIGN = "–"
@@ -38,16 +52,16 @@ FIXED_STATION_TEXT = (
 
 def outcome_of(w: Watch) -> Outcome:
     """Outcome of ``pkmcal watch``."""
-    causes, bars = _findings_table(w), _by_configuration(w)
+    causes, run = _findings_table(w), panels(_by_configuration(w))
     parts = (
         Part(
             "legs",
             "Tests",
-            html=charts.panels(_statistics(w), _zeros(w)),
+            blocks=panels(_statistics(w), _zeros(w)),
             tables=(legs_table(w), _others_table(w)),
         ),
         Part("causes", "Causes", tables=(causes,)) if causes else None,
-        Part("residuals", "Residuals", html=charts.panels(bars)) if bars else None,
+        Part("residuals", "Residuals", blocks=run) if run else None,
         _how(w),
     )
     return Outcome(
@@ -253,24 +267,28 @@ def _span(sizes: tuple[float, float]) -> str:
     return NO_VALUE_SIGN if texts == [NO_VALUE_SIGN, NO_VALUE_SIGN] else " to ".join(texts)
 
 
-def _statistics(w: Watch) -> charts.BarChart | None:
+def _statistics(w: Watch) -> Plot | None:
     """Chart of the larger statistic of each leg, relative to its threshold."""
     bars = [
-        _leg_bar(named(leg.legs), [t for t in (leg.whole, leg.zero) if t and t.dof], w.judged.level)
+        _leg_bar(named(leg.legs), leg.legs[0] + 1, tests, w.judged.level)
         for leg in w.judged.legs
+        for tests in [[t for t in (leg.whole, leg.zero) if t and t.dof]]
         if leg.whole.dof
     ]
-    return charts.bar_chart(
+    return bar_plot(
+        "statistics",
         "Each leg's χ² over its threshold",
-        "the larger of both tests; 1: threshold",
+        "",
+        "the larger of both tests, in thresholds",
         bars,
-        tuple((k + 0.5, bar.label) for k, bar in enumerate(bars)),
         "Statistic of each leg as a share of its threshold",
-        ((0.0, 1.0), (float(len(bars)), 1.0)),
+        more=(RuleMark(name="threshold", axis="y", at=1.0),),
+        high=1.0,
+        series="χ²",
     )
 
 
-def _leg_bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
+def _leg_bar(label: str, leg: int, tests: list[Score], level: float) -> Point:
     """Bar of a leg's tests."""
     from scipy.special import chdtri
 
@@ -281,57 +299,89 @@ def _leg_bar(label: str, tests: list[Score], level: float) -> charts.UprightBar:
         for t, limit in zip(tests, limits, strict=True)
     ]
     share = max(t.chi2 / limit for t, limit in zip(tests, limits, strict=True))
-    return charts.UprightBar(label, f"{label}: {'; '.join(texts)}", share, quiet=share < 1)
+    return Point(
+        x=label,
+        y=rounded(share),
+        tip=f"{label}: {'; '.join(texts)}",
+        key=leg_key(leg),
+        colour="quiet" if share < 1 else None,
+    )
 
 
-def _zeros(w: Watch) -> charts.RowChart | None:
-    """Box plots of the changes of the readings' zeros, by their standard deviations."""
+def _zeros(w: Watch) -> Plot | None:
+    """Changes of the readings' zeros with the interval of nine tenths by chance."""
     legs = [leg for leg in w.judged.legs if leg.change is not None and leg.zero and leg.zero.dof]
     if not legs or len({leg.unit for leg in legs}) > 1:
         return None
     factor, name = DISPLAY_UNITS[legs[0].unit]
-    boxes: list[charts.Spread] = []
+    points: list[Point] = []
     for leg in legs:
         if leg.change is None or not np.isfinite(leg.change.sigma[0]):
             continue
-        value, sigma = leg.change.value[0] * factor, leg.change.sigma[0] * factor
-        at = value + sigma * np.array([-charts.NORMAL_90, -0.6745, 0.0, 0.6745, charts.NORMAL_90])
-        q05, q25, q50, q75, q95 = (float(v) for v in at)
-        tip = f"{named(leg.legs)}: {_zero(leg)}"
-        boxes.append(
-            charts.Spread(named(leg.legs), tip, leg.legs[0] + 1, (q05, q25, q50, q75, q95))
+        value, sigma = float(leg.change.value[0]) * factor, float(leg.change.sigma[0]) * factor
+        first = leg.legs[0] + 1
+        points.append(
+            Point(
+                x=rounded(value),
+                y=named(leg.legs),
+                low=rounded(value - NORMAL_90 * sigma),
+                high=rounded(value + NORMAL_90 * sigma),
+                tip=f"{named(leg.legs)}: {_zero(leg)}",
+                key=leg_key(first),
+                colour=leg_colour(first),
+            )
         )
-    return charts.row_chart(
-        "The zero of each leg's reading, if nothing else changed",
-        name,
-        boxes,
-        None,
-        "Change of the zero of each leg's reading, middle half and nine tenths",
+    ends = [end for point in points for end in (point.low, point.high) if end is not None]
+    return Plot(
+        name="zeros",
+        title="The zero of each leg's reading, if nothing else changed",
+        caption="Lines: nine tenths by chance.",
+        alt="Change of the zero of each leg's reading, with the interval of nine tenths",
+        x=linear_axis(f"change, {name}", (*ends, 0.0)),
+        y=category_axis(str(point.y) for point in points),
+        marks=(
+            RuleMark(name="", axis="x", at=0.0, colour="quiet"),
+            DotsMark(name="", colour="quiet", points=tuple(points)),
+        ),
     )
 
 
-def _by_configuration(w: Watch) -> charts.BarChart | None:
-    """Root mean square residual of each configuration with the machine fixed."""
-    rows = np.flatnonzero(w.observed)
-    values = [float(w.residuals[k]) for k in rows]
-    names = [w.session.configurations[k] for k in rows]
-    bars = [
-        charts.UprightBar(
-            name,
-            f"{name}: {number(value, 2)} standard deviations",
-            value,
-            None,
-            value < LARGE_RESIDUAL_SIGMAS,
-        )
-        for name, value in zip(names, values, strict=True)
-        if np.isfinite(value)
-    ]
-    return charts.bar_chart(
-        "Residuals by configuration, the machine held as calibrated",
-        "configurations; standard deviations",
-        bars,
-        charts.ends_and_middle(bars),
-        f"Residuals of {count(len(bars), 'configuration')}",
-        ((0.0, 1.0), (float(len(bars)), 1.0)),
-        "line: expected of noise alone",
+def _by_configuration(w: Watch) -> Plot | None:
+    """Run chart: root mean square residual of each configuration with the machine fixed, in the
+    order in which they were measured.
+    """
+    points: list[Point] = []
+    for k in np.flatnonzero(w.observed).tolist():
+        name, value = w.session.configurations[k], float(w.residuals[k])
+        if np.isfinite(value):
+            points.append(
+                Point(
+                    x=name,
+                    y=rounded(value),
+                    tip=f"{name}: {number(value, 2)} standard deviations",
+                    key=configuration_key(name),
+                    colour="quiet" if value < LARGE_RESIDUAL_SIGMAS else None,
+                )
+            )
+    if not points:
+        return None
+    names, values = [str(p.x) for p in points], [float(p.y) for p in points]
+    return Plot(
+        name="run",
+        title="Residuals in the order of the configurations, the machine held as calibrated",
+        caption="A level that stays says that something changed; single points, that an image or"
+        " its readings are wrong.",
+        alt=f"Residuals of {count(len(points), 'configuration')}",
+        x=category_axis(names, "configurations"),
+        y=linear_axis(
+            "root mean square, standard deviations", (*values, LARGE_RESIDUAL_SIGMAS), zero=True
+        ),
+        marks=(
+            RuleMark(name="expected of noise alone", axis="y", at=1.0),
+            RuleMark(
+                name="emphasized from here", axis="y", at=LARGE_RESIDUAL_SIGMAS, colour="calibrated"
+            ),
+            LineMark(name="", colour="quiet", points=line_points(names, values)),
+            DotsMark(name="residuals", colour="calibrated", points=tuple(points)),
+        ),
     )

@@ -6,15 +6,31 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table, Verdict
+from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.blocks.plot import (
+    Colour,
+    DotsMark,
+    LineMark,
+    Mark,
+    Plot,
+    PlotAxis,
+    Point,
+    Tick,
+    category_axis,
+    leg_colour,
+    line_points,
+    linear_axis,
+    log_axis,
+    panels,
+    rounded,
+)
 from pkmcal.outcome.finding import Finding, wrong
-from pkmcal.pages.plots import plane, trace
 from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.findings import (
@@ -25,6 +41,7 @@ from pkmcal.studies.findings import (
     Gain,
     SweepResult,
 )
+from pkmcal.studies.statistics import Summary
 from pkmcal.studies.sweep import SweptSetting, Value, in_words
 from pkmcal.wording import amount, brief, count, decimals, number
 
@@ -32,6 +49,10 @@ MOST_LINES = 8
 """Maximum number of curves in one plot; beyond it, one curve averages all combinations."""
 MOST_TICKS = 8
 """Maximum number of values that are ticks of an axis; beyond it, the axis chooses its ticks."""
+LEAST_NUMBERS = 3
+"""Number of values from which on they are places on a scale, and are joined by lines."""
+LOG_AXIS_RATIO = 8.0
+"""Ratio of the largest to the smallest value from which on the axis is logarithmic."""
 MANY_FAILED = 0.1
 """Share of failed runs from which a combination is reported."""
 STUDY_METHOD_TEXT = (
@@ -76,7 +97,7 @@ def outcome_of(study: SweepResult) -> Outcome:
         stamp="Deviations hold" if not bad and not failing else "Look closer",
         figures=_key_figures(study),
         parts=(
-            Part("accuracy", "Accuracy", tables=(_table(study),), plots=_curves(study)),
+            Part("accuracy", "Accuracy", blocks=panels(*_curves(study)), tables=(_table(study),)),
             _coverage_part(study),
             Part(
                 "how",
@@ -169,11 +190,11 @@ def _key_figures(study: SweepResult) -> tuple[Figure, ...]:
     which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
     errors = (
         (brief(1e3 * best.position.value), "mm"),
-        (brief(1e3 * best.orientation.value), "mrad"),
+        (brief(np.rad2deg(best.orientation.value)), "°"),
     )
     percentiles = (
         (brief(1e3 * best.position_95), "mm"),
-        (brief(1e3 * best.orientation_95), "mrad"),
+        (brief(np.rad2deg(best.orientation_95)), "°"),
     )
     columns = slice(None) if _rotates(study) else slice(1)
     return (
@@ -205,9 +226,11 @@ def _table(study: SweepResult) -> Table:
     rows, turns = list[Row](), _rotates(study)
     for cell in study.found:
         turn = (
-            _with_error(1e3 * cell.orientation.value, 1e3 * cell.orientation.error),
-            brief(1e3 * cell.orientation_sigma),
-            brief(1e3 * cell.orientation_95),
+            _with_error(
+                float(np.rad2deg(cell.orientation.value)), float(np.rad2deg(cell.orientation.error))
+            ),
+            brief(np.rad2deg(cell.orientation_sigma)),
+            brief(np.rad2deg(cell.orientation_95)),
         )
         cells = (
             _with_error(1e3 * cell.position.value, 1e3 * cell.position.error),
@@ -221,7 +244,7 @@ def _table(study: SweepResult) -> Table:
         mark = Level.DOUBTFUL if cell.honest is False else None
         rows.append(Row(in_words(cell.values) or study.subject.name, cells, mark=mark))
     heads = ("", "tool, mm", "stated", "held, %", "tool's, %", "95 % below, mm")
-    heads += ("tool, mrad", "stated, mrad", "95 % below, mrad") if turns else ()
+    heads += ("tool, °", "stated, °", "95 % below, °") if turns else ()
     heads += ("failed, %",)
     legend = (
         "stated: deviation that calibrations tell of themselves; held: share of",
@@ -260,8 +283,13 @@ def _coverage_part(study: SweepResult) -> Part:
         "Where an interval of 95 % holds the truth in 95 of 100 calibrations, its deviation may be"
         " believed. Above the line deviations are on the safe side, below it they promise too much."
     )
-    plots = (_coverage_plot(study),)
-    return Part("honesty", "Do the stated deviations hold?", (text,), plots=plots, tables=(table,))
+    return Part(
+        "honesty",
+        "Do the stated deviations hold?",
+        (text,),
+        blocks=panels(_coverage_plot(study)),
+        tables=(table,),
+    )
 
 
 def _kind(name: str) -> str:
@@ -286,75 +314,144 @@ def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindi
         yield in_words({k: v for k, v in rest if len(study.varied[k]) > 1}), cells
 
 
-def _curves(study: SweepResult) -> tuple[Plot, ...]:
-    """Plots of the tool's error and its stated standard deviation along each name."""
+def _curves(study: SweepResult) -> list[Plot]:
+    """Plots of the tool's error and its stated standard deviation along the names, those with most
+    values first; a name whose combinations a plot before it shows has none.
+    """
     out: list[Plot] = []
-    for name, values in study.varied.items():
-        if len(values) < 2:
-            continue
+    several = [name for name, values in study.varied.items() if len(values) > 1]
+    for name in sorted(several, key=lambda name: -len(study.varied[name])):
         groups = list(_groups(study, name))
-        x = [value if isinstance(value, str) else float(value) for value in values]
-        data: list[dict[str, Any]] = []
-        if len(groups) > MOST_LINES:
-            # too many curves: one of the means
-            means = [study.at(name, value) for value in values]
-            bars = {"type": "data", "array": [2e3 * s.error for s in means]}
-            y = [1e3 * s.value for s in means]
-            data.append(trace("error, all else together", x, y, "--calibrated", error_y=bars))
-        else:
-            for k, (label, cells) in enumerate(groups):
-                colour = f"--leg{k % 8 + 1}"
-                bars = {"type": "data", "array": [2e3 * c.position.error for c in cells]}
-                y = [1e3 * c.position.value for c in cells]
-                data.append(trace(label or "error", x, y, colour, error_y=bars))
-                stated = [1e3 * c.position_sigma for c in cells]
-                dash = {"color": colour, "dash": "dot"}
-                label_text = f"stated, {label}" if label else "stated"
-                data.append(trace(label_text, x, stated, colour, "lines", line=dash))
-        unit = study.subject.names[name].unit
-        layout = plane(_name(name) + (f", {unit}" if unit else ""), "tool's position, mm")
-        layout["yaxis"] |= {"rangemode": "tozero"}
-        numbers = [v for v in x if not isinstance(v, str)]
-        if numbers and min(numbers) > 0 and max(numbers) / min(numbers) >= 8:
-            layout["xaxis"] |= {"type": "log"}
-        if numbers and len(numbers) <= MOST_TICKS:
-            layout["xaxis"] |= {"tickvals": numbers, "ticktext": [f"{v:g}" for v in numbers]}
-        caption = "Bars are two standard errors of the simulation; dotted: what is stated."
-        out.append(
-            Plot(
-                f"by-{name.replace('_', '-')}",
-                f"By {_name(name)}",
-                caption,
-                f"The tool's position error by {_name(name)}, with what calibrations state of it.",
-                {"data": data, "layout": layout},
-                height=380,
+        out.append(_curve(study, name, groups))
+        if len(groups) <= MOST_LINES:  # every combination is in this plot
+            break
+    return out
+
+
+def _curve(study: SweepResult, name: str, groups: list[tuple[str, list[CellFindings]]]) -> Plot:
+    """Plot of the tool's error along one name: one series for each combination of the others, or,
+    where there are too many, one of the means.
+    """
+    values, unit = study.varied[name], study.subject.names[name].unit
+    x = _value_axis(_name(name) + (f", {unit}" if unit else ""), values)
+    marks: list[Mark] = []
+    if len(groups) > MOST_LINES:
+        means = [study.at(name, value) for value in values]
+        marks += _series(study, name, x, "all else together", "calibrated", means)
+    else:
+        for k, (of, cells) in enumerate(groups):
+            colour, stated = leg_colour(k + 1), [cell.position_sigma for cell in cells]
+            marks += _series(study, name, x, of, colour, [c.position for c in cells], stated)
+    points = [p for mark in marks if isinstance(mark, DotsMark) for p in mark.points]
+    ends = [v for p in points for v in (p.y, p.high) if isinstance(v, float)]
+    return Plot(
+        name=f"by-{name.replace('_', '-')}",
+        title=f"By {_name(name)}",
+        caption="Lines through dots: two standard errors of the simulation; crosses: what"
+        " calibrations state.",
+        alt=f"The tool's position error by {_name(name)}, with what calibrations state of it; the"
+        " table has the numbers.",
+        x=x,
+        y=linear_axis("tool's position, mm", ends, zero=True),
+        marks=tuple(marks),
+    )
+
+
+def _series(
+    study: SweepResult,
+    name: str,
+    x: PlotAxis,
+    of: str,
+    colour: Colour,
+    errors: list[Summary],
+    stated: list[float] | None = None,
+) -> Iterator[Mark]:
+    """Dots of the errors at each value of a name, and crosses of the stated standard deviations.
+
+    of : combination of the other values, in words; empty without any.
+    """
+    dots, crosses = list[Point](), list[Point]()
+    for k, (value, error) in enumerate(zip(study.varied[name], errors, strict=True)):
+        at = str(value) if isinstance(value, str) or x.scale == "categories" else float(value)
+        where = value_with_unit(study, name, value) + (f", {of}" if of else "")
+        if np.isfinite(error.value):
+            reach = 2 * error.error if np.isfinite(error.error) else 0.0
+            dots.append(
+                Point(
+                    x=at,
+                    y=rounded(1e3 * error.value),
+                    low=rounded(1e3 * (error.value - reach)),
+                    high=rounded(1e3 * (error.value + reach)),
+                    tip=f"{where}: {_with_error(1e3 * error.value, 1e3 * error.error)} mm",
+                )
             )
-        )
-    return tuple(out)
+        if stated and np.isfinite(stated[k]):
+            sigma = 1e3 * stated[k]
+            tip = f"{where}: stated {brief(sigma)} mm"
+            crosses.append(Point(x=at, y=rounded(sigma), tip=tip))
+    if x.scale != "categories":  # between two values, or names, nothing is known
+        line = line_points((p.x for p in dots), (float(p.y) for p in dots))
+        yield LineMark(name="", colour=colour, points=line)
+    yield DotsMark(name=of or "error", colour=colour, points=tuple(dots))
+    if crosses:
+        label = f"stated, {of}" if of else "stated"
+        yield DotsMark(name=label, colour=colour, points=tuple(crosses), symbol="cross")
+
+
+def _value_axis(label: str, values: Sequence[Value]) -> PlotAxis:
+    """Axis of a name's values: of numbers, logarithmic if they span much, with the values as ticks
+    where these are three to ``MOST_TICKS``; two values, and names, are categories.
+    """
+    numbers = [float(v) for v in values if not isinstance(v, str)]
+    if len(numbers) < len(values) or len(numbers) < LEAST_NUMBERS:
+        return category_axis((str(v) for v in values), label)
+    wide = min(numbers) > 0 and max(numbers) / min(numbers) >= LOG_AXIS_RATIO
+    axis = (log_axis if wide else linear_axis)(label, numbers)
+    if len(numbers) <= MOST_TICKS:
+        ticks = tuple(Tick(at=v, label=f"{v:g}") for v in sorted(numbers))
+        axis = axis.model_copy(update={"ticks": ticks})
+    return axis
 
 
 def _coverage_plot(study: SweepResult) -> Plot:
     """Plot of actual against nominal coverage, all combinations together."""
-    x = 100 * COVERAGE_INTERVALS
+    x = (100 * COVERAGE_INTERVALS).tolist()
     used = [cell for cell in study.found if np.isfinite(cell.held).all()]
-    own, tool = (
-        100 * np.mean(shares, axis=0) if used else np.full(len(COVERAGE_INTERVALS), np.nan)
-        for shares in ([cell.held for cell in used], [cell.held_tool for cell in used])
-    )
-    line = {"color": "--quiet", "dash": "dash"}
-    data = [
-        trace("as promised", [50, 100], [50, 100], "--quiet", "lines", line=line),
-        trace("parameters", x, own, "--calibrated"),
-        trace("tool's pose", x, tool, "--drawing"),
+    marks: list[Mark] = [
+        LineMark(
+            name="as promised", colour="quiet", points=((x[0], x[0]), (x[-1], x[-1])), dashed=True
+        )
     ]
-    layout = plane("interval, %", "hold the truth, %")
+    ends = [*x]
+    series: tuple[tuple[str, Colour, list[Array]], ...] = (
+        ("parameters", "calibrated", [cell.held for cell in used]),
+        ("tool's pose", "nominal", [cell.held_tool for cell in used]),
+    )
+    for name, colour, shares in series:
+        if not shares:
+            continue
+        held = (100 * np.mean(shares, axis=0)).tolist()
+        ends += held
+        points = tuple(
+            Point(
+                x=rounded(of),
+                y=rounded(share),
+                tip=f"{name}: {number(share, 1)} % of the intervals of {of:g} % hold",
+            )
+            for of, share in zip(x, held, strict=True)
+            if np.isfinite(share)
+        )
+        line = line_points((p.x for p in points), (float(p.y) for p in points))
+        marks.append(LineMark(name="", colour=colour, points=line))
+        marks.append(DotsMark(name=name, colour=colour, points=points))
     return Plot(
-        "held",
-        "Intervals that hold",
-        "All combinations together.",
-        "Share of intervals that hold the truth against the share that they promise.",
-        {"data": data, "layout": layout},
-        height=380,
+        name="held",
+        title="Intervals that hold",
+        caption="All combinations together.",
+        alt="Share of intervals that hold the truth against the share that they promise.",
+        x=linear_axis("interval, %", x),
+        y=linear_axis("hold the truth, %", ends),
+        marks=tuple(marks),
     )
 
 

@@ -3,6 +3,7 @@
 import type { Section } from "../document";
 import type { Selection } from "../selection";
 import { logBar } from "./log_bar";
+import { panels, plot } from "./plot";
 import { dataTable } from "./table";
 import { checks, downloads, facts, listing, paragraph } from "./text";
 
@@ -22,6 +23,8 @@ const DRAWERS: Drawers = {
   downloads,
   table: dataTable,
   log_bar: logBar,
+  plot,
+  panels,
 };
 
 export function drawBlock(block: Block, context: Context): HTMLElement {

@@ -1,0 +1,150 @@
+"""Plots of a camera calibration: its corners over the image and by angle, views, and models."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.camera_calibration.calibrate import CameraCalibration
+from pkmcal.outcome.blocks.base import configuration_key
+from pkmcal.outcome.blocks.plot import (
+    BarsMark,
+    CellsMark,
+    ColourScale,
+    DotsMark,
+    Panels,
+    Plot,
+    Point,
+    category_axis,
+    linear_axis,
+    linear_ticks,
+    log_axis,
+    panels,
+    rounded,
+)
+from pkmcal.report.charts import bar_plot
+from pkmcal.wording import brief, count
+
+ANGLE_STEP = 5.0
+"""Width of a bar in the histogram of angles from the axis, degrees."""
+COVERAGE_CELLS = (16, 12)
+"""Columns and rows of cells in which corners are counted."""
+OUTLYING_VIEW_FACTOR = 2.0
+"""Held-out error, in that of the median view, from which on a view is emphasized."""
+
+
+def field_plots(c: CameraCalibration) -> tuple[Panels, ...]:
+    """Plots of where the corners are, and of each view's error."""
+    return panels(coverage_plot(c), angles_plot(c), views_plot(c))
+
+
+def coverage_plot(c: CameraCalibration) -> Plot:
+    """Number of corners in each cell of the image."""
+    width, height = c.camera.image_size
+    columns, rows = COVERAGE_CELLS
+    pixels = c.pixels[c.inliers]
+    column = np.clip(((pixels[:, 0] + 0.5) / width * columns).astype(int), 0, columns - 1)
+    row = np.clip(((pixels[:, 1] + 0.5) / height * rows).astype(int), 0, rows - 1)
+    counts = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    most = max(int(counts.max()), 1)
+    x, y = (-0.5, width - 0.5), (-0.5, height - 0.5)
+    return Plot(
+        name="coverage",
+        title="Corners by their place in the image",
+        caption="",
+        alt=f"{np.count_nonzero(counts)} of {counts.size} cells of the image hold corners, the"
+        f" fullest {most}",
+        x=linear_axis("x, pixels", x).model_copy(update={"limits": x}),
+        y=linear_axis("y, pixels", y).model_copy(update={"limits": (y[1], y[0])}),
+        marks=(
+            CellsMark(
+                x=x,
+                y=y,
+                values=tuple(tuple(float(n) or None for n in line) for line in counts.tolist()),
+                columns=tuple(f"column {k + 1}" for k in range(columns)),
+                rows=tuple(f"row {k + 1}" for k in range(rows)),
+            ),
+        ),
+        colours=ColourScale(label="corners", limits=(0, most), ticks=linear_ticks(0, most)),
+        equal=True,
+    )
+
+
+def angles_plot(c: CameraCalibration) -> Plot:
+    """Histogram of the corners' angles from the optical axis."""
+    rays = c.camera.ray(c.pixels[c.inliers])
+    angle = np.rad2deg(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+    angle = angle[np.isfinite(angle)]
+    last = int(np.ceil((angle.max() if angle.size else 1.0) / ANGLE_STEP)) + 1
+    counts = np.bincount((angle / ANGLE_STEP).astype(int), minlength=last).tolist()
+    bars = [
+        Point(
+            x=(k + 0.5) * ANGLE_STEP,
+            y=float(n),
+            tip=f"{k * ANGLE_STEP:.0f} to {(k + 1) * ANGLE_STEP:.0f}°: {count(n, 'corner')}",
+        )
+        for k, n in enumerate(counts)
+    ]
+    return Plot(
+        name="angles",
+        title="Corners by their angle from the axis",
+        caption="",
+        alt=f"Corners from {angle.min(initial=180):.0f} to {angle.max(initial=0):.0f} degrees",
+        x=linear_axis("angle, °", (0.0, len(bars) * ANGLE_STEP), zero=True),
+        y=linear_axis("number of corners", counts, zero=True),
+        marks=(BarsMark(name="", colour="quiet", points=tuple(bars), width=ANGLE_STEP),),
+    )
+
+
+def views_plot(c: CameraCalibration) -> Plot | None:
+    """Held-out error of each view; the fit's own error is in the tooltip."""
+    squares = np.where(c.inliers, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
+    fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.inliers.sum(axis=1), 1))
+    middle = float(np.median(c.held_out.by_view))
+    bars = [
+        Point(
+            x=name,
+            y=rounded(float(out)),
+            tip=f"{name}: {brief(float(out))} px held out, {brief(float(own))} px when fitted",
+            key=configuration_key(name),
+            colour="quiet" if out < OUTLYING_VIEW_FACTOR * middle else None,
+        )
+        for name, out, own in zip(c.views, c.held_out.by_view, fitted, strict=True)
+    ]
+    return bar_plot(
+        "views",
+        "Held-out error of each image",
+        "images",
+        "root mean square, px",
+        bars,
+        f"Bars of {len(bars)} images, the middle one {brief(middle)} px",
+    )
+
+
+def models_plot(c: CameraCalibration) -> Plot | None:
+    """Error of each compared model on the views that it was fitted to, and on those left out; None
+    for a single model.
+    """
+    if len(c.compared) < 2:
+        return None
+    fitted, left_out = list[Point](), list[Point]()
+    for one in c.compared:
+        chosen = (one.model, one.terms) == (c.camera.model, c.terms)
+        name = " ".join((one.model, *one.terms)) + (" (chosen)" if chosen else "")
+        tip = f"{name}: fitted {brief(one.rms)} px, left out {brief(one.left_out)} px"
+        for points, value in ((fitted, one.rms), (left_out, one.left_out)):
+            if np.isfinite(value) and value > 0:
+                points.append(Point(x=rounded(value), y=name, tip=tip))
+    points = (*fitted, *left_out)
+    names = dict.fromkeys(str(point.y) for point in points)
+    return Plot(
+        name="models",
+        title="Error of each model",
+        caption="",
+        alt=f"Errors of {len(names)} models, fitted and left out; the table has the numbers",
+        x=log_axis("root mean square, px", (float(point.x) for point in points)),
+        y=category_axis(names),
+        marks=(
+            DotsMark(name="fitted", colour="nominal", points=tuple(fitted)),
+            DotsMark(name="left out", colour="calibrated", points=tuple(left_out)),
+        ),
+    )
