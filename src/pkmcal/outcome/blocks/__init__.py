@@ -10,6 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from pkmcal.outcome.blocks.images import Images
 from pkmcal.outcome.blocks.text import Checks, Downloads, Listing, Paragraph
 
-Block = Annotated[Paragraph | Listing | Checks | Downloads, Field(discriminator="kind")]
+Block = Annotated[Paragraph | Listing | Checks | Downloads | Images, Field(discriminator="kind")]
