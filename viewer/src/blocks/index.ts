@@ -2,6 +2,7 @@
 
 import type { Section } from "../document";
 import type { Selection } from "../selection";
+import { images } from "./images";
 import { checks, downloads, listing, paragraph } from "./text";
 
 export type Block = Section["blocks"][number];
@@ -12,7 +13,7 @@ export interface Context {
 type Of<K extends Block["kind"]> = Extract<Block, { kind: K }>;
 type Drawers = { [K in Block["kind"]]: (block: Of<K>, context: Context) => HTMLElement };
 
-const DRAWERS: Drawers = { paragraph, listing, checks, downloads };
+const DRAWERS: Drawers = { paragraph, listing, checks, downloads, images };
 
 export function drawBlock(block: Block, context: Context): HTMLElement {
   const draw = DRAWERS[block.kind] as (block: Block, context: Context) => HTMLElement;
