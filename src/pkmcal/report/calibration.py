@@ -30,7 +30,6 @@ from pkmcal.levels import ROUNDING
 from pkmcal.measurements import LinkSet, Observation
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome import Figure, Outcome
-from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.report import (
     bed,
     field,
@@ -45,7 +44,9 @@ from pkmcal.report import (
     scene,
     workspace,
 )
+from pkmcal.report.links import Links
 from pkmcal.session.load import Session, digests, session_digest
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.web.report_page import report_page
 from pkmcal.wording import brief, count, number
 
@@ -143,7 +144,7 @@ def report_of(
         held = held_out_part(holdout, session)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(c, shifts, centres)
-    links = album.links
+    links = Links.of(session)
     space = image_scene.plot(session, estimate, links, poses.target_places(observation, estimate))
     # sections in the order of the page
     parts = (
@@ -161,7 +162,7 @@ def report_of(
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
-        field.section(session, observation, estimate, album.corners, links),
+        field.section(session, observation, estimate, album.corners, pictures.station_images(c)),
         provenance.left_out(session, observation.rejected, estimate),
         provenance.how(session, estimate, c.timings),
     )

@@ -11,8 +11,8 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import LinkSet
 from pkmcal.measurements.contract import DISPLAY_UNITS, measurement_kinds
 from pkmcal.outcome import Part, Row, Table
-from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, capital, count, decimals, number
 
 

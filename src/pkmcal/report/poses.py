@@ -12,10 +12,10 @@ from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages import charts
-from pkmcal.pages.overlays import INLIER_WEIGHT
 from pkmcal.report.links import Links
 from pkmcal.report.residuals import SIGMAS_IN_WORDS, level_bar
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, count, decimals, number
 
 MOST_WORST_POSES = 12

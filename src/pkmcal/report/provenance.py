@@ -17,11 +17,12 @@ from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.measurements.effects import EDGE_SHIFT
+from pkmcal.observe.overlays import EDGE_SIDE_NAMES
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.pages import page
-from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import amount, brief, count, decimals, number
 
 SIGMA_MEANING_TEXT = Markup(

@@ -12,12 +12,13 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.measurements.effects import EDGE_SHIFT
+from pkmcal.observe.overlays import EDGE_SIDE_NAMES
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import charts
-from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import count, joined, named, number
 
 GROUP_STANDS_OUT_FACTOR = 1.5
