@@ -16,7 +16,7 @@ from pkmcal.cameras import Camera
 from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.files import place_below, staged_folder
 from pkmcal.observe.images import upright_turns
-from pkmcal.observe.jpegs import jpeg as image_jpeg
+from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
 from pkmcal.observe.overlays import (
     EdgeCurve,
     Spot,
@@ -49,40 +49,46 @@ NOMINAL_OVER_IMAGES_TEXT = (
 
 
 def with_pictures(inspection: Inspection) -> Part:
-    """Section of the page with images of each station, each with every available pose."""
-    session, images = inspection.session, list[Image]()
-    for station in inspection.stations:
-        camera = station.images.camera
-        width, height = camera.image_size
-        for k in station.few().tolist():
-            configuration = session.configurations[int(station.images.configuration[k])]
-            path = session.stations[station.images.station].images[k].path
-            jpeg = image_jpeg(path, (width, height))
-            overlays: list[Overlay] = []
-            # the pose of the search first: it is what the images of a session are checked by
-            for title, T_camera_base in reversed(poses_of(station)):
-                edges, spots = nominal_over_image(inspection, station, camera, T_camera_base, k)
-                layers = edge_layer("edges", edges), *joint_layers(spots)
-                overlays.append(Overlay(title=title.capitalize(), layers=layers))
-            images.append(
-                Image(
-                    title=f"{station.name} / {configuration}",
-                    caption="" if jpeg else "the file could not be read",
-                    group=station.name,
-                    key=image_key(station.name, configuration),
-                    width=width,
-                    height=height,
-                    quarter_turns=upright_turns(path, camera.image_size),
-                    jpeg=jpeg,
-                    overlays=tuple(overlays),
-                )
-            )
-    block = Images(images=tuple(images), legs=session.machine.n_legs)
+    """Section of the page with the images, each with every available pose."""
+    # a few of each station first
+    first = [(s, k) for s, one in enumerate(inspection.stations) for k in one.few().tolist()]
+    others = [
+        (s, k) for s, one in enumerate(inspection.stations) for k in range(len(one.images.images))
+    ]
+    order = list(dict.fromkeys([*first, *others]))
+    files = [(inspection.stations[s].images.images, k) for s, k in order]
+    jpegs = jpegs_within(files, PAGE_JPEG_CHARACTERS)
+    images = [_image(inspection, s, k, one) for (s, k), one in zip(order, jpegs, strict=False)]
+    block = Images(images=tuple(images), first=len(first), legs=inspection.session.machine.n_legs)
     return Part(
         "photographs",
         "The nominal model over the images",
         blocks=(Paragraph(text=NOMINAL_OVER_IMAGES_TEXT), block),
         menu="Images",
+    )
+
+
+def _image(inspection: Inspection, s: int, k: int, jpeg: str) -> Image:
+    """Image k of a station with an overlay for each pose, that of the search first."""
+    session, station = inspection.session, inspection.stations[s]
+    camera, name = station.images.camera, station.name
+    configuration = session.configurations[int(station.images.configuration[k])]
+    overlays: list[Overlay] = []
+    for title, T_camera_base in reversed(poses_of(station)):
+        edges, spots = nominal_over_image(inspection, station, camera, T_camera_base, k)
+        layers = edge_layer("edges", edges), *joint_layers(spots)
+        overlays.append(Overlay(title=title.capitalize(), layers=layers))
+    path = session.stations[station.images.station].images[k].path
+    return Image(
+        title=f"{name} / {configuration}",
+        caption="" if jpeg else "the file could not be read",
+        group=name,
+        key=image_key(name, configuration),
+        width=camera.image_size[0],
+        height=camera.image_size[1],
+        quarter_turns=upright_turns(path, camera.image_size),
+        jpeg=jpeg,
+        overlays=tuple(overlays),
     )
 
 

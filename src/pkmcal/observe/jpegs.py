@@ -5,26 +5,22 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 from pkmcal.arrays import THREADS, Integers
 from pkmcal.errors import InputError
-from pkmcal.observe.images import Pictures
 
-FULL_JPEGS, FULL_JPEG_WIDTH, JPEG_WIDTH = 12, 2048, 1024
-"""Number of the first images with most pixels, their largest width, and that of the others, px."""
+FULL_JPEGS, FULL_JPEG_WIDTH, JPEG_WIDTH = 12, 2048, 640
+"""Number of the first images, which keep their pixels, their largest width, and that of the others,
+px: a page with 45 images has less than 3 MB."""
+PAGE_JPEG_CHARACTERS = 8_000_000
+"""Characters of all JPEGs of a page."""
 SMALL_JPEG_WIDTH = 256
 """Width (px) of an image for which the budget holds no more."""
 PAGE_JPEG_QUALITY = 70
 """"""
 JPEGS_DECODED_AT_ONCE = 32
 """Images decoded before the remaining budget is checked again."""
-
-
-def jpeg(path: Path | None, size: tuple[int, int]) -> str:
-    """Base64 JPEG of an image file, at most ``JPEG_WIDTH`` wide; empty if it cannot be read."""
-    return _base64_jpegs(Pictures([path], size, [path.name]), 0, (JPEG_WIDTH,))[0] if path else ""
 
 
 def jpegs_within(images: Sequence[tuple[Sequence[Integers], int]], room: int) -> Iterator[str]:

@@ -130,7 +130,7 @@ def joint_layers(spots: Sequence[Spot]) -> tuple[blocks.Layer, ...]:
         for one in spots
     )
     crosses = tuple(
-        blocks.Cross(at=one.nominal, key=leg_key(one.leg), tip=one.tip)
+        blocks.Cross(at=one.nominal, key=leg_key(one.leg))
         for one in spots
         if one.nominal is not None
     )

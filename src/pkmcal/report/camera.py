@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from pkmcal.arrays import THREADS, enlargement
+from pkmcal.arrays import enlargement
 from pkmcal.camera_calibration.calibrate import (
     CALIBRATION_CHECK_OPTIONS,
     CameraCalibration,
@@ -17,8 +16,8 @@ from pkmcal.camera_calibration.calibrate import (
     tilts,
 )
 from pkmcal.cameras.files import camera_text, foreign_text
-from pkmcal.observe.images import upright_turns
-from pkmcal.observe.jpegs import jpeg
+from pkmcal.observe.images import Pictures, upright_turns
+from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.blocks import Block
 from pkmcal.outcome.blocks.base import configuration_key
@@ -212,12 +211,15 @@ def _image_blocks(c: CameraCalibration, paths: list[Path]) -> tuple[Block, ...]:
     lengths = np.linalg.norm(c.residuals[c.inliers], axis=-1)
     factor = enlargement(lengths, VIEW_RESIDUAL_ARROW_LENGTH * size[0])
     order = np.argsort(-c.held_out.by_view, kind="stable").tolist()
-    with ThreadPoolExecutor(THREADS) as pool:
-        jpegs = pool.map(lambda v: jpeg(by_name.get(c.views[v]), size), order)
-        images = tuple(
-            _image(c, v, jpeg, factor, by_name.get(c.views[v]))
-            for v, jpeg in zip(order, jpegs, strict=True)
-        )
+    files = [by_name.get(c.views[v]) for v in order]
+    present = [path for path in files if path]
+    pictures = Pictures(present, size, [path.name for path in present])
+    each = [(pictures, k) for k in range(len(present))]
+    jpegs = dict(zip(present, jpegs_within(each, PAGE_JPEG_CHARACTERS), strict=False))
+    images = tuple(
+        _image(c, v, jpegs.get(path, "") if path else "", factor, path)
+        for v, path in zip(order, files, strict=True)
+    )
     text = (
         "Largest held-out error first. Circles: detected corners; arrows: from where the"
         f" calibrated camera expects them, {factor:g} times as long as they are; orange: rejected."

@@ -16,7 +16,7 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.observe.images import Pictures, upright_turns
-from pkmcal.observe.jpegs import jpegs_within
+from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
 from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
     EdgeCurve,
@@ -56,9 +56,9 @@ class AlbumSize:
     # images: browsers take a second to lay out as many
     images: int = 400
     # characters of all JPEGs
-    jpeg_characters: int = 8_000_000
-    # characters of the strips' JPEGs
-    strip_characters: int = 800_000
+    jpeg_characters: int = PAGE_JPEG_CHARACTERS
+    # first images with strips: those of all would double the page
+    strips: int = 12
 
 
 ALBUM_SIZE = AlbumSize()
@@ -168,7 +168,7 @@ def album(
     jpegs = list(jpegs_within(files, largest.jpeg_characters))
     chosen = ordered[: len(jpegs)]
     overlays = _ImageOverlays(calibration, shifts, centres, chosen)
-    overlays.add_strips(images, chosen, largest.strip_characters)
+    overlays.add_strips(images, chosen[: largest.strips])
     room = largest.jpeg_characters - sum(map(len, jpegs))
     return Album(
         tuple(
@@ -293,9 +293,8 @@ class _ImageOverlays:
         self,
         images: Mapping[int, Sequence[Integers]],
         chosen: Sequence[tuple[int, Image]],
-        room: int,
     ) -> None:
-        """Strips of the edges in the first images, as many as ``room`` characters hold."""
+        """Strips of the edges in some images."""
         c, coarse = self.calibration, self.calibration.observation.edges.coarse
         for s, photo in chosen:
             place = s, photo.configuration
@@ -311,11 +310,7 @@ class _ImageOverlays:
                 axis=1
             )
             mine, lines = mine[finite], lines.select(np.asarray(finite))
-            strips, jpeg = strips_of_image(c, image, mine, lines)
-            room -= len(jpeg)
-            if room < 0:
-                return
-            self.strips[place] = strips, jpeg
+            self.strips[place] = strips_of_image(c, image, mine, lines)
             for k, n in enumerate(mine.tolist()):
                 self.edges[place][n] = replace(self.edges[place][n], strip=k)
 

@@ -9,7 +9,7 @@ import { matches } from "../selection";
 import type { Context } from "./index";
 
 export function images(block: Images, { selection }: Context): HTMLElement {
-  const groups = [...new Set(block.images.map((image) => image.group))].filter(Boolean);
+  const groups = [...new Set(block.images.map((image) => image.group))].filter(Boolean).sort();
   const grid = h("div", { class: `images ${block.size}` });
   const bar = h("div", { class: "images-bar" });
   const element = h("div", {}, bar, grid);
@@ -45,7 +45,7 @@ export function images(block: Images, { selection }: Context): HTMLElement {
             group = name;
             draw();
           },
-        }, name || "All groups")));
+        }, name || "All")));
     }
     if (some.length > block.first) {
       bar.append(h("button", {
