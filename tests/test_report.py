@@ -18,11 +18,11 @@ from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.parameter_estimates import parameter_estimates
 from pkmcal.identify.tool import pose_by_parameters, tool_error
+from pkmcal.observe import overlays
+from pkmcal.observe.overlays import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import wrong
-from pkmcal.pages import overlays
-from pkmcal.pages.overlays import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
 from test_report_case import OUTWARD, RADIUS, Case, calibration, edges_of, make_case

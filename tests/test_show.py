@@ -511,7 +511,7 @@ def test_a_served_page_works_in_a_browser_without_webgl(tmp_path):
 
 def test_another_page_with_the_bundle_is_left_alone(tmp_path):
     page = tmp_path / "report.html"
-    page.write_text(f"<script>{bundle_file('enlarged.js')}</script>")
+    page.write_text(f"<script>{bundle_file('viewer.js')}</script>")
     before = page.read_bytes()
     done = run("show", "3-rpr", "-o", page)
     assert done.code == 2

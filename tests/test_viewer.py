@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from pkmcal.web.bundle_files import ENLARGED_FILE, SCRIPT_FILE, STYLE_FILE, bundle_file
+from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.document import schema_text
 
 ROOT = Path(__file__).resolve().parents[1]
 VIEWER, WEB = ROOT / "viewer", ROOT / "src" / "pkmcal" / "web"
 SOURCES = ("package.json", "package-lock.json", "tsconfig.json", "vite.config.js", "src")
-FILES = (SCRIPT_FILE, STYLE_FILE, ENLARGED_FILE)
+FILES = (SCRIPT_FILE, STYLE_FILE)
 INSTALL_SECONDS, BUILD_SECONDS = 120, 300
 
 
@@ -43,8 +43,7 @@ def test_the_schema_is_that_of_the_document():
 
 
 def test_the_bundle_can_stand_inside_a_page():
-    for name in (SCRIPT_FILE, ENLARGED_FILE):
-        assert not re.search(r"</script|<!--", bundle_file(name), re.I)
+    assert not re.search(r"</script|<!--", bundle_file(SCRIPT_FILE), re.I)
     assert "</style" not in bundle_file(STYLE_FILE).lower()
     assert not re.search(r"@import|url\(", bundle_file(STYLE_FILE))
     assert "eval(" not in bundle_file(SCRIPT_FILE)

@@ -35,8 +35,7 @@ const stamped = {
   },
 };
 
-// `enlarged`: the part of the viewer for pages that are not yet its views
-export default defineConfig(({ mode }) => ({
+export default defineConfig({
   root,
   plugins: [stamped],
   build: {
@@ -47,11 +46,11 @@ export default defineConfig(({ mode }) => ({
     reportCompressedSize: false,
     chunkSizeWarningLimit: 2000,
     lib: {
-      entry: join(root, mode === "viewer" ? "src/main.ts" : "src/enlarged.ts"),
+      entry: join(root, "src/main.ts"),
       formats: ["iife"],
       name: "pkmcalViewer",
-      fileName: () => `${mode}.js`,
+      fileName: () => "viewer.js",
       cssFileName: "viewer",
     },
   },
-}));
+});

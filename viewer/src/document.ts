@@ -277,7 +277,7 @@ export interface Section {
   mark: "good" | Level | null;
   expert: boolean;
   void: boolean;
-  blocks: (Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar | Plot | Panels)[];
+  blocks: (Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar | Plot | Panels | Images)[];
 }
 /**
  * Paragraph; small : as small print.
@@ -673,4 +673,146 @@ export interface ColourScale {
 export interface Panels {
   kind: "panels";
   plots: Plot[];
+}
+/**
+ * Grid of images; each opens in the inspector.
+ *
+ * first : number of images until the reader asks for all.
+ * legs : number of legs, for the colours' key; 0 for none.
+ * size : width of an image in the grid.
+ */
+export interface Images {
+  kind: "images";
+  images: Image[];
+  first: number;
+  legs: number;
+  size: "thumbnail" | "figure";
+}
+/**
+ * Image with its overlays.
+ *
+ * title, caption : name and contents.
+ * group : for the filter, such as the station; empty for none.
+ * key : of the image, so that a selection elsewhere finds it.
+ * width, height : of the camera's image, px.
+ * quarter_turns : clockwise, that turn it upright, as EXIF says.
+ * jpeg : base64, of at most these pixels; empty if the file cannot be read.
+ * overlays : of which a viewer shows one at a time.
+ * strip_jpeg : the strips one below the other, base64; empty without any.
+ */
+export interface Image {
+  title: string;
+  caption: string;
+  group: string;
+  key: string;
+  width: number;
+  height: number;
+  quarter_turns: number;
+  jpeg: string;
+  overlays: Overlay[];
+  strip_jpeg: string;
+  strips: Strip[];
+}
+/**
+ * Layers over an image; title : which of several overlays, empty for the only one.
+ */
+export interface Overlay {
+  title: string;
+  layers: Layer[];
+}
+/**
+ * Shapes that are switched on and off together.
+ *
+ * name : kind of the shapes, for title, shortcut and style.
+ * enlargement : of the arrows.
+ */
+export interface Layer {
+  name: "edges" | "rejected" | "joints" | "nominal" | "corners" | "residuals";
+  shapes: (Polyline | Ring | Cross | Arrow)[];
+  enlargement: number;
+}
+/**
+ * Curve in an image.
+ *
+ * key : what it belongs to; a leg's key gives the colour.
+ * tip : tooltip.
+ * dashed : measured, but not in use.
+ * strip : index of its strip in the image's ``strips``, null without one.
+ */
+export interface Polyline {
+  shape: "polyline";
+  points: [number, number][];
+  key: string;
+  tip: string;
+  dashed: boolean;
+  strip: number | null;
+}
+/**
+ * Circle of a fixed size around a pixel; label : text beside it, such as a leg's number.
+ */
+export interface Ring {
+  shape: "ring";
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  at: [number, number];
+  key: string;
+  tip: string;
+  dashed: boolean;
+  label: string;
+}
+/**
+ * Cross of a fixed size at a pixel.
+ */
+export interface Cross {
+  shape: "cross";
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  at: [number, number];
+  key: string;
+  tip: string;
+}
+/**
+ * Displacement (px) from a pixel, drawn as many times as long as its layer's enlargement.
+ *
+ * key : what a click leads to.
+ * dashed : not significant, or not in use.
+ */
+export interface Arrow {
+  shape: "arrow";
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  at: [number, number];
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  displacement: [number, number];
+  key: string;
+  tip: string;
+  dashed: boolean;
+}
+/**
+ * Image along an edge, sampled in native pixels across the predicted edge and along it.
+ *
+ * title : name of the edge, its residual and standard deviation.
+ * row : first row of the strip in the image's ``strip_jpeg``.
+ * length, across : columns along the edge, from A to B, and rows across it, outward first; the
+ *     prediction is in the middle row.
+ * offset : offset of the fitted line from the prediction, px outward, at evenly spaced positions
+ *     from the middle of the first column to that of the last.
+ * sigma : its standard deviation there, px.
+ */
+export interface Strip {
+  title: string;
+  row: number;
+  length: number;
+  across: number;
+  offset: number[];
+  sigma: number[];
 }

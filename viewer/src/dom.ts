@@ -19,6 +19,13 @@ export function h<K extends keyof HTMLElementTagNameMap>(
   return element;
 }
 
+const N_COLOURS = 8;
+
+/** Class of the colour of a leg's key, such as `leg:3`; empty for another key. */
+export function legClass(key: string): string {
+  return key.startsWith("leg:") ? `leg-${((Number(key.slice(4)) - 1) % N_COLOURS) + 1}` : "";
+}
+
 /** Factor and name of the unit in which a quantity is shown. */
 export const UNITS = {
   m: { factor: 1e3, name: "mm", decimals: 1 },

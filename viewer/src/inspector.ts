@@ -1,34 +1,46 @@
 /**
- * Inspector of an image with its overlay, an SVG in the image's pixels: zoom about the pointer to
- * single pixels, by wheel, pinch or keys; layers that can be switched off; brightness.
+ * Inspector of an image with its overlays: zoom about the pointer to single pixels, by wheel, pinch
+ * or keys; layers that can be switched off; brightness; the strip of a chosen edge.
  */
 
+import "./inspector.css";
+import type { Image, Layer } from "./document";
 import { h, number } from "./dom";
+import { cameraPixel, imageSvg, scaleMarks, uprightSize } from "./overlay";
+import { stripPanel } from "./strips";
 
 const LARGEST_PIXEL = 80; // screen pixels for one of the image
 const SMOOTH_BELOW = 3; // likewise; above it pixels have edges
 const KEY_ZOOM = 1.4;
 const KEY_PAN = 0.15; // of the window
 
-/** Layers of the overlay, by the classes of their shapes, with their key. */
-const LAYERS = [
-  { name: "Edges", key: "e", shapes: ".edge, path.halo" },
-  { name: "Not used", key: "u", shapes: ".missed" },
-  { name: "Joints", key: "j", shapes: ".spot .ring, .spot .halo, .spot text" },
-  { name: "Nominal", key: "n", shapes: ".spot .cross" },
-  { name: "Corners", key: "c", shapes: ".seen" },
-  { name: "Residuals", key: "r", shapes: ".arrow" },
-] as const;
+const CLICK_DISTANCE = 4; // screen pixels that a pointer may move between down and up
+
+/** Titles and keys of the layers. */
+const LAYERS: Record<Layer["name"], { title: string; key: string }> = {
+  edges: { title: "Edges", key: "e" },
+  rejected: { title: "Not used", key: "u" },
+  joints: { title: "Joints", key: "j" },
+  nominal: { title: "Nominal", key: "n" },
+  corners: { title: "Corners", key: "c" },
+  residuals: { title: "Residuals", key: "r" },
+};
+type LayerName = keyof typeof LAYERS;
 
 export class Inspector {
   readonly element: HTMLElement;
   private readonly host = h("div", { class: "inspected" });
-  private readonly layers = h("span", { class: "inspector-layers" });
+  private readonly tip = h("div", { class: "inspector-tip", hidden: true });
+  private readonly strip = h("div");
+  private readonly choices = h("span", { class: "inspector-choices" });
+  private readonly layers = h("span", { class: "inspector-choices" });
   private readonly gamma: HTMLInputElement;
   private readonly where = h("output", { class: "inspector-where" });
+  private image: Image | null = null;
   private picture: SVGSVGElement | null = null;
+  private overlay = 0;
   private curve: SVGElement[] = [];
-  private readonly off = new Set<string>();
+  private readonly off = new Set<LayerName>();
   private readonly pointers = new Map<number, { x: number; y: number }>();
   private size = { x: 0, y: 0, width: 1, height: 1 };
   /** Image pixel at the window's middle, and screen pixels for one of the image. */
@@ -46,6 +58,8 @@ export class Inspector {
       "div",
       { class: "inspector" },
       this.host,
+      this.tip,
+      this.strip,
       h(
         "div",
         { class: "inspector-bar" },
@@ -54,6 +68,7 @@ export class Inspector {
         button("−", "Smaller (−)", () => this.zoom(1 / KEY_ZOOM)),
         button("+", "Larger (+)", () => this.zoom(KEY_ZOOM)),
         button("Whole", "Whole image (0)", () => this.fit()),
+        this.choices,
         this.layers,
         h("label", { class: "inspector-gamma" }, "Dark parts", this.gamma),
         this.where,
@@ -62,17 +77,45 @@ export class Inspector {
     this.listen();
   }
 
-  /** Show a picture; layers and brightness stay as they were. */
-  show(picture: SVGSVGElement): void {
+  /** Show an image; choice of the overlay, layers and brightness stay as they were. */
+  show(image: Image): void {
+    this.image = image;
+    this.size = { x: -0.5, y: -0.5, ...uprightSize(image) };
+    this.strip.replaceChildren();
+    this.replaceOverlay(Math.min(this.overlay, Math.max(image.overlays.length - 1, 0)));
+    this.fit();
+  }
+
+  /** Draw the image with one of its overlays. */
+  private replaceOverlay(overlay: number): void {
+    const { image } = this;
+    if (!image) return;
+    this.overlay = overlay;
+    const picture = imageSvg(image, overlay);
     this.picture = picture;
-    const { x, y, width, height } = picture.viewBox.baseVal;
-    this.size = { x, y, width, height };
     picture.setAttribute("preserveAspectRatio", "xMidYMid meet");
     this.host.replaceChildren(picture);
     this.addCurve(picture);
-    this.addLayers(picture);
+    this.choices.replaceChildren(...(image.overlays.length < 2 ? [] : image.overlays.map(({ title }, k) =>
+      h("button", {
+        type: "button", title: "Key o", "aria-pressed": String(k === overlay), onclick: () => {
+          this.replaceOverlay(k);
+          this.draw();
+        },
+      }, title))));
+    this.addLayers(image.overlays[overlay]?.layers ?? []);
     this.brighten();
-    this.fit();
+  }
+
+  /** Show the strip of an edge below the image, none for an index without one. */
+  private chooseStrip(index: number): void {
+    const { image, picture } = this;
+    if (!image || !picture) return;
+    const present = index >= 0 && index < image.strips.length;
+    this.strip.replaceChildren(...(present ? [stripPanel(image, index)] : []));
+    picture.querySelectorAll<SVGElement>("[data-strip]").forEach((edge) => {
+      edge.classList.toggle("chosen-strip", Number(edge.dataset.strip) === index);
+    });
   }
 
   /** The whole image in the window. */
@@ -87,17 +130,21 @@ export class Inspector {
     const pans: Record<string, [number, number]> = {
       ArrowUp: [0, -1], ArrowDown: [0, 1], a: [-1, 0], d: [1, 0], w: [0, -1], s: [0, 1],
     };
-    const layer = LAYERS.find((one) => one.key === name);
+    const layer = (Object.keys(LAYERS) as LayerName[]).find((one) => LAYERS[one].key === name);
     if (name === "ArrowLeft" || name === "ArrowRight") this.step(name === "ArrowLeft" ? -1 : 1);
     else if (name === "+" || name === "=") this.zoom(KEY_ZOOM);
     else if (name === "-") this.zoom(1 / KEY_ZOOM);
     else if (name === "0") this.fit();
+    else if (name === "o" && this.image && this.image.overlays.length > 1) {
+      this.replaceOverlay((this.overlay + 1) % this.image.overlays.length);
+      this.draw();
+    } else if (name === "x" && this.image?.strips.length) this.nextStrip();
     else if (pans[name]) {
       const { width, height } = this.host.getBoundingClientRect();
       this.view.x += (pans[name][0] * KEY_PAN * width) / this.view.scale;
       this.view.y += (pans[name][1] * KEY_PAN * height) / this.view.scale;
       this.draw();
-    } else if (layer) this.toggle(layer.name);
+    } else if (layer) this.toggle(layer);
     else return false;
     return true;
   }
@@ -133,6 +180,7 @@ export class Inspector {
       "viewBox",
       [this.view.x - width / 2, this.view.y - height / 2, width, height].join(" "),
     );
+    scaleMarks(this.picture, 1 / this.view.scale);
     this.host.classList.toggle("pixels", this.view.scale > SMOOTH_BELOW);
     this.where.textContent = `${number(this.view.scale, this.view.scale < 10 ? 1 : 0)}×`;
   }
@@ -166,32 +214,39 @@ export class Inspector {
     else image?.setAttribute("filter", "url(#inspector-tones)");
   }
 
-  private addLayers(picture: SVGSVGElement): void {
-    const present = LAYERS.filter((layer) => picture.querySelector(layer.shapes));
+  private addLayers(layers: Layer[]): void {
     this.layers.replaceChildren(
-      ...present.map(({ name, key }) =>
-        h(
-          "button",
-          { type: "button", "data-layer": name, title: `Key ${key}`, onclick: () => this.toggle(name) },
-          name,
-        )),
+      ...layers.filter((layer) => layer.shapes.length).map(({ name }) =>
+        h("button", {
+          type: "button", "data-layer": name, title: `Key ${LAYERS[name].key}`, onclick: () => this.toggle(name),
+        }, LAYERS[name].title)),
     );
     this.applyLayers();
   }
 
-  private toggle(name: string): void {
+  private toggle(name: LayerName): void {
     if (!this.off.delete(name)) this.off.add(name);
     this.applyLayers();
   }
 
   private applyLayers(): void {
-    for (const { name, shapes } of LAYERS) {
-      this.picture?.querySelectorAll<SVGElement>(shapes).forEach((shape) => {
-        shape.style.display = this.off.has(name) ? "none" : "";
-      });
-      this.layers.querySelector(`[data-layer="${name}"]`)
-        ?.setAttribute("aria-pressed", String(!this.off.has(name)));
+    for (const layer of this.picture?.querySelectorAll<SVGElement>("[data-layer]") ?? []) {
+      layer.style.display = this.off.has(layer.dataset.layer as LayerName) ? "none" : "";
     }
+    for (const button of this.layers.querySelectorAll<HTMLElement>("[data-layer]")) {
+      button.setAttribute("aria-pressed", String(!this.off.has(button.dataset.layer as LayerName)));
+    }
+  }
+
+  private nextStrip(): void {
+    const chosen = this.picture?.querySelector<SVGElement>(".chosen-strip");
+    this.chooseStrip(chosen ? Number(chosen.dataset.strip) + 1 : 0);
+  }
+
+  /** Shape of the overlay under the pointer. */
+  private shapeAt(event: PointerEvent): SVGElement | null {
+    const under = document.elementFromPoint(event.clientX, event.clientY);
+    return under?.closest<SVGElement>(".inspected .shape") ?? null;
   }
 
   private listen(): void {
@@ -204,14 +259,24 @@ export class Inspector {
     host.addEventListener("dblclick", (event) => {
       this.zoom(KEY_ZOOM ** 3, { x: event.clientX, y: event.clientY });
     });
+    let down = { x: 0, y: 0 };
     host.addEventListener("pointerdown", (event) => {
+      down = { x: event.clientX, y: event.clientY };
       pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
       host.setPointerCapture(event.pointerId);
     });
     const up = (event: PointerEvent): void => {
       pointers.delete(event.pointerId);
     };
-    host.addEventListener("pointerup", up);
+    host.addEventListener("pointerup", (event) => {
+      up(event);
+      if (Math.hypot(event.clientX - down.x, event.clientY - down.y) > CLICK_DISTANCE) return;
+      const strip = this.shapeAt(event)?.dataset.strip;
+      if (strip !== undefined) this.chooseStrip(Number(strip));
+    });
+    host.addEventListener("pointerleave", () => {
+      this.tip.hidden = true;
+    });
     host.addEventListener("pointercancel", up);
     host.addEventListener("pointermove", (event) => {
       this.locate(event);
@@ -243,7 +308,13 @@ export class Inspector {
     const box = this.host.getBoundingClientRect();
     const x = this.view.x + (event.clientX - box.left - box.width / 2) / this.view.scale;
     const y = this.view.y + (event.clientY - box.top - box.height / 2) / this.view.scale;
+    const [u, v] = this.image ? cameraPixel(this.image, x, y) : [x, y];
     const scale = number(this.view.scale, this.view.scale < 10 ? 1 : 0);
-    this.where.textContent = `x ${number(x, 1)}, y ${number(y, 1)} px · ${scale}×`;
+    this.where.textContent = `x ${number(u, 1)}, y ${number(v, 1)} px · ${scale}×`;
+    const text = this.pointers.size ? "" : this.shapeAt(event)?.dataset.tip;
+    this.tip.hidden = !text;
+    this.tip.textContent = text ?? "";
+    const left = Math.min(event.clientX - box.left + 14, box.width - this.tip.offsetWidth - 4);
+    this.tip.style.transform = `translate(${Math.max(left, 4)}px, ${event.clientY - box.top + 14}px)`;
   }
 }

@@ -6,8 +6,6 @@ For the page, and as PNG files, in which large images are binned as for the sear
 from __future__ import annotations
 
 import re
-from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,19 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.files import place_below, staged_folder
+from pkmcal.observe.images import upright_turns
+from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
+from pkmcal.observe.overlays import (
+    EdgeCurve,
+    Spot,
+    edge_layer,
+    joint_layers,
+    machine_laid_over,
+)
 from pkmcal.outcome import Part
-from pkmcal.pages import page
-from pkmcal.pages.jpegs import jpeg
-from pkmcal.pages.overlays import Drawn, Picture, Spot, machine_laid_over
-from pkmcal.pages.page import N_COLOURS
+from pkmcal.outcome.blocks.base import image_key
+from pkmcal.outcome.blocks.images import Image, Images, Overlay
+from pkmcal.outcome.blocks.text import Paragraph
 
 DRAWN_PIXEL_BINARY_DIGITS = 4
 """Binary digits of the fractions of a pixel in cv2's drawing functions."""
@@ -29,39 +35,61 @@ CAPTION_BAR_HEIGHT = 26
 """Height (px) of the caption above each image."""
 PANE_GAP = 6
 """Distance (px) between the two images."""
+LEG_COLOURS = (
+    0xFFB52E, 0x6AD0FF, 0x28DCA8, 0xFF9FD8, 0x86AAFF, 0xFF7C3A, 0xF4E04D, 0xD5DBE0,
+)  # fmt: skip
+"""Colours (RGB) of legs on images, those of ``viewer/src/overlay.css``; machines with more legs
+repeat them."""
+NOMINAL_OVER_IMAGES_TEXT = (
+    "Lines: the nominal model's legs in their colours; circles: its joints. By the pose found they"
+    " lie on the legs to a few pixels, as far as the nominal model is right; where they do not, or"
+    " follow another leg, something is mixed up. By a pose by hand they need only lie near the"
+    " legs. Open an image to compare both poses (key o)."
+)
 
 
 def with_pictures(inspection: Inspection) -> Part:
-    """Section of the page with the stations' first images, each with every available pose."""
-    pairs: list[tuple[Picture, ...]] = []
-    for station in inspection.stations:
-        for k in station.few():
-            configuration = int(station.images.configuration[k])
-            photo = inspection.session.stations[station.images.station].images[k]
-            width, height = station.images.camera.image_size
-            shot = jpeg(photo.path, (width, height))
-            pictures: list[Picture] = []
-            for text, T_camera_base in poses_of(station):
-                eye = station.images.camera
-                edges, spots = nominal_over_image(inspection, station, eye, T_camera_base, int(k))
-                pictures.append(
-                    Picture(
-                        station=station.name,
-                        configuration=inspection.session.configurations[configuration],
-                        why=text,
-                        width=width,
-                        height=height,
-                        jpeg=shot,
-                        edges=edges,
-                        spots=spots,
-                        kind="predicted",
-                    )
-                )
-            pairs.append(tuple(pictures))
-    html = page.filled_template(
-        "overlay.html.j2", n_legs=inspection.session.machine.n_legs, pairs=pairs
+    """Section of the page with the images, each with every available pose."""
+    # a few of each station first
+    first = [(s, k) for s, one in enumerate(inspection.stations) for k in one.few().tolist()]
+    others = [
+        (s, k) for s, one in enumerate(inspection.stations) for k in range(len(one.images.images))
+    ]
+    order = list(dict.fromkeys([*first, *others]))
+    files = [(inspection.stations[s].images.images, k) for s, k in order]
+    jpegs = jpegs_within(files, PAGE_JPEG_CHARACTERS)
+    images = [_image(inspection, s, k, one) for (s, k), one in zip(order, jpegs, strict=False)]
+    block = Images(images=tuple(images), first=len(first), legs=inspection.session.machine.n_legs)
+    return Part(
+        "photographs",
+        "The nominal model over the images",
+        blocks=(Paragraph(text=NOMINAL_OVER_IMAGES_TEXT), block),
+        menu="Images",
     )
-    return Part("photographs", "The nominal model over the images", html=html, menu="Images")
+
+
+def _image(inspection: Inspection, s: int, k: int, jpeg: str) -> Image:
+    """Image k of a station with an overlay for each pose, that of the search first."""
+    session, station = inspection.session, inspection.stations[s]
+    camera, name = station.images.camera, station.name
+    configuration = session.configurations[int(station.images.configuration[k])]
+    overlays: list[Overlay] = []
+    for title, T_camera_base in reversed(poses_of(station)):
+        edges, spots = nominal_over_image(inspection, station, camera, T_camera_base, k)
+        layers = edge_layer("edges", edges), *joint_layers(spots)
+        overlays.append(Overlay(title=title.capitalize(), layers=layers))
+    path = session.stations[station.images.station].images[k].path
+    return Image(
+        title=f"{name} / {configuration}",
+        caption="" if jpeg else "the file could not be read",
+        group=name,
+        key=image_key(name, configuration),
+        width=camera.image_size[0],
+        height=camera.image_size[1],
+        quarter_turns=upright_turns(path, camera.image_size),
+        jpeg=jpeg,
+        overlays=tuple(overlays),
+    )
 
 
 def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
@@ -73,7 +101,7 @@ def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
 
 def nominal_over_image(
     inspection: Inspection, station: StationInspection, camera: Camera, T_camera_base: Array, k: int
-) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
+) -> tuple[tuple[EdgeCurve, ...], tuple[Spot, ...]]:
     """Visible silhouettes of the nominal tubes in image k, and the joint centres.
 
     camera : of the station, or of its binned images.
@@ -133,7 +161,7 @@ def picture(inspection: Inspection, station: StationInspection, k: int) -> Any:
     return np.concatenate(joined, axis=1)
 
 
-def _draw(pane: Any, edges: tuple[Drawn, ...], spots: tuple[Spot, ...]) -> None:
+def _draw(pane: Any, edges: tuple[EdgeCurve, ...], spots: tuple[Spot, ...]) -> None:
     """Draw lines and joints into an image, each on a dark one for contrast with white."""
     import cv2
 
@@ -162,16 +190,5 @@ def _draw(pane: Any, edges: tuple[Drawn, ...], spots: tuple[Spot, ...]) -> None:
 
 def _colour(leg: int) -> tuple[int, int, int]:
     """Colour of a leg on images, BGR."""
-    return leg_colours()[(leg - 1) % N_COLOURS]
-
-
-@cache
-def leg_colours() -> tuple[tuple[int, int, int], ...]:
-    """Colours of legs on images from the page's style sheet, the only place that defines them;
-    BGR.
-    """
-    style = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
-    (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)", style, flags=re.MULTILINE)
-    colours = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
-    numbers = [int(colours[str(k + 1)], 16) for k in range(N_COLOURS)]
-    return tuple((n & 255, n >> 8 & 255, n >> 16) for n in numbers)
+    n = LEG_COLOURS[(leg - 1) % len(LEG_COLOURS)]
+    return n & 255, n >> 8 & 255, n >> 16

@@ -39,6 +39,8 @@ MISSING_LEVEL = 128
 """Grey level of the blocks that a sequential JPEG file's data do not reach."""
 MORE_SCAN_DATA = bytes(range(1, 255))
 """Bytes that a JPEG decoder takes for more of an unfinished scan."""
+UPRIGHT_TURNS = {3: 2, 6: 1, 8: 3}
+"""Quarter turns clockwise that make an image of an EXIF orientation upright."""
 
 
 def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
@@ -71,6 +73,20 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         return grey
     clockwise = {6: True, 8: False}.get(exif.orientation, size[0] > size[1])
     return np.ascontiguousarray(np.rot90(grey, -1 if clockwise else 1))
+
+
+def upright_turns(path: Path, image_size: tuple[int, int]) -> int:
+    """Quarter turns clockwise by which EXIF asks viewers to turn the image of :func:`decode`.
+
+    0 for an image that was turned when decoded, and for a file that cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            image = open_image(stream, path.name)
+            turned = sensor_size(image) != tuple(image_size)
+            return 0 if turned else UPRIGHT_TURNS.get(read_exif(image).orientation, 0)
+    except (OSError, InputError):
+        return 0
 
 
 def _checked_grey(data: bytes, image: ImageFile, label: str) -> Integers:

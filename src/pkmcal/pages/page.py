@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import legible
 from pkmcal.files import json_value, remember, remembered
-from pkmcal.web.bundle_files import ENLARGED_FILE, bundle_file
 from pkmcal.wording import count
 
 if TYPE_CHECKING:
@@ -44,7 +43,6 @@ def page_html(outcome: Outcome, made: datetime | None = None) -> str:
         remarks=[finding.text for finding in outcome.findings if finding.level == "note"],
         plots=plots,
         plotly=plotly_script() if plots else "",
-        inspector=bundle_file(ENLARGED_FILE),
     )
 
 

@@ -48,6 +48,7 @@ from pkmcal.report import (
     scene,
     workspace,
 )
+from pkmcal.report.links import Links
 from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.web.report_page import report_page
@@ -155,7 +156,7 @@ def report_of(
         held = held_out_part(holdout, session)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(c, shifts, centres)
-    links = album.links
+    links = Links.of(session)
     space = image_scene.plot(session, estimate, links, poses.target_places(observation, estimate))
     # sections in the order of the page
     parts = (
@@ -175,7 +176,7 @@ def report_of(
         residuals.section(
             session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
         ),
-        field.section(session, observation, estimate, album.corners, links),
+        field.section(session, observation, estimate, album.corners, pictures.station_images(c)),
         provenance.left_out(session, observation.rejected, estimate),
         provenance.how(session, estimate, c.timings),
     )

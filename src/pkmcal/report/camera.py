@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from markupsafe import Markup
 
-from pkmcal.arrays import THREADS, enlargement
+from pkmcal.arrays import enlargement
 from pkmcal.camera_calibration.calibrate import (
     CALIBRATION_CHECK_OPTIONS,
     CameraCalibration,
@@ -18,13 +16,16 @@ from pkmcal.camera_calibration.calibrate import (
     tilts,
 )
 from pkmcal.cameras.files import camera_text, foreign_text
+from pkmcal.observe.images import Pictures, upright_turns
+from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.blocks import Block
+from pkmcal.outcome.blocks.base import configuration_key
+from pkmcal.outcome.blocks.images import Arrow, Image, Images, Layer, Overlay, Ring, Shape
 from pkmcal.outcome.blocks.plot import panels
-from pkmcal.pages import page
-from pkmcal.pages.jpegs import jpeg
-from pkmcal.pages.overlays import Arrow, Picture
+from pkmcal.outcome.blocks.text import Listing, Paragraph
 from pkmcal.report.camera_plots import field_plots, models_plot
-from pkmcal.report.field import ImageField
+from pkmcal.report.field import ImageField, field_image
 from pkmcal.wording import brief, count, decimals, number
 
 VIEW_RESIDUAL_ARROW_LENGTH = 0.05
@@ -62,8 +63,6 @@ def outcome_of(
     others : names and formats of camera files for other programs.
     """
     c = calibration
-    wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
-    factor = enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly distinguished, and so to be used together only: {together}."
     # with its covariance, which is the prior of `calibrate --refine-camera`
@@ -91,18 +90,12 @@ def outcome_of(
             Part(
                 "field",
                 "Field",
-                blocks=field_plots(c),
-                html=_field(c),
+                blocks=(_field_block(c), *field_plots(c)),
             ),
             Part(
                 "images",
                 "Images",
-                html=page.filled_template(
-                    "corners.html.j2",
-                    pictures=_images(c, [Path(path) for path in paths], factor),
-                    factor=factor,
-                    missed=[d for d in c.detections if not d.success],
-                ),
+                blocks=_image_blocks(c, [Path(path) for path in paths]),
             ),
             Part("how", "What σ means", (CAMERA_SIGMA_TEXT,)),
         ),
@@ -210,45 +203,69 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     )
 
 
-def _images(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Picture, ...]:
-    """All views with their images, found by file name."""
+def _image_blocks(c: CameraCalibration, paths: list[Path]) -> tuple[Block, ...]:
+    """All views with their images, found by file name, the largest held-out error first."""
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
-    with ThreadPoolExecutor(THREADS) as pool:
-        jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
-        return tuple(_image(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
+    lengths = np.linalg.norm(c.residuals[c.inliers], axis=-1)
+    factor = enlargement(lengths, VIEW_RESIDUAL_ARROW_LENGTH * size[0])
+    order = np.argsort(-c.held_out.by_view, kind="stable").tolist()
+    files = [by_name.get(c.views[v]) for v in order]
+    present = [path for path in files if path]
+    pictures = Pictures(present, size, [path.name for path in present])
+    each = [(pictures, k) for k in range(len(present))]
+    jpegs = dict(zip(present, jpegs_within(each, PAGE_JPEG_CHARACTERS), strict=False))
+    images = tuple(
+        _image(c, v, jpegs.get(path, "") if path else "", factor, path)
+        for v, path in zip(order, files, strict=True)
+    )
+    text = (
+        "Largest held-out error first. Circles: detected corners; arrows: from where the"
+        f" calibrated camera expects them, {factor:g} times as long as they are; orange: rejected."
+    )
+    missed = [f"{one.name}: {one.reason}" for one in c.detections if not one.success]
+    listing = (Listing(title="Not used", items=tuple(missed)),) if missed else ()
+    return Paragraph(text=text, small=True), Images(images=images), *listing
 
 
-def _image(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
+def _image(c: CameraCalibration, v: int, jpeg: str, factor: float, path: Path | None) -> Image:
     """One view with its detected corners."""
-    finite = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
-    corners: list[Arrow] = []
-    for i in finite.tolist():
-        (x, y), off = c.pixels[v, i].tolist(), c.residuals[v, i]
-        places = decimals(max(c.rms, 1e-6)) + 1
+    finite = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1)).tolist()
+    rings, arrows = list[Shape](), list[Shape]()
+    places = decimals(max(c.rms, 1e-6)) + 1
+    for i in finite:
+        (x, y), (dx, dy) = c.pixels[v, i].tolist(), c.residuals[v, i].tolist()
         tip = (
-            f"Corner {i}: {number(off[0], places, signed=True)},"
-            f" {number(off[1], places, signed=True)} px; weight {c.weight[v, i]:.2f}"
+            f"Corner {i}: {number(dx, places, signed=True)},"
+            f" {number(dy, places, signed=True)} px; weight {c.weight[v, i]:.2f}"
         )
-        dx, dy = (off * factor).tolist()
-        corners.append(Arrow(x, y, dx, dy, not c.inliers[v, i], tip))
-    n_rejected = sum(corner.quiet for corner in corners)
+        at, dashed = (round(x, 2), round(y, 2)), not c.inliers[v, i]
+        rings.append(Ring(at=at, tip=tip, dashed=dashed))
+        arrows.append(
+            Arrow(at=at, displacement=(round(dx, 5), round(dy, 5)), tip=tip, dashed=dashed)
+        )
+    n_rejected = len(finite) - int(c.inliers[v, finite].sum())
     caption = f"{count(len(finite), 'corner')}" + (f", {n_rejected} rejected" if n_rejected else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
     caption += "" if jpeg else "; the image is not at hand"
     width, height = c.camera.image_size
-    return Picture(
-        station="",
-        configuration=c.views[v],
+    layers = (
+        Layer(name="corners", shapes=tuple(rings)),
+        Layer(name="residuals", shapes=tuple(arrows), enlargement=factor),
+    )
+    return Image(
+        title=c.views[v],
+        caption=caption,
+        key=configuration_key(c.views[v]),
         width=width,
         height=height,
+        quarter_turns=upright_turns(path, c.camera.image_size) if path else 0,
         jpeg=jpeg,
-        caption=caption,
-        corners=tuple(corners),
+        overlays=(Overlay(layers=layers),),
     )
 
 
-def _field(c: CameraCalibration) -> Markup:
+def _field_block(c: CameraCalibration) -> Images:
     """Number of corners in each cell, and mean residuals of cells with three or more.
 
     The means have an enlargement of their own, as they are smaller than single residuals.
@@ -262,20 +279,18 @@ def _field(c: CameraCalibration) -> Markup:
     row = np.clip(((pixels[:, 1] + 0.5) / dy).astype(int), 0, rows - 1)
     flat = row * columns + column
     counts = np.bincount(flat, minlength=rows * columns)
-    most = max(int(counts.max()), 1)
-    cells = [
-        (k % columns * dx - 0.5, k // columns * dy - 0.5, dx, dy, int(n), float(n) / most)
-        for k, n in enumerate(counts.tolist())
-        if n
-    ]
     # mean residual of cells with three or more corners, at the corners' mean
-    full = np.flatnonzero(counts >= 3)
-    roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
+    arrows: list[Arrow] = []
+    for k in np.flatnonzero(counts >= 3).tolist():
+        root, mean = pixels[flat == k].mean(axis=0), off[flat == k].mean(axis=0)
+        tip = (
+            f"{number(mean[0], 3, signed=True)}, {number(mean[1], 3, signed=True)} px, of"
+            f" {count(int(counts[k]), 'corner')}"
+        )
+        arrows.append(Arrow(at=tuple(root.tolist()), displacement=tuple(mean.tolist()), tip=tip))
+    means = np.array([one.displacement for one in arrows]).reshape(-1, 2)
     factor = enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
-    shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
-    field = ImageField(
-        "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
-        tuple(Arrow(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
-    )  # fmt: skip
-    return page.filled_template("field.html.j2", field=field, cells=cells, factor=factor)
+    middle = float(c.camera.parameters[2]), float(c.camera.parameters[3])
+    field = ImageField("Mean residual", 0, (width, height), middle, tuple(arrows))
+    caption = f"arrows × {factor:g}; without order where the model fits"
+    return Images(images=(field_image(field, factor, (), caption),), size="figure")

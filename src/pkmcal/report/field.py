@@ -7,28 +7,27 @@ solution of the offsets of its edges and corners along their own directions.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, enlargement
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
+from pkmcal.observe.jpegs import base64_jpeg, narrowed
+from pkmcal.observe.overlays import measured_curves, offsets_across_curves, own_edges
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
-from pkmcal.pages import page
-from pkmcal.pages.overlays import (
-    INLIER_WEIGHT,
-    Arrow,
-    measured_curves,
-    offsets_across_curves,
-    own_edges,
-)
+from pkmcal.outcome.blocks import images as blocks
+from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, number
 
 FIELD_EDGE_FRACTIONS = np.linspace(0.05, 0.95, 10)
@@ -46,27 +45,31 @@ CELL_BY_CHANCE_SHARE = 0.01
 """Share of cells that are significant by chance, if edges err independently."""
 FIELD_ARROW_LENGTH = 0.06
 """Length of a large mean shift as drawn, in image widths."""
+MEAN_IMAGE_WIDTH, MEAN_IMAGES = 640, 12
+"""Width (px) of a station's mean image, and the number of images in it."""
 FIELD_READING_TEXT = (
     "Arrows: from where the calibrated machine expects edges and corners to where they are, the"
-    " mean of each cell of the picture. Without order where the camera's file is right; arrows that"
-    " grow with the distance from the middle, or go round it, are a lens that the file does not"
-    " describe. Strong: more than chance makes in one cell of a hundred. A click leads to the"
-    " image that differs most there."
+    " mean of each cell of the image. Without order where the camera's file is right; arrows that"
+    " grow with the distance from the principal point (cross), or turn round it, are a lens that"
+    " the file does not describe. Orange: not significant; one cell of a hundred is by chance. A"
+    " click on an arrow leads to the image with the largest residual there."
 )
 
 
 @dataclass(frozen=True)
 class ImageField:
-    """Mean residuals over the image of a camera; insignificant ones are quiet.
+    """Mean residuals over the image of a camera.
 
+    station : index of the first station with the camera's images.
     middle : principal point, px.
+    cells : mean shifts, px; insignificant ones are dashed.
     """
 
     title: str
-    width: int
-    height: int
+    station: int
+    size: tuple[int, int]
     middle: tuple[float, float]
-    cells: tuple[Arrow, ...]
+    cells: tuple[blocks.Arrow, ...]
 
 
 @dataclass(frozen=True)
@@ -97,19 +100,65 @@ def section(
     observation: Observation,
     estimate: Estimate,
     corners: BoardCorners,
-    links: Links,
+    images: Mapping[int, Sequence[Integers]],
 ) -> Part | None:
-    """Section of the report; None without residuals."""
-    result = fields(session, field_offsets(session, observation.edges, estimate, corners), links)
+    """Section of the report; None without residuals.
+
+    images : of the stations, by their indices.
+    """
+    offsets = field_offsets(session, observation.edges, estimate, corners)
+    result = fields(session, offsets)
     if not result:
         return None
-    image_fields, factor, longest = result
+    lengths = np.array([np.hypot(*cell.displacement) for one in result for cell in one.cells])
+    factor = enlargement(lengths, FIELD_ARROW_LENGTH * max(one.size[0] for one in result))
     text = (
-        f"{FIELD_READING_TEXT} Drawn {factor:g} times as long as they are; the longest is"
-        f" {brief(longest)} px."
+        f"{FIELD_READING_TEXT} Arrows are {factor:g} times as long as the residuals; the largest is"
+        f" {brief(float(lengths.max()))} px."
     )
-    html = page.filled_template("fields.html.j2", fields=image_fields)
-    return Part("field", "Residuals over the picture", (text,), html=html, menu="Over the picture")
+    block = blocks.Images(
+        images=tuple(field_image(one, factor, images.get(one.station, ())) for one in result),
+        size="figure",
+    )
+    return Part(
+        "field",
+        "Residuals over the image",
+        blocks=(Paragraph(text=text), block),
+        menu="Over the image",
+    )
+
+
+def field_image(
+    one: ImageField, factor: float, images: Sequence[Integers], caption: str = ""
+) -> blocks.Image:
+    """Mean residuals over the mean of images.
+
+    factor : enlargement of the arrows.
+    """
+    cross = blocks.Cross(at=one.middle, tip="Principal point")
+    shapes: tuple[blocks.Shape, ...] = (cross, *one.cells)
+    layer = blocks.Layer(name="residuals", shapes=shapes, enlargement=factor)
+    mean = mean_image(images)
+    return blocks.Image(
+        title=one.title,
+        caption=caption,
+        width=one.size[0],
+        height=one.size[1],
+        jpeg="" if mean is None else base64_jpeg(mean),
+        overlays=(blocks.Overlay(layers=(layer,)),),
+    )
+
+
+def mean_image(images: Sequence[Integers]) -> Integers | None:
+    """Mean of a few images, spread over all of them; None if none can be read."""
+    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), MEAN_IMAGES)).astype(int))
+    sizes = list[Array]()
+    for k in chosen.tolist():
+        try:
+            sizes.append(narrowed(images[k], MEAN_IMAGE_WIDTH).astype(float))
+        except InputError:  # the images' own section names it
+            continue
+    return np.rint(np.mean(sizes, axis=0)).astype(np.uint8) if sizes else None
 
 
 def field_offsets(
@@ -152,11 +201,8 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
     legs = legs_in_camera(
         machine, state.T_camera_base[s], state.T_base_platform[rows], session.joints[rows]
     )
-    own = own_edges(machine, legs, image, some)
-    outward = state.columns[EDGE_SHIFT][session.camera_of_station[s]]
-    normal = own.normal + outward * (some.basis @ some.shift[..., None])[..., 0]
-    normal /= np.sqrt(dot(normal, normal))[..., None]
-    shifted = replace(own, normal=normal)
+    outward = float(state.columns[EDGE_SHIFT][session.camera_of_station[s]])
+    shifted = own_edges(machine, legs, image, some, outward)
     measured, expected = (
         measured_curves(machine, camera, legs, image, part, FIELD_EDGE_FRACTIONS)
         for part in (some, shifted)
@@ -173,38 +219,24 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
     )
 
 
-def fields(
-    session: Session, value: Offsets, links: Links
-) -> tuple[tuple[ImageField, ...], float, float] | None:
-    """Field of each station, with the arrows' enlargement and the longest arrow, px.
-
-    Hand-held images of one camera share a field. None without a cell.
-    """
-    entries = [station.entry or station.name for station in session.stations]
-    arrows: list[tuple[str, int, list[Arrow]]] = []
+def fields(session: Session, value: Offsets) -> tuple[ImageField, ...]:
+    """Field of each station with enough data; hand-held images of one camera share a field."""
+    links, entries = Links.of(session), [one.entry or one.name for one in session.stations]
+    out: list[ImageField] = []
     for entry in dict.fromkeys(entries):
         of_entry = [s for s, name in enumerate(entries) if name == entry]
         mine = np.isin(value.station, of_entry)
-        size = session.stations[of_entry[0]].camera.image_size
-        cells = _cells(value.select(mine), size, links)
+        camera = session.stations[of_entry[0]].camera
+        cells = _cells(value.select(mine), camera.image_size, links)
         if cells:
-            arrows.append((entry, of_entry[0], cells))
-    if not arrows:
-        return None
-    lengths = np.array([np.hypot(cell.dx, cell.dy) for _, _, cells in arrows for cell in cells])
-    width = max(session.stations[s].camera.image_size[0] for _, s, _ in arrows)
-    factor = enlargement(lengths, FIELD_ARROW_LENGTH * width)
-    out: list[ImageField] = []
-    for entry, s, cells in arrows:
-        camera = session.stations[s].camera
-        intrinsics = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
-        middle = intrinsics["center.x"], intrinsics["center.y"]
-        enlarged = tuple(replace(cell, dx=cell.dx * factor, dy=cell.dy * factor) for cell in cells)
-        out.append(ImageField(entry, *camera.image_size, middle, enlarged))
-    return tuple(out), factor, float(lengths.max())
+            intrinsics = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+            middle = intrinsics["center.x"], intrinsics["center.y"]
+            size = camera.image_size
+            out.append(ImageField(entry, of_entry[0], size, middle, tuple(cells)))
+    return tuple(out)
 
 
-def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
+def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[blocks.Arrow]:
     """Mean shifts, px, of the image's cells with enough data."""
     from scipy.special import fdtrc
 
@@ -248,7 +280,7 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
     places = (
         np.stack([cells % FIELD_CELLS_ACROSS, cells // FIELD_CELLS_ACROSS], axis=-1) + 0.5
     ) * side - 0.5
-    out: list[Arrow] = []
+    out: list[blocks.Arrow] = []
     for c in np.flatnonzero(n >= FEWEST_IN_A_CELL).tolist():
         here = first[number_of == c]
         (x, y), (right, down) = places[c].tolist(), shift[c].tolist()
@@ -258,6 +290,14 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[Arrow]:
             f" {len(np.unique(some.thing[here]))} edges and corners"
         )
         size_of = np.abs(value[number_of == c])
-        lead = links.to_largest(some.station[here], some.configuration[here], size_of)
-        out.append(Arrow(x, y, right, down, not significant[c], tip, lead))
+        key = links.to_largest(some.station[here], some.configuration[here], size_of)
+        out.append(
+            blocks.Arrow(
+                at=(round(x, 1), round(y, 1)),
+                displacement=(round(right, 5), round(down, 5)),
+                key=key,
+                tip=tip,
+                dashed=not significant[c],
+            )
+        )
     return out

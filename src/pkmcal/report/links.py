@@ -1,13 +1,14 @@
-"""Links from charts to the images on the page."""
+"""Keys of images and configurations, by which plots and arrows lead to images of the page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.outcome.blocks.base import Key, configuration_key, image_key
+from pkmcal.session.load import Session
 
 Place = tuple[int, int]
 """Image by the indices of its station and configuration."""
@@ -15,30 +16,30 @@ Place = tuple[int, int]
 
 @dataclass(frozen=True)
 class Links:
-    """Links to images; empty texts for images that are not on the page.
+    """Keys by indices of stations and configurations; empty keys without their names."""
 
-    anchors : ids on the page, in its order.
-    by_configuration : id of each configuration's first image.
-    """
-
-    anchors: dict[Place, str] = field(default_factory=dict[Place, str])
-    by_configuration: dict[int, str] = field(default_factory=dict[int, str])
+    stations: tuple[str, ...] = ()
+    configurations: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, places: Iterable[Place]) -> Links:
-        """Links to images in the page's order."""
-        anchors = {(s, k): f"image-{s + 1}-{k + 1}" for s, k in places}
-        return cls(anchors, {k: name for (_, k), name in reversed([*anchors.items()])})
+    def of(cls, session: Session) -> Links:
+        """Keys of a session's images and configurations."""
+        return cls(tuple(one.name for one in session.stations), tuple(session.configurations))
 
-    def to_configuration(self, k: int) -> str:
-        """Link to a configuration's first image."""
-        return f"#{self.by_configuration[k]}" if k in self.by_configuration else ""
+    def to_image(self, s: int, k: int) -> Key:
+        """Key of the image of a configuration at a station."""
+        return image_key(self.stations[s], self.configurations[k]) if self.stations else ""
 
-    def to_largest(self, station: Integers, configuration: Integers, size: Array) -> str:
-        """Link to the image of the largest value.
+    def to_configuration(self, k: int) -> Key:
+        """Key of a configuration."""
+        return configuration_key(self.configurations[k]) if self.configurations else ""
+
+    def to_largest(self, station: Integers, configuration: Integers, size: Array) -> Key:
+        """Key of the image of the largest value.
 
         station, configuration, size : (n,); NaN counts least.
         """
-        order = np.argsort(-np.nan_to_num(size, nan=-np.inf), kind="stable")
-        places = zip(station[order].tolist(), configuration[order].tolist(), strict=True)
-        return next((f"#{self.anchors[place]}" for place in places if place in self.anchors), "")
+        if not len(size):
+            return ""
+        largest = int(np.argmax(np.nan_to_num(size, nan=-np.inf)))
+        return self.to_image(int(station[largest]), int(configuration[largest]))

@@ -3,39 +3,43 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers, enlargement
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, Rejection
-from pkmcal.observe.images import Pictures
-from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tubes_of
-from pkmcal.outcome import Part
-from pkmcal.pages import page
-from pkmcal.pages.jpegs import FULL_JPEGS, small_and_large
-from pkmcal.pages.overlays import (
+from pkmcal.observe.images import Pictures, upright_turns
+from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
+from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
-    INLIER_WEIGHT,
-    Arrow,
-    Drawn,
-    Picture,
+    EdgeCurve,
     Spot,
+    edge_layer,
     edge_name,
+    joint_layers,
     measured_curves,
     polyline,
     residual_words,
     straightened,
 )
+from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tubes_of
+from pkmcal.outcome import Part
+from pkmcal.outcome.blocks import images as blocks
+from pkmcal.outcome.blocks.base import image_key
+from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.links import Links, Place
+from pkmcal.report.links import Place
+from pkmcal.report.strips import edge_lines, strips_of_image
 from pkmcal.session.image_files import Image
 from pkmcal.session.load import Session, Station
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
@@ -52,7 +56,9 @@ class AlbumSize:
     # images: browsers take a second to lay out as many
     images: int = 400
     # characters of all JPEGs
-    jpeg_characters: int = 8_000_000
+    jpeg_characters: int = PAGE_JPEG_CHARACTERS
+    # first images with strips: those of all would double the page
+    strips: int = 12
 
 
 ALBUM_SIZE = AlbumSize()
@@ -68,27 +74,69 @@ class Album:
     corners : corners of the board in all images.
     """
 
-    pictures: tuple[Picture, ...]
-    rejected: tuple[Picture, ...]
+    images: tuple[blocks.Image, ...]
+    rejected: tuple[blocks.Image, ...]
     total: int
     factor: float
-    links: Links
     corners: BoardCorners
 
 
-def section(session: Session, display: Album) -> Part:
+def section(session: Session, album: Album) -> Part:
     """Section of the report."""
-    html = page.filled_template(
-        "photographs.html.j2",
-        n_legs=session.machine.n_legs,
-        album=display,
-        legs=any(p.edges or p.missed or p.spots for p in display.pictures),
-        boards=any(p.corners for p in display.pictures),
-        missed=any(p.missed for p in display.pictures),
-        large=sum(bool(p.large) for p in display.pictures),
-        full=FULL_JPEGS,
+    if not (album.images or album.rejected):
+        return Part("photographs", "Images", ("There is no image to show.",))
+    legs = session.machine.n_legs
+    parts = [
+        Paragraph(text=_order_text(album)),
+        Paragraph(text=_legend_text(album), small=True),
+        blocks.Images(images=album.images, legs=legs if _has(album, "edges") else 0),
+    ]
+    if album.rejected:
+        parts += [
+            Paragraph(
+                text="Rejected as a whole: these images do not show where they were taken from, and"
+                " nothing of them is in use."
+            ),
+            blocks.Images(images=album.rejected),
+        ]
+    return Part("photographs", "Images", blocks=tuple(parts))
+
+
+def _order_text(album: Album) -> str:
+    """Which images there are, and their order."""
+    n, strips = len(album.images), sum(bool(one.strips) for one in album.images)
+    some = f"{n} of {album.total} images" if n < album.total else f"All {count(n, 'image')}"
+    text = f"{some}: those without data in use first, then by their residuals, the largest first."
+    if strips:
+        which = "every image" if strips == n else f"the first {count(strips, 'image')}"
+        text += (
+            f" In {which}, a click on an edge shows the image along it, with the fitted line and"
+            " its standard deviation."
+        )
+    return text
+
+
+def _legend_text(album: Album) -> str:
+    """What the overlays' shapes are."""
+    texts = {
+        "edges": "Lines: measured edges in their leg's colour, dashed where the robust weight is"
+        " below a half.",
+        "rejected": "Dotted: edges that were searched and rejected.",
+        "joints": "Circles: joints of the calibrated machine; crosses: of the nominal model.",
+        "corners": "Small circles: detected corners of the board; arrows: to where the calibrated"
+        f" machine expects them, {album.factor:g} times as long as they are.",
+    }
+    return " ".join(text for name, text in texts.items() if _has(album, name))
+
+
+def _has(album: Album, name: str) -> bool:
+    """Whether an image has shapes in a layer."""
+    return any(
+        layer.name == name and layer.shapes
+        for image in album.images
+        for overlay in image.overlays
+        for layer in overlay.layers
     )
-    return Part("photographs", "Images", html=html)
 
 
 def album(
@@ -111,34 +159,36 @@ def album(
         for photo in {p.configuration: p for p in reversed(station.images)}.values()
     ]
     ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
-    images = {s: _decoded(station) for s, station in enumerate(session.stations)} | {
-        **calibration.images
-    }
+    images = station_images(calibration)
     files = [
         (images[s], session.stations[s].images.index(photo))
         for s, photo in ordered[: largest.images]
     ]
     # JPEGs until the budget is spent; overlays for the images that have one
-    shots = list(small_and_large(files, largest.jpeg_characters))
-    chosen = ordered[: len(shots)]
-    links = Links.of((s, photo.configuration) for s, photo in chosen)
+    jpegs = list(jpegs_within(files, largest.jpeg_characters))
+    chosen = ordered[: len(jpegs)]
     overlays = _ImageOverlays(calibration, shifts, centres, chosen)
-    room = largest.jpeg_characters - sum(len(small) + len(large) for small, large in shots)
+    overlays.add_strips(images, chosen[: largest.strips])
+    room = largest.jpeg_characters - sum(map(len, jpegs))
     return Album(
         tuple(
-            overlays.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
-            for (s, photo), shot in zip(chosen, shots, strict=True)
-            for place in [(s, photo.configuration)]
+            overlays.image(s, photo, jpeg, level.get((s, photo.configuration), np.nan))
+            for (s, photo), jpeg in zip(chosen, jpegs, strict=True)
         ),
         tuple(_rejected(session, largest.images, room)),
         len(every),
         overlays.factor,
-        links,
         overlays.corners,
     )
 
 
-def _rejected(session: Session, most: int, room: int) -> Iterator[Picture]:
+def station_images(calibration: Calibration) -> dict[int, Sequence[Integers]]:
+    """Images of each station by its index, decoded on access where they are not in memory."""
+    stations = enumerate(calibration.session.stations)
+    return {s: _decoded(station) for s, station in stations} | {**calibration.images}
+
+
+def _rejected(session: Session, most: int, room: int) -> Iterator[blocks.Image]:
     """Images that could not be localized, each with the reason.
 
     ``most`` of them are shown, in ``room`` characters of JPEGs. Images without room are listed
@@ -146,20 +196,30 @@ def _rejected(session: Session, most: int, room: int) -> Iterator[Picture]:
     """
     lost = [(one, photo) for one in session.rejected for photo in one.station.images]
     files = [(_decoded(one.station), one.station.images.index(photo)) for one, photo in lost[:most]]
-    shots = list(small_and_large(files, room))
-    shots += [("", "")] * (len(lost) - len(shots))
-    for k, ((one, photo), shot) in enumerate(zip(lost, shots, strict=True), start=1):
-        width, height = one.station.camera.image_size
-        yield Picture(
-            station=one.station.name,
-            configuration=session.configurations[photo.configuration],
-            width=width,
-            height=height,
-            jpeg=shot[0],
-            large=shot[1],
-            caption=f"left out, for {one.reason}",
-            anchor=f"rejected-{k}",
+    jpegs = list(jpegs_within(files, room))
+    jpegs += [""] * (len(lost) - len(jpegs))
+    for (one, photo), jpeg in zip(lost, jpegs, strict=True):
+        yield _block(
+            one.station, photo, session.configurations, f"rejected, for {one.reason}", jpeg
         )
+
+
+def _block(
+    station: Station, photo: Image, configurations: Sequence[str], caption: str, jpeg: str
+) -> blocks.Image:
+    """Image without overlays."""
+    configuration = configurations[photo.configuration]
+    width, height = station.camera.image_size
+    return blocks.Image(
+        title=f"{station.name} / {configuration}",
+        caption=caption,
+        group=station.name,
+        key=image_key(station.name, configuration),
+        width=width,
+        height=height,
+        quarter_turns=upright_turns(photo.path, station.camera.image_size),
+        jpeg=jpeg,
+    )
 
 
 def _decoded(station: Station) -> Pictures:
@@ -201,8 +261,9 @@ class _ImageOverlays:
     ) -> None:
         self.calibration = calibration
         session, estimate = calibration.session, calibration.estimate
-        self.edges: dict[Place, list[Drawn]] = defaultdict(list)
-        self.missed: dict[Place, list[Drawn]] = defaultdict(list)
+        self.edges: dict[Place, dict[int, EdgeCurve]] = defaultdict(dict)
+        self.missed: dict[Place, list[EdgeCurve]] = defaultdict(list)
+        self.strips: dict[Place, tuple[tuple[blocks.Strip, ...], str]] = {}
         self.spots: dict[Place, list[Spot]] = defaultdict(list)
         self.reasons: dict[Place, list[str]] = defaultdict(list)
         self.corners = board_corners(session, calibration.boards, estimate)
@@ -228,16 +289,38 @@ class _ImageOverlays:
                 self._missed(rejected[s], s, configurations)
                 self._spots(centres, s, configurations)
 
-    def picture(
-        self, s: int, photo: Image, shot: tuple[str, str], anchor: str, level: float
-    ) -> Picture:
-        """Image with its overlays."""
+    def add_strips(
+        self,
+        images: Mapping[int, Sequence[Integers]],
+        chosen: Sequence[tuple[int, Image]],
+    ) -> None:
+        """Strips of the edges in some images."""
+        c, coarse = self.calibration, self.calibration.observation.edges.coarse
+        for s, photo in chosen:
+            place = s, photo.configuration
+            mine = np.array([n for n in self.edges[place] if not coarse[n]], dtype=int)
+            if not len(mine):
+                continue
+            try:
+                image = images[s][c.session.stations[s].images.index(photo)]
+            except InputError:  # the caption names it
+                continue
+            lines = edge_lines(c, mine, s)
+            finite = np.isfinite(lines.curve).all(axis=(1, 2)) & np.isfinite(lines.sigma).all(
+                axis=1
+            )
+            mine, lines = mine[finite], lines.select(np.asarray(finite))
+            self.strips[place] = strips_of_image(c, image, mine, lines)
+            for k, n in enumerate(mine.tolist()):
+                self.edges[place][n] = replace(self.edges[place][n], strip=k)
+
+    def image(self, s: int, photo: Image, jpeg: str, level: float) -> blocks.Image:
+        """Image with its overlay."""
         session = self.calibration.session
         k, station = photo.configuration, session.stations[s]
         p, c = station.images.index(photo), self.corners
         mine = c.select((c.station == s) & (c.image == p))
-        width, height = station.camera.image_size
-        edges, missed = self.edges[s, k], self.missed[s, k]
+        edges, missed = tuple(self.edges[s, k].values()), self.missed[s, k]
         n_rejected = sum(edge.quiet for edge in edges)
         rms = float(np.sqrt(np.mean(np.sum(mine.off**2, axis=1)))) if len(mine) else 0.0
         captions = [
@@ -248,31 +331,44 @@ class _ImageOverlays:
             f"{count(len(mine), 'corner')}, {brief(rms)} px off" if len(mine) else "",
             f"residuals {number(level, 2)} σ" if np.isfinite(level) else "nothing in use",
             *self.reasons[s, k],
-            "" if shot[0] else "the file could not be read",
+            "" if jpeg else "the file could not be read",
         ]
-        return Picture(
-            station=station.name,
-            configuration=session.configurations[k],
-            width=width,
-            height=height,
-            jpeg=shot[0],
-            large=shot[1],
-            edges=tuple(edges),
-            missed=tuple(missed),
-            spots=tuple(self.spots[s, k]),
-            corners=tuple(self._corner(mine, n) for n in range(len(mine))),
-            caption="; ".join(text for text in captions if text),
-            anchor=anchor,
+        caption = "; ".join(text for text in captions if text)
+        layers = (
+            edge_layer("rejected", missed),
+            edge_layer("edges", edges),
+            *self._corner_layers(mine),
+            *joint_layers(self.spots[s, k]),
+        )
+        strips, sheet = self.strips.get((s, k), ((), ""))
+        return _block(station, photo, session.configurations, caption, jpeg).model_copy(
+            update={
+                "overlays": (blocks.Overlay(layers=tuple(one for one in layers if one.shapes)),),
+                "strips": strips,
+                "strip_jpeg": sheet,
+            }
         )
 
-    def _corner(self, corners: BoardCorners, n: int) -> Arrow:
-        """Arrow from a detected corner to its prediction."""
-        (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
-        tip = (
-            f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
-            f" {number(-dy, 2, signed=True)} px from where it is expected"
+    def _corner_layers(self, corners: BoardCorners) -> tuple[blocks.Layer, blocks.Layer]:
+        """Detected corners, and arrows from there to where they are predicted."""
+        rings, arrows = list[blocks.Shape](), list[blocks.Shape]()
+        for n in range(len(corners)):
+            (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
+            tip = (
+                f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
+                f" {number(-dy, 2, signed=True)} px from where it is expected"
+            )
+            at, dashed = (round(x, 2), round(y, 2)), not corners.used[n]
+            rings.append(blocks.Ring(at=at, tip=tip, dashed=dashed))
+            arrows.append(
+                blocks.Arrow(
+                    at=at, displacement=(round(dx, 4), round(dy, 4)), tip=tip, dashed=dashed
+                )
+            )
+        return (
+            blocks.Layer(name="corners", shapes=tuple(rings)),
+            blocks.Layer(name="residuals", shapes=tuple(arrows), enlargement=self.factor),
         )
-        return Arrow(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
 
     def _edges(self, shifts: Array, s: int, configurations: Integers) -> None:
         """Collect the measured edges of a station."""
@@ -291,7 +387,7 @@ class _ImageOverlays:
             )
             drawn = polyline(leg, points, weight < INLIER_WEIGHT, tip)
             if drawn:
-                self.edges[s, int(edges.configuration[n])].append(drawn)
+                self.edges[s, int(edges.configuration[n])][n] = drawn
 
     def _missed(self, rejected: list[Rejection], s: int, configurations: Integers) -> None:
         """Collect predictions of rejected edges, each with the reason."""

@@ -17,10 +17,10 @@ from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.measurements.effects import EDGE_SHIFT
+from pkmcal.observe.overlays import EDGE_SIDE_NAMES
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.outcome.blocks.base import station_key
 from pkmcal.outcome.blocks.text import Fact, Facts, Listing, Paragraph
-from pkmcal.pages.overlays import EDGE_SIDE_NAMES
 from pkmcal.report import parameters
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT

@@ -12,6 +12,7 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.measurements.effects import EDGE_SHIFT
+from pkmcal.observe.overlays import EDGE_SIDE_NAMES
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import Key, configuration_key, leg_key, station_key
@@ -29,9 +30,9 @@ from pkmcal.outcome.blocks.plot import (
     rounded,
 )
 from pkmcal.outcome.blocks.text import Listing
-from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
 from pkmcal.report.charts import NORMAL_90, bar_plot, box, row_plot
 from pkmcal.session.load import Session
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import count, joined, named, number
 
 GROUP_STANDS_OUT_FACTOR = 1.5

@@ -93,7 +93,7 @@ class Viewed:
 
     def jpeg(self, s: int, k: int, widest: int = WIDEST_VIEWED_PICTURE) -> bytes:
         """Image as JPEG in the size of the screen, at most ``widest`` pixels across."""
-        from pkmcal.pages.jpegs import coded, narrowed
+        from pkmcal.observe.jpegs import coded, narrowed
 
         return coded(narrowed(self.image(s, k), widest), VIEWED_JPEG_QUALITY)
 

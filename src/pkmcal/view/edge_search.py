@@ -16,10 +16,8 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import StationImages
-from pkmcal.observe.predict import EdgePoints, edge_points, legs_in_camera, tubes_of
-from pkmcal.pages.overlays import (
+from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
-    INLIER_WEIGHT,
     edge_name,
     measured_curves,
     offsets_across_curves,
@@ -28,8 +26,10 @@ from pkmcal.pages.overlays import (
     residual_words,
     straightened,
 )
+from pkmcal.observe.predict import EdgePoints, edge_points, legs_in_camera, tubes_of
+from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.view.content import Pane, Viewed
-from pkmcal.view.overlay import placed_by_hand
+from pkmcal.view.overlay import path_data, placed_by_hand
 from pkmcal.view.requests import ViewRequest
 from pkmcal.wording import count, number
 
@@ -101,7 +101,7 @@ def _legs(viewed: Viewed, request: ViewRequest, pane: Pane, out: dict[str, Any])
             quiet, tip = True, f"{tip}; {reasons[place]}"
         line = polyline(place[0], points, quiet, tip)
         if line:
-            out["edges"].append({"leg": line.leg, "d": line.path, "quiet": quiet, "tip": tip})
+            out["edges"].append({"leg": line.leg, "d": path_data(line), "quiet": quiet, "tip": tip})
     # predicted edges that were not measured
     missed = _missing_edges(pane, measured.edges, measured.rejected, reasons)
     out["missed"] = missed
@@ -183,7 +183,7 @@ def _missing_edges(
         tip = f"{edge_name(*place).capitalize()}: {why}"
         line = polyline(place[0], points, True, tip)
         if line:
-            out.append({"leg": line.leg, "d": line.path, "tip": line.tip, "reason": why})
+            out.append({"leg": line.leg, "d": path_data(line), "tip": line.tip, "reason": why})
     return out
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
-from pkmcal.pages.overlays import (
+from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
-    Drawn,
+    EdgeCurve,
     machine_laid_over,
     polyline,
     straightened,
@@ -47,7 +47,7 @@ def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any
         {
             "leg": leg,
             "quiet": not pane.machine.document.legs[leg - 1].tubes,
-            "d": "".join(edge.path for edge in lines if edge.leg == leg),
+            "d": "".join(path_data(edge) for edge in lines if edge.leg == leg),
         }
         for leg in legs
     ]
@@ -67,6 +67,11 @@ def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any
         "legs": paths,
         "joints": joints,
     }
+
+
+def path_data(edge: EdgeCurve) -> str:
+    """Edge as data of an SVG path."""
+    return "M" + "L".join(f"{x:.2f},{y:.2f}" for x, y in edge.points)
 
 
 def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
@@ -117,7 +122,7 @@ def _joint(viewed: Viewed, request: ViewRequest, k: int) -> Array:
     return points[pin.leg - 1]
 
 
-def _bare_limbs(pane: Pane) -> list[Drawn]:
+def _bare_limbs(pane: Pane) -> list[EdgeCurve]:
     """Axes of the legs without tubes."""
     bare = [j for j, leg in enumerate(pane.machine.document.legs) if not leg.tubes]
     if not bare:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
+from pkmcal.errors import legible
 from pkmcal.files import resolved
 from pkmcal.view.content import Viewed
 from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
@@ -12,10 +13,15 @@ from pkmcal.view.pose_file import PoseFile
 from pkmcal.view.requests import ViewRequest
 from pkmcal.web import serving
 from pkmcal.web.guard import Guard
+from pkmcal.web.page import script_json
 
 if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.responses import Response
+
+
+STATE_MARK = "{{ state }}"
+"""Place of the state's JSON in ``view.html``."""
 
 
 def application(viewed: Viewed, token: str, port: int) -> Guard:
@@ -56,8 +62,7 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
         return Response(_template("view.js"), media_type="text/javascript")
 
     async def style(_request: Request) -> Response:
-        report = (resources.files("pkmcal.pages") / "templates" / "style.css").read_text("utf-8")
-        return Response(report + _template("view.css"), media_type="text/css")
+        return Response(_template("view.css"), media_type="text/css")
 
     # requests by POST, each a validated JSON document
     routes = [
@@ -76,33 +81,31 @@ def application(viewed: Viewed, token: str, port: int) -> Guard:
 
 
 def view_page_html(viewed: Viewed) -> str:
-    """HTML of the page; it requests images and overlays itself."""
-    from pkmcal.pages.page import environment
-
+    """HTML of the page with its state; it requests images and overlays itself."""
     session = viewed.session
     stations = [
         {
-            "name": station.name,
+            "name": legible(station.name),
             "size": station.camera.image_size,
             "legs": "legs" in station.observe,
             "handheld": station.handheld,
             "posed": station.T_camera_base is not None,
             "images": [
-                " ".join([session.configurations[p.configuration], *filter(None, [p.repeat])])
+                legible(
+                    " ".join([session.configurations[p.configuration], *filter(None, [p.repeat])])
+                )
                 for p in station.images
             ],
         }
         for station in session.stations
     ]
-    template = environment().from_string(_template("view.html.j2"))
-    return template.render(
-        name=resolved(session.folder).name,
-        folder=session.folder,
-        n_legs=session.machine.n_legs,
-        stations=stations,
-        calibrated=viewed.calibration is not None,
-        state={"stations": stations, "calibrated": viewed.calibration is not None},
-    )
+    state = {
+        "name": legible(resolved(session.folder).name),
+        "legs": session.machine.n_legs,
+        "stations": stations,
+        "calibrated": viewed.calibration is not None,
+    }
+    return _template("view.html").replace(STATE_MARK, script_json(state))
 
 
 def _template(name: str) -> str:

@@ -10,8 +10,6 @@ from importlib import resources
 
 SCRIPT_FILE, STYLE_FILE = "viewer.js", "viewer.css"
 """The viewer."""
-ENLARGED_FILE = "enlarged.js"
-"""The inspector of images, for pages that are not yet views of the viewer."""
 
 
 @cache

@@ -2,6 +2,7 @@
 
 import type { Section } from "../document";
 import type { Selection } from "../selection";
+import { images } from "./images";
 import { logBar } from "./log_bar";
 import { panels, plot } from "./plot";
 import { dataTable } from "./table";
@@ -25,6 +26,7 @@ const DRAWERS: Drawers = {
   log_bar: logBar,
   plot,
   panels,
+  images,
 };
 
 export function drawBlock(block: Block, context: Context): HTMLElement {

@@ -10,12 +10,13 @@ from typing import Annotated
 
 from pydantic import Field
 
+from pkmcal.outcome.blocks.images import Images
 from pkmcal.outcome.blocks.log_bar import LogBar
 from pkmcal.outcome.blocks.plot import Panels, Plot
 from pkmcal.outcome.blocks.table import DataTable
 from pkmcal.outcome.blocks.text import Checks, Downloads, Facts, Listing, Paragraph
 
 Block = Annotated[
-    Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar | Plot | Panels,
+    Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar | Plot | Panels | Images,
     Field(discriminator="kind"),
 ]

@@ -16,6 +16,29 @@ const timings = []; // ms from a move of the mouse to the overlay that it asked 
 const held = () => here.shown === "calibration";
 const mine = () => stations[here.s];
 
+// ---------------------------------------------------------------- state
+
+function node(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  made.append(...children);
+  return made;
+}
+
+document.title = `${state.name}, images`;
+$("name").textContent = state.name;
+$("machines").hidden = !state.calibrated;
+state.stations.forEach((station, s) => {
+  const heading = node("h2", {}, station.name);
+  if (station.handheld) heading.append(" ", node("span", { class: "small" }, "by hand"));
+  document.querySelector(".list").append(heading, node("ol", {}, ...station.images.map((image, k) =>
+    node("li", {}, node("button", { type: "button", "data-station": s, "data-image": k }, image)))));
+});
+for (let leg = 1; leg <= state.legs; leg += 1) {
+  $("legs").append(node("li", {}, node("span", { class: `chip photo leg-${(leg - 1) % 8 + 1}` }, `${leg}`), " ",
+    node("span", { class: "small", "data-leg": leg })));
+}
+
 // ---------------------------------------------------------------- asking
 
 async function post(what, body) {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -23,6 +22,8 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
+from pkmcal.outcome.blocks import images as blocks
+from pkmcal.outcome.blocks.base import leg_key
 from pkmcal.wording import number
 
 EDGE_CURVE_POINTS = 13
@@ -36,29 +37,26 @@ FINE_EDGE_CURVE_POINTS = 65
 """Points of a predicted curve, so that occlusion by other legs is resolved to 1/64 of a leg."""
 LEG_NUMBER_WIDTH = 0.04
 """Width of a leg's number and its joint mark, in image widths."""
-INLIER_WEIGHT = 0.5
-"""Robust weight below which an edge counts as rejected; overlays draw it dashed."""
+PIXEL_DECIMALS = 2
+"""Decimals of pixels in a document."""
 
 
 @dataclass(frozen=True)
-class Drawn:
+class EdgeCurve:
     """Edge as a polyline in pixels.
 
     leg : from 1.
     points : n pairs (x, y).
-    quiet : drawn dashed.
+    quiet : not in use; dashed.
     tip : tooltip.
+    strip : index of its rectified strip, None without one.
     """
 
     leg: int
     points: tuple[tuple[float, float], ...]
     quiet: bool
     tip: str
-
-    @cached_property
-    def path(self) -> str:
-        """SVG path data."""
-        return "M" + "L".join(f"{x:.2f},{y:.2f}" for x, y in self.points)
+    strip: int | None = None
 
 
 def edge_name(leg: int, tube: int, side: int) -> str:
@@ -66,14 +64,16 @@ def edge_name(leg: int, tube: int, side: int) -> str:
     return f"leg {leg + 1}, tube {tube + 1}, {EDGE_SIDE_NAMES[side]} edge"
 
 
-def polyline(leg: int, points: Sequence[Sequence[float]], quiet: bool, tip: str) -> Drawn | None:
+def polyline(
+    leg: int, points: Sequence[Sequence[float]], quiet: bool, tip: str
+) -> EdgeCurve | None:
     """Polyline through the points of :func:`straightened`; None for fewer than two.
 
     leg : from 0.
     """
     if len(points) < 2:
         return None
-    return Drawn(leg + 1, tuple((x, y) for x, y in points), quiet, tip)
+    return EdgeCurve(leg + 1, tuple((x, y) for x, y in points), quiet, tip)
 
 
 @dataclass(frozen=True)
@@ -102,52 +102,40 @@ class Spot:
         return f"Leg {self.leg}, {self.end} joint: nominal model {number(away, 1)} px away"
 
 
-@dataclass(frozen=True)
-class Arrow:
-    """Displacement in an image, px, as drawn: of a board's corner, or the mean residual of a cell.
-
-    A corner's arrow leads from the detected to the predicted pixel.
-
-    x, y : start. dx, dy : components.
-    lead : link to the data of the arrow.
-    """
-
-    x: float
-    y: float
-    dx: float
-    dy: float
-    quiet: bool = False
-    tip: str = ""
-    lead: str = ""
+def edge_layer(name: blocks.LayerName, edges: Sequence[EdgeCurve]) -> blocks.Layer:
+    """Layer of edges in their legs' colours."""
+    digits = PIXEL_DECIMALS
+    shapes = tuple(
+        blocks.Polyline(
+            points=tuple((round(x, digits), round(y, digits)) for x, y in one.points),
+            key=leg_key(one.leg),
+            tip=one.tip,
+            dashed=one.quiet,
+            strip=one.strip,
+        )
+        for one in edges
+    )
+    return blocks.Layer(name=name, shapes=shapes)
 
 
-@dataclass(frozen=True)
-class Picture:
-    """Image with its overlays.
-
-    jpeg, large : base64; empty if the file cannot be read, large also if there was no room.
-    edges, spots, corners : overlays.
-    why : reason for showing the image.
-    caption : contents of the image.
-    kind : measured or predicted edges.
-    anchor : id on the page.
-    missed : edges that were searched and rejected.
-    """
-
-    station: str
-    configuration: str
-    width: int
-    height: int
-    jpeg: str
-    edges: tuple[Drawn, ...] = ()
-    spots: tuple[Spot, ...] = ()
-    why: str = ""
-    caption: str = ""
-    kind: str = "measured"
-    anchor: str = ""
-    large: str = ""
-    missed: tuple[Drawn, ...] = ()
-    corners: tuple[Arrow, ...] = ()
+def joint_layers(spots: Sequence[Spot]) -> tuple[blocks.Layer, ...]:
+    """Layers of joint centres, and of those of the nominal model where it is compared."""
+    rings = tuple(
+        blocks.Ring(
+            at=one.calibrated,
+            key=leg_key(one.leg),
+            tip=one.tip,
+            label=str(one.leg) if one.labelled else "",
+        )
+        for one in spots
+    )
+    crosses = tuple(
+        blocks.Cross(at=one.nominal, key=leg_key(one.leg))
+        for one in spots
+        if one.nominal is not None
+    )
+    layers = blocks.Layer(name="joints", shapes=rings), blocks.Layer(name="nominal", shapes=crosses)
+    return tuple(layer for layer in layers if layer.shapes)
 
 
 def machine_laid_over(
@@ -156,7 +144,7 @@ def machine_laid_over(
     T_camera_base: Array,
     joints: Array,
     T_base_platform: Array,
-) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
+) -> tuple[tuple[EdgeCurve, ...], tuple[Spot, ...]]:
     """Visible silhouettes of a machine's tubes in an image, and its joint centres.
 
     Parts of a silhouette that another leg occludes are left out.
@@ -168,7 +156,7 @@ def machine_laid_over(
     legs = legs_in_camera(machine, T_camera_base, T_base_platform[None], joints[None])
     points = edge_points(machine, camera, legs, tubes, FINE_EDGE_CURVE_POINTS)
     clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
-    edges: list[Drawn] = []
+    edges: list[EdgeCurve] = []
     # each visible stretch is a polyline of its own
     for e, (curve, visible) in enumerate(zip(points.pixel[0], clear, strict=True)):
         leg, tip = int(tubes.leg[e]), f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
@@ -209,14 +197,20 @@ def measured_curves(
     return camera.project(rays)
 
 
-def own_edges(machine: Machine, legs: LegsInCamera, image: Integers, edges: EdgeSet) -> EdgeSet:
-    """Edges with the normals that the machine predicts; arguments as :func:`measured_curves`."""
+def own_edges(
+    machine: Machine, legs: LegsInCamera, image: Integers, edges: EdgeSet, outward: float = 0.0
+) -> EdgeSet:
+    """Edges with the normals that the machine predicts; arguments as :func:`measured_curves`.
+
+    outward : px by which the predicted edges are shifted.
+    """
     radius = machine.layout.radius_of(edges.leg, edges.tube)
     start, stop = edges.span.T
     each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
     at = image, edges.leg
     own, _ = normals_of_edges(legs.a[at], legs.u[at], machine.values[radius], each)
-    return replace(edges, normal=own)
+    own = own + outward * (edges.basis @ edges.shift[..., None])[..., 0]
+    return replace(edges, normal=own / np.sqrt(dot(own, own))[..., None])
 
 
 def offsets_across_curves(expected: Array, measured: Array) -> tuple[Array, Array]:

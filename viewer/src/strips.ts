@@ -1,0 +1,55 @@
+/**
+ * Rectified strip of an edge, enlarged across it, with the prediction, the fitted line and its
+ * standard deviation.
+ */
+
+import "./strips.css";
+import type { Image, Strip } from "./document";
+import { h } from "./dom";
+import { toBlobUrl } from "./image_data";
+import { svg } from "./overlay";
+
+const ENLARGEMENTS = [8, 64]; // screen pixels for one across the edge
+
+export function stripPanel(image: Image, index: number): HTMLElement {
+  const strip = image.strips[index];
+  const host = h("div", { class: "strip-host" });
+  const buttons = ENLARGEMENTS.map((factor) =>
+    h("button", { type: "button", onclick: () => show(factor) }, `${factor}×`));
+  const show = (factor: number): void => {
+    host.replaceChildren(stripSvg(image, strip, factor));
+    buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(ENLARGEMENTS[k] === factor)));
+  };
+  show(ENLARGEMENTS[0]);
+  return h("div", { class: "strip" },
+    h("p", { class: "strip-title" }, strip.title, " ", ...buttons), host,
+    h("p", { class: "strip-key" },
+      h("span", { class: "fitted" }), "fitted line ± σ ", h("span", { class: "predicted" }),
+      "calibrated machine · outward is up; from the base's end at the left to the platform's"));
+}
+
+function stripSvg(image: Image, strip: Strip, factor: number): SVGElement {
+  const { length, across, row, offset, sigma } = strip;
+  const rows = across * (ENLARGEMENTS[0] / factor);
+  const middle = (across - 1) / 2;
+  const along = (k: number): number => (k * (length - 1)) / Math.max(offset.length - 1, 1);
+  const path = (values: number[]): string => values.map((one, k) => `${along(k)},${middle - one}`).join("L");
+  const upper = offset.map((one, k) => one + sigma[k]);
+  const lower = offset.map((one, k) => one - sigma[k]);
+  const sprite = {
+    width: Math.max(...image.strips.map((one) => one.length)),
+    height: Math.max(...image.strips.map((one) => one.row + one.across)),
+  };
+  const picture = svg("svg", {
+    class: "strip-image", preserveAspectRatio: "none", role: "img", "aria-label": strip.title,
+    viewBox: `-0.5 ${middle - rows / 2} ${length} ${rows}`,
+  },
+    svg("image", {
+      x: -0.5, y: -row - 0.5, ...sprite, preserveAspectRatio: "none", href: toBlobUrl(image.strip_jpeg),
+    }),
+    svg("path", { class: "predicted", d: `M${path(offset.map(() => 0))}` }),
+    svg("path", { class: "band", d: `M${path(upper)}L${path(lower).split("L").reverse().join("L")}Z` }),
+    svg("path", { class: "fitted", d: `M${path(offset)}` }));
+  picture.setAttribute("height", String(across * ENLARGEMENTS[0]));
+  return picture;
+}
