@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pkmcal import wording
+from pkmcal.arrays import enlargement
 from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
@@ -21,7 +22,7 @@ from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import wrong
 from pkmcal.pages import overlays
-from pkmcal.pages.charts import enlargement, ticks_between
+from pkmcal.pages.charts import ticks_between
 from pkmcal.pages.overlays import EDGE_CURVE_POINTS, STRAIGHT_CURVE_DEVIATION
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of

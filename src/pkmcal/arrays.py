@@ -4,6 +4,7 @@ worker threads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Hashable, Iterable
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -60,3 +61,14 @@ def _short(value: Any) -> str:
             return f"<{type(value).__name__} of {len(value)}>"
     text = repr(value)
     return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+
+
+def enlargement(lengths: Array, wanted: float) -> float:
+    """Round magnification for lengths (n,): 1, 2 or 5 times a power of ten, at least 1.
+
+    The 90 % quantile comes as near ``wanted`` as it can from below.
+    """
+    large = float(np.quantile(lengths, 0.9)) if lengths.size else wanted
+    ratio = max(wanted / max(large, 1e-9), 1.0)
+    power = 10.0 ** math.floor(math.log10(ratio))
+    return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))

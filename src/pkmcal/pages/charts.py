@@ -163,17 +163,6 @@ class BarChart:
         return "M" + "L".join(points) if points else ""
 
 
-def enlargement(lengths: Array, wanted: float) -> float:
-    """Round magnification for lengths (n,): 1, 2 or 5 times a power of ten, at least 1.
-
-    The 90 % quantile comes as near ``wanted`` as it can from below.
-    """
-    large = float(np.quantile(lengths, 0.9)) if lengths.size else wanted
-    ratio = max(wanted / max(large, 1e-9), 1.0)
-    power = 10.0 ** math.floor(math.log10(ratio))
-    return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))
-
-
 def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float, str], ...]:
     """Round values between two limits, with their text."""
     rough = (high - low) / about

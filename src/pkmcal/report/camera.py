@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from pkmcal.arrays import THREADS
+from pkmcal.arrays import THREADS, enlargement
 from pkmcal.camera_calibration.calibrate import (
     CALIBRATION_CHECK_OPTIONS,
     CameraCalibration,
@@ -63,7 +63,7 @@ def outcome_of(
     """
     c = calibration
     wanted = VIEW_RESIDUAL_ARROW_LENGTH * c.camera.image_size[0]
-    factor = charts.enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
+    factor = enlargement(np.linalg.norm(c.residuals[c.inliers], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly distinguished, and so to be used together only: {together}."
     # with its covariance, which is the prior of `calibrate --refine-camera`
@@ -270,7 +270,7 @@ def _field(c: CameraCalibration) -> Markup:
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    factor = charts.enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
+    factor = enlargement(np.linalg.norm(means, axis=-1), VIEW_RESIDUAL_ARROW_LENGTH * width)
     shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
     field = ImageField(
         "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, enlargement
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Observation
@@ -19,7 +19,6 @@ from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.pages import page
-from pkmcal.pages.charts import enlargement
 from pkmcal.pages.overlays import (
     INLIER_WEIGHT,
     Arrow,

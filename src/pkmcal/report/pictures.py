@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, enlargement
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
@@ -18,7 +18,6 @@ from pkmcal.observe.images import Pictures
 from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
 from pkmcal.pages import page
-from pkmcal.pages.charts import enlargement
 from pkmcal.pages.jpegs import FULL_JPEGS, small_and_large
 from pkmcal.pages.overlays import (
     EDGE_CURVE_POINTS,

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, enlargement
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.outlines import ring
 from pkmcal.geometry.rigid import apply
@@ -20,7 +20,7 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.outcome import Part, Plot
 from pkmcal.pages import page
-from pkmcal.pages.charts import CHART_WIDTH, enlargement
+from pkmcal.pages.charts import CHART_WIDTH
 from pkmcal.pages.plots import line, markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
