@@ -35,7 +35,6 @@ from pkmcal.report import (
     bed,
     field,
     identifiability,
-    image_scene,
     linked,
     parameters,
     pictures,
@@ -144,12 +143,12 @@ def report_of(
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(c, shifts, centres)
     links = album.links
-    space = image_scene.plot(session, estimate, links, poses.target_places(observation, estimate))
+    targets = poses.target_places(observation, estimate)
     # sections in the order of the page
     parts = (
-        scene.section(session, estimate, centres),
-        provenance.stations(session, observation, estimate, space),
-        workspace.section(session, estimate, over, links) if over else None,
+        scene.section(session, estimate, centres, targets, over),
+        provenance.stations(session, observation, estimate) if session.station_names else None,
+        workspace.section(session, estimate, over) if over else None,
         parameters.section(session.machine, estimate),
         identifiability.section(findings, estimate.machine.parameters),
         parameters.correlations_part(estimate),

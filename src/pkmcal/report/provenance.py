@@ -17,7 +17,7 @@ from pkmcal.identify.unidentified import identified
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.measurements.effects import EDGE_SHIFT
-from pkmcal.outcome import Part, Plot, Row, Table
+from pkmcal.outcome import Part, Row, Table
 from pkmcal.pages import page
 from pkmcal.pages.overlays import EDGE_SIDE_NAMES, INLIER_WEIGHT
 from pkmcal.report import parameters
@@ -60,16 +60,9 @@ def used_images(session: Session, observation: Observation, estimate: Estimate) 
     )
 
 
-def stations(
-    session: Session, observation: Observation, estimate: Estimate, space: Plot | None
-) -> Part:
-    """Section with the machine and its cameras.
-
-    The plot in space, and a table with a row for each station.
-    """
-    plots, camera = (space,) if space else (), session.camera_of_station
-    if not session.station_names:
-        return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
+def stations(session: Session, observation: Observation, estimate: Estimate) -> Part:
+    """Section with a row for each station."""
+    camera = session.camera_of_station
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
     used = used_images(session, observation, estimate)
@@ -104,8 +97,7 @@ def stations(
     table = Table(
         "Where the cameras stood", columns, tuple(rows), brief=False, words=(len(columns) - 1,)
     )
-    title = "The machine and its cameras"
-    return Part("stations", title, plots=plots, tables=(table,), menu="Cameras")
+    return Part("stations", "Cameras", tables=(table,))
 
 
 def _pose_cells(estimate: Estimate, s: int) -> tuple[str, str, str, str]:

@@ -2,7 +2,9 @@
 
 import type { Section } from "../document";
 import type { Selection } from "../selection";
+import { space } from "./space";
 import { checks, downloads, listing, paragraph } from "./text";
+import { tool_map } from "./tool_map";
 
 export type Block = Section["blocks"][number];
 /** What a block may use beside its own data. */
@@ -12,7 +14,7 @@ export interface Context {
 type Of<K extends Block["kind"]> = Extract<Block, { kind: K }>;
 type Drawers = { [K in Block["kind"]]: (block: Of<K>, context: Context) => HTMLElement };
 
-const DRAWERS: Drawers = { paragraph, listing, checks, downloads };
+const DRAWERS: Drawers = { paragraph, listing, checks, downloads, space, tool_map };
 
 export function drawBlock(block: Block, context: Context): HTMLElement {
   const draw = DRAWERS[block.kind] as (block: Block, context: Context) => HTMLElement;

@@ -235,7 +235,8 @@ export class MachineModel {
   /** Distance of the ground's lines, m. */
   readonly gridStep: number;
   readonly layers: Record<Layer, Group>;
-  private readonly extent: number;
+  /** Largest side of the box around the machine, m. */
+  readonly extent: number;
   private readonly legs: LegModel[];
   private readonly platform = new Group();
   private readonly platformAxes: Lines;
@@ -457,7 +458,10 @@ export class MachineModel {
       });
     }
     if (this.layers.cameras.visible) {
-      for (const camera of machine.cameras) add(camera.name, "frame-name", vector(camera.position as Point));
+      for (const camera of machine.cameras) {
+        const places = [vector(camera.position as Point)];
+        out.push({ text: camera.name, className: "frame-name", places, atBorder: true });
+      }
     }
     return out;
   }

@@ -45,7 +45,7 @@ class SpacePoints(Schema):
 
     colour : custom property of the style sheet.
     keys, tips : of each point.
-    values : of each point, in ``unit``, for shades; empty for one colour.
+    sizes : relative to others; empty for all alike.
     shown : whether they are drawn from the start.
     """
 
@@ -54,8 +54,7 @@ class SpacePoints(Schema):
     points: Line
     keys: tuple[Key, ...]
     tips: tuple[Text, ...]
-    values: tuple[float, ...] = ()
-    unit: str = ""
+    sizes: tuple[float, ...] = ()
     shown: bool = True
 
 
@@ -87,8 +86,9 @@ class Space(Schema):
     names : of the machine before and after ``changes``; the configurations are those after.
     changes : of each leg; one entry for all poses, or one for each of them; none without a second
         machine.
-    enlargement : of changes, ellipsoids and arrows at the start; a slider changes it.
+    enlargement : of changes and arrows at the start; a slider changes it.
     sigmas : standard deviations of the ellipsoids.
+    ellipsoid_enlargement : of the ellipsoids at the start; likewise.
     """
 
     kind: Literal["space"] = "space"
@@ -100,8 +100,9 @@ class Space(Schema):
     names: tuple[Text, Text] = ("", "")
     changes: tuple[tuple[LegChange, ...], ...] = ()
     ellipsoids: tuple[Ellipsoid, ...] = ()
-    sigmas: float = 0.0
     enlargement: float = 1.0
+    sigmas: float = 0.0
+    ellipsoid_enlargement: float = 1.0
     points: tuple[SpacePoints, ...] = ()
     arrows: tuple[SpaceArrows, ...] = ()
     paths: tuple[SpacePath, ...] = ()
