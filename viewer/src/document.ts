@@ -36,7 +36,7 @@ export interface Machine {
   motion: string;
   legs: Leg[];
   readings: Reading[];
-  axes: Axis[];
+  axes: JointAxis[];
   base_outline: [number, number, number][];
   platform_outline: [number, number, number][];
   cameras: CameraShape[];
@@ -98,7 +98,7 @@ export interface Reading {
 /**
  * Axis of a joint: a point and a unit direction, in the frame of the body that holds it.
  */
-export interface Axis {
+export interface JointAxis {
   leg: number;
   side: "base" | "platform";
   /**
@@ -227,7 +227,7 @@ export interface Section {
   name: string;
   title: string;
   menu: string;
-  blocks: (Paragraph | Listing | Checks | Downloads | Space | ToolMapBlock)[];
+  blocks: (Paragraph | Listing | Checks | Downloads | Plot | Panels | Space | ToolMapBlock)[];
 }
 /**
  * Paragraph; small : as small print.
@@ -274,6 +274,285 @@ export interface Download {
   name: string;
   media_type: string;
   content: string;
+}
+/**
+ * Plot in the plane.
+ *
+ * caption : how to read it.
+ * alt : description for readers who cannot see it.
+ * marks : from back to front.
+ * equal : same scale on both axes.
+ */
+export interface Plot {
+  kind: "plot";
+  name: string;
+  title: string;
+  caption: string;
+  alt: string;
+  x: PlotAxis;
+  y: PlotAxis;
+  marks: (LineMark | DotsMark | BarsMark | BoxesMark | BandMark | RuleMark | CellsMark)[];
+  colours: ColourScale | null;
+  equal: boolean;
+}
+/**
+ * Axis of a plot.
+ *
+ * label : quantity and unit, such as "rms, mm"; may be empty.
+ * scale : of numbers, or one place for each of ``categories``.
+ * limits : values at the ends of an axis of numbers; the first may be the larger one.
+ * ticks : labels of an axis of numbers.
+ */
+export interface PlotAxis {
+  label: string;
+  scale: "linear" | "log" | "categories";
+  limits: [number, number] | null;
+  ticks: Tick[];
+  categories: string[];
+}
+/**
+ * Label of an axis at a value.
+ */
+export interface Tick {
+  at: number;
+  label: string;
+}
+/**
+ * Polyline; a null breaks it. name : in the legend; empty for no entry.
+ */
+export interface LineMark {
+  mark: "line";
+  name: string;
+  colour:
+    | "nominal"
+    | "calibrated"
+    | "quiet"
+    | "ink"
+    | "good"
+    | "warn"
+    | "bad"
+    | "leg-1"
+    | "leg-2"
+    | "leg-3"
+    | "leg-4"
+    | "leg-5"
+    | "leg-6"
+    | "leg-7"
+    | "leg-8";
+  points: [number | string, number | null][];
+  dashed: boolean;
+  key: string;
+}
+/**
+ * Dots, with intervals as lines through them.
+ */
+export interface DotsMark {
+  mark: "dots";
+  name: string;
+  colour:
+    | "nominal"
+    | "calibrated"
+    | "quiet"
+    | "ink"
+    | "good"
+    | "warn"
+    | "bad"
+    | "leg-1"
+    | "leg-2"
+    | "leg-3"
+    | "leg-4"
+    | "leg-5"
+    | "leg-6"
+    | "leg-7"
+    | "leg-8";
+  points: Point[];
+  symbol: "circle" | "cross";
+  radius: number;
+}
+/**
+ * Point of a mark.
+ *
+ * low, high : ends of an interval along the axis of the values, which is y unless y has
+ *     categories: a standard deviation's bar, or the range that is expected.
+ * tip : tooltip.
+ * key : what the point belongs to; empty for nothing.
+ * colour : null for the mark's.
+ * value : for the plot's colour scale.
+ */
+export interface Point {
+  x: number | string;
+  y: number | string;
+  low: number | null;
+  high: number | null;
+  tip: string;
+  key: string;
+  colour:
+    | (
+        | "nominal"
+        | "calibrated"
+        | "quiet"
+        | "ink"
+        | "good"
+        | "warn"
+        | "bad"
+        | "leg-1"
+        | "leg-2"
+        | "leg-3"
+        | "leg-4"
+        | "leg-5"
+        | "leg-6"
+        | "leg-7"
+        | "leg-8"
+      )
+    | null;
+  value: number | null;
+}
+/**
+ * Bars from zero, with intervals as lines over them.
+ *
+ * width : of a bar on an axis of numbers; 0 on one of categories, whose bars fill their place.
+ *     Bars of several marks stand side by side on an axis of categories.
+ */
+export interface BarsMark {
+  mark: "bars";
+  name: string;
+  colour:
+    | "nominal"
+    | "calibrated"
+    | "quiet"
+    | "ink"
+    | "good"
+    | "warn"
+    | "bad"
+    | "leg-1"
+    | "leg-2"
+    | "leg-3"
+    | "leg-4"
+    | "leg-5"
+    | "leg-6"
+    | "leg-7"
+    | "leg-8";
+  points: Point[];
+  width: number;
+}
+/**
+ * Box plots, one in each row.
+ */
+export interface BoxesMark {
+  mark: "boxes";
+  boxes: Box[];
+}
+/**
+ * Distribution in one row: quantiles at 5, 25, 50, 75 and 95 %, those in the middle as a bar.
+ *
+ * at : category of the y axis.
+ */
+export interface Box {
+  at: string;
+  /**
+   * @minItems 5
+   * @maxItems 5
+   */
+  quantiles: [number, number, number, number, number];
+  tip: string;
+  key: string;
+  colour:
+    | "nominal"
+    | "calibrated"
+    | "quiet"
+    | "ink"
+    | "good"
+    | "warn"
+    | "bad"
+    | "leg-1"
+    | "leg-2"
+    | "leg-3"
+    | "leg-4"
+    | "leg-5"
+    | "leg-6"
+    | "leg-7"
+    | "leg-8";
+}
+/**
+ * Shaded range of an axis, over the whole of the other one.
+ */
+export interface BandMark {
+  mark: "band";
+  name: string;
+  axis: "x" | "y";
+  low: number;
+  high: number;
+}
+/**
+ * Straight line at a value of an axis, over the whole of the other one.
+ */
+export interface RuleMark {
+  mark: "rule";
+  name: string;
+  axis: "x" | "y";
+  at: number;
+  colour:
+    | "nominal"
+    | "calibrated"
+    | "quiet"
+    | "ink"
+    | "good"
+    | "warn"
+    | "bad"
+    | "leg-1"
+    | "leg-2"
+    | "leg-3"
+    | "leg-4"
+    | "leg-5"
+    | "leg-6"
+    | "leg-7"
+    | "leg-8";
+}
+/**
+ * Rectangle of cells of equal size, coloured by the plot's colour scale.
+ *
+ * x, y : values of the axes at its left and right, and at its top and bottom.
+ * values : of each row, from the top; null for an empty cell.
+ * columns, rows : names for the tooltips.
+ */
+export interface CellsMark {
+  mark: "cells";
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  x: [number, number];
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  y: [number, number];
+  values: (number | null)[][];
+  columns: string[];
+  rows: string[];
+}
+/**
+ * Colours of values, with its legend.
+ *
+ * diverging : two colours on either side of the middle of ``limits``; otherwise one, the larger
+ *     the more ink.
+ */
+export interface ColourScale {
+  label: string;
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  limits: [number, number];
+  ticks: Tick[];
+  diverging: boolean;
+}
+/**
+ * Plots side by side where there is room.
+ */
+export interface Panels {
+  kind: "panels";
+  plots: Plot[];
 }
 /**
  * Stage with a machine.

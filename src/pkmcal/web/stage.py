@@ -327,7 +327,7 @@ def _outline(points: Array) -> Array:
     return ring(np.array(distinct)) if len(distinct) > 2 else np.array(distinct)
 
 
-def _axes(machine: Machine) -> Iterator[shapes.Axis]:
+def _axes(machine: Machine) -> Iterator[shapes.JointAxis]:
     """Axes of the joints: of turning carriers by their chain, of universal and revolute joints by
     the mechanism file or, in a planar machine, the plane's normal.
     """
@@ -349,7 +349,7 @@ def _axes(machine: Machine) -> Iterator[shapes.Axis]:
                 at, axis = centres[j], np.array(stated or (0.0, 0.0, 1.0))
             else:
                 continue
-            yield shapes.Axis(
+            yield shapes.JointAxis(
                 leg=j,
                 side=side,
                 point=point(at),

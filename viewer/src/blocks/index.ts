@@ -2,6 +2,7 @@
 
 import type { Section } from "../document";
 import type { Selection } from "../selection";
+import { panels, plot } from "./plot";
 import { space } from "./space";
 import { checks, downloads, listing, paragraph } from "./text";
 import { tool_map } from "./tool_map";
@@ -14,7 +15,7 @@ export interface Context {
 type Of<K extends Block["kind"]> = Extract<Block, { kind: K }>;
 type Drawers = { [K in Block["kind"]]: (block: Of<K>, context: Context) => HTMLElement };
 
-const DRAWERS: Drawers = { paragraph, listing, checks, downloads, space, tool_map };
+const DRAWERS: Drawers = { paragraph, listing, checks, downloads, plot, panels, space, tool_map };
 
 export function drawBlock(block: Block, context: Context): HTMLElement {
   const draw = DRAWERS[block.kind] as (block: Block, context: Context) => HTMLElement;

@@ -77,7 +77,7 @@ export class SpaceModel {
     private readonly stage: Stage,
   ) {
     const { palette, scene } = stage;
-    this.model = new MachineModel(block.machine, stage);
+    this.model = new MachineModel(block.machine, stage, "--base");
     const { extent } = this.model;
 
     this.before = new Lines(lineMaterial(palette, "--drawing", { width: 2, over: true }));

@@ -10,11 +10,13 @@ from typing import Annotated
 
 from pydantic import Field
 
+from pkmcal.outcome.blocks.plot import Panels, Plot
 from pkmcal.outcome.blocks.space import Space
 from pkmcal.outcome.blocks.text import Checks, Downloads, Listing, Paragraph
 from pkmcal.outcome.blocks.tool_map import ToolMapBlock
 
 Block = Annotated[
-    Paragraph | Listing | Checks | Downloads | Space | ToolMapBlock, Field(discriminator="kind")
+    Paragraph | Listing | Checks | Downloads | Plot | Panels | Space | ToolMapBlock,
+    Field(discriminator="kind"),
 ]
 """Block of a section."""

@@ -65,7 +65,7 @@ class Reading(Schema):
     zero: Text
 
 
-class Axis(Schema):
+class JointAxis(Schema):
     """Axis of a joint: a point and a unit direction, in the frame of the body that holds it."""
 
     leg: int
@@ -129,7 +129,7 @@ class Machine(Schema):
     motion: Text
     legs: tuple[Leg, ...]
     readings: tuple[Reading, ...]
-    axes: tuple[Axis, ...]
+    axes: tuple[JointAxis, ...]
     base_outline: Line
     platform_outline: Line
     cameras: tuple[CameraShape, ...]
