@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from conftest import FEW_CANDIDATES, run
 from document_keys import assert_keys
+from page_documents import page_blocks, page_document
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
@@ -348,7 +349,10 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path, monkey
     np.testing.assert_allclose(
         table.values, [c["joints"] for c in values["configurations"]], atol=1e-6
     )
-    assert 'id="where"' in (session / "plan" / "plan.html").read_text()
+    page = page_document((session / "plan" / "plan.html").read_text())
+    (stage,) = page_blocks(page, "space", "where")
+    assert [pose["label"] for pose in stage["poses"]] == list(table.names)
+    assert sum(len(points["points"]) for points in stage["points"]) == len(table.names)
     # with a calibration beside it, what is known counts
     shutil.copytree(demo.calibration, session / "calibration")
     after = run("plan", str(session), "-n", "4", "-o", str(tmp_path / "after"))
