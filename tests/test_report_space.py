@@ -193,7 +193,8 @@ addEventListener("load", async () => {
     out.moved = first !== await set(".poses input", 1);
     out.label = $(".poses output").textContent;
     const before = await drawn();
-    canvas.dispatchEvent(new KeyboardEvent("keydown", { key: " " }));
+    const space = new KeyboardEvent("keydown", { key: " ", bubbles: true });
+    canvas.dispatchEvent(space);
     await wait(1500);
     out.morphed = before !== await drawn();
     const wheel = new WheelEvent("wheel", { deltaY: 100, bubbles: true, cancelable: true });
@@ -244,5 +245,5 @@ def test_stage_and_map_in_a_browser(case, tmp_path, width, options):
     assert root["note"] == ("true" if options is NO_GL else "false")
     if options is NO_GL:
         return
-    assert root["moved"] == root["morphed"] == root["scrolls"] == "true"
+    assert [root[name] for name in ("moved", "morphed", "scrolls")] == ["true"] * 3
     assert root["label"] == "c1"

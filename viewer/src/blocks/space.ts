@@ -12,6 +12,7 @@ import "./space.css";
 
 const MOST_ENLARGED = { changes: 100, ellipsoids: 1000 };
 const MORPH = 500; // ms from one machine to the other
+const FRAME = 16; // ms between two pictures of a motion
 const TOUR = 12_000; // ms through all poses, at most SLOWEST each
 const SLOWEST = 600;
 const BESIDE = 1.2; // largest angle between the eye and a camera, rad
@@ -142,14 +143,14 @@ function changeBar(
     const [from, to] = [state.share, state.share < 0.5 ? 1 : 0];
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     const began = performance.now();
-    const step = (now: number): void => {
-      const t = still ? 1 : Math.min((now - began) / MORPH, 1);
+    const step = (): void => {
+      const t = still ? 1 : Math.min((performance.now() - began) / MORPH, 1);
       state.share = from + (to - from) * t * t * (3 - 2 * t);
       morph.value = String(state.share);
       draw();
-      if (t < 1) requestAnimationFrame(step);
+      if (t < 1) setTimeout(step, FRAME);
     };
-    requestAnimationFrame(step);
+    step();
   };
   const parts: HTMLElement[] = [];
   if (block.changes.length) {
