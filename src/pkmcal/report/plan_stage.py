@@ -33,7 +33,6 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
     points = list(_by_station(plan))
     if plan.tried:
         points.append(_candidates(plan.tried))
-    home = machine.home()[None]
     block = Space(
         title="",
         caption="The slider takes the machine through the configurations in their order; points are"
@@ -44,7 +43,7 @@ def stage_part(plan: MeasurementPlan, cameras: Sequence[tuple[str, Camera, Array
             machine,
             leg_rows(machine, None),
             {name: (camera, inverse(T)) for name, camera, T in cameras},
-            Postures(machine.inverse(home), home),
+            Postures(*(part[:1] for part in postures)),
         ),
         poses=space_poses(machine, postures, plan.names, configuration_key),
         points=tuple(points),

@@ -23,13 +23,12 @@ from pkmcal.report.space import (
     start_enlargements,
 )
 from pkmcal.session.load import Session
-from pkmcal.web.motion import Postures, home_posture
+from pkmcal.web.motion import Postures
 from pkmcal.web.stage import extent_of, leg_rows, line, machine_shape
 from pkmcal.wording import brief, count
 
 MOST_SLIDER_POSES = 90
 """Poses of the slider; more would make the page large and the slider too fine for a finger."""
-MOST_ARROWS = 250
 
 
 def section(
@@ -39,17 +38,19 @@ def section(
     targets: tuple[Array, Integers],
     tool_map: ToolMap | str | None,
     most: int = MOST_SLIDER_POSES,
-) -> Part:
-    """Section of the report.
+) -> Part | None:
+    """Section of the report; None if no pose was estimated.
 
     targets : measured targets (N, 3), base frame, m, and their configurations (N,).
     most : largest number of poses of the slider.
     """
     machine, state, names = estimate.machine, estimate.state, session.configurations
     used = np.flatnonzero(estimate.configurations)
-    some = used[chosen(len(used), most)] if len(used) else used
+    if not len(used):
+        return None
+    some = used[chosen(len(used), most)]
     postures = Postures(session.joints[some], state.T_base_platform[some])
-    first = Postures(*(part[:1] for part in postures)) if len(some) else home_posture(machine)
+    first = Postures(*(part[:1] for part in postures))
     sigma = np.sqrt(np.diag(estimate.covariance))
     arrows = () if tool_map is None or isinstance(tool_map, str) else (tool_arrows(tool_map),)
     block = Space(
@@ -72,7 +73,7 @@ def section(
         ),
         poses=space_poses(machine, postures, [names[k] for k in some], configuration_key),
         names=("nominal model", "calibrated"),
-        changes=changes(session.machine, machine, postures if len(some) else first, centres),
+        changes=changes(session.machine, machine, postures, centres),
         ellipsoids=ellipsoids(centres),
         sigmas=ELLIPSOID_SIGMAS,
         **start_enlargements(extent_of(machine, first), centres),
@@ -89,7 +90,7 @@ def _caption(shown: int, used: int) -> str:
         "True to scale, except for the change of the joint centres from the nominal model (blue)"
         f" and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged as the sliders say."
         f" The slider takes the machine through {count(shown, 'pose')}{fewer}; a click on a pose's"
-        " point leads to its images."
+        " point leads to its images, and the space bar changes between nominal model and result."
     )
 
 
@@ -97,7 +98,6 @@ def tool_arrows(tool_map: ToolMap) -> SpaceArrows:
     """Error of the nominal model at poses spread evenly over the workspace."""
     _, after = tool_map.evenly
     finite = np.flatnonzero(np.isfinite(after.off_position))
-    finite = finite[chosen(len(finite), MOST_ARROWS)] if finite.size else finite
     off = after.off_position[finite] * 1e3
     return SpaceArrows(
         name="Nominal model's error",

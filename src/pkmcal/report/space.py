@@ -47,7 +47,7 @@ def changes(
     before: Machine, after: Machine, postures: Postures, centres: tuple[Centres, ...]
 ) -> tuple[tuple[LegChange, ...], ...]:
     """Changes of the legs' lines at the postures of the machine ``after``; of the first alone if
-    all are the same.
+    all are the same, none where the machine ``before`` does not close.
 
     centres : of base and platform, with the registration of the machine before.
     """
@@ -61,6 +61,8 @@ def changes(
         # on the platform in its own frame, in which most machines' changes are constant
         shifted = (now.platform - apply(base, was.platform))[:, :, None] @ turn
         legs.append((now.base - apply(base, was.base), shifted[:, :, 0]))
+    if not all(np.isfinite(part).all() for leg in legs for part in leg):
+        return ()
     constant = all(
         np.ptp(part, axis=0).max() < 10.0**-SMALL_DECIMALS for leg in legs for part in leg
     )

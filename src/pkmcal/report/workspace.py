@@ -18,15 +18,15 @@ from pkmcal.wording import brief, count
 
 POSE_NEAR_SLICE_SHARE = 0.2
 """Largest distance of a pose that is drawn in a slice, in extents of the poses across it."""
-LIMIT_DIGITS = 2
-"""Significant digits of the accuracy with which a map starts."""
+LIMIT_DIGITS, VALUE_DIGITS = 2, 4
+"""Significant digits of the accuracy with which a map starts, and of its values."""
 SLICES_READING_TEXT = (
-    "Slices at home's orientation; darker is worse, and the green line encloses where the accuracy"
-    " below holds. Its share is that of poses spread evenly over the workspace and its"
-    " orientations. Crosses: measured poses near the slice. Error before: distance of the nominal"
-    " model's pose from the calibrated one at the same readings, frames laid over each other. σ"
-    " after: one standard deviation by the calibrated geometry; the noise of single readings and"
-    " what the model leaves out come on top. Gain: the former over the latter."
+    "Slices at home's orientation; the stronger the colour, the worse. The green line encloses"
+    " where the accuracy below holds. Its share is that of poses spread evenly over the workspace"
+    " and its orientations. Crosses: measured poses near the slice. Error before: distance of the"
+    " nominal model's pose from the calibrated one at the same readings, frames laid over each"
+    " other. σ after: one standard deviation by the calibrated geometry; the noise of single"
+    " readings and what the model leaves out come on top. Gain: the former over the latter."
 )
 NO_UNTURNED_SLICES_TEXT = (
     "The platform does not move aside without turning, so there are no slices of one orientation."
@@ -161,8 +161,8 @@ def _median(values: Array) -> float:
 
 
 def _value(value: float) -> float | None:
-    """Value with three significant digits, None if it is not finite."""
-    return float(f"{value:.3g}") if np.isfinite(value) else None
+    """Value with ``VALUE_DIGITS`` significant digits, None if it is not finite."""
+    return float(f"{value:.{VALUE_DIGITS}g}") if np.isfinite(value) else None
 
 
 def _grid(cut: Slice, values: Array) -> Grid:

@@ -6,7 +6,7 @@ import { h, number } from "../dom";
 import type { Context } from "./index";
 import "./tool_map.css";
 
-const WIDTH = 640; // of the drawing, in its own units
+const WIDTH = { wide: 640, narrow: 380 }; // of the drawing, in its own units
 const LEFT = 58;
 const BOTTOM = 44;
 const TOP = 12;
@@ -25,8 +25,9 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
   const components = [...new Set(block.layers.map((one) => one.component))];
   const middle = Math.floor((block.slices.filter((one) => one.normal === block.slices[0].normal).length - 1) / 2);
   const state = { name: names[0], component: components[0], slice: middle };
-  // of one accuracy for error and standard deviation, so that their shares compare
-  const limits = new Map(block.layers.map((one) => [one.unit || one.name, one.limit]));
+  // error and standard deviation have one limit, so that their shares compare
+  const limitKey = (one: MapLayer): string => `${one.component} ${one.unit || one.name}`;
+  const limits = new Map(block.layers.map((one) => [limitKey(one), one.limit]));
   const layer = (): MapLayer =>
     block.layers.find((one) => one.name === state.name && one.component === state.component) ?? block.layers[0];
 
@@ -42,7 +43,7 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
   const limit = h("input", {
     type: "number", min: 0, step: "any", "aria-label": "Wanted accuracy",
     oninput: () => {
-      if (limit.valueAsNumber > 0) limits.set(layer().unit || layer().name, limit.valueAsNumber);
+      if (limit.valueAsNumber > 0) limits.set(limitKey(layer()), limit.valueAsNumber);
       draw(false);
     },
   });
@@ -53,7 +54,7 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
 
   const draw = (withLimit = true): void => {
     const one = layer();
-    const wanted = limits.get(one.unit || one.name) ?? one.limit;
+    const wanted = limits.get(limitKey(one)) ?? one.limit;
     const slice = block.slices[state.slice];
     if (withLimit) limit.value = String(wanted);
     level.textContent = `${slice.normal} = ${number(slice.level, 0)} mm`;
@@ -135,8 +136,9 @@ function s<K extends keyof SVGElementTagNameMap>(
 
 function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, alt: string) {
   const { u, v } = slice;
+  const width = matchMedia("(max-width: 600px)").matches ? WIDTH.narrow : WIDTH.wide;
   const [du, dv] = [u, v].map((w) => (w.length > 1 ? w[1] - w[0] : 1));
-  const scale = (WIDTH - LEFT - RIGHT) / (du * u.length);
+  const scale = (width - LEFT - RIGHT) / (du * u.length);
   const height = TOP + dv * v.length * scale + BOTTOM;
   /** Drawing's coordinates of a place in cells, from the outer corner of the first. */
   const place = ([x, y]: number[]): [number, number] =>
@@ -192,14 +194,14 @@ function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, alt: 
     return s("path", { class: "map-pose", "data-key": pose.key, d: `M${x - 4} ${y - 4}l8 8m0 -8l-8 8` },
       s("title", {}, pose.tip));
   });
-  const svg = s("svg", { viewBox: `0 0 ${WIDTH} ${height.toFixed(0)}`, role: "img", "aria-label": alt },
+  const svg = s("svg", { viewBox: `0 0 ${width} ${height.toFixed(0)}`, role: "img", "aria-label": alt },
     s("clipPath", { id: clip }, s("path", { d: path(reach) })),
     field, s("path", { class: "map-border", d: path(reach) }), labels, ...crosses,
     ...axis(u, du, (x) => place(cellOf(x, v[0]))[0], (x, text) =>
       s("text", { x, y: height - BOTTOM + 18, "text-anchor": "middle" }, text)),
     ...axis(v, dv, (y) => place(cellOf(u[0], y))[1], (y, text) =>
       s("text", { x: LEFT - 8, y: y + 4, "text-anchor": "end" }, text)),
-    s("text", { x: (LEFT + WIDTH) / 2, y: height - 8, "text-anchor": "middle", class: "map-title" }, `${slice.across}, mm`),
+    s("text", { x: (LEFT + width) / 2, y: height - 8, "text-anchor": "middle", class: "map-title" }, `${slice.across}, mm`),
     s("text", {
       x: 14, y: (height - BOTTOM) / 2, "text-anchor": "middle", class: "map-title",
       transform: `rotate(-90 14 ${(height - BOTTOM) / 2})`,
@@ -207,7 +209,7 @@ function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, alt: 
   const at = (event: PointerEvent): string => {
     const box = svg.getBoundingClientRect();
     const p: [number, number] = [
-      ((event.clientX - box.left) / box.width) * WIDTH, ((event.clientY - box.top) / box.height) * height,
+      ((event.clientX - box.left) / box.width) * width, ((event.clientY - box.top) / box.height) * height,
     ];
     const value = valueAt(p);
     if (value === null) return "";
