@@ -14,7 +14,12 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Outcome, Verdict
 from pkmcal.report import scene
-from pkmcal.report.space import ELLIPSOID_SIGMAS, MOST_ENLARGED, changes
+from pkmcal.report.space import (
+    ELLIPSOID_SIGMAS,
+    MOST_ENLARGED_CHANGE,
+    MOST_ENLARGED_ELLIPSOID,
+    changes,
+)
 from pkmcal.report.workspace import section
 from pkmcal.web.motion import Postures
 from pkmcal.web.report_page import report_page
@@ -69,7 +74,7 @@ def test_the_change_leads_back_to_the_nominal_model(case):
     for side in centres:
         drawn = np.array([getattr(leg, side.side)[-1] for leg in change])
         np.testing.assert_allclose(drawn, side.change, atol=1e-8)
-    assert 1 <= block.enlargement <= MOST_ENLARGED["change"]
+    assert 1 <= block.enlargement <= MOST_ENLARGED_CHANGE
 
 
 def test_the_change_of_an_arm_turns_with_it():
@@ -94,7 +99,7 @@ def test_the_change_of_an_arm_turns_with_it():
 def test_ellipsoids_are_the_covariance(case):
     block, centres = stage(case), centres_of(case)
     assert block.sigmas == ELLIPSOID_SIGMAS
-    assert 1 <= block.ellipsoid_enlargement <= MOST_ENLARGED["ellipsoid"]
+    assert 1 <= block.ellipsoid_enlargement <= MOST_ENLARGED_ELLIPSOID
     for side in centres:
         own = [one for one in block.ellipsoids if one.side == side.side]
         assert [one.leg for one in own] == list(range(6))

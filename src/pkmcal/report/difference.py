@@ -248,7 +248,7 @@ def _space(d: MachineDifference) -> tuple[Space, ...]:
         poses = tool_map.evenly[1].T_base_platform[:1]
         posture = Postures(machine.inverse(poses), poses)
     arrows = () if isinstance(tool_map, str) else (_tool_arrows(d, tool_map),)
-    spread = bool(d.change.dof)
+    change, spread = start_enlargements(extent_of(machine, posture), d.centres)
     return (
         Space(
             title="Both machines, and where the tool goes",
@@ -260,9 +260,10 @@ def _space(d: MachineDifference) -> tuple[Space, ...]:
             poses=(),
             names=("A", "B"),
             changes=changes(d.a.machine, machine, posture, d.centres),
-            ellipsoids=ellipsoids(d.centres) if spread else (),
+            ellipsoids=ellipsoids(d.centres) if d.change.dof else (),
             sigmas=ELLIPSOID_SIGMAS,
-            **start_enlargements(extent_of(machine, posture), d.centres),
+            enlargement=change,
+            ellipsoid_enlargement=spread,
             arrows=arrows,
         ),
     )

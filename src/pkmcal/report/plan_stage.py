@@ -72,16 +72,17 @@ def _by_station(plan: MeasurementPlan) -> list[SpacePoints]:
 
 def _candidates(tried: tuple[TriedStation, ...]) -> SpacePoints:
     """Candidate places of the camera, the larger the better alone."""
-    alone = np.array([one.alone for one in tried])
-    level = np.log(alone)
+    level = np.log([one.alone for one in tried])
     worse = (level - level.min()) / (np.ptp(level) or 1.0)
-    points = space_points(
+    chosen = [", chosen" if one.chosen else "" for one in tried]
+    return space_points(
         "Places tried",
         "--quiet",
         np.array([one.place.position for one in tried]),
         [""] * len(tried),
-        [f"alone {brief(float(v) * 1e3)} mm" + (", chosen" if one.chosen else "")
-         for one, v in zip(tried, alone, strict=True)],
-    )  # fmt: skip
-    sizes = np.round(1 - (1 - SMALLEST_CANDIDATE) * worse, 2)
-    return points.model_copy(update={"sizes": tuple(sizes.tolist())})
+        [
+            f"alone {brief(one.alone * 1e3)} mm" + (", chosen" if one.chosen else "")
+            for one in tried
+        ],
+        np.round(1 - (1 - SMALLEST_CANDIDATE) * worse, 2).tolist(),
+    )

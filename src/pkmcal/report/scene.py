@@ -53,6 +53,7 @@ def section(
     first = Postures(*(part[:1] for part in postures))
     sigma = np.sqrt(np.diag(estimate.covariance))
     arrows = () if tool_map is None or isinstance(tool_map, str) else (tool_arrows(tool_map),)
+    change, spread = start_enlargements(extent_of(machine, first), centres)
     block = Space(
         title="",
         caption=_caption(len(some), len(used)),
@@ -76,7 +77,8 @@ def section(
         changes=changes(session.machine, machine, postures, centres),
         ellipsoids=ellipsoids(centres),
         sigmas=ELLIPSOID_SIGMAS,
-        **start_enlargements(extent_of(machine, first), centres),
+        enlargement=change,
+        ellipsoid_enlargement=spread,
         points=_points(session, estimate, targets),
         arrows=arrows,
     )
@@ -114,7 +116,10 @@ def _points(
 ) -> tuple[SpacePoints, ...]:
     """Measured poses, and targets measured by trackers or boards."""
     used = np.flatnonzero(estimate.configurations)
-    every = [("Measured poses", "--calibrated", estimate.state.T_base_platform[used, :3, 3], used)]
+    places = estimate.state.T_base_platform[used, :3, 3]
+    every: list[tuple[str, str, Array, Integers]] = [
+        ("Measured poses", "--calibrated", places, used)
+    ]
     if len(targets[0]):
         every.append(("Measured targets", "--drawing", *targets))
     out: list[SpacePoints] = []

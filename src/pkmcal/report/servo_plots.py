@@ -75,7 +75,7 @@ def astray_plot(s: Study) -> Plot | None:
         boxes.append(
             Box(
                 at=o.estimate.title,
-                quantiles=quantiles(values),
+                quantiles=quantiles(values.tolist()),
                 tip=tip,
                 colour=ESTIMATE_COLOURS[o.estimate.name],
             )

@@ -21,7 +21,7 @@ SMALL_DECIMALS = 8
 """Decimals of lengths in metres that a page enlarges."""
 CHANGE_SHARE = 0.2
 """Length of large changes after enlargement, in radii of the machine."""
-MOST_ENLARGED = {"change": 100.0, "ellipsoid": 1000.0}
+MOST_ENLARGED_CHANGE, MOST_ENLARGED_ELLIPSOID = 100.0, 1000.0
 """Largest enlargements, those of the stage's sliders."""
 ELLIPSOID_SHARE = 0.07
 """Length of large ellipsoids' semi-axes after enlargement, in radii of the machine."""
@@ -80,31 +80,25 @@ def ellipsoids(centres: tuple[Centres, ...]) -> tuple[Ellipsoid, ...]:
     out: list[Ellipsoid] = []
     for side in centres:
         values, vectors = np.linalg.eigh(side.blocks)
-        axes = (vectors * (ELLIPSOID_SIGMAS * np.sqrt(np.maximum(values, 0)))[:, None]).mT
-        out += [
-            Ellipsoid(
-                leg=j,
-                side="base" if side.side == "base" else "platform",
-                axes=tuple(small_vector(v) for v in own),  # pyrefly: ignore
-            )
-            for j, own in enumerate(axes)
-        ]
+        half = (vectors * (ELLIPSOID_SIGMAS * np.sqrt(np.maximum(values, 0)))[:, None]).mT
+        for j, (u, v, w) in enumerate(half):
+            axes = small_vector(u), small_vector(v), small_vector(w)
+            body = "base" if side.side == "base" else "platform"
+            out.append(Ellipsoid(leg=j, side=body, axes=axes))
     return tuple(out)
 
 
-def start_enlargements(extent: float, centres: tuple[Centres, ...]) -> dict[str, float]:
+def start_enlargements(extent: float, centres: tuple[Centres, ...]) -> tuple[float, float]:
     """Round enlargements at which change and ellipsoids of the joint centres are visible.
 
     extent : of the machine, m.
     """
     change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
     spread = ELLIPSOID_SIGMAS * np.concatenate([c.sigma for c in centres])
-    return {
-        "enlargement": min(enlargement(change, CHANGE_SHARE * extent / 2), MOST_ENLARGED["change"]),
-        "ellipsoid_enlargement": min(
-            enlargement(spread, ELLIPSOID_SHARE * extent / 2), MOST_ENLARGED["ellipsoid"]
-        ),
-    }
+    return (
+        min(enlargement(change, CHANGE_SHARE * extent / 2), MOST_ENLARGED_CHANGE),
+        min(enlargement(spread, ELLIPSOID_SHARE * extent / 2), MOST_ENLARGED_ELLIPSOID),
+    )
 
 
 def small_vector(v: Array) -> Vector:
@@ -113,9 +107,19 @@ def small_vector(v: Array) -> Vector:
 
 
 def space_points(
-    name: str, colour: str, at: Array, keys: Sequence[Key], tips: Sequence[str], **more: bool
+    name: str,
+    colour: str,
+    at: Array,
+    keys: Sequence[Key],
+    tips: Sequence[str],
+    sizes: Sequence[float] = (),
 ) -> SpacePoints:
     """Points (n, 3), m, true to scale."""
     return SpacePoints(
-        name=name, colour=colour, points=line(at, 4), keys=tuple(keys), tips=tuple(tips), **more
+        name=name,
+        colour=colour,
+        points=line(at, 4),
+        keys=tuple(keys),
+        tips=tuple(tips),
+        sizes=tuple(sizes),
     )
