@@ -74,15 +74,12 @@ def _candidates(tried: tuple[TriedStation, ...]) -> SpacePoints:
     """Candidate places of the camera, the larger the better alone."""
     level = np.log([one.alone for one in tried])
     worse = (level - level.min()) / (np.ptp(level) or 1.0)
-    chosen = [", chosen" if one.chosen else "" for one in tried]
+    state = [", chosen" if one.chosen else "" for one in tried]
     return space_points(
         "Places tried",
         "--quiet",
         np.array([one.place.position for one in tried]),
         [""] * len(tried),
-        [
-            f"alone {brief(one.alone * 1e3)} mm" + (", chosen" if one.chosen else "")
-            for one in tried
-        ],
+        [f"alone {brief(one.alone * 1e3)} mm{text}" for one, text in zip(tried, state, strict=True)],
         np.round(1 - (1 - SMALLEST_CANDIDATE) * worse, 2).tolist(),
     )
