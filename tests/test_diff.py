@@ -12,6 +12,7 @@ import pytest
 
 from conftest import run
 from document_keys import assert_keys
+from page_documents import page_blocks, page_document
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
@@ -21,7 +22,6 @@ from pkmcal.judge.machine_change import machine_change
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level
-from pkmcal.pages.page import page_html
 from pkmcal.report.difference import outcome_of
 from test_bundle import estimate
 from test_identify_scene import make_scene
@@ -263,8 +263,14 @@ def test_the_command(demo, tmp_path):
     assert values["chance"] < 1e-6
     assert values["tool"]["change"]["position"]["median"] > 1e-3
     assert values["shared_configurations"] == 0
-    page = (out / "diff.html").read_text()
-    assert "How far each joint moved" in page
+    page = page_document((out / "diff.html").read_text())
+    (stage,) = page_blocks(page, "space")
+    (arrows,) = stage["arrows"]
+    sizes = np.linalg.norm(arrows["vectors"], axis=1)
+    assert np.median(sizes) == pytest.approx(values["tool"]["change"]["position"]["median"], 1e-3)
+    assert stage["enlargement"] > 1
+    (bars,) = page_blocks(page, "plot")
+    assert [mark["name"] for mark in bars["marks"]] == ["base joint", "platform joint"]
     done = run("diff", demo.calibration, "gough-stewart", "-o", out)
     assert (
         "✗ Nominal model and calibration differ by more than chance explains: the tool" in done.out
@@ -327,4 +333,7 @@ def test_a_machine_without_a_map_is_compared_all_the_same(tmp_path):
     outcome = outcome_of(value)
     assert "There is no map of the workspace: " in outcome.parts[0].text[0]
     assert value.as_dict()["tool"]["why_not"]
-    assert "There is no map" in page_html(outcome)
+    (stage,) = outcome.parts[0].blocks
+    assert stage.arrows == ()
+    sides = [side for leg in stage.changes[0] for side in (leg.base[-1], leg.platform[-1])]
+    np.testing.assert_allclose(sides, 0, atol=1e-9)

@@ -11,7 +11,6 @@ from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends, rod_lengths
-from pkmcal.report.image_scene import posed_limbs
 from pose_sessions import (
     T_CAMERA_BASE,
     T_PLATFORM_BOARD,
@@ -202,7 +201,7 @@ def test_limbs_are_drawn_where_the_hinges_turn_them():
     """Every rod as long as it is; with bars that do not turn it would be off by centimetres."""
     machine, poses = load_mechanism("h4-rods"), papers_poses()
     joints = machine.inverse(poses)
-    limbs = posed_limbs(machine, joints, poses)
+    limbs = machine.ends_at(joints, poses)
     rods = rod_lengths(machine.layout, machine.values, joints)
     np.testing.assert_allclose(np.linalg.norm(limbs.b - limbs.a, axis=-1), rods, atol=1e-12)
     unturned = limb_ends(machine.layout, machine.values, joints, poses).b

@@ -351,9 +351,12 @@ def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path, monkey
     )
     document = page_document((session / "plan" / "plan.html").read_text())
     sections = [section["name"] for section in document["sections"]]
-    assert sections.index("curve") < sections.index("order")
+    assert sections.index("curve") < sections.index("where") < sections.index("order")
     (curve,) = (plot for plot in page_blocks(document, "plot") if plot["name"] == "curve")
     assert min(len(curve[axis]["ticks"]) for axis in "xy") >= 3
+    (stage,) = page_blocks(document, "space", "where")
+    assert [pose["label"] for pose in stage["poses"]] == list(table.names)
+    assert sum(len(points["points"]) for points in stage["points"]) == len(table.names)
     # with a calibration beside it, what is known counts
     shutil.copytree(demo.calibration, session / "calibration")
     after = run("plan", str(session), "-n", "4", "-o", str(tmp_path / "after"))

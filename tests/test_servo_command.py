@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-import re
-import shutil
-import subprocess
 
+import numpy as np
 import pytest
 
 from conftest import run
 from document_keys import assert_keys
+from page_documents import page_blocks, page_document
 from pkmcal.cameras.files import camera_text
 from pkmcal.placement.default_camera import default_camera
 
 QUICK = ("--runs", 3, "--rate", 6, "--noise", 0, "--joint-noise", 0, "--duration", 8, "--delay", 0)
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
 HOME = "0,0,0.3567,0,0,0"
 
 
@@ -47,49 +43,22 @@ def test_a_built_in_machine(studied):
     assert curves["identified"][-1] < 0.01
 
 
-def test_the_page_is_whole(studied):
-    page = (studied[1] / "servo.html").read_text(encoding="utf-8")
-    for name in ("curves", "tail", "space", "image"):
-        text = re.search(rf'id="figure-{name}">(.*?)</script>', page, re.DOTALL)
-        assert text
-        figure = json.loads(text[1], parse_constant=pytest.fail)
-        assert figure["data"]
-    frames = json.loads(re.search(r'id="frames-space">(.*?)</script>', page, re.DOTALL)[1])
-    assert len(frames) == 48
-    assert frames[0]["traces"] == list(range(7))
-    shifted = frames[0]["data"][0]["x"] != frames[-1]["data"][0]["x"]
-    assert shifted
-    assert "Play" in page
-    assert "http://" not in re.sub(r'id="plotly">.*?</script>', "", page, flags=re.DOTALL)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="NO CHROMIUM: the animation was not played")
-def test_the_animation_has_its_pictures(studied, tmp_path):
-    """In a browser; the last one has the platform at the goal."""
-    page = (studied[1] / "servo.html").read_text(encoding="utf-8")
-    # no timer, and no wait for a frame of the screen: the browser's virtual time has neither
-    script = """<script>new MutationObserver((_, watch) => {
-      watch.disconnect();
-      const plot = document.getElementById("plot-space");
-      const frames = plot._transitionData._frames;
-      const last = frames[frames.length - 1];
-      Plotly.animate(plot, [last.name], plot.layout.updatemenus[0].buttons[1].args[1]);
-      const platform = last.data[plot.data.findIndex((trace) => trace.name === "platform")];
-      const goal = plot.data.find((trace) => trace.name === "goal");
-      document.title = `frames ${frames.length} ${platform.z[0]} ${goal.z[0]}`;
-    }).observe(document.getElementById("plot-space"), { attributeFilter: ["data-drawn"] });
-    </script></body>"""
-    changed = tmp_path / "servo.html"
-    changed.write_text(page.replace("</body>", script), encoding="utf-8")
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom",
-               f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=20000",
-               changed.as_uri()]  # fmt: skip
-    display = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    title = re.search(r"<title>frames (\d+) ([\d.]+) ([\d.]+)</title>", display.stdout)
-    assert title, display.stdout[:500]
-    assert int(title[1]) == 48
-    assert float(title[2]) == pytest.approx(float(title[3]), abs=0.5)
+def test_the_page_shows_one_run(studied):
+    """The animation ends at the goal, whose joints have their own line."""
+    document = page_document((studied[1] / "servo.html").read_text(encoding="utf-8"))
+    plots = [plot for one in page_blocks(document, "panels") for plot in one["plots"]]
+    plots += page_blocks(document, "plot")
+    assert {plot["name"] for plot in plots} == {"astray", "curves", "tail", "image"}
+    (stage,) = page_blocks(document, "space")
+    assert len(stage["poses"]) == 48
+    first, last = (stage["poses"][k]["configuration"]["legs"] for k in (0, -1))
+    joints = np.array([leg["platform"][-1] for leg in last])
+    goal = next(path for path in stage["paths"] if path["dashed"])
+    away = np.linalg.norm(joints[:, None] - np.array(goal["lines"][0]), axis=-1).min(axis=1)
+    assert away.max() < 5e-4
+    start = np.array([leg["platform"][-1] for leg in first])
+    assert np.linalg.norm(start - joints, axis=1).max() > 5e-3
+    assert [camera["name"] for camera in stage["machine"]["cameras"]] == ["camera"]
 
 
 def test_words_for_people(tmp_path):

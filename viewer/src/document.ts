@@ -40,7 +40,7 @@ export interface Machine {
   motion: string;
   legs: Leg[];
   readings: Reading[];
-  axes: Axis[];
+  axes: JointAxis[];
   base_outline: [number, number, number][];
   platform_outline: [number, number, number][];
   cameras: CameraShape[];
@@ -63,7 +63,7 @@ export interface Leg {
   body: number | null;
   tubes: Tube[];
   path: [number, number, number][];
-  rows: Row[];
+  rows: Property[];
 }
 /**
  * Visible cylinder of a leg; ``start`` and ``stop`` from A towards B, m.
@@ -76,7 +76,7 @@ export interface Tube {
 /**
  * Row of a table of properties.
  */
-export interface Row {
+export interface Property {
   label: string;
   value: string;
 }
@@ -102,7 +102,7 @@ export interface Reading {
 /**
  * Axis of a joint: a point and a unit direction, in the frame of the body that holds it.
  */
-export interface Axis {
+export interface JointAxis {
   leg: number;
   side: "base" | "platform";
   /**
@@ -277,7 +277,20 @@ export interface Section {
   mark: "good" | Level | null;
   expert: boolean;
   void: boolean;
-  blocks: (Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar | Plot | Panels | Images)[];
+  blocks: (
+    | Paragraph
+    | Listing
+    | Facts
+    | Checks
+    | Downloads
+    | DataTable
+    | LogBar
+    | Plot
+    | Panels
+    | Images
+    | Space
+    | ToolMapBlock
+  )[];
 }
 /**
  * Paragraph; small : as small print.
@@ -815,4 +828,162 @@ export interface Strip {
   across: number;
   offset: number[];
   sigma: number[];
+}
+/**
+ * Stage with a machine.
+ *
+ * alt : description for readers who do not see the stage.
+ * poses : configurations of the slider; with none the machine stays at home.
+ * names : of the machine before and after ``changes``; the configurations are those after.
+ * changes : of each leg; one entry for all poses, or one for each of them; none without a second
+ *     machine.
+ * enlargement : of changes and arrows at the start; a slider changes it.
+ * sigmas : standard deviations of the ellipsoids.
+ * ellipsoid_enlargement : of the ellipsoids at the start; likewise.
+ */
+export interface Space {
+  kind: "space";
+  title: string;
+  caption: string;
+  alt: string;
+  machine: Machine;
+  poses: SpacePose[];
+  /**
+   * @minItems 2
+   * @maxItems 2
+   */
+  names: [string, string];
+  changes: LegChange[][];
+  ellipsoids: Ellipsoid[];
+  enlargement: number;
+  sigmas: number;
+  ellipsoid_enlargement: number;
+  points: SpacePoints[];
+  arrows: SpaceArrows[];
+  paths: SpacePath[];
+}
+/**
+ * Configuration of the slider; label : its name.
+ */
+export interface SpacePose {
+  key: string;
+  label: string;
+  configuration: Configuration;
+}
+/**
+ * Change of a leg's lines from one machine to the other, m; drawn enlarged.
+ *
+ * base : of each point of the leg's ``base``, base frame.
+ * platform : of each point of its ``platform``, platform frame.
+ */
+export interface LegChange {
+  base: [number, number, number][];
+  platform: [number, number, number][];
+}
+/**
+ * Uncertainty of a joint centre; drawn enlarged.
+ *
+ * leg : index from 0.
+ * axes : semi-axes, m, in the frame of the side.
+ */
+export interface Ellipsoid {
+  leg: number;
+  side: "base" | "platform";
+  /**
+   * @minItems 3
+   * @maxItems 3
+   */
+  axes: [[number, number, number], [number, number, number], [number, number, number]];
+}
+/**
+ * Points with a name in the legend.
+ *
+ * colour : custom property of the style sheet.
+ * keys, tips : of each point.
+ * sizes : relative to others; empty for all alike.
+ * shown : whether they are drawn from the start.
+ */
+export interface SpacePoints {
+  name: string;
+  colour: string;
+  points: [number, number, number][];
+  keys: string[];
+  tips: string[];
+  sizes: number[];
+  shown: boolean;
+}
+/**
+ * Small vectors at points, m; drawn enlarged.
+ */
+export interface SpaceArrows {
+  name: string;
+  colour: string;
+  points: [number, number, number][];
+  vectors: [number, number, number][];
+  tips: string[];
+  shown: boolean;
+}
+/**
+ * Polylines with a name in the legend, m, base frame.
+ */
+export interface SpacePath {
+  name: string;
+  colour: string;
+  lines: [number, number, number][][];
+  dashed: boolean;
+}
+/**
+ * Contour maps with a choice of layer and slice.
+ */
+export interface ToolMapBlock {
+  kind: "tool_map";
+  caption: string;
+  alt: string;
+  slices: MapSlice[];
+  layers: MapLayer[];
+}
+/**
+ * Plane of positions at home's orientation, mm.
+ *
+ * across, up, normal : names of the axes.
+ * level : coordinate along the normal.
+ * u, v : coordinates of the columns and rows.
+ * poses : measured poses near the plane.
+ */
+export interface MapSlice {
+  across: string;
+  up: string;
+  normal: string;
+  level: number;
+  u: number[];
+  v: number[];
+  poses: MapPose[];
+}
+/**
+ * Measured pose in a slice, mm.
+ */
+export interface MapPose {
+  key: string;
+  tip: string;
+  u: number;
+  v: number;
+}
+/**
+ * Quantity over the workspace.
+ *
+ * unit : mm or °; empty for a ratio.
+ * better : whether small or large values are good.
+ * limit : value at which the field for a wanted accuracy starts.
+ * slices : its values in each slice.
+ * evenly : its values at poses spread evenly over the workspace and its orientations, from which
+ *     shares are computed.
+ */
+export interface MapLayer {
+  name: string;
+  component: "position" | "orientation";
+  unit: string;
+  better: "small" | "large";
+  limit: number;
+  slices: (number | null)[][][];
+  evenly: number[];
 }

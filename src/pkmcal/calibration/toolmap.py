@@ -33,7 +33,7 @@ class ToolMapOptions:
     # cells along the longer side of a slice
     cells: int = 20
     # heights of the slices, as shares of the range of those poses
-    heights: tuple[float, ...] = (0.15, 0.5, 0.85)
+    heights: tuple[float, ...] = (0.1, 0.3, 0.5, 0.7, 0.9)
     # extension of the slices beyond those poses to either side, as a share of their range
     margin: float = 0.08
     # fewest rows and columns of cells, and smallest share of reachable cells among these, for a

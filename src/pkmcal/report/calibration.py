@@ -38,7 +38,6 @@ from pkmcal.report import (
     correlation_plot,
     field,
     identifiability,
-    image_scene,
     linked,
     parameters,
     pictures,
@@ -48,7 +47,6 @@ from pkmcal.report import (
     scene,
     workspace,
 )
-from pkmcal.report.links import Links
 from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.web.report_page import report_page
@@ -156,13 +154,12 @@ def report_of(
         held = held_out_part(holdout, session)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(c, shifts, centres)
-    links = Links.of(session)
-    space = image_scene.plot(session, estimate, links, poses.target_places(observation, estimate))
+    targets = poses.target_places(observation, estimate)
     # sections in the order of the page
     parts = (
-        scene.section(session, estimate, centres),
-        provenance.stations(session, observation, estimate, space),
-        workspace.section(session, estimate, over, links) if over else None,
+        scene.section(session, estimate, centres, targets, over),
+        provenance.stations(session, observation, estimate) if session.station_names else None,
+        workspace.section(session, estimate, over) if over else None,
         parameters.section(session.machine, estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate),

@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.toolmap import ToolMap
+from pkmcal.errors import GeometryError
 from pkmcal.judge.difference import MachineDifference
 from pkmcal.levels import ROUNDING
-from pkmcal.outcome import Figure, Level, Outcome, Part, Plot, Row, Table
-from pkmcal.pages.plots import COMMON_AXIS_LAYOUT, COMMON_PLOT_LAYOUT, coloured, space_layout
+from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
+from pkmcal.outcome.blocks.base import leg_key
+from pkmcal.outcome.blocks.plot import (
+    BarsMark,
+    Colour,
+    Plot,
+    Point,
+    category_axis,
+    linear_axis,
+    rounded,
+)
+from pkmcal.outcome.blocks.space import Space, SpaceArrows
+from pkmcal.report.space import (
+    ELLIPSOID_SIGMAS,
+    changes,
+    ellipsoids,
+    small_vector,
+    start_enlargements,
+)
 from pkmcal.report.watch import NO_VALUE_SIGN, chance_text
 from pkmcal.report.workspace import middle_and_worst
+from pkmcal.web.motion import Postures, home_posture
+from pkmcal.web.stage import extent_of, leg_rows, line, machine_shape
 from pkmcal.wording import DISPLAY_UNITS, brief, count, decimals, number
 
 CHANGES_ON_TERMINAL = 8
@@ -22,14 +40,13 @@ CHANGES_ON_TERMINAL = 8
 
 def outcome_of(d: MachineDifference) -> Outcome:
     """Outcome of ``pkmcal diff``."""
-    tool = () if isinstance(d.tool, str) else (_space(d.tool),)
     text = (d.tool,) if isinstance(d.tool, str) else ()
     parts = (
-        Part("tool", "What it does to the tool", text, plots=tool, tables=_tool_tables(d)),
+        Part("tool", "What it does to the tool", text, blocks=_space(d), tables=_tool_tables(d)),
         Part(
             "joints",
             "Joints and legs",
-            plots=(_joints(d),),
+            blocks=(_joints(d),),
             tables=(_legs(d),),
         ),
         Part("parameters", "All numbers", tables=_parameters(d)),
@@ -186,69 +203,86 @@ def _row(d: MachineDifference, k: int) -> Row:
 
 def _joints(d: MachineDifference) -> Plot:
     """Bars of the distance that each joint moved, with its standard deviation."""
-    legs = [f"leg {leg + 1}" for leg in range(d.a.machine.n_legs)]
-    data: list[dict[str, Any]] = []
-    for side, colour in zip(d.centres, ("--drawing", "--calibrated"), strict=True):
+    legs = range(d.a.machine.n_legs)
+    marks: list[BarsMark] = []
+    most = 0.0
+    colours: tuple[Colour, Colour] = ("nominal", "calibrated")
+    for side, colour in zip(d.centres, colours, strict=True):
         shifted = np.linalg.norm(side.change, axis=-1) * 1e3
-        data.append(
-            {
-                "type": "bar",
-                "name": f"{side.side} joint",
-                "x": legs,
-                "y": np.round(shifted, 5).tolist(),
-                "marker": {"color": colour},
-                "error_y": {
-                    "type": "data",
-                    "array": np.round(side.sigma * 1e3, 5).tolist(),
-                    "visible": bool(d.change.dof),
-                    "color": "--ink",
-                    "thickness": 1,
-                },
-                "hovertemplate": "%{x}, %{data.name}: %{y:.3g} mm<extra></extra>",
-            }
+        sigma = side.sigma * 1e3 if d.change.dof else np.zeros_like(shifted)
+        most = max(most, float((shifted + sigma).max()))
+        points = tuple(
+            Point(
+                x=f"leg {j + 1}",
+                y=rounded(float(shifted[j])),
+                low=rounded(float(shifted[j] - sigma[j])) if sigma[j] > 0 else None,
+                high=rounded(float(shifted[j] + sigma[j])) if sigma[j] > 0 else None,
+                tip=f"leg {j + 1}, {side.side} joint: {brief(float(shifted[j]))} mm",
+                key=leg_key(j + 1),
+            )
+            for j in legs
         )
-    layout = {
-        **COMMON_PLOT_LAYOUT,
-        "barmode": "group",
-        "margin": {"l": 56, "r": 12, "t": 10, "b": 36},
-        "xaxis": {**COMMON_AXIS_LAYOUT},
-        "yaxis": {**COMMON_AXIS_LAYOUT, "title": {"text": "moved, mm"}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
-    }
+        marks.append(BarsMark(name=f"{side.side} joint", colour=colour, points=points))
     return Plot(
-        "joints",
-        "How far each joint moved",
-        "Bars with lines: the standard deviation by chance."
+        name="joints",
+        title="How far each joint moved",
+        caption="Lines on the bars: the standard deviation by chance."
         if d.change.dof
         else "Joints of both nominal models laid over each other.",
-        "Bars of how far each leg's base joint and platform joint moved, in millimetres; the table"
-        " below has the numbers.",
-        {"data": data, "layout": layout, "config": {}},
-        height=320,
+        alt="Bars of how far each leg's base joint and platform joint moved, in millimetres; the"
+        " table below has the numbers.",
+        x=category_axis(f"leg {j + 1}" for j in legs),
+        y=linear_axis("moved, mm", (0.0, most), zero=True),
+        marks=tuple(marks),
     )
 
 
-def _space(tool_map: ToolMap) -> Plot:
-    """Plot of the evenly spread poses, coloured by the tool's change."""
+def _space(d: MachineDifference) -> tuple[Space, ...]:
+    """Stage with the second machine, its change from the first, and that of the tool."""
+    machine, tool_map = d.change.machine, d.tool
+    try:
+        posture = home_posture(machine)
+    except GeometryError:
+        if isinstance(tool_map, str):
+            return ()
+        poses = tool_map.evenly[1].T_base_platform[:1]
+        posture = Postures(machine.inverse(poses), poses)
+    arrows = () if isinstance(tool_map, str) else (_tool_arrows(d, tool_map),)
+    change, spread = start_enlargements(extent_of(machine, posture), d.centres)
+    return (
+        Space(
+            title="Both machines, and where the tool goes",
+            caption=f"At home. Blue lines: A, {d.a.name}. In colours: B, {d.b.name}, laid over it."
+            " Arrows lead from the tool's place by A to that by B at the same readings.",
+            alt="Both machines in three dimensions with the change of their joints enlarged, and"
+            " arrows of how the tool's position changes over the workspace.",
+            machine=machine_shape(machine, leg_rows(machine, d.change.sigma), {}, posture),
+            poses=(),
+            names=("A", "B"),
+            changes=changes(d.a.machine, machine, posture, d.centres),
+            ellipsoids=ellipsoids(d.centres) if d.change.dof else (),
+            sigmas=ELLIPSOID_SIGMAS,
+            enlargement=change,
+            ellipsoid_enlargement=spread,
+            arrows=arrows,
+        ),
+    )
+
+
+def _tool_arrows(d: MachineDifference, tool_map: ToolMap) -> SpaceArrows:
+    """Change of the tool at the evenly spread poses, from the first machine to the second."""
     _, after = tool_map.evenly
+    finite = np.flatnonzero(np.isfinite(after.off_position))
     off, sigma = _changes(tool_map)
-    hover = [[float(f"{a:.3g}"), float(f"{b:.3g}")] for a, b in zip(off, sigma, strict=True)]
-    points = coloured(
-        "tool",
-        after.T_base_platform[np.isfinite(after.off_position), :3, 3],
-        off,
-        "mm",
-        customdata=hover,
-        hovertemplate="x: %{x:.3g}<br>y: %{y:.3g}<br>z: %{z:.3g}<br>differs by %{customdata[0]:.3g}"
-        " mm<br>σ %{customdata[1]:.3g} mm<extra></extra>",
-    )
-    layout = space_layout()
-    layout["showlegend"] = False
-    return Plot(
-        "reach",
-        "Where the tool differs",
-        "The tool's place at the same readings, by the second less by the first. Drag to turn.",
-        "Points of the workspace in three dimensions, coloured by how far the tool differs.",
-        {"data": [points], "layout": layout, "config": {"scrollZoom": True}},
-        height=420,
+    tips = [
+        f"the tool differs by {brief(a)} mm" + (f" (±{brief(b)})" if d.change.dof else "")
+        for a, b in zip(off.tolist(), sigma.tolist(), strict=True)
+    ]
+    return SpaceArrows(
+        name="Change of the tool",
+        colour="--calibrated",
+        # from the place by the first machine to that by the second
+        points=line(after.T_base_platform[finite, :3, 3] + after.off[finite, 3:], 6),
+        vectors=tuple(small_vector(-v) for v in after.off[finite, 3:]),
+        tips=tuple(tips),
     )

@@ -8,22 +8,16 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
-from pkmcal.cameras.frustum import frustum
 from pkmcal.files import csv_text, json_value, yaml_text
 from pkmcal.geometry.rigid import inverse
 from pkmcal.levels import NEGLIGIBLE
-from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
+from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, note
-from pkmcal.pages.plots import (
-    line,
-    markers,
-    path_between_cameras,
-    uncropped,
-)
 from pkmcal.placement.stations import StationPose
-from pkmcal.planning.plan import Accuracy, MeasurementPlan, TriedStation
+from pkmcal.planning.plan import Accuracy, MeasurementPlan
 from pkmcal.planning.rig import BoardFrom, LegsFrom
 from pkmcal.report.plan_curve import curve_plot
+from pkmcal.report.plan_stage import stage_part
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, number
 
 PLAN_TABLE_FILE, PLAN_STATIONS_FILE = "plan.csv", "stations.yaml"
@@ -36,8 +30,6 @@ INDEX_NAMES = {
     "E": "the largest eigenvalue of the machine's covariance (E)",
     "O1": "the noise amplification index O1",
 }
-FRUSTUM_LENGTH_SHARE = 0.35
-"""Length of a drawn frustum, in distances between camera and machine."""
 PLAN_METHOD_TEXT = (
     "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
     " corners, poses and readings, with the platform's pose of that configuration eliminated."
@@ -62,8 +54,7 @@ def outcome_of(plan: MeasurementPlan) -> Outcome:
     if plan.tried:
         texts[PLAN_STATIONS_FILE] = yaml_text(stations_document(plan))
         parts.append(_camera_poses(plan))
-    if _cameras(plan):
-        parts.append(_space(plan))
+    parts.append(stage_part(plan, _cameras(plan)))
     parts.append(_order(plan))
     parts.append(Part("how", "How it was computed", (*PLAN_METHOD_TEXT, *plan.subject.words)))
     machine = plan.subject.rig.machine
@@ -240,69 +231,6 @@ def _camera_poses(plan: MeasurementPlan) -> Part:
         words=(0, 1),
     )
     return Part("places", "Where to put the camera", tables=(table,))
-
-
-def _space(plan: MeasurementPlan) -> Part:
-    """Section with a plot of the machine, its configurations, cameras, and candidate places."""
-    rig, home = plan.subject.rig, plan.subject.rig.machine.home()[None]
-    machine = rig.machine
-    # machine at home, and platform positions of the plan
-    ends = machine.ends_at(machine.inverse(home), home)
-    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
-    legs = [np.stack([a, b]) for a, b in zip(ends.a[0], ends.b[0], strict=True)]
-    places = plan.T_base_platform[:, :3, 3]
-    hover = [f"{n} (from {listed(s, 3)})" for n, s in zip(plan.names, plan.stations, strict=True)]
-    data = [
-        line("The machine at home", "--drawing", 5, legs),
-        markers(
-            "Platform in the plan", places, {"size": 3, "color": "--calibrated"},
-            hovertext=hover, hoverinfo="text",
-        ),
-    ]  # fmt: skip
-    # cameras with their frustums
-    eyes: list[Array] = []
-    for name, camera, T_camera_base in _cameras(plan):
-        T = inverse(T_camera_base)
-        eye = T[:3, 3]
-        view = frustum(camera, T, FRUSTUM_LENGTH_SHARE * float(np.linalg.norm(middle - eye)))
-        eyes.append(eye)
-        style = {"size": 4, "color": "--ink", "symbol": "square"}
-        data += [
-            line(name, "--ink", 3, view, showlegend=False),
-            markers(
-                name, eye[None], style, mode="markers+text", text=[name],
-                textposition="top center", textfont={"color": "--ink"}, showlegend=False,
-                hoverinfo="skip",
-            ),
-        ]  # fmt: skip
-    if plan.tried:
-        data.append(_candidate_markers(plan.tried))
-    layout = uncropped(data, path_between_cameras(np.reshape(eyes, (-1, 3)) - middle))
-    layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
-    plot = Plot(
-        "where",
-        "Cameras and configurations",
-        "Drag to turn, wheel or pinch to come nearer."
-        + (" Dots: places that were tried, the darker the better alone." if plan.tried else ""),
-        "The machine, the platform's places in the plan, and the cameras, in three dimensions",
-        {"data": data, "layout": layout, "config": {"scrollZoom": True}},
-        height=520,
-    )
-    return Part("where", "In space", plots=(plot,))
-
-
-def _candidate_markers(tried: tuple[TriedStation, ...]) -> dict[str, Any]:
-    """Markers at candidate places, coloured by the accuracy that each gives alone."""
-    at = np.array([one.place.position for one in tried])
-    value = np.array([one.alone for one in tried]) * 1e3
-    style = {
-        "size": 4,
-        "color": np.log10(value).round(3).tolist(),
-        "colorscale": "Blues",
-        "opacity": 0.7,
-    }
-    hover = [f"alone {brief(v)} mm" for v in value]
-    return markers("Places tried", at, style, hovertext=hover, hoverinfo="text")
 
 
 def stations_document(plan: MeasurementPlan) -> dict[str, Any]:

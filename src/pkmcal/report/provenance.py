@@ -18,7 +18,7 @@ from pkmcal.measurements import Observation, Rejection
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.observe.overlays import EDGE_SIDE_NAMES
-from pkmcal.outcome import Part, Plot, Row, Table
+from pkmcal.outcome import Part, Row, Table
 from pkmcal.outcome.blocks.base import station_key
 from pkmcal.outcome.blocks.text import Fact, Facts, Listing, Paragraph
 from pkmcal.report import parameters
@@ -68,16 +68,9 @@ def used_images(session: Session, observation: Observation, estimate: Estimate) 
     )
 
 
-def stations(
-    session: Session, observation: Observation, estimate: Estimate, space: Plot | None
-) -> Part:
-    """Section with the machine and its cameras.
-
-    The plot in space, and a table with a row for each station.
-    """
-    plots, camera = (space,) if space else (), session.camera_of_station
-    if not session.station_names:
-        return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
+def stations(session: Session, observation: Observation, estimate: Estimate) -> Part:
+    """Section with a row for each station."""
+    camera = session.camera_of_station
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
     used = used_images(session, observation, estimate)
@@ -116,8 +109,7 @@ def stations(
     table = Table(
         "Where the cameras stood", columns, tuple(rows), brief=False, words=(len(columns) - 1,)
     )
-    title = "The machine and its cameras"
-    return Part("stations", title, plots=plots, tables=(table,), menu="Cameras")
+    return Part("stations", "Cameras", tables=(table,))
 
 
 def _pose_cells(estimate: Estimate, s: int) -> tuple[str, str, str, str]:

@@ -1,4 +1,4 @@
-"""Study of visual servoing as an outcome, as in [B] Fig. 10: curves, an animation, the image."""
+"""Study of visual servoing as an outcome: its figures, tables, and parts of the report."""
 
 from __future__ import annotations
 
@@ -7,33 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers, rms
+from pkmcal.arrays import Array, rms
 from pkmcal.control.sentences import chosen_legs, judgement
 from pkmcal.control.study import Study, Trials
-from pkmcal.geometry.outlines import ring
-from pkmcal.geometry.rigid import inverse
-from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.pages.page import N_COLOURS
-from pkmcal.pages.plots import coordinates, line, markers, plane, space_layout
+from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.blocks.plot import panels
+from pkmcal.report.servo_plots import (
+    astray_plot,
+    error_plot,
+    image_plot,
+    run_stage,
+    shares,
+    tail_plot,
+)
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
 """Listed sets of legs of each size."""
-SERVO_ESTIMATE_COLOURS = {
-    "true": "--quiet",
-    "identified": "--drawing",
-    "cad": "--good",
-    "hand": "--calibrated",
-}
-SERVO_BAND_COLOURS = {"identified": "rgba(0,104,168,.16)", "hand": "rgba(194,72,12,.16)"}
-ANIMATION_FRAMES = 60
-"""Frames of the animation; more would only make the page large."""
-SERVO_CURVE_POINTS = 300
-"""Points of a curve."""
-LEAST_SERVO_ERROR_SHARE = 1e-5
-"""Lower limit of curves, as a share of the initial error."""
-SERVO_EDGE_POINTS = 17
-"""Points along a drawn edge; in a mirror edges are curved."""
 SERVO_METHOD_TEXT = (
     "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
     " what is seen and what was seen when the goal was taught: of the edges' normals, or of the"
@@ -65,55 +55,10 @@ def outcome_of(study: Study) -> Outcome:
                 "curves",
                 "Error curves",
                 terminal_text=(stillness(study),),
-                plots=(
-                    Plot(
-                        "curves",
-                        f"Error of the {study.plan.loop.law}, as a part of its start's",
-                        "Lines: the median; shaded: from the least to the largest; of runs that"
-                        " reach the goal. Logarithmic, so that an exponential is a straight line;"
-                        " [B] Fig. 10 for one run.",
-                        "Norm of the error against time for four estimates of the geometry",
-                        curves(study),
-                        height=420,
-                    ),
-                    Plot(
-                        "tail",
-                        "The end of the ways, platform's joints from the goal",
-                        "Distance of the platform's joints from the goal, as a part of the way,"
-                        " median of runs that reach it.",
-                        "Distance from the goal against time, enlarged near zero",
-                        tail(study),
-                        height=320,
-                    ),
-                ),
+                blocks=(*panels(astray_plot(study)), error_plot(study), tail_plot(study)),
                 tables=(outcome_table(study), *([ends] if ends else [])),
             ),
-            Part(
-                "run",
-                "One run",
-                plots=(
-                    Plot(
-                        "space",
-                        f"Run {run + 1} in space",
-                        "The true machine, led by the identified geometry; dashed: the goal; grey:"
-                        " the way of the platform's middle with the identified geometry, orange"
-                        " with the one by hand.",
-                        "The machine in three dimensions on its way to the goal",
-                        space(study, run),
-                        height=560,
-                        frames=frames(study, run),
-                    ),
-                    Plot(
-                        "image",
-                        f"Run {run + 1} in the image",
-                        "Edges of the seen legs at the start (thin) and at the goal (thick), and"
-                        " the way of their ends between; the frame is the image's.",
-                        "The legs' edges in the camera's image and their ways from start to goal",
-                        image(study, run),
-                        height=520,
-                    ),
-                ),
-            ),
+            Part("run", "One run", blocks=(run_stage(study, run), image_plot(study, run))),
             Part("legs", "Legs", tables=(choices_table(study),)),
             Part("how", "How it was computed", SERVO_METHOD_TEXT, tables=(settings_table(study),)),
         ),
@@ -412,259 +357,3 @@ def _seconds(o: Trials) -> str:
 def _magnitude(value: float) -> str:
     """Magnitude with two digits, or 0."""
     return brief(value) if value > 0 else "0"
-
-
-# ------------------------------------------------------------------ against time
-
-
-def shares(o: Trials, values: Array) -> Array:
-    """Values (R, K) relative to the start, of the runs that reached the goal.
-
-    Of all runs if none did.
-    """
-    rows = o.runs.reached if o.reached else np.ones(len(values), dtype=bool)
-    return values[rows] / np.maximum(values[rows, :1], 1e-300)
-
-
-def _sample_rows(samples: int, most: int) -> Integers:
-    """Indices of at most ``most`` samples at equal distances."""
-    return np.unique(np.linspace(0, samples - 1, min(samples, most)).round().astype(int))
-
-
-def _significant(values: Array, digits: int = 4) -> list[float]:
-    """Numbers with so many significant digits."""
-    return [float(f"{v:.{digits}g}") for v in values]
-
-
-def curves(s: Study) -> dict[str, Any]:
-    """Plot of the error's norm against time, a line and a band for each estimate."""
-    data: list[dict[str, Any]] = []
-    time = s.outcomes[0].runs.time
-    rows = _sample_rows(len(time), SERVO_CURVE_POINTS)
-    for o in s.outcomes:
-        values = np.maximum(shares(o, o.runs.error)[:, rows], LEAST_SERVO_ERROR_SHARE)
-        name = o.estimate.name
-        if name in SERVO_BAND_COLOURS:
-            data.append(_band(time[rows], values, SERVO_BAND_COLOURS[name], name))
-    for o in s.outcomes:
-        values = np.maximum(
-            np.median(shares(o, o.runs.error)[:, rows], axis=0), LEAST_SERVO_ERROR_SHARE
-        )
-        data.append(_curve(o, time[rows], values, "%{y:.2g} after %{x:.2f} s"))
-    layout = plane("time, s", "error / error at the start")
-    layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
-    return {"data": data, "layout": layout, "config": {}}
-
-
-def tail(s: Study) -> dict[str, Any]:
-    """Plot of the distance from the goal as a share of the path, enlarged near zero."""
-    data: list[dict[str, Any]] = []
-    time = s.outcomes[0].runs.time
-    rows = _sample_rows(len(time), SERVO_CURVE_POINTS)
-    for o in s.outcomes:
-        values = 100 * np.median(shares(o, o.runs.travel)[:, rows], axis=0)
-        data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
-    layout = plane("time, s", "% of the way")
-    layout["yaxis"] |= {"range": [0, 10]}
-    return {"data": data, "layout": layout, "config": {}}
-
-
-def _curve(o: Trials, time: Array, values: Array, hover: str) -> dict[str, Any]:
-    """Trace of an estimate."""
-    dash = {"true": "dot", "cad": "dash"}.get(o.estimate.name, "solid")
-    style = {"color": SERVO_ESTIMATE_COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
-    entries = {"hoverinfo": "all", "hovertemplate": hover}
-    return _line_trace(o.estimate.title, _significant(time), _significant(values), style, **entries)
-
-
-def _line_trace(name: str, x: Any, y: Any, style: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """Trace of a line in the plane."""
-    plain = {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": y}
-    return {**plain, "line": style, "hoverinfo": "skip", **more}
-
-
-def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
-    """Trace of the band between the smallest and the largest of all runs."""
-    both = np.concatenate([time, time[::-1]])
-    edge = np.concatenate([values.max(axis=0), values.min(axis=0)[::-1]])
-    fill = {"fill": "toself", "fillcolor": colour, "showlegend": False}
-    return _line_trace(
-        f"{name}, all runs", _significant(both), _significant(edge), {"width": 0}, **fill
-    )
-
-
-# ------------------------------------------------------------------ in space
-
-
-def _limbs(s: Study, poses: Array) -> tuple[Array, Array]:
-    """Ends A and B (n, L, 3) of the true limbs at poses (n, 4, 4), m."""
-    machine = s.eye.true.machine
-    ends = machine.ends_at(np.nan_to_num(machine.inverse(poses)), poses)
-    return np.broadcast_to(ends.a, ends.b.shape), ends.b
-
-
-def _moving(s: Study, pose: Array) -> list[dict[str, Any]]:
-    """Coordinates of the moving traces: each leg, then the platform."""
-    a, b = (v[0] for v in _limbs(s, pose[None]))
-    legs = (coordinates([np.stack(ends)]) for ends in zip(a, b, strict=True))
-    return [dict(leg) for leg in legs] + [dict(coordinates([ring(b)]))]
-
-
-def space(s: Study, run: int) -> dict[str, Any]:
-    """Plot of the machine on its path.
-
-    Moving traces come first, so that frames refer to them by index.
-    """
-    runs = s.trials("identified").runs
-    start, goal = runs.T_base_platform[run, 0], runs.goals[run]
-    observed = set(s.eye.true.legs.tolist())
-    # moving traces: observed legs in their colours, then the platform
-    *legs, platform = _moving(s, start)
-    data = [
-        line(
-            f"leg {j + 1}" + ("" if j in observed else ", not seen"),
-            f"--leg{j % N_COLOURS + 1}" if j in observed else "--quiet",
-            8 if j in observed else 4,
-            (),
-            **leg,
-        )
-        for j, leg in enumerate(legs)
-    ]
-    data.append(line("platform", "--ink", 6, (), **platform))
-    # static traces: base, goal, paths and camera
-    a, b = (v[0] for v in _limbs(s, goal[None]))
-    data.append(line("base", "--muted", 3, [ring(a)], showlegend=False))
-    dashed = line("goal", "--ink", 2, [ring(b)])
-    dashed["line"]["dash"] = "dash"
-    data.append(dashed)
-    for name, colour in (("identified", "--muted"), ("hand", "--calibrated")):
-        o = s.trials(name)
-        poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
-        middle = _limbs(s, poses)[1].mean(axis=1)
-        data.append(line(f"way, {o.estimate.title.lower()}", colour, 5, [middle]))
-    camera = markers(
-        "camera",
-        inverse(s.eye.true.T_camera_base)[None, :3, 3],
-        {"size": 5, "color": "--ink", "symbol": "square"},
-        mode="markers+text",
-        text=["camera"],
-        textposition="top center",
-        textfont={"color": "--ink", "size": 12},
-        hoverinfo="skip",
-        showlegend=False,
-    )
-    layout = space_layout({"x": 1.3, "y": -1.3, "z": 0.7}) | {
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 70},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
-        "updatemenus": [_player()],
-    }
-    return {"data": [*data, camera], "layout": layout, "config": {"scrollZoom": True}}
-
-
-def frames(s: Study, run: int) -> tuple[dict[str, Any], ...]:
-    """Frames of the animation of :func:`space`."""
-    runs = s.trials("identified").runs
-    out: list[dict[str, Any]] = []
-    for row in _sample_rows(int(runs.last[run]) + 1, ANIMATION_FRAMES):
-        moving = _moving(s, runs.T_base_platform[run, row])
-        out.append(
-            {
-                "name": f"{runs.time[row]:.2f} s",
-                "data": [{"type": "scatter3d", **trace} for trace in moving],
-                "traces": list(range(len(moving))),
-            }
-        )
-    return tuple(out)
-
-
-def _player() -> dict[str, Any]:
-    """Buttons of the animation."""
-    still = {"transition": {"duration": 0}}
-    play = {"frame": {"duration": 60, "redraw": True}, "fromcurrent": True, **still}
-    pause = {"frame": {"duration": 0, "redraw": False}, "mode": "immediate", **still}
-    return {
-        "type": "buttons",
-        "direction": "left",
-        "x": 0,
-        "y": 0,
-        "xanchor": "left",
-        "yanchor": "top",
-        "pad": {"t": 14},
-        "showactive": False,
-        "bgcolor": "--card",
-        "bordercolor": "--quiet",
-        "buttons": [
-            {"label": "▶ Play", "method": "animate", "args": [None, play]},
-            {"label": "❚❚ Pause", "method": "animate", "args": [[None], pause]},
-        ],
-    }
-
-
-# ------------------------------------------------------------------ in the image
-
-
-def image(s: Study, run: int) -> dict[str, Any]:
-    """Plot of edges at start and goal, paths of their ends, and the border of the image."""
-    width, height = s.eye.camera.image_size
-    right, bottom = width - 0.5, height - 0.5
-    x, y = [-0.5, right, right, -0.5, -0.5], [-0.5, -0.5, bottom, bottom, -0.5]
-    data = [_line_trace("image", x, y, {"color": "--muted", "width": 1.5}, showlegend=False)]
-    runs = s.trials("identified").runs
-    first, goal = runs.T_base_platform[run, :1], runs.goals[run : run + 1]
-    data += _edges(s, first, 1.2, "at the start", "dot")
-    data += _edges(s, goal, 2.6, "at the goal", "solid")
-    data += _end_paths(s, run, "identified", "solid")
-    data += _end_paths(s, run, "hand", "dash")
-    layout = plane("x, pixels", "y, pixels")
-    layout["xaxis"] |= {"range": [-0.04 * width, 1.04 * width], "constrain": "domain"}
-    layout["yaxis"] |= {"range": [1.04 * height, -0.04 * height], "constrain": "domain"}
-    layout["yaxis"] |= {"scaleanchor": "x"}
-    return {"data": data, "layout": layout, "config": {}}
-
-
-def _pixels(s: Study, poses: Array, places: int) -> Array:
-    """Pixels (n, E, places, 2) along the edges of the observed legs."""
-    machine = s.eye.true.machine
-    return s.eye.points(poses, np.nan_to_num(machine.inverse(poses)), places).pixel
-
-
-def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[dict[str, Any]]:
-    """Traces of the edges at a pose."""
-    pixels = _pixels(s, pose, SERVO_EDGE_POINTS)[0]
-    return [
-        _line_trace(
-            f"edges {name}",
-            _pixel_list(pixels[e, :, 0]),
-            _pixel_list(pixels[e, :, 1]),
-            {"color": f"--leg{int(leg) % N_COLOURS + 1}", "width": width, "dash": dash},
-            legendgroup=name,
-            showlegend=e == 0,
-        )
-        for e, leg in enumerate(s.eye.tubes.leg)
-    ]
-
-
-def _end_paths(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
-    """Traces of the paths of both ends of each leg's first edge."""
-    o = s.trials(name)
-    poses = o.runs.T_base_platform[run][_sample_rows(len(o.runs.time), ANIMATION_FRAMES)]
-    pixels, gap = _pixels(s, poses, 3), np.full((1, 2), np.nan)
-    data: list[dict[str, Any]] = []
-    for e in range(0, len(s.eye.tubes.leg), 2):
-        ways = np.concatenate([pixels[:, e, 0], gap, pixels[:, e, -1]])
-        data.append(
-            _line_trace(
-                f"way, {o.estimate.title.lower()}",
-                _pixel_list(ways[:, 0]),
-                _pixel_list(ways[:, 1]),
-                {"color": SERVO_ESTIMATE_COLOURS[name], "width": 1.6, "dash": dash},
-                legendgroup=f"way {name}",
-                showlegend=e == 0,
-            )
-        )
-    return data
-
-
-def _pixel_list(values: Array) -> list[float | None]:
-    """Pixels with one decimal, None for NaN."""
-    return [round(float(v), 1) if np.isfinite(v) else None for v in values]

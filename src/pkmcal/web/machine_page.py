@@ -15,6 +15,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.blocks.base import Pose
+from pkmcal.outcome.blocks.machine import Machine as MachineShape
 from pkmcal.web import document as shapes
 from pkmcal.web import serving
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
@@ -70,7 +71,7 @@ def machine_document(
     )
 
 
-def _notes(machine: Machine, shape: shapes.Machine, redundant: bool) -> tuple[str, ...]:
+def _notes(machine: Machine, shape: MachineShape, redundant: bool) -> tuple[str, ...]:
     """Sentences on what the page assumes."""
     out: list[str] = []
     if shape.home.beyond:
@@ -92,9 +93,8 @@ def _sweeps(machine: Machine) -> tuple[shapes.Sweep, ...]:
     ranges = slider_ranges(machine, home.readings[0])
     values, postures = sweeps(machine, home, ranges, SWEEP_CONFIGURATIONS)
     closed = postures.closed
-    shapes_of = iter(
-        configurations(machine, postures.readings[closed], postures.T_base_platform[closed])
-    )
+    at_closed = Postures(*(part[closed] for part in postures))
+    shapes_of = iter(configurations(machine, at_closed))
     each = [next(shapes_of) if is_closed else None for is_closed in closed]
     return tuple(
         shapes.Sweep(
@@ -145,7 +145,7 @@ def configuration_at(machine: Machine, request: PoseRequest) -> dict[str, Any]:
     after = moved(machine, posture, request.index, request.value, high - low)
     if not after.closed.all():
         return {"configuration": None}
-    (shape,) = configurations(machine, after.readings, after.T_base_platform)
+    (shape,) = configurations(machine, after)
     return {"configuration": shape.model_dump(mode="json")}
 
 

@@ -8,7 +8,7 @@ its ``place``, ``skeleton`` and ``chain``.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,9 +24,9 @@ from pkmcal.mechanisms.closure import base_ends, scales
 from pkmcal.mechanisms.document import ActuatedLength
 from pkmcal.mechanisms.layout import CarrierGroup
 from pkmcal.mechanisms.motors import bodies
+from pkmcal.outcome.blocks import machine as shapes
 from pkmcal.outcome.blocks.base import Line, PoseRow, Vector
-from pkmcal.web import document as shapes
-from pkmcal.web.motion import home_posture
+from pkmcal.web.motion import Postures, home_posture
 from pkmcal.wording import DISPLAY_UNITS, number, split_name, with_unit
 
 ARROW_LENGTH = {"m": 0.16, "rad": 0.6}
@@ -46,73 +46,111 @@ SAME_POINT = 1e-6
 """Distance, m, below which two points of an outline are one."""
 
 
-def point(p: Array) -> Vector:
-    """Point (3,), rounded to a micrometre."""
-    x, y, z = (round(float(c), 6) + 0.0 for c in p)
+def point(p: Array, decimals: int = 6) -> Vector:
+    """Point (3,), m, rounded; to a micrometre by default."""
+    x, y, z = (round(float(c), decimals) + 0.0 for c in p)
     return x, y, z
 
 
-def pose_row(row: Array) -> PoseRow:
-    """Row (4,) of a pose, rounded to a nanometre."""
-    x, y, z, t = (round(float(c), 9) + 0.0 for c in row)
+def pose_row(row: Array, decimals: int = 9) -> PoseRow:
+    """Row (4,) of a pose, rounded; to a nanometre by default."""
+    x, y, z, t = (round(float(c), decimals) + 0.0 for c in row)
     return x, y, z, t
 
 
-def line(points: Array) -> Line:
+def line(points: Array, decimals: int = 6) -> Line:
     """Points (n, 3) of a polyline."""
-    return tuple(point(p) for p in points)
+    return tuple(point(p, decimals) for p in points)
 
 
 # ------------------------------------------------------------------ configurations
 
 
-def configurations(
-    machine: Machine, readings: Array, T_base_platform: Array
-) -> list[shapes.Configuration]:
-    """Machine at readings (n, m) and the poses (n, 4, 4) that belong to them."""
-    ends = machine.ends_at(readings, T_base_platform)
-    extent = extent_of(machine)
-    arms = [
-        np.broadcast_to(arm, (len(readings), *arm.shape[-2:])) for arm in machine.arms_at(readings)
-    ]
+class LegLines(NamedTuple):
+    """Lines of one leg at n postures, base frame, m.
+
+    base : (n, k, 3) from where a motor holds the arm, if there is one, to A.
+    platform : (n, k, 3) from the hinge of a bar, if there is one, to B.
+    """
+
+    base: Array
+    platform: Array
+
+
+def leg_lines(machine: Machine, postures: Postures) -> list[LegLines]:
+    """Lines of all legs at n postures."""
+    readings, poses = postures
+    b = np.broadcast_to(machine.ends_at(readings, poses).b, (len(poses), machine.n_legs, 3))
     chains = dict(_chains(machine, machine.layout.platform))
+    out: list[LegLines] = []
+    for j, arm in enumerate(machine.arms_at(readings)):
+        base, platform = np.broadcast_to(arm, (len(poses), *arm.shape[-2:])), b[:, j, None]
+        chain = chains[j]
+        if chain is not None and chain.motion != "fixed":
+            hinge = np.stack([apply(T, chain.point) for T in poses])
+            platform = np.concatenate([hinge[:, None], platform], axis=1)
+        out.append(LegLines(base, platform))
+    return out
+
+
+def configurations(machine: Machine, postures: Postures) -> list[shapes.Configuration]:
+    """Machine at n postures, with the signs and zeros of its readings."""
+    readings = postures.readings
+    extent = extent_of(machine, home_posture(machine))
+    lines = leg_lines(machine, postures)
+    a, b = (np.stack([getattr(leg, side)[:, -1] for leg in lines], axis=1)
+            for side in ("base", "platform"))  # fmt: skip
     zeros = machine.arms_at(np.zeros(machine.n_joints))
-    positive = [_positive_paths(machine, q, a, b, extent)
-                for q, a, b in zip(readings, ends.a, ends.b, strict=True)]  # fmt: skip
-    low, high = machine.joint_ranges.T
     offsets = np.where(machine.layout.closing, machine.values[machine.layout.rod], 0.0)
+    low, high = machine.joint_ranges.T
     out: list[shapes.Configuration] = []
-    for n, T in enumerate(T_base_platform):
-        legs: list[shapes.LegConfiguration] = []
-        for j in range(machine.n_legs):
-            a, b = ends.a[n, j], ends.b[n, j]
-            chain, zero = chains[j], zeros[j]
-            hinge = () if chain is None or chain.motion == "fixed" else (apply(T, chain.point),)
+    for n, plain in enumerate(plain_configurations(postures, lines, decimals=6)):
+        q, legs = readings[n], list[shapes.LegConfiguration]()
+        positive = _positive_paths(machine, q, a[n], b[n], extent)
+        for j, (leg, zero) in enumerate(zip(plain.legs, zeros, strict=True)):
             if machine.layout.rod_reads[j]:
-                zero = (a + offsets[j] * (b - a) / np.linalg.norm(b - a))[None]
+                along = b[n, j] - a[n, j]
+                zero = (a[n, j] + offsets[j] * along / np.linalg.norm(along))[None]
             elif machine.layout.actuated[j] < 0:
                 zero = np.zeros((0, 3))
-            legs.append(
-                shapes.LegConfiguration(
-                    base=line(arms[j][n]),
-                    platform=line(np.stack([*hinge, b])),
-                    positive=line(positive[n][j]),
-                    zero=line(zero),
-                )
-            )
-        q = readings[n]
+            signs = {"positive": line(positive[j]), "zero": line(zero)}
+            legs.append(leg.model_copy(update=signs))
         slack = 1e-9 * np.abs(q)
         beyond = np.flatnonzero((q < low - slack) | (q > high + slack))
-        out.append(
-            shapes.Configuration(
-                readings=tuple(round(float(x), 9) + 0.0 for x in q),
-                T_base_platform=(pose_row(T[0]), pose_row(T[1]), pose_row(T[2]), pose_row(T[3])),
-                rotation=point(rotation_vector(T[:3, :3])),
-                legs=tuple(legs),
-                beyond=tuple(beyond.tolist()),
-            )
-        )
+        out.append(plain.model_copy(update={"legs": tuple(legs), "beyond": tuple(beyond.tolist())}))
     return out
+
+
+def plain_configurations(
+    postures: Postures, lines: Sequence[LegLines], decimals: int = 4
+) -> list[shapes.Configuration]:
+    """Configurations without the signs of the readings.
+
+    decimals : of points in metres; a tenth of a millimetre by default.
+    """
+    return [
+        shapes.Configuration(
+            readings=tuple(round(float(x), decimals + 3) + 0.0 for x in q),
+            T_base_platform=(
+                pose_row(T[0], decimals + 3),
+                pose_row(T[1], decimals + 3),
+                pose_row(T[2], decimals + 3),
+                pose_row(T[3], decimals + 3),
+            ),
+            rotation=point(rotation_vector(T[:3, :3])),
+            legs=tuple(
+                shapes.LegConfiguration(
+                    base=line(leg.base[n], decimals),
+                    platform=line(leg.platform[n], decimals),
+                    positive=(),
+                    zero=(),
+                )
+                for leg in lines
+            ),
+            beyond=(),
+        )
+        for n, (q, T) in enumerate(zip(*postures, strict=True))
+    ]
 
 
 def _positive_paths(machine: Machine, q: Array, a: Array, b: Array, extent: float) -> list[Array]:
@@ -149,12 +187,10 @@ def _positive_paths(machine: Machine, q: Array, a: Array, b: Array, extent: floa
     return out
 
 
-def extent_of(machine: Machine) -> float:
-    """Largest side of the box around the joints at home, m."""
-    (readings,), (home,) = home_posture(machine)
-    ends = machine.ends_at(readings, home)
-    points = np.concatenate([ends.a, ends.b, *machine.arms_at(readings)])
-    return float(np.ptp(points, axis=0).max()) or 1.0
+def extent_of(machine: Machine, posture: Postures) -> float:
+    """Largest side of the box around the joints at one posture, m."""
+    points = [leg_part[0] for leg in leg_lines(machine, posture) for leg_part in leg]
+    return float(np.ptp(np.concatenate(points), axis=0).max()) or 1.0
 
 
 # ------------------------------------------------------------------ the machine
@@ -162,20 +198,28 @@ def extent_of(machine: Machine) -> float:
 
 def machine_shape(
     machine: Machine,
-    rows: Mapping[int, Sequence[shapes.Row]],
+    rows: Mapping[int, Sequence[shapes.Property]],
     cameras: Mapping[str, tuple[Camera, Array]],
+    posture: Postures | None = None,
 ) -> shapes.Machine:
-    """Machine of a stage, at home.
+    """Machine of a stage.
 
     rows : parameters of each leg, from 0.
     cameras : camera and T_base_camera (4, 4) by name.
+    posture : at which it is first drawn, without the signs of the readings and the workspace; home
+        with both by default. Raises GeometryError for a machine that does not close at home.
     """
-    home = home_posture(machine)
-    extent = extent_of(machine)
+    if posture is None:
+        at = home_posture(machine)
+        (first,) = configurations(machine, at)
+        workspace = workspace_points(machine)
+    else:
+        at, workspace = posture, np.zeros((0, 3))
+        (first,) = plain_configurations(at, leg_lines(machine, at))
+    extent = extent_of(machine, at)
     own = bodies(machine.document)
-    ranges = slider_ranges(machine, home.readings[0])
+    ranges = slider_ranges(machine, at.readings[0])
     paths = _paths(machine, ranges)
-    (first,) = configurations(machine, *home)
     return shapes.Machine(
         name=machine.name,
         motion=machine.document.motion,
@@ -205,7 +249,7 @@ def machine_shape(
             )
             for name, (camera, T) in cameras.items()
         ),
-        workspace=line(workspace_points(machine)),
+        workspace=line(workspace),
         home=first,
     )
 
@@ -283,7 +327,7 @@ def _outline(points: Array) -> Array:
     return ring(np.array(distinct)) if len(distinct) > 2 else np.array(distinct)
 
 
-def _axes(machine: Machine) -> Iterator[shapes.Axis]:
+def _axes(machine: Machine) -> Iterator[shapes.JointAxis]:
     """Axes of the joints: of turning carriers by their chain, of universal and revolute joints by
     the mechanism file or, in a planar machine, the plane's normal.
     """
@@ -305,7 +349,7 @@ def _axes(machine: Machine) -> Iterator[shapes.Axis]:
                 at, axis = centres[j], np.array(stated or (0.0, 0.0, 1.0))
             else:
                 continue
-            yield shapes.Axis(
+            yield shapes.JointAxis(
                 leg=j,
                 side=side,
                 point=point(at),
@@ -381,12 +425,12 @@ def millimetres(p: Array) -> str:
     return f"({', '.join(texts)}) mm"
 
 
-def leg_rows(machine: Machine, sigma: Array | None) -> dict[int, list[shapes.Row]]:
+def leg_rows(machine: Machine, sigma: Array | None) -> dict[int, list[shapes.Property]]:
     """Parameters of each leg, from 0, for people; vectors are one row.
 
     sigma : (P,) standard deviations; the prior sigmas by default.
     """
-    table, out = machine.parameters, dict[int, list[shapes.Row]]()
+    table, out = machine.parameters, dict[int, list[shapes.Property]]()
     values = table.unit_axes(machine.values)
     spread = table.tolerance if sigma is None else sigma
     k = 0
@@ -406,19 +450,19 @@ def leg_rows(machine: Machine, sigma: Array | None) -> dict[int, list[shapes.Row
         if leg is not None:
             label = table.labels[k].removesuffix(" x")
             out.setdefault(leg - 1, []).append(
-                shapes.Row(label=label[:1].upper() + label[1:], value=text)
+                shapes.Property(label=label[:1].upper() + label[1:], value=text)
             )
         k += width
     for j, leg in enumerate(machine.document.legs):
         rows = out.setdefault(j, [])
         kind = f"{leg.base.joint} on the base, {leg.platform.joint} on the platform"
-        rows.insert(0, shapes.Row(label="Joints", value=kind))
+        rows.insert(0, shapes.Property(label="Joints", value=kind))
         if isinstance(leg.length, ActuatedLength) or base_carriers()[leg.base.joint].driven:
             scale = np.broadcast_to(scales(machine.layout, machine.values), machine.n_legs)[j]
             if abs(scale - 1) > 1e-12 and not machine.layout.unsure_scales[j]:
-                rows.append(shapes.Row(label="Reading scale", value=number(float(scale), 6)))
+                rows.append(shapes.Property(label="Reading scale", value=number(float(scale), 6)))
         if not leg.tubes:
-            rows.append(shapes.Row(label="Tubes", value="none in the file; drawn thin"))
+            rows.append(shapes.Property(label="Tubes", value="none in the file; drawn thin"))
     return out
 
 

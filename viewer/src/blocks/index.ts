@@ -5,8 +5,10 @@ import type { Selection } from "../selection";
 import { images } from "./images";
 import { logBar } from "./log_bar";
 import { panels, plot } from "./plot";
+import { space } from "./space";
 import { dataTable } from "./table";
 import { checks, downloads, facts, listing, paragraph } from "./text";
+import { tool_map } from "./tool_map";
 
 export type Block = Section["blocks"][number];
 /** What a block may use beside its own data. */
@@ -27,6 +29,8 @@ const DRAWERS: Drawers = {
   plot,
   panels,
   images,
+  space,
+  tool_map,
 };
 
 export function drawBlock(block: Block, context: Context): HTMLElement {

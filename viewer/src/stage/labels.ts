@@ -8,6 +8,8 @@ export interface Label {
   className: string;
   /** Where it may stand, best first. */
   places: Vector3[];
+  /** Whether it stands at the border, with an arrow, where its place is out of view. */
+  atBorder?: boolean;
 }
 
 interface Box {
@@ -15,9 +17,13 @@ interface Box {
   top: number;
   right: number;
   bottom: number;
+  /** Direction of the place, if that is out of view. */
+  arrow?: string;
 }
 
 const GAP = 2;
+const ARROWS = ["→", "↘", "↓", "↙", "←", "↖", "↑", "↗"];
+const ARROW_WIDTH = 16;
 
 export class Labels {
   readonly layer = h("div", { class: "labels", "aria-hidden": "true" });
@@ -55,6 +61,7 @@ export class Labels {
         .find((candidate) => candidate && !taken.some((other) => overlap(candidate, other)));
       one.element.style.visibility = box ? "visible" : "hidden";
       if (!box) continue;
+      one.element.dataset.arrow = box.arrow ?? "";
       taken.push(box);
       one.element.style.transform = `translate(${box.left}px, ${box.top}px)`;
     }
@@ -66,15 +73,23 @@ function screen(
   camera: Camera,
   width: number,
   height: number,
-  size: { width: number; height: number },
+  size: { width: number; height: number; label: Label },
 ): Box | undefined {
   const p = place.clone().project(camera);
-  if (p.z > 1) return undefined;
-  const left = Math.round(((p.x + 1) / 2) * width - size.width / 2);
-  const top = Math.round(((1 - p.y) / 2) * height - size.height / 2);
-  const box = { left, top, right: left + size.width, bottom: top + size.height };
-  const inside = left >= 0 && top >= 0 && box.right <= width && box.bottom <= height;
-  return inside ? box : undefined;
+  const { atBorder } = size.label;
+  if (p.z > 1 && !atBorder) return undefined;
+  const side = p.z > 1 ? -1 : 1; // a point behind the eye is projected to the opposite side
+  const x = ((side * p.x + 1) / 2) * width - size.width / 2;
+  const y = ((1 - side * p.y) / 2) * height - size.height / 2;
+  const inside = p.z <= 1 && x >= 0 && y >= 0 && x + size.width <= width && y + size.height <= height;
+  if (!inside && !atBorder) return undefined;
+  const extra = inside ? 0 : ARROW_WIDTH;
+  const left = Math.round(Math.min(Math.max(x, 0), width - size.width - extra));
+  const top = Math.round(Math.min(Math.max(y, 0), height - size.height));
+  const box = { left, top, right: left + size.width + extra, bottom: top + size.height };
+  if (inside) return box;
+  const angle = Math.atan2(y - height / 2, x - width / 2);
+  return { ...box, arrow: ARROWS[(Math.round(angle / (Math.PI / 4)) + 8) % 8] };
 }
 
 function overlap(a: Box, b: Box): boolean {

@@ -54,6 +54,9 @@ export type Layer = keyof typeof LAYERS;
 /** Name of a leg's colour in the style sheet. */
 export const legColour = (leg: number): string => `--leg${(leg % LEG_COLOURS) + 1}`;
 
+type Side = "base" | "platform";
+const SAME_POINT = 1e-3; // m, for points that are rounded to a tenth of a millimetre
+
 const matrix = (T: Configuration["T_base_platform"]): Matrix4 =>
   new Matrix4().set(...(T.flat() as Parameters<Matrix4["set"]>));
 
@@ -190,32 +193,44 @@ class LegModel {
   }
 }
 
-/** Plate through a closed polygon, with its border. */
-function plate(outline: Point[], colour: string, extent: number, palette: Palette): Group {
-  const group = new Group();
-  if (outline.length === 2) {
-    const bar = new Rod(
-      palette.paint(new MeshStandardMaterial({ roughness: 0.6 }), "--metal"),
-      BAR * extent,
-    );
-    bar.place(vector(outline[0]), vector(outline[1]));
-    group.add(bar.mesh);
+/** Plate through a closed polygon with its border, or a bar between two points. */
+class Plate {
+  readonly group = new Group();
+  private readonly bar: Rod;
+  private readonly border: Lines;
+  private readonly fill: Mesh;
+
+  constructor(colour: string, extent: number, palette: Palette) {
+    this.bar = new Rod(palette.paint(new MeshStandardMaterial({ roughness: 0.6 }), "--metal"), BAR * extent);
+    this.border = new Lines(lineMaterial(palette, colour, { width: 2.5 }));
+    const material = new MeshBasicMaterial({
+      transparent: true, opacity: 0.22, side: DoubleSide, depthWrite: false,
+    });
+    this.fill = new Mesh(new BufferGeometry(), palette.paint(material, colour));
+    this.fill.frustumCulled = false;
+    this.group.add(this.bar.mesh, this.border.object, this.fill);
   }
-  if (outline.length < 4) return group;
-  const centre = outline
-    .slice(1)
-    .reduce((sum, p) => sum.add(vector(p)), new Vector3())
-    .divideScalar(outline.length - 1);
-  const corners = outline.slice(1).flatMap((p, k) => [...centre.toArray(), ...outline[k], ...p]);
-  const geometry = new BufferGeometry();
-  geometry.setAttribute("position", new Float32BufferAttribute(corners, 3));
-  const fill = new MeshBasicMaterial({
-    transparent: true, opacity: 0.22, side: DoubleSide, depthWrite: false,
-  });
-  const border = new Lines(lineMaterial(palette, colour, { width: 2.5 }));
-  border.place([outline]);
-  group.add(new Mesh(geometry, palette.paint(fill, colour)), border.object);
-  return group;
+
+  place(outline: Point[]): void {
+    const closed = outline.length > 3;
+    this.bar.mesh.visible = outline.length === 2;
+    if (outline.length === 2) this.bar.place(vector(outline[0]), vector(outline[1]));
+    this.border.place(closed ? [outline] : []);
+    this.fill.visible = closed;
+    if (!closed) return;
+    const centre = outline
+      .slice(1)
+      .reduce((sum, p) => sum.add(vector(p)), new Vector3())
+      .divideScalar(outline.length - 1);
+    const corners = outline.slice(1).flatMap((p, k) => [...centre.toArray(), ...outline[k], ...p]);
+    this.fill.geometry.setAttribute("position", new Float32BufferAttribute(corners, 3));
+  }
+}
+
+/** Corner of a plate; leg : whose first point it is, so that it moves with it. */
+interface Corner {
+  point: Point;
+  leg: number;
 }
 
 /** Axes of a frame. */
@@ -235,11 +250,14 @@ export class MachineModel {
   /** Distance of the ground's lines, m. */
   readonly gridStep: number;
   readonly layers: Record<Layer, Group>;
-  private readonly extent: number;
+  /** Largest side of the box around the machine, m. */
+  readonly extent: number;
   private readonly legs: LegModel[];
   private readonly platform = new Group();
+  private readonly plates: Record<Side, Plate>;
+  private readonly corners: Record<Side, Corner[]>;
   private readonly platformAxes: Lines;
-  private readonly links: { rods: Rod[]; legs: number[]; side: "base" | "platform" }[] = [];
+  private readonly links: { rods: Rod[]; legs: number[]; side: Side }[] = [];
   private readonly points: Vector3[];
   private configuration: Configuration;
   private highlighted: number[] | null = null;
@@ -247,6 +265,7 @@ export class MachineModel {
   constructor(
     private readonly machine: Machine,
     private readonly stage: Stage,
+    platformColour = "--platform",
   ) {
     const { palette, scene } = stage;
     const { home } = machine;
@@ -266,9 +285,13 @@ export class MachineModel {
     const grid = new Grid(box, palette);
     this.gridStep = grid.step;
     scene.add(grid.object);
-    scene.add(plate(machine.base_outline as Point[], "--base", extent, palette));
-    this.platform.add(plate(machine.platform_outline as Point[], "--platform", extent, palette));
-    scene.add(this.platform);
+    this.plates = {
+      base: new Plate("--base", extent, palette),
+      platform: new Plate(platformColour, extent, palette),
+    };
+    this.corners = { base: this.cornersOf("base"), platform: this.cornersOf("platform") };
+    this.platform.add(this.plates.platform.group);
+    scene.add(this.plates.base.group, this.platform);
 
     this.legs = machine.legs.map((leg, j) => {
       const model = new LegModel(leg, j, home.legs[j], extent, palette);
@@ -282,7 +305,7 @@ export class MachineModel {
 
     // what legs of one motor, or of one bar of the platform, have between them
     const metal = palette.paint(new MeshStandardMaterial({ roughness: 0.6 }), "--metal");
-    const link = (legs: number[], side: "base" | "platform"): void => {
+    const link = (legs: number[], side: Side): void => {
       if (legs.length < 2) return;
       const rods = legs.slice(1).map(() => new Rod(metal, BAR * extent));
       scene.add(...rods.map((rod) => rod.mesh));
@@ -311,6 +334,8 @@ export class MachineModel {
     const T = matrix(configuration.T_base_platform);
     this.platform.matrixAutoUpdate = false;
     this.platform.matrix.copy(T);
+    this.plates.base.place(this.outline("base", new Matrix4()));
+    this.plates.platform.place(this.outline("platform", T.clone().invert()));
     for (const { rods, legs, side } of this.links) {
       const ends = legs.map((j) => vector((configuration.legs[j][side] as Point[]).at(-1) as Point));
       rods.forEach((rod, k) => rod.place(ends[k], ends[k + 1]));
@@ -345,6 +370,29 @@ export class MachineModel {
     this.stage.setLabels(this.labels());
   }
 
+  /** Corners of a plate at home, in the frame of its side. */
+  private cornersOf(side: Side): Corner[] {
+    const { machine } = this;
+    const { legs, T_base_platform } = machine.home;
+    const toSide = side === "base" ? new Matrix4() : matrix(T_base_platform).invert();
+    const firsts = legs.map((leg, j) => {
+      const onGuide = side === "base" && leg.base.length === 1 && machine.legs[j].path.length > 0;
+      return onGuide ? null : vector(leg[side][0] as Point).applyMatrix4(toSide);
+    });
+    const outline = (side === "base" ? machine.base_outline : machine.platform_outline) as Point[];
+    return outline.map((point) => ({
+      point,
+      leg: firsts.findIndex((first) => first !== null && first.distanceTo(vector(point)) < SAME_POINT),
+    }));
+  }
+
+  /** Outline of a plate in the present configuration. */
+  private outline(side: Side, toSide: Matrix4): Point[] {
+    return this.corners[side].map(({ point, leg }) =>
+      leg < 0 ? point
+        : vector(this.configuration.legs[leg][side][0] as Point).applyMatrix4(toSide).toArray() as Point);
+  }
+
   private outlinePoints(home: Configuration): Vector3[] {
     const T = matrix(home.T_base_platform);
     const lines = [
@@ -369,7 +417,7 @@ export class MachineModel {
     });
   }
 
-  private axisLines(side: "base" | "platform"): Point[][] {
+  private axisLines(side: Side): Point[][] {
     return this.machine.axes
       .filter((axis) => axis.side === side)
       .map(({ point, direction }) =>
@@ -457,7 +505,10 @@ export class MachineModel {
       });
     }
     if (this.layers.cameras.visible) {
-      for (const camera of machine.cameras) add(camera.name, "frame-name", vector(camera.position as Point));
+      for (const camera of machine.cameras) {
+        const places = [vector(camera.position as Point)];
+        out.push({ text: camera.name, className: "frame-name", places, atBorder: true });
+      }
     }
     return out;
   }

@@ -1,4 +1,4 @@
-/** Colours of the canvas: those of the style sheet, again when the scheme changes. */
+/** Colours of the canvas: those of the style sheet, again when the scheme changes or the page is printed. */
 
 import { Color, type Material } from "three";
 
@@ -6,13 +6,15 @@ type Painted = Material & { color: Color };
 
 export class Palette {
   private readonly painted: { material: Painted; name: string }[] = [];
-  private readonly scheme = matchMedia("(prefers-color-scheme: dark)");
+  private readonly media = ["(prefers-color-scheme: dark)", "print"].map((query) => matchMedia(query));
 
   constructor(onchange: () => void) {
-    this.scheme.addEventListener("change", () => {
-      for (const { material, name } of this.painted) material.color.copy(this.colour(name));
-      onchange();
-    });
+    for (const one of this.media) {
+      one.addEventListener("change", () => {
+        for (const { material, name } of this.painted) material.color.copy(this.colour(name));
+        onchange();
+      });
+    }
   }
 
   /** Colour of a custom property of the style sheet, such as `--leg1`. */

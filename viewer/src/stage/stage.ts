@@ -27,15 +27,25 @@ const KEY_ZOOM = 1.15;
 const SOON = 150; // ms
 const TAP = 5; // px; a pointer that moves by less has tapped
 
+/** Directions towards the eye. */
+export const VIEWS: Record<string, Vector3> = {
+  "Reset view": new Vector3(0.75, -1, 0.55),
+  "From above": new Vector3(0, -0.001, 1),
+  "From the side": new Vector3(0, -1, 0.02),
+};
+export const PLANE_VIEW = new Vector3(0.15, -0.6, 1);
+
+/** What is under the pointer: a leg, or a part that has a key and a text. */
 export interface Picked {
-  leg: number;
+  leg: number | null;
+  part: { key: string; tip: string } | null;
 }
 
 export class Stage {
   readonly scene = new Scene();
   readonly palette = new Palette(() => this.draw());
   readonly element: HTMLElement;
-  /** Objects that can be hovered; the nearest ancestor with a leg in `userData` is picked. */
+  /** Objects that can be hovered; `userData` holds their leg, or the parts of their instances. */
   readonly pickable: Object3D[] = [];
   onpick: (picked: Picked | null) => void = () => undefined;
   ontap: (picked: Picked | null) => void = () => undefined;
@@ -50,8 +60,11 @@ export class Stage {
   private fitted: { points: Vector3[]; direction: Vector3 } | null = null;
   private untouched = true;
 
-  /** Throws an error where the browser has no WebGL. */
-  constructor(description: string) {
+  /**
+   * Throws an error where the browser has no WebGL.
+   * inPage : whether the stage is a part of a page that scrolls.
+   */
+  constructor(description: string, inPage = false) {
     // what was drawn last stays readable, for print
     this.renderer = new WebGLRenderer({
       antialias: true, alpha: true, preserveDrawingBuffer: true, powerPreference: "low-power",
@@ -73,6 +86,7 @@ export class Stage {
     this.controls.zoomToCursor = true;
     this.controls.addEventListener("change", () => this.draw());
     this.controls.addEventListener("start", () => (this.untouched = false));
+    if (inPage) this.leaveScrolling(canvas);
 
     new ResizeObserver(() => this.resize()).observe(this.element);
     canvas.addEventListener("keydown", (event) => this.key(event));
@@ -192,6 +206,18 @@ export class Stage {
     this.draw();
   }
 
+  /** A finger's vertical motion, and the wheel before a click on the stage, scroll the page. */
+  private leaveScrolling(canvas: HTMLCanvasElement): void {
+    canvas.style.touchAction = "pan-y";
+    let clicked = false;
+    canvas.addEventListener("pointerdown", () => (this.controls.enableZoom = clicked = true), true);
+    canvas.addEventListener("pointerleave", () => (clicked = false));
+    const allow = (event: WheelEvent): void => {
+      this.controls.enableZoom = clicked || event.ctrlKey;
+    };
+    this.element.addEventListener("wheel", allow, { capture: true, passive: true });
+  }
+
   private listen(canvas: HTMLCanvasElement): void {
     let down: { x: number; y: number } | null = null;
     const aim = (event: PointerEvent): void => {
@@ -223,8 +249,10 @@ export class Stage {
   private picked(): Picked | null {
     const caster = new Raycaster();
     caster.setFromCamera(this.pointer, this.camera);
-    const hit = caster.intersectObjects(this.pickable, false)[0];
-    const leg = hit?.object.userData.leg as number | undefined;
-    return leg === undefined ? null : { leg };
+    const visible = this.pickable.filter((object) => object.visible && object.parent?.visible);
+    const hit = caster.intersectObjects(visible, false)[0];
+    if (!hit) return null;
+    const { leg, parts } = hit.object.userData as { leg?: number; parts?: NonNullable<Picked["part"]>[] };
+    return { leg: leg ?? null, part: parts?.[hit.instanceId ?? 0] ?? null };
   }
 }

@@ -1,24 +1,16 @@
 /** Page of a machine: the stage, and sliders for its readings. */
 
-import { Vector3 } from "three";
+import type { Vector3 } from "three";
 import type { Configuration, Reading, MachineDocument } from "../document";
 import { UNITS, h, number, quantity } from "../dom";
+import { chip, legTable } from "../stage/legs";
 import { LAYERS, type Layer, MachineModel } from "../stage/machine";
-import { Stage } from "../stage/stage";
+import { PLANE_VIEW, type Picked, Stage, VIEWS } from "../stage/stage";
 import { type Poses, askProgram, sweptPoses } from "./poses";
 
-const VIEWS: Record<string, Vector3> = {
-  "Reset view": new Vector3(0.75, -1, 0.55),
-  "From above": new Vector3(0, -0.001, 1),
-  "From the side": new Vector3(0, -1, 0.02),
-};
-const PLANE_VIEW = new Vector3(0.15, -0.6, 1);
 const NO_WEBGL =
   "This browser draws nothing in space: it has no WebGL, or it is switched off. The readings, the" +
   " platform's position and the legs' values beside are complete.";
-
-const chip = (leg: number): HTMLElement =>
-  h("span", { class: `chip leg-${(leg % 8) + 1}` }, String(leg + 1));
 
 export function machineView(host: HTMLElement, content: MachineDocument): void {
   const { machine } = content;
@@ -264,7 +256,7 @@ function legsList(content: MachineDocument, onchoice: (leg: number | null) => vo
     rows.replaceChildren(
       current === null
         ? h("p", { class: "small" }, "Choose a leg, here or in space, for its values.")
-        : legTable(content, current),
+        : legTable(content.machine, current),
     );
     onchoice(current);
     if (current !== null) rows.scrollIntoView({ block: "nearest" });
@@ -282,16 +274,6 @@ function legsList(content: MachineDocument, onchoice: (leg: number | null) => vo
   return { element: h("div", {}, h("div", { class: "leg-buttons" }, ...buttons), rows), choose };
 }
 
-function legTable(content: MachineDocument, leg: number): HTMLElement {
-  const { rows, number: name } = content.machine.legs[leg];
-  return h(
-    "table",
-    { class: "values" },
-    h("caption", {}, `Leg ${name}`),
-    h("tbody", {}, ...rows.map((row) => h("tr", {}, h("th", { scope: "row" }, row.label), h("td", {}, row.value)))),
-  );
-}
-
 /** Tooltip and highlight of the leg under the pointer. */
 function hovering(
   stage: Stage,
@@ -300,9 +282,9 @@ function hovering(
   highlight: (legs: number[] | null) => void,
 ) {
   let last: number | null = null;
-  const onpick = (picked: { leg: number } | null): void => {
+  const onpick = (picked: Picked | null): void => {
     const leg = picked?.leg ?? null;
-    stage.showTooltip(leg === null ? null : legTable(content, leg));
+    stage.showTooltip(leg === null ? null : legTable(content.machine, leg));
     if (leg === last) return;
     last = leg;
     highlight(leg === null ? chosen() : [leg]);

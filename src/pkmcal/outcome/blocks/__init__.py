@@ -13,10 +13,24 @@ from pydantic import Field
 from pkmcal.outcome.blocks.images import Images
 from pkmcal.outcome.blocks.log_bar import LogBar
 from pkmcal.outcome.blocks.plot import Panels, Plot
+from pkmcal.outcome.blocks.space import Space
 from pkmcal.outcome.blocks.table import DataTable
 from pkmcal.outcome.blocks.text import Checks, Downloads, Facts, Listing, Paragraph
+from pkmcal.outcome.blocks.tool_map import ToolMapBlock
 
 Block = Annotated[
-    Paragraph | Listing | Facts | Checks | Downloads | DataTable | LogBar | Plot | Panels | Images,
+    Paragraph
+    | Listing
+    | Facts
+    | Checks
+    | Downloads
+    | DataTable
+    | LogBar
+    | Plot
+    | Panels
+    | Images
+    | Space
+    | ToolMapBlock,
     Field(discriminator="kind"),
 ]
+"""Block of a section."""
