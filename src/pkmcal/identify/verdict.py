@@ -355,10 +355,13 @@ def _undetermined(
         by_noise <= options.least_noise_share
         and shift > options.undetermined_share * findings.by_nominal
     )
-    sentences = (*findings.unidentified, *findings.weak)
-    most = max((s.moves_platform for s in sentences), default=0.0)
-    least = min(options.large_cause_share * shift, most)
-    for one in (s for s in sentences if s.moves_platform >= least):
+    causes = sorted(
+        (*findings.unidentified, *findings.weak), key=lambda s: s.moves_platform, reverse=True
+    )
+    large = [
+        s for s in causes if s.matters and s.moves_platform > options.large_cause_share * shift
+    ]
+    for one in large or causes[:1]:
         yield finding(
             "machine.undetermined",
             Level.WRONG if refused else Level.DOUBTFUL,
