@@ -7,6 +7,7 @@ benchmarks/wrong_sessions.py, number 1.
 from __future__ import annotations
 
 import base64
+import re
 import shutil
 import subprocess
 import sys
@@ -24,8 +25,8 @@ from pkmcal.checks import pictures
 from pkmcal.checks.check import check_session
 from pkmcal.judge.validate import validate_calibration
 from pkmcal.outcome import Outcome
-from pkmcal.pages import page
 from pkmcal.report import calibration, validation
+from pkmcal.web.report_page import report_page
 
 HERE = Path(__file__).resolve().parents[1]
 HELD_OUT = 6
@@ -68,7 +69,7 @@ def images(work: Path) -> str:
 
 def report(work: Path) -> str:
     """The report, whole."""
-    return page.page_html(calibration.outcome_of(calibrated(session(work), HELD_OUT)))
+    return report_page(calibration.outcome_of(calibrated(session(work), HELD_OUT)))
 
 
 def report_part(work: Path, name: str) -> str:
@@ -81,7 +82,7 @@ def confirmed(work: Path) -> str:
     out = work / "out"
     if not (out / "calibration.json").exists():
         calibration.save(calibrated(session(work), HELD_OUT), out)
-    return page.page_html(validation.outcome_of(validate_calibration(out, session(work))))
+    return report_page(validation.outcome_of(validate_calibration(out, session(work))))
 
 
 def laid_over(folder: Path) -> str:
@@ -139,6 +140,10 @@ def _wrong_sessions() -> ModuleType:
 
 def _only(outcome: Outcome, name: str) -> str:
     retained = tuple(part for part in outcome.parts if part.name == name)
-    html = page.page_html(replace(outcome, parts=retained, findings=(), figures=()))
-    hidden = "header.top, .verdict, .note { display: none !important; }"
-    return html.replace("</style>", hidden + "</style>", 1)
+    html = report_page(replace(outcome, parts=retained, findings=(), figures=()))
+    hidden = (
+        "<style>.report { display: block; } .top, .contents, .verdict, .note, .own"
+        " { display: none !important; }</style>"
+    )
+    # instead of the policy, which allows no other style
+    return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', hidden, html)

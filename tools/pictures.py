@@ -44,6 +44,7 @@ from pkmcal.simulation import load_truth, simulate_session, true_machine
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 from pkmcal.view.content import Viewed
 from pkmcal.view.server import application
+from pkmcal.web.report_page import report_page
 from pkmcal.web.serving import (
     LOOPBACK_ADDRESS,
     listening_socket,
@@ -74,13 +75,12 @@ class Shot:
 
 
 def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot:
-    """A white page in the report's style; ``body`` may use its drawing macros as ``draw``."""
-    style = (Path(page.__file__).parent / "templates" / "style.css").read_text(encoding="utf-8")
-    extra = (
+    """A white page in the report's font."""
+    style = (
         "html, body { margin: 0; background: #fff; overflow: hidden; }"
-        "body { font-family: 'Liberation Sans', Arial, sans-serif; color: #1a1e24; }"
+        "body { font: 16px/1.5 'Liberation Sans', Arial, sans-serif; color: #1a1e24; }"
     )
-    html = f"<!doctype html><meta charset=utf-8><style>{style}{extra}{more_style}</style>{body}"
+    html = f"<!doctype html><meta charset=utf-8><style>{style}{more_style}</style>{body}"
     return Shot(html, width, height)
 
 
@@ -318,7 +318,7 @@ def plan(_case: Case) -> Shot:
     subject = of_machine(machine, [default_camera()], machine.joint_names)
     outcome = outcome_of(make_plan(subject, free_stations=3))
     retained = tuple(part for part in outcome.parts if part.name == "where")
-    html = page.page_html(replace(outcome, parts=retained, findings=()))
+    html = report_page(replace(outcome, parts=retained, findings=()))
     return Shot(html, 1000, 1390)
 
 
@@ -360,7 +360,7 @@ def tutorial_validation(case: Case) -> Shot:
 def trouble_scale(case: Case) -> Shot:
     """The top of a refused report: one reading has another scale."""
     value = guide.calibrated(guide.wrong(case.work, "legs", "encoder's scale 1 %"))
-    return Shot(page.page_html(outcome_of_calibration(value)), 1180, 345)
+    return Shot(report_page(outcome_of_calibration(value)), 1180, 345)
 
 
 def trouble_columns(case: Case) -> Shot:
