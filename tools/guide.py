@@ -18,13 +18,14 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from pkmcal.outcome.blocks.images import Images
 
 import pkmcal
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.checks import pictures
 from pkmcal.checks.check import check_session
 from pkmcal.judge.validate import validate_calibration
-from pkmcal.outcome import Outcome
+from pkmcal.outcome import Outcome, Part, Verdict
 from pkmcal.report import calibration, validation
 from pkmcal.web.report_page import report_page
 
@@ -93,10 +94,15 @@ def laid_over(folder: Path) -> str:
     if check.look is None:
         sys.exit(f"{folder}: nothing to look at")
     few = replace(check.look, stations=check.look.stations[:1])
-    # the section shows up to three images of a station, each twice; one is enough
-    figures = str(pictures.with_pictures(few).html).split("<figure")[1:3]
-    style = "<style>.row { display: flex; gap: 10px; padding: 6px } .row figure { flex: 1 }</style>"
-    return style + "<div class='row'>" + "".join("<figure" + one for one in figures) + "</div>"
+    (block,) = (one for one in pictures.with_pictures(few).blocks if isinstance(one, Images))
+    first = block.images[0]
+    # the pose by hand to the left
+    poses = tuple(
+        first.model_copy(update={"overlays": (one,), "caption": one.title})
+        for one in reversed(first.overlays)
+    )
+    pair = Images(images=poses, size="figure", legs=block.legs)
+    return parts_page(Part("pair", "", blocks=(pair,)), style="main h2 { display: none; }")
 
 
 def wrong(work: Path, kind: str, name: str, spoil: Callable[[Path], None] | None = None) -> Path:
@@ -139,11 +145,17 @@ def _wrong_sessions() -> ModuleType:
 
 
 def _only(outcome: Outcome, name: str) -> str:
-    retained = tuple(part for part in outcome.parts if part.name == name)
-    html = report_page(replace(outcome, parts=retained, findings=(), figures=()))
-    hidden = (
-        "<style>.report { display: block; } .top, .contents, .verdict, .note, .own"
-        " { display: none !important; }</style>"
+    return parts_page(*(part for part in outcome.parts if part.name == name))
+
+
+def parts_page(*parts: Part, style: str = "") -> str:
+    """Sections of a report alone, without head, contents and verdict."""
+    opened = tuple(replace(part, expert=False) for part in parts)
+    outcome = Outcome(command="", title="", verdict=Verdict(True, ""), parts=opened)
+    own = (
+        "<style>.report { display: block; } .top, .contents, .verdict { display: none !important; }"
+        f" {style}</style>"
     )
     # instead of the policy, which allows no other style
-    return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', hidden, html)
+    policy = r'<meta http-equiv="Content-Security-Policy"[^>]*>'
+    return re.sub(policy, own, report_page(outcome))
