@@ -18,7 +18,6 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from pkmcal.outcome.blocks.images import Images
 
 import pkmcal
 from pkmcal.calibration.calibrate import Calibration
@@ -26,6 +25,7 @@ from pkmcal.checks import pictures
 from pkmcal.checks.check import check_session
 from pkmcal.judge.validate import validate_calibration
 from pkmcal.outcome import Outcome, Part, Verdict
+from pkmcal.outcome.blocks.images import Images
 from pkmcal.report import calibration, validation
 from pkmcal.web.report_page import report_page
 

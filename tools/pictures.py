@@ -20,8 +20,6 @@ from threading import Thread
 
 import cv2
 import numpy as np
-from pkmcal.outcome.blocks.images import Images
-from pkmcal.outcome.blocks.plot import panels
 
 import pkmcal
 from pkmcal.arrays import Array
@@ -31,6 +29,8 @@ from pkmcal.identify.start import start_state
 from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Measurements
 from pkmcal.outcome import Part
+from pkmcal.outcome.blocks.images import Images
+from pkmcal.outcome.blocks.plot import panels
 from pkmcal.placement.default_camera import default_camera
 from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.planning.plan import plan_measurements as make_plan
