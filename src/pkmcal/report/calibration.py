@@ -253,8 +253,8 @@ def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
     statistics = estimate.statistics
 
     def judged(*codes: str) -> Mark:
-        found = [one for code in codes for one in verdict.of(code)]
-        levels = {one.level for one in found if not is_remark(one)}
+        of_codes = [one for code in codes for one in verdict.of(code)]
+        levels = {one.level for one in of_codes if not is_remark(one)}
         return next((one for one in (Level.WRONG, Level.DOUBTFUL) if one in levels), "good")
 
     far = verdict.of("machine.far_from_nominal")
@@ -338,7 +338,8 @@ def _comparison(
         return None
     tested_text = (
         " Held out: configurations that the calibration has not used, with the images' own noise."
-        * bool(tested)
+        if tested
+        else ""
     )
     return LogBar(
         title="Error of the tool's position",
