@@ -35,9 +35,9 @@ def main() -> None:
     """Print the ratio, the parts of a calibration, and the memory used."""
     begin = time.perf_counter()
     from pkmcal.calibration.calibrate import calibrate_session
-    from pkmcal.pages.page import page_html
     from pkmcal.report.calibration import outcome_of
     from pkmcal.session.load import load_session
+    from pkmcal.web.report_page import report_page
 
     start_up = time.perf_counter() - begin
     with tempfile.TemporaryDirectory() as folder:
@@ -47,7 +47,7 @@ def main() -> None:
         runs = [calibrate_session(session).timings for _ in range(3)]
         parts = {name: min(run[name] for run in runs) for name in runs[0]}
         begin = time.perf_counter()
-        page_html(outcome_of(first))
+        report_page(outcome_of(first))
         parts["report"] = time.perf_counter() - begin
         paths = [p.path for s in session.stations for p in s.images]
         plain = best_of(lambda: decode_and_canny(paths))

@@ -11,6 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from pkmcal.pages.page import page_html
 
 from pkmcal.boards.board import Detection, chessboard
 from pkmcal.boards.detect import detect_boards
@@ -36,7 +37,6 @@ from pkmcal.camera_calibration.model_selection import (
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
-from pkmcal.pages.page import page_html
 from pkmcal.report.camera import outcome_of
 from test_boards import CAMERAS, render, view
 

@@ -25,7 +25,7 @@ from pkmcal.files import json_text, read_json, read_yaml
 from pkmcal.mechanisms import machine_from_document
 from pkmcal.outcome import Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level
-from pkmcal.pages.page import page_html
+from pkmcal.web.report_page import report_page
 
 HOSTILE = "a\x1b[31m\x9b2J\u202eb\u200bc\u2066\x07\x85\u2028\r\nM502\n*/ --> ]]> {{ x }} \\"
 INVISIBLE = {"Cc", "Cf", "Cs", "Zl", "Zp"}
@@ -94,8 +94,8 @@ def test_pages_are_legible():
     table = Table(HOSTILE, (HOSTILE, HOSTILE), (Row(HOSTILE, (HOSTILE,)),))
     verdict = Verdict(False, HOSTILE, tuple(Finding("", x, saved_text=HOSTILE) for x in Level))
     parts = (Part("a", HOSTILE, (HOSTILE,), (HOSTILE,), tables=(table,), notes=(HOSTILE,)),)
-    page = page_html(Outcome("check", HOSTILE, verdict, HOSTILE, HOSTILE, parts=parts))
-    own = invisible(page_html(Outcome("check", "a", Verdict(True, "b"))), keep="\n\t")
+    page = report_page(Outcome("check", HOSTILE, verdict, HOSTILE, HOSTILE, parts=parts))
+    own = invisible(report_page(Outcome("check", "a", Verdict(True, "b"))), keep="\n\t")
     assert invisible(page, keep="\n\t") <= own
     assert legible("\u202e") in page
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from page_documents import page_blocks, page_section, page_text
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.commands.cli import app
 from pkmcal.errors import InputError, ResultError
@@ -25,11 +26,11 @@ from pkmcal.mechanisms import (
     machine_from_document,
     mechanism_text,
 )
-from pkmcal.pages.page import page_html
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.report.calibration import outcome_of, save
 from pkmcal.session.load import load_session
 from pkmcal.simulation.truth import true_machine
+from pkmcal.web.report_page import report_document
 
 NOISE = 1e-3
 
@@ -265,6 +266,6 @@ def test_what_needs_a_camera_states_so(belts):
 
 
 def test_the_page_holds_no_section_of_cameras(belts):
-    page = page_html(outcome_of(calibrate_session(belts[0])))
-    assert "Where the cameras stood" not in page
-    assert "χ² of the readings" in page
+    document = report_document(outcome_of(calibrate_session(belts[0]))).model_dump(mode="json")
+    assert not page_blocks(document, "table", "stations")
+    assert "χ² of the readings" in page_text(page_section(document, "how"))

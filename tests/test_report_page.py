@@ -121,11 +121,11 @@ def test_comparison_is_of_the_same_poses(case):
         case.session.joints[estimate.configurations],
     )  # fmt: skip
     assert value.comparison is not None
-    shown = {one.label: one.value for one in value.comparison.magnitudes}
-    assert shown["Tolerances"] == pytest.approx(1e3 * prior.position.mean(), rel=1e-2)
-    assert shown["Calibrated"] == pytest.approx(1e3 * tool.position.mean())
-    if "Nominal model" in shown:
-        assert shown["Nominal model"] == pytest.approx(1e3 * tool.off_position.mean())
+    marked = {one.label: one.value for one in value.comparison.magnitudes}
+    assert marked["Tolerances"] == pytest.approx(1e3 * prior.position.mean(), rel=1e-2)
+    assert marked["Calibrated"] == pytest.approx(1e3 * tool.position.mean())
+    if "Nominal model" in marked:
+        assert marked["Nominal model"] == pytest.approx(1e3 * tool.off_position.mean())
 
 
 def test_findings_without_effect_are_remarks(case):
@@ -234,16 +234,16 @@ def test_cells_are_sorted_by_their_number(text, value):
 
 
 @pytest.mark.parametrize(
-    ("marks", "shown"),
+    ("marks", "marked"),
     [(("good", "good"), 0), ((None, "good"), 1), (("good", "doubtful"), 2), (("wrong",) * 2, 2)],
 )
-def test_rows_that_are_all_good_have_no_marks(marks, shown):
+def test_rows_that_are_all_good_have_no_marks(marks, marked):
     marks = [Level(mark) if mark in ("doubtful", "wrong") else mark for mark in marks]
     rows = tuple(Row(f"row {k}", ("1",), mark=mark) for k, mark in enumerate(marks))
     part = Part("part", "Part", tables=(Table("Table", ("", "mm"), rows),))
     outcome = Outcome(command="check", title="Check", verdict=Verdict(True, "Fine."), parts=(part,))
     (table,) = page_blocks(report_document(outcome).model_dump(mode="json"), "table")
-    assert sum(row["mark"] is not None for row in table["rows"]) == shown
+    assert sum(row["mark"] is not None for row in table["rows"]) == marked
 
 
 # ------------------------------------------------------------------ the page

@@ -249,7 +249,7 @@ def test_a_joint_that_never_moves_is_a_warning(folder):
 
 
 def test_importing_pkmcal_is_light():
-    heavy = ["cv2", "scipy", "plotly", "numpy", "pydantic"]
+    heavy = ["cv2", "scipy", "numpy", "pydantic"]
     code = f"import sys, pkmcal; print([m for m in {heavy} if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from conftest import FEW_IMPUTATIONS
+from page_documents import page_text
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import handheld, refinement
 from pkmcal.calibration.calibrate import calibrate_session
@@ -32,12 +33,12 @@ from pkmcal.observe.image_localization import finest_view, refine_local
 from pkmcal.observe.pose_likelihood import LIKELIHOOD_OPTIONS
 from pkmcal.observe.predict import edge_points, legs_in_camera
 from pkmcal.observe.silhouettes import silhouette_edges
-from pkmcal.pages.page import page_html
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.report.calibration import outcome_of
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
 from pkmcal.simulation.truth import load_truth
+from pkmcal.web.report_page import report_document
 from rendered import rendered
 from test_handheld import at_truth, localized_with
 
@@ -165,7 +166,7 @@ def test_edges_that_could_not_be_measured_are_found_whole(calibration):
     assert coarse == edges.coarse.tolist()
     count = int(edges.coarse.sum())
     text = f"{len(edges) - count} edges measured and {count} from silhouettes"
-    page = page_html(values)
+    page = page_text(report_document(values).model_dump(mode="json"))
     assert text in page
     # the variance between measurement passes is in the standard deviations, and in the message
     variance = calibration.measurements.imputation_covariance

@@ -7,6 +7,7 @@ benchmarks/wrong_sessions.py, number 1.
 from __future__ import annotations
 
 import base64
+import re
 import shutil
 import subprocess
 import sys
@@ -23,9 +24,10 @@ from pkmcal.calibration.calibrate import Calibration
 from pkmcal.checks import pictures
 from pkmcal.checks.check import check_session
 from pkmcal.judge.validate import validate_calibration
-from pkmcal.outcome import Outcome
-from pkmcal.pages import page
+from pkmcal.outcome import Outcome, Part, Verdict
+from pkmcal.outcome.blocks.images import Images
 from pkmcal.report import calibration, validation
+from pkmcal.web.report_page import report_page
 
 HERE = Path(__file__).resolve().parents[1]
 HELD_OUT = 6
@@ -68,7 +70,7 @@ def images(work: Path) -> str:
 
 def report(work: Path) -> str:
     """The report, whole."""
-    return page.page_html(calibration.outcome_of(calibrated(session(work), HELD_OUT)))
+    return report_page(calibration.outcome_of(calibrated(session(work), HELD_OUT)))
 
 
 def report_part(work: Path, name: str) -> str:
@@ -81,7 +83,7 @@ def confirmed(work: Path) -> str:
     out = work / "out"
     if not (out / "calibration.json").exists():
         calibration.save(calibrated(session(work), HELD_OUT), out)
-    return page.page_html(validation.outcome_of(validate_calibration(out, session(work))))
+    return report_page(validation.outcome_of(validate_calibration(out, session(work))))
 
 
 def laid_over(folder: Path) -> str:
@@ -92,10 +94,15 @@ def laid_over(folder: Path) -> str:
     if check.look is None:
         sys.exit(f"{folder}: nothing to look at")
     few = replace(check.look, stations=check.look.stations[:1])
-    # the section shows up to three images of a station, each twice; one is enough
-    figures = str(pictures.with_pictures(few).html).split("<figure")[1:3]
-    style = "<style>.row { display: flex; gap: 10px; padding: 6px } .row figure { flex: 1 }</style>"
-    return style + "<div class='row'>" + "".join("<figure" + one for one in figures) + "</div>"
+    (block,) = (one for one in pictures.with_pictures(few).blocks if isinstance(one, Images))
+    first = block.images[0]
+    # the pose by hand to the left
+    poses = tuple(
+        first.model_copy(update={"overlays": (one,), "caption": one.title})
+        for one in reversed(first.overlays)
+    )
+    pair = Images(images=poses, size="figure", legs=block.legs)
+    return parts_page(Part("pair", "", blocks=(pair,)), style="main h2 { display: none; }")
 
 
 def wrong(work: Path, kind: str, name: str, spoil: Callable[[Path], None] | None = None) -> Path:
@@ -138,7 +145,17 @@ def _wrong_sessions() -> ModuleType:
 
 
 def _only(outcome: Outcome, name: str) -> str:
-    retained = tuple(part for part in outcome.parts if part.name == name)
-    html = page.page_html(replace(outcome, parts=retained, findings=(), figures=()))
-    hidden = "header.top, .verdict, .note { display: none !important; }"
-    return html.replace("</style>", hidden + "</style>", 1)
+    return parts_page(*(part for part in outcome.parts if part.name == name))
+
+
+def parts_page(*parts: Part, style: str = "") -> str:
+    """Sections of a report alone, without head, contents and verdict."""
+    opened = tuple(replace(part, expert=False) for part in parts)
+    outcome = Outcome(command="", title="", verdict=Verdict(True, ""), parts=opened)
+    own = (
+        "<style>.report { display: block; } .top, .contents, .verdict { display: none !important; }"
+        f" {style}</style>"
+    )
+    # instead of the policy, which allows no other style
+    policy = r'<meta http-equiv="Content-Security-Policy"[^>]*>'
+    return re.sub(policy, own, report_page(outcome))

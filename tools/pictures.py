@@ -28,22 +28,24 @@ from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
 from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Measurements
-from pkmcal.pages import page
+from pkmcal.outcome import Part
+from pkmcal.outcome.blocks.images import Images
+from pkmcal.outcome.blocks.plot import panels
 from pkmcal.placement.default_camera import default_camera
 from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.planning.plan import plan_measurements as make_plan
 from pkmcal.planning.subject import of_machine
-from pkmcal.report import pictures, scene
+from pkmcal.report import pictures
 from pkmcal.report import residuals as residual_plots
 from pkmcal.report.calibration import outcome_of as outcome_of_calibration
 from pkmcal.report.calibration import save
-from pkmcal.report.links import Links
 from pkmcal.report.plan import outcome_of
 from pkmcal.session.load import Session
 from pkmcal.simulation import load_truth, simulate_session, true_machine
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 from pkmcal.view.content import Viewed
 from pkmcal.view.server import application
+from pkmcal.web.report_page import report_page
 from pkmcal.web.serving import (
     LOOPBACK_ADDRESS,
     listening_socket,
@@ -74,13 +76,12 @@ class Shot:
 
 
 def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot:
-    """A white page in the report's style; ``body`` may use its drawing macros as ``draw``."""
-    style = (Path(page.__file__).parent / "templates" / "style.css").read_text(encoding="utf-8")
-    extra = (
+    """A white page in the report's font."""
+    style = (
         "html, body { margin: 0; background: #fff; overflow: hidden; }"
-        "body { font-family: 'Liberation Sans', Arial, sans-serif; color: #1a1e24; }"
+        "body { font: 16px/1.5 'Liberation Sans', Arial, sans-serif; color: #1a1e24; }"
     )
-    html = f"<!doctype html><meta charset=utf-8><style>{style}{extra}{more_style}</style>{body}"
+    html = f"<!doctype html><meta charset=utf-8><style>{style}{more_style}</style>{body}"
     return Shot(html, width, height)
 
 
@@ -90,29 +91,18 @@ def result(case: Case) -> Shot:
     centres = joint_centres(
         session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
     )
-    drawn = scene.scene_of(session, estimate, centres)
-    taken = pictures.album(case.result, outward(case), centres)
-    shots = {(p.station, p.configuration): p for p in taken.pictures}
-    shot = shots.get(("station2", "0011")) or taken.pictures[0]
-    shot = replace(shot, jpeg=shot.large)
-    template = page.environment().from_string(
-        '{% import "charts.html.j2" as draw %}'
-        '<div class="grid"><div>{{ draw.picture(shot) }}<p>An image, the edges fitted in it,'
-        " and the joints of the calibrated machine (rings) and of the nominal model"
-        " (crosses)</p></div>"
-        '<div class="right">{{ draw.view(view) }}<p>The machine from above, mm: joints by'
-        ' <b class="d">the nominal model</b> and <b class="c">as calibrated</b>, their'
-        " differences {{ '{:g}'.format(scene.factor) }} times enlarged, ellipses of 2σ"
-        " {{ '{:g}'.format(scene.spread_factor) }} times</p></div></div>"
+    images = pictures.album(case.result, outward(case), centres).images
+    chosen = next((one for one in images if one.title == "station2 / 0011"), images[0])
+    report = outcome_of_calibration(case.result)
+    (geometry,) = (part for part in report.parts if part.name == "geometry")
+    image = Part("image", "", blocks=(Images(images=(chosen,), size="figure"),))
+    html = guide.parts_page(
+        image,
+        geometry,
+        style="main { display: grid; grid-template-columns: 640px 500px; gap: 22px; padding: 8px; }"
+        " main h2 { display: none; }",
     )
-    body = template.render(shot=shot, view=scene.plane_projections(drawn)[0], scene=drawn)
-    style = (
-        ".grid { display: grid; grid-template-columns: 640px 500px; gap: 22px; padding: 8px; }"
-        ".grid p { font-size: 15px; line-height: 1.35; margin: 8px 4px 0; color: #58626d; }"
-        ".right svg { max-width: none; height: 480px; } .shot { border-radius: 8px; }"
-        ".d { color: #0068a8; } .c { color: #c2480c; }"
-    )
-    return whole_page(body, 1180, 545, style)
+    return Shot(html, 1180, 545)
 
 
 def outward(case: Case) -> Array:
@@ -168,17 +158,12 @@ def positions(case: Case) -> Shot:
 def residuals(case: Case) -> Shot:
     """The report's histogram of the edges' residuals, and the boxes by leg."""
     edges, estimate = case.result.observation.edges, case.result.estimate
-    results = {
-        "histogram": residual_plots.histogram(estimate.edge_residuals),
-        "by_leg": residual_plots.by_leg(case.session, edges, estimate, Links()),
-    }
-    template = page.environment().from_string(
-        '{% import "charts.html.j2" as draw %}<div class="two">'
-        "<div><h3>{{ r.histogram.title }}</h3>{{ draw.bars(r.histogram) }}</div>"
-        "<div><h3>{{ r.by_leg.title }}</h3>{{ draw.rows(r.by_leg) }}</div></div>"
+    plots = panels(
+        residual_plots.histogram(estimate.edge_residuals),
+        residual_plots.by_leg(case.session, edges, estimate),
     )
-    style = ".two { display: grid; grid-template-columns: 1fr 1fr; gap: 20px; padding: 0 16px; }"
-    return whole_page(template.render(r=results), 900, 290, style)
+    html = guide.parts_page(Part("residuals", "", blocks=plots), style="main h2 { display: none; }")
+    return Shot(html, 900, 330)
 
 
 def repeats(case: Case) -> Shot:
@@ -317,9 +302,8 @@ def plan(_case: Case) -> Shot:
     machine = pkmcal.load_mechanism(DEMO_MECHANISM)
     subject = of_machine(machine, [default_camera()], machine.joint_names)
     outcome = outcome_of(make_plan(subject, free_stations=3))
-    retained = tuple(part for part in outcome.parts if part.name == "where")
-    html = page.page_html(replace(outcome, parts=retained, findings=()))
-    return Shot(html, 1000, 1390)
+    (where,) = (part for part in outcome.parts if part.name == "where")
+    return Shot(guide.parts_page(where), 1000, 700)
 
 
 def view(case: Case) -> Shot:
@@ -334,7 +318,7 @@ def tutorial_images(case: Case) -> Shot:
 
 def tutorial_check(case: Case) -> Shot:
     """The nominal model over one of them, at the rough and at the localized pose."""
-    return whole_page(guide.laid_over(guide.session(case.work)), 1000, 410)
+    return Shot(guide.laid_over(guide.session(case.work)), 1000, 410)
 
 
 def tutorial_report(case: Case) -> Shot:
@@ -360,21 +344,21 @@ def tutorial_validation(case: Case) -> Shot:
 def trouble_scale(case: Case) -> Shot:
     """The top of a refused report: one reading has another scale."""
     value = guide.calibrated(guide.wrong(case.work, "legs", "encoder's scale 1 %"))
-    return Shot(page.page_html(outcome_of_calibration(value)), 1180, 345)
+    return Shot(report_page(outcome_of_calibration(value)), 1180, 345)
 
 
 def trouble_columns(case: Case) -> Shot:
     """The nominal model over an image whose readings are in exchanged columns."""
     spoil = guide.two_columns_exchanged
     folder = guide.wrong(case.work, "legs", "two columns exchanged", spoil)
-    return whole_page(guide.laid_over(folder), 1000, 410)
+    return Shot(guide.laid_over(folder), 1000, 410)
 
 
 def trouble_numbering(case: Case) -> Shot:
     """The same for legs in another numbering."""
     spoil = guide.numbered_from_another_leg
     folder = guide.wrong(case.work, "legs", "numbered from another leg", spoil)
-    return whole_page(guide.laid_over(folder), 1000, 410)
+    return Shot(guide.laid_over(folder), 1000, 410)
 
 
 PICTURES: dict[str, Callable[[Case], Shot]] = {

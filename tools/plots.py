@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.pages.charts import ticks_between
+from pkmcal.outcome.blocks.plot import linear_ticks
 
 INK, MUTED, RULE = "#1a1e24", "#58626d", "#dde2e7"
 NOMINAL, CALIBRATED, GOOD = "#0068a8", "#c2480c", "#00664b"
@@ -132,14 +132,14 @@ class Plot:
         return svg(*self.size, *self.parts)
 
     def _axes(self) -> None:
-        for value, words in ticks_between(*self.x):
-            place = self.at(value, self.y[0])
+        for tick in linear_ticks(*self.x):
+            place = self.at(tick.at, self.y[0])
             self.parts.append(line([place, (place[0], self.top)], RULE, 1))
-            self.parts.append(text((place[0], place[1] + 17), words, MUTED, "middle"))
-        for value, words in ticks_between(*self.y) if self.ticks else ():
-            place = self.at(self.x[0], value)
+            self.parts.append(text((place[0], place[1] + 17), tick.label, MUTED, "middle"))
+        for tick in linear_ticks(*self.y) if self.ticks else ():
+            place = self.at(self.x[0], tick.at)
             self.parts.append(line([place, (self.right, place[1])], RULE, 1))
-            self.parts.append(text((place[0] - 7, place[1] + 4), words, MUTED, "end"))
+            self.parts.append(text((place[0] - 7, place[1] + 4), tick.label, MUTED, "end"))
         middle = (self.left + self.right) / 2
         self.parts.append(text((middle, self.size[1] - 8), self.labels[0], MUTED, "middle"))
         half = (self.top + self.bottom) / 2

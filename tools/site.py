@@ -1,8 +1,7 @@
 """Differences between the documentation's site and the pages in the repository (a MkDocs hook).
 
 Pages link to sources, which are no pages of the site: there such a link is its text alone. The
-README, to which pages link as well, is included as a page, and from the report a script that makes
-its scrolling areas reachable by the keyboard.
+README, to which pages link as well, is included as a page.
 """
 
 from __future__ import annotations
@@ -14,17 +13,15 @@ from typing import Any
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
-SCROLL = ROOT / "src/pkmcal/pages/templates/scroll.js"
 OUTSIDE = r"\[([^\]]+)\]\({}(?!README\.md)[^)]+\)"
 """A link out of the folder of the pages, by the way up from the page's own folder."""
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Takes in the README, and a script of the report."""
+    """Takes in the README."""
     text = (ROOT / "README.md").read_text("utf-8").replace("](docs/", "](")
     text = re.sub(r"\[([^\]]+)\]\((?!https?:|#|pictures/)([^)]+?)\)", _inside, text)
     files.append(File.generated(config, "readme.md", content=text))
-    files.append(File.generated(config, SCROLL.name, abs_src_path=str(SCROLL)))
     return files
 
 

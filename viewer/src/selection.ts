@@ -23,6 +23,7 @@ export class Selection {
   }
 
   choose(key: Key | null): void {
+    if (key === null && this.chosen === null) return;
     this.chosen = key === this.chosen ? null : key;
     this.tell();
   }
@@ -42,12 +43,21 @@ export function matches(key: Key, selected: Key | null): boolean {
   return other === `configuration:${image.slice(slash + 1)}` || other === `station:${image.slice(6, slash)}`;
 }
 
+/** Elements that are chosen by a click; canvases and images have more to do at theirs. */
+const CHOSEN_BY_CLICK = "tr[data-key], .plot [data-key]";
+
 /** Hovering and clicking elements with `data-key` inside a host, and their classes. */
 export function connect(host: HTMLElement, selection: Selection): void {
   const keyOf = (event: Event): Key | null =>
     (event.target as Element).closest<HTMLElement>("[data-key]")?.dataset.key || null;
   host.addEventListener("pointerover", (event) => selection.hover(keyOf(event)));
   host.addEventListener("pointerleave", () => selection.hover(null));
+  host.addEventListener("click", (event) => {
+    const target = event.target as Element;
+    const key = target.closest<HTMLElement>(CHOSEN_BY_CLICK)?.dataset.key;
+    if (key && !target.closest("a, button")) selection.choose(key);
+  });
+  addEventListener("keydown", (event) => { if (event.key === "Escape") selection.choose(null); });
   selection.subscribe((hovered, chosen) => {
     for (const element of host.querySelectorAll<HTMLElement>("[data-key]")) {
       const key = element.dataset.key ?? "";

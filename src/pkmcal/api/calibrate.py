@@ -37,12 +37,15 @@ class CalibrationResult(Calibration, Result):
         }
     )
     kind = ("a calibration", None)
-    _repr_html_ = Result._repr_html_  # a calibration that was loaded has a table instead
 
     @cached_property
     def outcome(self) -> Outcome:
         """Verdict, cards and sections of the report, and the texts of the files."""
         return outcome_of(self)
+
+    def _repr_html_(self) -> str:
+        """The report in a frame; a calibration that was loaded has a table instead."""
+        return Result._repr_html_(self) or ""
 
     @classmethod
     def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:

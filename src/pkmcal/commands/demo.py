@@ -81,10 +81,10 @@ def demo(
     )
     code = answer(result, folder, outcome=outcome, as_json=as_json)
     if not as_json:
-        out = terminal.out()
-        terminal.print_table(out, truth_table(comparison))
-        out.print()
-        terminal.print_points(out, [("[cyan]→[/]", truth_sentence(comparison))])
+        console_out = terminal.out()
+        terminal.print_table(console_out, truth_table(comparison))
+        console_out.print()
+        terminal.print_points(console_out, [("[cyan]→[/]", truth_sentence(comparison))])
         if not no_open and console.can_show():
             import webbrowser
 

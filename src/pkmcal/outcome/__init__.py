@@ -1,7 +1,7 @@
 """Result of a command, in one type for all commands.
 
 Every command ends in an :class:`Outcome`. One finisher writes it, prints it and sets the exit
-code; one page template shows it; other programs read its ``document``. Terminal, page and JSON
+code; one view of the viewer shows it; other programs read its ``document``. Terminal, page and JSON
 hold the same tables and figures.
 """
 
@@ -180,7 +180,6 @@ class Part:
     text : paragraphs.
     terminal_text : sentences that the terminal prints as well.
     blocks : what the viewer draws of it.
-    html : filled template (images, charts), in which all values are escaped.
     notes : small print.
     menu : shorter name for the page's navigation.
     expert : collapsed on the page, among the sections for the metrologist.
@@ -193,7 +192,6 @@ class Part:
     terminal_text: tuple[str, ...] = ()
     blocks: tuple[Block, ...] = ()
     plots: tuple[Plot, ...] = ()
-    html: str = ""
     tables: tuple[Table, ...] = ()
     checks: tuple[Check, ...] = ()
     notes: tuple[str, ...] = ()

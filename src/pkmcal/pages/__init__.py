@@ -1,1 +1,1 @@
-"""Components of HTML pages: the page template of all commands, charts, plots, image overlays."""
+"""Plots of the papers' tables."""

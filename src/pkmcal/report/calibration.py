@@ -49,7 +49,7 @@ from pkmcal.report import (
 )
 from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.solver.kernels import INLIER_WEIGHT
-from pkmcal.web.report_page import report_page
+from pkmcal.web.report_page import is_remark, report_page
 from pkmcal.wording import amount, brief, count, number
 
 if TYPE_CHECKING:
@@ -246,13 +246,14 @@ def calibration_cards(
 
 def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
     """Limits of a usable result by the question of their card, with the verdict's own judgement."""
-    estimate, found, verdict = (
+    estimate, findings, verdict = (
         calibration.estimate, calibration.identification, calibration.verdict,
     )  # fmt: skip
     statistics = estimate.statistics
 
     def judged(*codes: str) -> Mark:
-        levels = {one.level for code in codes for one in verdict.of(code)}
+        of_codes = [one for code in codes for one in verdict.of(code)]
+        levels = {one.level for one in of_codes if not is_remark(one)}
         return next((one for one in (Level.WRONG, Level.DOUBTFUL) if one in levels), "good")
 
     far = verdict.of("machine.far_from_nominal")
@@ -263,7 +264,7 @@ def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
         )
     }
     # what the result is for: the flatness of a bed, else the platform's joints at given readings
-    share, bed = VERDICT.nominal_error_share, found.bed
+    share, bed = VERDICT.nominal_error_share, findings.bed
     if bed:
         limits[FLATNESS_QUESTION] = (
             f"limit {amount(share * bed.by_drawing, 'm')}: {share:.0%} of what the tolerances give",
@@ -272,7 +273,7 @@ def _limits(calibration: Calibration) -> dict[str, tuple[str, Mark]]:
     elif np.any(estimate.configurations):
         limits[TOOL_QUESTION] = (
             f"platform's joints {amount(platform_sigma(estimate), 'm')}, limit"
-            f" {amount(share * found.by_nominal, 'm')}: {share:.0%} of what the tolerances give",
+            f" {amount(share * findings.by_nominal, 'm')}: {share:.0%} of what the tolerances give",
             judged("platform.no_gain", "machine.undetermined"),
         )
     weights = np.concatenate([estimate.edge_weights, estimate.pose_weights])
@@ -334,8 +335,10 @@ def _comparison(
     )
     if len(magnitudes) < 2:
         return None
-    tested_text = " Held out: against configurations that the calibration has not used." * bool(
-        tested
+    tested_text = (
+        " Held out: configurations that the calibration has not used, with the images' own noise."
+        if tested
+        else ""
     )
     return LogBar(
         title="Error of the tool's position",

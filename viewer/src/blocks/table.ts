@@ -71,13 +71,22 @@ export function dataTable(block: DataTable): HTMLElement {
   const tools = filters.length || copies.length ? [h("div", { class: "tools" }, ...filters, ...copies)] : [];
   const content = [
     ...tools,
-    h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": block.title || "Table" }, table),
+    scrollable(table, block.title || "Table"),
     more,
     ...(block.note ? [h("p", { class: "small" }, block.note)] : []),
   ];
   addEventListener("beforeprint", () => { all = true; update(); });
   if (block.folded) return h("details", {}, h("summary", {}, block.title), ...content);
   return h("div", { class: "data-table" }, ...(block.title ? [h("h3", {}, block.title)] : []), ...content);
+}
+
+/** Area that scrolls sideways, and is reached by the keyboard as long as there is anything to scroll. */
+function scrollable(table: HTMLElement, label: string): HTMLElement {
+  const area = h("div", { class: "scroll", role: "region", "aria-label": label }, table);
+  new ResizeObserver(() => {
+    area.tabIndex = area.scrollWidth > area.clientWidth ? 0 : -1;
+  }).observe(area);
+  return area;
 }
 
 class Sorting {
