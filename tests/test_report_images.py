@@ -125,7 +125,7 @@ def test_sigma_of_a_fitted_line_is_the_scatter_of_its_normal(case):
 
 
 @pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 1), (8, 3)])
-def test_images_are_shown_upright_as_exif_says(tmp_path, orientation, turns):
+def test_images_are_upright_by_exif(tmp_path, orientation, turns):
     from pkmcal.files.images import Exif, with_exif
 
     grey = np.zeros((24, 32), np.uint8)
