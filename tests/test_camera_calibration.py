@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from pkmcal.pages.page import page_html
 
+from page_documents import page_blocks, page_document
 from pkmcal.boards.board import Detection, chessboard
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.fit import (
@@ -38,6 +39,7 @@ from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
 from pkmcal.report.camera import outcome_of
+from pkmcal.web.report_page import report_page
 from test_boards import CAMERAS, render, view
 
 BOARD = chessboard((8, 6), 0.03)
@@ -398,13 +400,23 @@ def test_the_page(wide_calibration, tmp_path):
     value = wide_calibration
     path = tmp_path / "p0.png"
     cv2.imwrite(str(path), np.full((768, 1024), 120, dtype=np.uint8))
-    html = page_html(outcome_of(value, [path]))
-    assert html.count('class="shot"') == 10
-    assert html.count('href="data:image/jpeg;base64,') == 1
-    assert html.count('class="seen"') == 480
-    assert "http://" not in html
-    assert "https://" not in html
-    assert "Usable" in html
+    document = page_document(report_page(outcome_of(value, [path])))
+    assert document["verdict"]["tone"] == "good"
+    (block,) = page_blocks(document, "images", "images")
+    assert len(block["images"]) == 10
+    assert [one["title"] for one in block["images"] if one["jpeg"]] == ["p0.png"]
+    # the largest held-out error first
+    order = np.argsort(-value.held_out.by_view, kind="stable")
+    assert [one["title"] for one in block["images"]] == [value.views[v] for v in order]
+    rings, arrows = (
+        [shape for one in block["images"] for shape in one["overlays"][0]["layers"][k]["shapes"]]
+        for k in (0, 1)
+    )
+    assert len(rings) == len(arrows) == 480
+    off = np.array([arrow["displacement"] for arrow in arrows[:48]])
+    np.testing.assert_allclose(off, value.residuals[order[0]], atol=1e-5)
+    (field,) = page_blocks(document, "images", "field")
+    assert field["images"][0]["overlays"][0]["layers"][0]["shapes"]
 
 
 def test_importing_cameras_needs_no_opencv():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,15 +12,14 @@ import numpy as np
 import pytest
 import yaml
 
-import pkmcal.pages
 from conftest import run
 from pkmcal.checks import advice as words
 from pkmcal.checks.check import check_session
 from pkmcal.checks.forecast import Forecast, LegForecast, forecast
 from pkmcal.checks.pictures import (
     CAPTION_BAR_HEIGHT,
+    LEG_COLOURS,
     PANE_GAP,
-    leg_colours,
     picture,
     picture_names,
     with_pictures,
@@ -243,8 +243,9 @@ def test_pictures_of_all_images(checked_session, tmp_path):
     after = drawn[CAPTION_BAR_HEIGHT:, width + PANE_GAP :]
     plain = cv2.cvtColor(station.images.images[0], cv2.COLOR_GRAY2BGR)
     assert np.mean(np.any(after != plain, axis=-1)) < 0.2
-    for colour in leg_colours()[:6]:  # thin lines are blended with what they cross
-        assert np.abs(after.astype(int) - colour).max(axis=-1).min() < 60
+    for colour in LEG_COLOURS[:6]:  # thin lines are blended with what they cross
+        bgr = colour & 255, colour >> 8 & 255, colour >> 16
+        assert np.abs(after.astype(int) - bgr).max(axis=-1).min() < 60
 
 
 def test_pictures_of_large_images_are_binned(checked_session):
@@ -294,22 +295,28 @@ def test_each_number_stands_once_and_apart(checked_session):
     assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
 
 
-def test_colours_are_those_of_the_style_sheet():
-    style = Path(pkmcal.pages.__file__).with_name("templates") / "style.css"
-    blue, green, red = leg_colours()[0]
-    assert f"--leg1: #{red:02x}{green:02x}{blue:02x}" in style.read_text()
+def test_colours_are_those_of_the_viewer():
+    style = Path(__file__).parents[1] / "viewer" / "src" / "overlay.css"
+    colours = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", style.read_text()))
+    assert [int(colours[str(k + 1)], 16) for k in range(len(colours))] == list(LEG_COLOURS)
 
 
-def test_a_page_with_pictures(checked_session):
+def test_a_page_with_images(checked_session):
     part = with_pictures(checked_session.look)
-    assert part.html.count('<svg class="shot"') == 2 * 9
-    assert part.html.count('plain">pose by hand') == part.html.count('plain">pose found') == 9
-    assert "predicted edges" in part.html
+    (block,) = [one for one in part.blocks if one.kind == "images"]
+    assert len(block.images) == sum(station.photographs for station in checked_session.stations)
+    assert block.first == 9
+    assert len({image.group for image in block.images[:9]}) == 3
+    for image in block.images:
+        assert [overlay.title for overlay in image.overlays] == ["Pose found", "Pose by hand"]
+        for overlay in image.overlays:
+            assert [layer.name for layer in overlay.layers] == ["edges", "joints"]
     lost = checked_session.look.stations[0]
     edges = replace(checked_session.look, stations=(replace(lost, quality=None, by_hand=None),))
-    html = with_pictures(edges).html
-    assert html.count('<svg class="shot"') == 3
-    assert "best pose found, not recognised" in html
+    block = next(one for one in with_pictures(edges).blocks if one.kind == "images")
+    (overlay,) = block.images[0].overlays
+    assert overlay.title == "Best pose found, not recognised"
+    assert len(block.images) == len(lost.images.images)
 
 
 @pytest.fixture

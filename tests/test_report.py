@@ -204,19 +204,24 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
 def test_joints_are_drawn_where_the_camera_sees_them(case):
     session, estimate = case.session, case.estimate
     base, platform = joint_centres(session.machine, estimate.machine, estimate.covariance)
-    shot = album_of(case).pictures[0]
-    s = [station.name for station in session.stations].index(shot.station)
-    k = session.configurations.index(shot.configuration)
+    shot = album_of(case).images[0]
+    names = shot.title.split(" / ")
+    s = [station.name for station in session.stations].index(names[0])
+    k = session.configurations.index(names[1])
     T_camera_base, pose = estimate.state.T_camera_base[s], estimate.state.T_base_platform[k]
     project = session.stations[s].camera.project
-    assert len(shot.spots) == 12
-    for spot in shot.spots:
-        side, T = (base, T_camera_base) if spot.end == "base" else (platform, T_camera_base @ pose)
+    layers = {layer.name: layer.shapes for layer in shot.overlays[0].layers}
+    assert len(layers["joints"]) == len(layers["nominal"]) == 12
+    for ring, cross in zip(layers["joints"], layers["nominal"], strict=True):
+        at_base = "base joint" in ring.tip
+        side, T = (base, T_camera_base) if at_base else (platform, T_camera_base @ pose)
+        leg = int(ring.key.removeprefix("leg:"))
         new, old = (
-            project(apply(T, points[spot.leg - 1])) for points in (side.calibrated, side.nominal)
+            project(apply(T, points[leg - 1])) for points in (side.calibrated, side.nominal)
         )
-        np.testing.assert_allclose(spot.calibrated, new, atol=0.051)  # one decimal is written
-        np.testing.assert_allclose(spot.nominal, old, atol=0.051)
+        assert cross.key == ring.key
+        np.testing.assert_allclose(ring.at, new, atol=0.051)  # one decimal is written
+        np.testing.assert_allclose(cross.at, old, atol=0.051)
 
 
 def test_straight_curves_are_two_points_and_bent_ones_are_kept():
@@ -256,8 +261,8 @@ def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):
         edge_weights=case.estimate.edge_weights[retained],
     )
     observation = replace(case.observation, edges=edges.select(retained))
-    display = album_of(case, observation=observation, estimate=estimate).pictures
-    named = [(shot.station, shot.configuration) for shot in display]
+    display = album_of(case, observation=observation, estimate=estimate).images
+    named = [tuple(shot.title.split(" / ")) for shot in display]
     assert len(set(named)) == len(named) == 15
     assert named[:2] == [("front0", "c2"), ("front1", "c3")]
     assert named[-1] == ("front2", "c4")
@@ -266,8 +271,12 @@ def test_pictures_are_sorted_by_their_residuals_those_of_no_use_first(case):
 
 
 def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
-    shots = {(shot.station, shot.configuration): shot for shot in album_of(case).pictures}
-    (line,) = shots["front0", "c0"].missed
+    shots = {shot.title: shot for shot in album_of(case).images}
+    (line,) = next(
+        layer.shapes
+        for layer in shots["front0 / c0"].overlays[0].layers
+        if layer.name == "rejected"
+    )
     assert line.tip == "Leg 3, tube 2, right edge, not used: seen over 3.5 mm only"
     # beside where the machine itself shows that edge, as far as a curve is drawn straight
     state = case.estimate.state
@@ -282,23 +291,24 @@ def test_edges_that_were_left_out_are_drawn_with_their_reason(case):
     x, y = (np.interp(at, range(len(line.points)), c) for c in zip(*line.points, strict=True))
     away = np.hypot(curve[:, :1] - x, curve[:, 1:] - y).min(axis=1)
     assert away[1:-1].max() < STRAIGHT_CURVE_DEVIATION
-    assert "too dark" in shots["front1", "c3"].caption
+    assert "too dark" in shots["front1 / c3"].caption
 
 
-def test_as_many_pictures_are_shown_as_there_is_room_for(case):
+def test_as_many_images_are_shown_as_there_is_room_for(case):
     seven = pictures.AlbumSize(images=7)
-    display = album_of(case, seven).pictures
-    html = str(pictures.section(case.session, album_of(case, seven)).html)
-    assert "Here are 7 of 15 images" in html
-    assert html.count('<figure class="picture"') == html.count("data-large=") == 7
-    whole = sum(len(shot.jpeg) + len(shot.large) for shot in display)
-    small = sum(len(shot.jpeg) for shot in display)
-    room = (whole + small) // 2
-    display = album_of(case, replace(seven, jpeg_characters=room)).pictures
-    assert len(display) == 7
-    assert 0 < sum(bool(shot.large) for shot in display) < 7
-    assert sum(len(shot.jpeg) + len(shot.large) for shot in display) <= room
-    fewer = album_of(case, replace(seven, jpeg_characters=small // 2)).pictures
+    display = album_of(case, seven)
+    part = pictures.section(case.session, display)
+    (block,) = [one for one in part.blocks if one.kind == "images"]
+    assert [one.title for one in block.images] == [one.title for one in display.images]
+    assert len(block.images) == 7
+    assert "7 of 15 images" in part.blocks[0].text
+    large = [len(shot.jpeg) for shot in display.images]
+    few = album_of(case, replace(seven, jpeg_characters=sum(large) * 9 // 10)).images
+    size = [len(shot.jpeg) for shot in few]
+    assert len(few) == 7
+    assert 0 < sum(a < b for a, b in zip(size, large, strict=True)) < 7  # in fewer pixels
+    assert sum(size) <= sum(large) * 9 // 10
+    fewer = album_of(case, replace(seven, jpeg_characters=min(size) * 3)).images
     assert 0 < len(fewer) < 7
 
 

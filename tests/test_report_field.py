@@ -6,7 +6,6 @@ import pytest
 from pkmcal.report import correlation_plot, field
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.field import Offsets
-from pkmcal.report.links import Links
 from test_report_case import OUTWARD, Case, make_case
 
 
@@ -16,21 +15,16 @@ def case(tmp_path_factory) -> Case:
 
 
 def drawn_field(case: Case, shift_at, noise, n=6000):
-    """The first station's cells from n edges with ``shift_at`` pixels across themselves, and the
-    factor of the arrows.
-    """
+    """The first station's cells from n edges with ``shift_at`` pixels across themselves."""
     rng = np.random.default_rng(5)
     pixel = rng.uniform(0, 1, (n, 2)) * [319, 239]
     angle = rng.uniform(0, np.pi, n)
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     value = np.sum(direction * shift_at(pixel), axis=-1) + noise * rng.normal(size=n)
     zero = np.zeros(n, dtype=int)
-    values = field.fields(
-        case.session, Offsets(zero, zero, np.arange(n), pixel, direction, value), Links()
-    )
-    assert values is not None
-    (one,), factor, _ = values
-    return one, factor
+    offsets = Offsets(zero, zero, np.arange(n), pixel, direction, value)
+    (one,) = field.fields(case.session, offsets)
+    return one
 
 
 def test_cells_have_the_shift_that_their_edges_agree_on(case):
@@ -38,19 +32,19 @@ def test_cells_have_the_shift_that_their_edges_agree_on(case):
         away = pixel - [160.2, 119.1]
         return 2e-7 * np.sum(away**2, axis=-1, keepdims=True) * away
 
-    one, factor = drawn_field(case, lens, noise=0.01)
+    one = drawn_field(case, lens, noise=0.01)
     assert one.middle == (160.2, 119.1)
-    place = np.array([(c.x, c.y) for c in one.cells])
-    shift = np.array([(c.dx, c.dy) for c in one.cells]) / factor
+    place = np.array([cell.at for cell in one.cells])
+    shift = np.array([cell.displacement for cell in one.cells])
     # half a cell of 320 / 14 px: the lens moves the corner by 1.6 px
     np.testing.assert_allclose(shift, lens(place), atol=0.12)
     far = np.linalg.norm(place - one.middle, axis=1) > 60
-    assert all(not cell.quiet for cell, away in zip(one.cells, far, strict=True) if away)
+    assert all(not cell.dashed for cell, away in zip(one.cells, far, strict=True) if away)
 
 
 def test_noise_alone_stands_out_in_one_cell_of_a_hundred(case):
-    one, _ = drawn_field(case, np.zeros_like, noise=0.2, n=20000)
-    loud = sum(not cell.quiet for cell in one.cells)
+    one = drawn_field(case, np.zeros_like, noise=0.2, n=20000)
+    loud = sum(not cell.dashed for cell in one.cells)
     assert len(one.cells) > 130
     assert loud <= 6  # 1.5 expected; more than six by chance once in a thousand
 
@@ -63,12 +57,9 @@ def test_of_parallel_edges_only_what_is_across_them_is_shown(case):
     zero = np.zeros(n, dtype=int)
     value = 0.3 + 0.01 * rng.normal(size=n)
     offsets = Offsets(zero, zero, np.arange(n), pixel, direction, value)
-    result = field.fields(case.session, offsets, Links())
-    assert result is not None
-    (one,), factor, longest = result
-    shift = np.array([(c.dx, c.dy) for c in one.cells]) / factor
+    (one,) = field.fields(case.session, offsets)
+    shift = np.array([cell.displacement for cell in one.cells])
     np.testing.assert_allclose(shift, np.tile([0.3, 0.0], (len(shift), 1)), atol=0.02)
-    assert longest == pytest.approx(0.3, abs=0.02)
 
 
 def test_edges_are_off_by_what_they_were_shifted(case):

@@ -125,7 +125,7 @@ def test_sigma_of_a_fitted_line_is_the_scatter_of_its_normal(case):
 
 
 @pytest.mark.parametrize(("orientation", "turns"), [(1, 0), (3, 2), (6, 1), (8, 3)])
-def test_images_are_shown_upright_as_exif_says(tmp_path, orientation, turns):
+def test_images_are_upright_by_exif(tmp_path, orientation, turns):
     from pkmcal.files.images import Exif, with_exif
 
     grey = np.zeros((24, 32), np.uint8)
@@ -197,10 +197,18 @@ def test_arrows_of_the_field_lead_to_images(page):
         shape
         for image in field["images"]
         for shape in image["overlays"][0]["layers"][0]["shapes"]
-        if shape["shape"] == "arrow"
+        if shape["shape"] == "arrow" and not shape["label"]
     ]
     assert arrows
     assert {arrow["key"] for arrow in arrows} <= keys
+    # the scale is 1, 2 or 5 times a power of ten, and a tenth to a fifth of the image as drawn
+    for image in field["images"]:
+        (layer,) = image["overlays"][0]["layers"]
+        (scale,) = [one for one in layer["shapes"] if one.get("label")]
+        length = scale["displacement"][0]
+        assert f"{length:e}"[0] in "125"
+        assert scale["label"] == f"{length:g} px"
+        assert 0.07 < length * layer["enlargement"] / image["width"] <= 0.2
 
 
 def test_corners_and_joints_are_apart_in_layers(case):

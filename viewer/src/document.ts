@@ -793,6 +793,7 @@ export interface Cross {
  *
  * key : what a click leads to.
  * dashed : not significant, or not in use.
+ * label : text beside the tip, such as the length of a scale.
  */
 export interface Arrow {
   shape: "arrow";
@@ -809,6 +810,7 @@ export interface Arrow {
   key: string;
   tip: string;
   dashed: boolean;
+  label: string;
 }
 /**
  * Image along an edge, sampled in native pixels across the predicted edge and along it.

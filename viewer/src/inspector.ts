@@ -32,6 +32,7 @@ export class Inspector {
   private readonly host = h("div", { class: "inspected" });
   private readonly tip = h("div", { class: "inspector-tip", hidden: true });
   private readonly strip = h("div");
+  private readonly strips: HTMLElement;
   private readonly choices = h("span", { class: "inspector-choices" });
   private readonly layers = h("span", { class: "inspector-choices" });
   private readonly gamma: HTMLInputElement;
@@ -54,6 +55,7 @@ export class Inspector {
     });
     const button = (text: string, label: string, act: () => void): HTMLElement =>
       h("button", { type: "button", "aria-label": label, title: label, onclick: act }, text);
+    this.strips = button("Strip", "Strip along the next edge (x), or of the edge that is clicked", () => this.nextStrip());
     this.element = h(
       "div",
       { class: "inspector" },
@@ -70,6 +72,7 @@ export class Inspector {
         button("Whole", "Whole image (0)", () => this.fit()),
         this.choices,
         this.layers,
+        this.strips,
         h("label", { class: "inspector-gamma" }, "Dark parts", this.gamma),
         this.where,
       ),
@@ -96,6 +99,7 @@ export class Inspector {
     picture.setAttribute("preserveAspectRatio", "xMidYMid meet");
     this.host.replaceChildren(picture);
     this.addCurve(picture);
+    this.strips.hidden = !image.strips.length;
     this.choices.replaceChildren(...(image.overlays.length < 2 ? [] : image.overlays.map(({ title }, k) =>
       h("button", {
         type: "button", title: "Key o", "aria-pressed": String(k === overlay), onclick: () => {

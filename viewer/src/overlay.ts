@@ -108,6 +108,11 @@ function shapeGroup(shape: Shape, layer: Layer, image: Image): SVGElement {
       const head = `M${-ARROW_HEAD},${-0.5 * ARROW_HEAD}L0,0L${-ARROW_HEAD},${0.5 * ARROW_HEAD}`;
       group.append(svg("path", { class: "hit", d }), svg("path", { class: "line", d }),
         mark([x + dx, y + dy], turn, svg("path", { class: "line", d: head })));
+      if (shape.label) {
+        const label = svg("text", { x: 8, y: 5 });
+        label.textContent = shape.label;
+        group.append(mark([x + dx, y + dy], upright, label));
+      }
     }
   }
   return group;

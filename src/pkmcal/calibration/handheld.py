@@ -142,7 +142,8 @@ def localize(
     case = Case(session, images, boards, scene)
     if len(fixed) < len(images):
         try:
-            case = _without(case, lost)
+            tried = {k: places[k].T_camera_base[0] for k in lost if len(places[k].T_camera_base)}
+            case = _without(case, lost, tried)
         except PkmcalError as error:
             return Localization(search.leg_localization, places, error)
     return Localization(search.leg_localization, places, case)
@@ -499,7 +500,7 @@ def without_misplaced(
         machine=estimate.machine, T_camera_base=state.T_camera_base,
         T_base_platform=state.T_base_platform, edges=mine,
     )  # fmt: skip
-    return _without(case._replace(scene=scene), wrong)
+    return _without(case._replace(scene=scene), wrong, dict(enumerate(scene.T_camera_base)))
 
 
 def why_lost(hypotheses: PoseHypotheses) -> str:
@@ -510,12 +511,12 @@ def why_lost(hypotheses: PoseHypotheses) -> str:
     )
 
 
-def _without(case: Case, lost: Mapping[int, str]) -> Case:
+def _without(case: Case, lost: Mapping[int, str], tried: Mapping[int, Array]) -> Case:
     """Case without rejected stations, the others renumbered.
 
     Raises `InputError` if no hand-held image remains, or only one configuration.
 
-    lost : reasons by station number.
+    lost : reasons by station number. tried : most likely T_camera_base of these.
     """
     session, scene = case.session, case.scene
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
@@ -535,7 +536,7 @@ def _without(case: Case, lost: Mapping[int, str]) -> Case:
     retained = [k for k in range(len(session.stations)) if k not in lost]
     number = {k: new for new, k in enumerate(retained)}
     trackers = range(len(session.stations), len(scene.T_camera_base))
-    remainder = session.without(lost)
+    remainder = session.without(lost, tried)
     rows = {photo.configuration for s in remainder.stations for photo in s.images}
     if len(rows) < 2:
         names = [session.configurations[k] for k in sorted(rows)]

@@ -221,7 +221,8 @@ def _image_blocks(c: CameraCalibration, paths: list[Path]) -> tuple[Block, ...]:
     )
     text = (
         "Largest held-out error first. Circles: detected corners; arrows: from where the"
-        f" calibrated camera expects them, {factor:g} times as long as they are; orange: rejected."
+        f" calibrated camera expects them, {factor:g} times as long as they are; orange circles:"
+        " rejected."
     )
     missed = [f"{one.name}: {one.reason}" for one in c.detections if not one.success]
     listing = (Listing(title="Not used", items=tuple(missed)),) if missed else ()

@@ -7,6 +7,7 @@ solution of the offsets of its edges and corners along their own directions.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -47,12 +48,14 @@ FIELD_ARROW_LENGTH = 0.06
 """Length of a large mean shift as drawn, in image widths."""
 MEAN_IMAGE_WIDTH, MEAN_IMAGES = 640, 12
 """Width (px) of a station's mean image, and the number of images in it."""
+SCALE_ARROW_LENGTH = 0.2
+"""Largest length of the scale as drawn, in image widths."""
 FIELD_READING_TEXT = (
     "Arrows: from where the calibrated machine expects edges and corners to where they are, the"
     " mean of each cell of the image. Without order where the camera's file is right; arrows that"
     " grow with the distance from the principal point (cross), or turn round it, are a lens that"
-    " the file does not describe. Orange: not significant; one cell of a hundred is by chance. A"
-    " click on an arrow leads to the image with the largest residual there."
+    " the file does not describe. Pale: not significant; of a hundred cells one is strong by"
+    " chance. A click on an arrow leads to the image with the largest residual there."
 )
 
 
@@ -136,7 +139,7 @@ def field_image(
     factor : enlargement of the arrows.
     """
     cross = blocks.Cross(at=one.middle, tip="Principal point")
-    shapes: tuple[blocks.Shape, ...] = (cross, *one.cells)
+    shapes: tuple[blocks.Shape, ...] = (cross, *one.cells, scale_arrow(one.size, factor))
     layer = blocks.Layer(name="residuals", shapes=shapes, enlargement=factor)
     mean = mean_image(images)
     return blocks.Image(
@@ -147,6 +150,15 @@ def field_image(
         jpeg="" if mean is None else base64_jpeg(mean),
         overlays=(blocks.Overlay(layers=(layer,)),),
     )
+
+
+def scale_arrow(size: tuple[int, int], factor: float) -> blocks.Arrow:
+    """Scale of enlarged arrows, at the lower left: a round length in px."""
+    longest = SCALE_ARROW_LENGTH * size[0] / factor
+    power = 10.0 ** math.floor(math.log10(longest))
+    length = max(m * power for m in (1, 2, 5) if m * power <= longest)
+    at = 0.04 * size[0], size[1] - 0.05 * size[0]
+    return blocks.Arrow(at=at, displacement=(length, 0.0), label=f"{length:g} px")
 
 
 def mean_image(images: Sequence[Integers]) -> Integers | None:

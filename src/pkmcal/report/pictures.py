@@ -24,6 +24,7 @@ from pkmcal.observe.overlays import (
     edge_layer,
     edge_name,
     joint_layers,
+    machine_laid_over,
     measured_curves,
     polyline,
     residual_words,
@@ -38,7 +39,7 @@ from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.links import Place
 from pkmcal.report.strips import edge_lines, strips_of_image
 from pkmcal.session.image_files import Image
-from pkmcal.session.load import Session, Station
+from pkmcal.session.load import RejectedStation, Session, Station
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, count, number
 
@@ -95,7 +96,7 @@ def section(session: Session, album: Album) -> Part:
         parts += [
             Paragraph(
                 text="Rejected as a whole: these images do not show where they were taken from, and"
-                " nothing of them is in use."
+                " nothing of them is in use. Lines: the nominal model at the most likely pose."
             ),
             blocks.Images(images=album.rejected),
         ]
@@ -199,9 +200,25 @@ def _rejected(session: Session, most: int, room: int) -> Iterator[blocks.Image]:
     jpegs = list(jpegs_within(files, room))
     jpegs += [""] * (len(lost) - len(jpegs))
     for (one, photo), jpeg in zip(lost, jpegs, strict=True):
-        yield _block(
+        image = _block(
             one.station, photo, session.configurations, f"rejected, for {one.reason}", jpeg
         )
+        yield image.model_copy(update={"overlays": _tried_overlay(session, one, photo)})
+
+
+def _tried_overlay(
+    session: Session, rejected: RejectedStation, photo: Image
+) -> tuple[blocks.Overlay, ...]:
+    """Nominal model at the most likely pose of a rejected station, if there is one."""
+    T_camera_base, camera = rejected.T_camera_base, rejected.station.camera
+    if T_camera_base is None:
+        return ()
+    joints, pose = (
+        of[photo.configuration] for of in (session.joints, session.forward.T_base_platform)
+    )
+    edges, spots = machine_laid_over(session.machine, camera, T_camera_base, joints, pose)
+    layers = edge_layer("edges", edges), *joint_layers(spots)
+    return (blocks.Overlay(title="Most likely pose", layers=layers),)
 
 
 def _block(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -105,11 +106,13 @@ class RejectedStation:
 
     label : name in messages.
     reason : text that follows "for".
+    T_camera_base : (4, 4) most likely pose, None where no pose was tried.
     """
 
     station: Station
     label: str
     reason: str
+    T_camera_base: Array | None = None
 
     @property
     def finding(self) -> Finding:
@@ -206,10 +209,16 @@ class Session:
         """Session with a subset of its camera stations."""
         return replace(self, stations=tuple(self.stations[k] for k in numbers))
 
-    def without(self, reasons: Mapping[int, str]) -> Session:
-        """Session with some stations rejected. reasons : by station number."""
+    def without(
+        self, reasons: Mapping[int, str], tried: Mapping[int, Array] = MappingProxyType({})
+    ) -> Session:
+        """Session with some stations rejected.
+
+        reasons : by station number. tried : their most likely T_camera_base, where there is one.
+        """
         rejected = tuple(
-            RejectedStation(self.stations[k], self.label(k), why) for k, why in reasons.items()
+            RejectedStation(self.stations[k], self.label(k), why, tried.get(k))
+            for k, why in reasons.items()
         )
         return replace(
             self.of_stations([k for k in range(len(self.stations)) if k not in reasons]),

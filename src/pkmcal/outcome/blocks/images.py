@@ -60,6 +60,7 @@ class Arrow(Schema):
 
     key : what a click leads to.
     dashed : not significant, or not in use.
+    label : text beside the tip, such as the length of a scale.
     """
 
     shape: Literal["arrow"] = "arrow"
@@ -68,6 +69,7 @@ class Arrow(Schema):
     key: Key = ""
     tip: Text = ""
     dashed: bool = False
+    label: Text = ""
 
 
 Shape = Annotated[Polyline | Ring | Cross | Arrow, Field(discriminator="shape")]
