@@ -34,6 +34,7 @@ interface Size {
 const LETTER = 6.8, ROW = 22;
 /** Share of a plot's width that names of rows may take. */
 const MOST_NAMES = 0.4;
+const UNSEEN_WIDTH = 420;
 const PANEL_HEIGHT = 220, WIDE_HEIGHT = 320, HIGHEST = 620, WIDE = 560;
 /** Part of a category's place that bars leave free, at each side. */
 const GAP = 0.12;
@@ -53,8 +54,8 @@ export function plot(block: PlotBlock): HTMLElement {
     drawn = width;
     area.replaceChildren(picture(block, width));
   };
-  // a plot in a closed part of the page has no width yet
-  draw(640);
+  // a plot in a closed part of the page has no width yet; on paper it keeps this one
+  draw(UNSEEN_WIDTH);
   new ResizeObserver(() => requestAnimationFrame(() => {
     if (area.clientWidth) draw(area.clientWidth);
   })).observe(area);
