@@ -127,7 +127,8 @@ def test_every_plot_of_a_report_can_be_read_without_seeing_it(case):
     """A description, labels on each axis of numbers, names that differ, and no values but finite
     ones, which JSON has.
     """
-    parts = report_of(calibration(case.session, case.observation, case.estimate)).parts
+    verdict = Verdict(True, "Fine.")
+    parts = report_of(calibration(case.session, case.observation, case.estimate, verdict)).parts
     plots = [plot for part in parts for plot in plots_of(part)]
     assert len({plot.name for plot in plots}) == len(plots) >= 12
     for plot in plots:
