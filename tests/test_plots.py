@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pkmcal.api.study import study
+from pkmcal.calibration.discrepancy_basis import BedSurface
 from pkmcal.identify.parameter_estimates import parameter_estimates
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.blocks.plot import (
@@ -21,7 +24,7 @@ from pkmcal.outcome.blocks.plot import (
     log_axis,
     panels,
 )
-from pkmcal.report import charts, residuals
+from pkmcal.report import bed, camera_plots, charts, residuals
 from pkmcal.report.calibration import report_of
 from pkmcal.report.parameter_changes import changes
 from pkmcal.web.report_page import report_page
@@ -124,7 +127,8 @@ def test_every_plot_of_a_report_can_be_read_without_seeing_it(case):
     """A description, labels on each axis of numbers, names that differ, and no values but finite
     ones, which JSON has.
     """
-    parts = report_of(calibration(case.session, case.observation, case.estimate)).parts
+    verdict = Verdict(True, "Fine.")
+    parts = report_of(calibration(case.session, case.observation, case.estimate, verdict)).parts
     plots = [plot for part in parts for plot in plots_of(part)]
     assert len({plot.name for plot in plots}) == len(plots) >= 12
     for plot in plots:
@@ -202,6 +206,93 @@ def test_changes_are_in_tolerances_by_leg(case):
     assert point.key == "leg:2"
     # leg 1 holds the frame
     assert ("changes-1", "base centre y") not in points
+
+
+# ------------------------------------------------------------------ of other results
+
+
+def test_a_bed_is_coloured_by_its_height():
+    height = np.array([-2e-4, 1e-4, 1e-4])
+    surface = BedSurface(np.arange(3), np.zeros(3), np.arange(3.0) / 10, height, np.full(3, 1e-5))
+    plot = bed.surface_plot(SimpleNamespace(configurations=("a", "b", "c")), surface)
+    dots = mark_of(plot, "dots").points
+    assert [(dot.y, dot.value, dot.key) for dot in dots] == [
+        (0, -0.2, "configuration:a"), (100, 0.1, "configuration:b"), (200, 0.1, "configuration:c"),
+    ]  # fmt: skip
+    assert "−0.200 ± 0.010 mm" in dots[0].tip
+    assert plot.colours.limits == pytest.approx((-0.2, 0.2))
+    assert plot.equal
+
+
+@pytest.fixture(scope="module")
+def camera():
+    """A camera calibration of two views: corners in the left half, one rejected in each view."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform((0, 0), (159, 239), (2, 40, 2))
+    inliers = np.ones((2, 40), dtype=bool)
+    inliers[:, 0] = False
+    model = SimpleNamespace(
+        image_size=(320, 240),
+        model="pinhole",
+        ray=lambda p: np.stack([(p[:, 0] - 160) / 300, (p[:, 1] - 120) / 300, np.ones(len(p))], -1),
+    )
+    candidates = (("pinhole", (), 0.9, 1.0), ("pinhole", ("k1",), 0.1, 0.12))
+    return SimpleNamespace(
+        camera=model,
+        terms=("k1",),
+        pixels=pixels,
+        inliers=inliers,
+        residuals=rng.normal(0, 0.1, (2, 40, 2)),
+        views=("a.png", "b.png"),
+        held_out=SimpleNamespace(by_view=np.array([0.1, 0.5])),
+        compared=tuple(
+            SimpleNamespace(model=name, terms=terms, rms=rms, left_out=left_out)
+            for name, terms, rms, left_out in candidates
+        ),
+    )
+
+
+def test_a_camera_shows_where_its_corners_are(camera):
+    cells = mark_of(camera_plots.coverage_plot(camera), "cells")
+    counts = np.array([[value or 0 for value in row] for row in cells.values])
+    assert counts.sum() == camera.inliers.sum()
+    assert counts[:, : counts.shape[1] // 2].sum() == counts.sum()
+    angles = mark_of(camera_plots.angles_plot(camera), "bars")
+    assert sum(bar.y for bar in angles.points) == camera.inliers.sum()
+    largest = np.rad2deg(np.arctan(np.hypot(160, 120) / 300))
+    assert angles.points[-1].x - angles.width < largest
+
+
+def test_a_camera_compares_its_views_and_models(camera):
+    bars = mark_of(camera_plots.views_plot(camera), "bars").points
+    assert [(bar.x, bar.y, bar.colour) for bar in bars] == [
+        ("a.png", 0.1, "quiet"), ("b.png", 0.5, "quiet"),
+    ]  # fmt: skip
+    plot = camera_plots.models_plot(camera)
+    assert plot.y.categories == ("pinhole", "pinhole k1 (chosen)")
+    fitted, held_out = (mark.points for mark in plot.marks)
+    assert [point.x for point in (*fitted, *held_out)] == [0.9, 0.1, 1.0, 0.12]
+    one = SimpleNamespace(**{**vars(camera), "compared": camera.compared[:1]})
+    assert camera_plots.models_plot(one) is None
+
+
+def test_lines_of_a_study_join_numbers_only(one_process):
+    """Three numbers on a scale are joined; of two names every combination is shown once."""
+    result = study("3-rpr", ["configurations=4,5,6", "stations=1,2"], runs=2)
+    part = result.outcome.parts[0]
+    (plot,) = plots_of(part)
+    assert plot.name == "by-configurations"
+    assert [tick.at for tick in plot.x.ticks] == [4, 5, 6]
+    lines = [mark.points for mark in plot.marks if mark.mark == "line"]
+    dots = [mark for mark in plot.marks if mark.mark == "dots" and mark.symbol == "circle"]
+    assert [mark.name for mark in dots] == ["stations 1", "stations 2"]
+    for line, mark in zip(lines, dots, strict=True):
+        assert line == tuple((point.x, point.y) for point in mark.points)
+    values = {cell.position.value for cell in result.found}
+    plotted = [point.y * 1e-3 for mark in dots for point in mark.points]
+    np.testing.assert_allclose(sorted(plotted), sorted(values), rtol=1e-5)
+    for point in dots[0].points:
+        assert point.low < point.y < point.high
 
 
 # ------------------------------------------------------------------ in a browser

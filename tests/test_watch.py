@@ -278,6 +278,7 @@ def test_a_joint_that_moved(watched):
     now = moved(watched.true, leg2_base__center__x=2e-3, leg2_base__center__y=-1e-3)
     value = watched.evidence(now, rng, few=8)
     judged = detect_changes(value, watched.true, ALPHA)
+    assert not judged.another_machine
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("base", (1,))
     off = first.change.value - [2e-3, -1e-3, 0]
@@ -292,6 +293,7 @@ def test_two_changes_are_both_named(watched):
     rng = np.random.default_rng(23)
     now = moved(watched.true, leg3_length__offset=1.5e-3, leg5_length__offset=-1.5e-3)
     judged = detect_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
+    assert not judged.another_machine
     causes = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
     assert causes == {("zero", (2,)), ("zero", (4,))}
     verdict = watch_verdict(judged, new_data(8))
@@ -299,11 +301,28 @@ def test_two_changes_are_both_named(watched):
     assert verdict.reasons[1].startswith("Besides, the zero of")
 
 
+@pytest.mark.parametrize("seed", [31, 32])
+def test_another_machine_is_called_another_machine(watched, seed):
+    """One that is built from the same nominal model: no parts are named."""
+    rng = np.random.default_rng(seed)
+    table = watched.true.parameters
+    sigma = table.tolerances_free()
+    shift = table.free_matrix() @ (sigma * rng.normal(size=len(sigma)))
+    other = watched.true.with_values(watched.true.values + shift)
+    judged = detect_changes(watched.evidence(other, rng, few=8), watched.true, ALPHA)
+    assert judged.another_machine
+    assert judged.findings == ()
+    verdict = watch_verdict(judged, new_data(8))
+    assert verdict.codes == ("watch.another_machine",)
+    assert not verdict.usable
+
+
 def test_warming_is_distinguished_from_a_leg(watched):
     machine = watched.true
     lengths = np.array([k not in ("radius", "scale") for k in machine.parameters.kinds])
     warm = machine.with_values(machine.values * np.where(lengths, 1 + 2e-3, 1.0))
     judged = detect_changes(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
+    assert not judged.another_machine
     assert judged.findings[0].suspect.cause.part == "scale"
     assert abs(judged.scale_change.value[0] - 2e-3) < 4 * judged.scale_change.sigma[0]
     verdict = watch_verdict(judged, new_data())

@@ -228,11 +228,11 @@ def test_a_camera_that_was_left_in_place_finds_less(demo, stayed, tmp_path):
     assert results[1].json["moved_stations"] == []
     least = [np.mean([leg["detectable"]["zero"] for leg in done.json["legs"]]) for done in results]
     assert least[1] < 0.8 * least[0]
-    without, kept = (
+    moved_text, fixed_text = (
         page_text(page_document((tmp_path / name / "watch.html").read_text())) for name in "01"
     )
-    assert f"Left in place: {stayed.name}" in kept
-    assert "Left in place" not in without
+    assert f"Left in place: {stayed.name}" in fixed_text
+    assert "Left in place" not in moved_text
 
 
 def test_stations_are_numbered_without_images_that_were_not_placed(demo, stayed, monkeypatch):

@@ -298,7 +298,8 @@ class ChangeTests:
     machine : of the numbers of all legs together. scale : of a common scale of all lengths.
     stations : of each camera that is assumed to be unmoved. alpha : false-alarm rate of all tests
     together. level : of a single test, for that rate. rest : ``machine`` without what the findings
-    explain.
+    explain. another_machine : whether a change of all numbers, of their tolerances' size, makes the
+    data a hundred times as likely as a few causes do; these are then not among the findings.
     """
 
     legs: tuple[LegTest, ...]
@@ -310,6 +311,7 @@ class ChangeTests:
     alpha: float
     level: float
     stations: tuple[StationTest, ...] = ()
+    another_machine: bool = False
 
     @property
     def changed(self) -> bool:
@@ -344,6 +346,7 @@ class ChangeTests:
             "level": self.level,
             "power": DETECTION_POWER,
             "changed": self.changed,
+            "another_machine": self.another_machine,
             "machine": asdict(self.machine),
             "legs": [leg.document() for leg in self.legs],
             "scale": {**asdict(self.scale), **self.scale_change.document()},
@@ -407,7 +410,11 @@ def detect_changes(evidence: Evidence, machine: Machine, alpha: float) -> Change
         return out
     # Causes of a significant change, and what they do not explain.
     findings = explained(evidence, single_causes(machine, evidence), alpha)
-    rest = _project_out(evidence, [f.suspect.cause for f in findings])
+    causes = [f.suspect.cause for f in findings]
+    few = twice_log_odds(evidence, joined_causes(causes)) if causes else 0.0
+    if twice_log_odds(evidence, whole_machine(machine)) > few + DISTINCT_LOG_ODDS:
+        return replace(out, another_machine=True)
+    rest = _project_out(evidence, causes)
     rest = chi_square(rest, whole_machine(machine))
     return replace(out, findings=findings, rest=rest)
 

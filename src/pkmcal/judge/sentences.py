@@ -371,6 +371,12 @@ def _change_verdict(
 ) -> Verdict:
     names = around.names
     findings = judged.findings
+    if judged.another_machine:
+        headline = (
+            "This is not the machine that was calibrated, or most of its numbers have changed."
+        )
+        facts = {"chi2": judged.machine.chi2, "dof": judged.machine.dof}
+        return Verdict(False, headline, (wrong("watch.another_machine", **facts), *warnings))
     if not findings:
         headline = "The machine is not as calibrated."
         return Verdict(False, headline, (_unidentified_finding(judged), *warnings))

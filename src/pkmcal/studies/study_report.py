@@ -135,16 +135,19 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
         if _rotates(study):
             error += f" and {amount(cell.orientation.value, 'rad')}"
         return f"Calibrations leave {error} at the tool. {text}"
+    errors = [c.position.value for c in study.found if np.isfinite(c.position.value)]
+    smallest, largest = brief(1e3 * min(errors)), amount(max(errors), "m")
+    accuracy = f"Calibrations leave {smallest} to {largest} at the tool"
     sure = [gain for gain in gains if gain.sure]
     if not sure:
-        return f"{text} Nothing of what was varied shows beyond chance in so many runs."
+        return f"{accuracy}; nothing of what was varied shows beyond chance in so many runs. {text}"
     gain = sure[0]
     return (
-        f"{text} Most is gained by {_name(gain.name)}: from"
+        f"{accuracy}; most is gained by {_name(gain.name)}: from"
         f" {value_with_unit(study, gain.name, gain.worst)} to"
-        f" {value_with_unit(study, gain.name, gain.best)} the tool's"
-        f" error falls from {amount(gain.before, 'm')} to {amount(gain.after, 'm')}"
-        f" ({brief(gain.times)} times)."
+        f" {value_with_unit(study, gain.name, gain.best)} it falls from"
+        f" {amount(gain.before, 'm')} to {amount(gain.after, 'm')}"
+        f" ({brief(gain.times)} times). {text}"
     )
 
 

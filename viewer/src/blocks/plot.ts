@@ -34,9 +34,12 @@ interface Size {
 const LETTER = 6.8, ROW = 22;
 /** Share of a plot's width that names of rows may take. */
 const MOST_NAMES = 0.4;
+const UNSEEN_WIDTH = 420;
 const PANEL_HEIGHT = 220, WIDE_HEIGHT = 320, HIGHEST = 620, WIDE = 560;
 /** Part of a category's place that bars leave free, at each side. */
 const GAP = 0.12;
+/** Letters of a name below a bar. */
+const LONGEST_NAME = 12;
 const COLOUR_STEPS = 20;
 
 export function panels(block: Panels): HTMLElement {
@@ -51,8 +54,8 @@ export function plot(block: PlotBlock): HTMLElement {
     drawn = width;
     area.replaceChildren(picture(block, width));
   };
-  // a plot in a closed part of the page has no width yet
-  draw(640);
+  // a plot in a closed part of the page has no width yet; on paper it keeps this one
+  draw(UNSEEN_WIDTH);
   new ResizeObserver(() => requestAnimationFrame(() => {
     if (area.clientWidth) draw(area.clientWidth);
   })).observe(area);
@@ -171,8 +174,9 @@ function scale(axis: Axis, along: Along): Plot.ScaleOptions {
 
 /** Grid, labels and title of an axis. */
 function axis(axis: Axis, along: Along, size: Size): Plot.Markish[] {
+  const shorten = along === "x" ? shortened : (label: string) => label;
   const ticks = axis.scale === "categories"
-    ? axis.categories.map((label, k) => ({ at: k + 0.5, label })) : axis.ticks;
+    ? axis.categories.map((label, k) => ({ at: k + 0.5, label: shorten(label) })) : axis.ticks;
   const text = new Map(ticks.map((tick) => [tick.at, tick.label]));
   const options = {
     // without a limit on their number, a logarithmic scale would leave out labels of its choice
@@ -192,6 +196,10 @@ function axis(axis: Axis, along: Along, size: Size): Plot.Markish[] {
   }
   return [Plot.gridY(at, grid), Plot.axisY(at, { ...options, labelAnchor: "top", labelOffset: size.marginLeft - 4 })];
 }
+
+/** Name below a bar, which has little room; its tooltip has all of it. */
+const shortened = (label: string): string =>
+  label.length > LONGEST_NAME ? `${label.slice(0, LONGEST_NAME / 2 - 1)}…${label.slice(-LONGEST_NAME / 2)}` : label;
 
 /** As many of the labels, at equal distances, as stand beside each other without touching. */
 function thinned(at: number[], letters: number, size: Size): number[] {
