@@ -80,6 +80,9 @@ def _candidates(tried: tuple[TriedStation, ...]) -> SpacePoints:
         "--quiet",
         np.array([one.place.position for one in tried]),
         [""] * len(tried),
-        [f"alone {brief(one.alone * 1e3)} mm{text}" for one, text in zip(tried, state, strict=True)],
+        [
+            f"alone {brief(one.alone * 1e3)} mm{text}"
+            for one, text in zip(tried, state, strict=True)
+        ],
         np.round(1 - (1 - SMALLEST_CANDIDATE) * worse, 2).tolist(),
     )
