@@ -227,6 +227,20 @@ class Plate {
   }
 }
 
+/** Closed polygon with its corners around their centre: an enlarged change may exchange neighbours. */
+function ordered(outline: Point[]): Point[] {
+  if (outline.length < 4) return outline;
+  const corners = outline.slice(1).map(vector);
+  const centre = corners.reduce((sum, p) => sum.add(p), new Vector3()).divideScalar(corners.length);
+  const arms = corners.map((p) => p.clone().sub(centre));
+  const normal = arms.reduce((sum, arm, k) =>
+    sum.add(arm.clone().cross(arms[(k + 1) % arms.length])), new Vector3()).normalize();
+  const [u, v] = [arms[0], normal.cross(arms[0])];
+  const angles = arms.map((arm) => Math.atan2(arm.dot(v), arm.dot(u)));
+  const order = corners.map((_p, k) => k).sort((a, b) => angles[a] - angles[b]);
+  return [...order, order[0]].map((k) => corners[k].toArray() as Point);
+}
+
 /** Corner of a plate; leg : whose first point it is, so that it moves with it. */
 interface Corner {
   point: Point;
@@ -388,9 +402,9 @@ export class MachineModel {
 
   /** Outline of a plate in the present configuration. */
   private outline(side: Side, toSide: Matrix4): Point[] {
-    return this.corners[side].map(({ point, leg }) =>
+    return ordered(this.corners[side].map(({ point, leg }) =>
       leg < 0 ? point
-        : vector(this.configuration.legs[leg][side][0] as Point).applyMatrix4(toSide).toArray() as Point);
+        : vector(this.configuration.legs[leg][side][0] as Point).applyMatrix4(toSide).toArray() as Point));
   }
 
   private outlinePoints(home: Configuration): Vector3[] {

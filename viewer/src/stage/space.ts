@@ -158,20 +158,22 @@ export class SpaceModel {
   allPoints(): Vector3[] {
     const { points, machine } = this.block;
     return [
-      ...this.model.fitPoints(),
+      ...this.machinePoints(),
       ...points.flatMap((one) => one.points as Point[]).map(vector),
       ...machine.cameras.flatMap((camera) =>
         [camera.position as Point, ...(camera.lines as Point[][]).flat()].map(vector)),
     ];
   }
 
-  /** Points of the machine, of all its poses, without the cameras. */
+  /** Points of the machine in all its poses, without the cameras. */
   machinePoints(): Vector3[] {
-    const cameras = this.model.layers.cameras.visible;
-    this.model.layers.cameras.visible = false;
+    const { cameras } = this.model.layers;
+    const shown = cameras.visible;
+    cameras.visible = false;
     const own = this.model.fitPoints();
-    this.model.layers.cameras.visible = cameras;
-    return own;
+    cameras.visible = shown;
+    const legs = this.block.poses.flatMap((pose) => pose.configuration.legs);
+    return [...own, ...legs.flatMap((leg) => [...leg.base, ...leg.platform] as Point[]).map(vector)];
   }
 
   private placeArrows(enlargement: number): void {

@@ -43,7 +43,7 @@ export interface Picked {
 
 export class Stage {
   readonly scene = new Scene();
-  readonly palette = new Palette(() => this.draw());
+  readonly palette = new Palette(() => this.drawNow());
   readonly element: HTMLElement;
   /** Objects that can be hovered; `userData` holds their leg, or the parts of their instances. */
   readonly pickable: Object3D[] = [];
@@ -93,20 +93,24 @@ export class Stage {
     this.listen(canvas);
   }
 
-  /** Draw before the next repaint; a page that is not repainted, such as in print, soon anyway. */
+  /** Draw before the next repaint; a page that is not repainted soon anyway. */
   draw(): void {
     if (this.pending) return;
     this.pending = true;
     const now = (): void => {
-      if (!this.pending) return;
-      this.pending = false;
-      const { clientWidth: width, clientHeight: height } = this.element;
-      if (!width || !height) return;
-      this.renderer.render(this.scene, this.camera);
-      this.labels.place(this.camera, width, height);
+      if (this.pending) this.drawNow();
     };
     requestAnimationFrame(now);
     setTimeout(now, SOON);
+  }
+
+  /** Draw at once, as a page needs that is about to be printed. */
+  private drawNow(): void {
+    this.pending = false;
+    const { clientWidth: width, clientHeight: height } = this.element;
+    if (!width || !height) return;
+    this.renderer.render(this.scene, this.camera);
+    this.labels.place(this.camera, width, height);
   }
 
   setLabels(labels: Label[]): void {
