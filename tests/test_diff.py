@@ -264,6 +264,7 @@ def test_the_command(demo, tmp_path):
     assert values["tool"]["change"]["position"]["median"] > 1e-3
     assert values["shared_configurations"] == 0
     page = page_document((out / "diff.html").read_text())
+    assert page["verdict"]["tone"] == "neutral"
     (stage,) = page_blocks(page, "space")
     (arrows,) = stage["arrows"]
     sizes = np.linalg.norm(arrows["vectors"], axis=1)

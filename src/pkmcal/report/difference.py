@@ -59,6 +59,8 @@ def outcome_of(d: MachineDifference) -> Outcome:
         kicker=f"{d.a.name} → {d.b.name}",
         subject=f"A: {d.a.name}, a {d.a.kind}; B: {d.b.name}, a {d.b.kind}",
         verdict=d.verdict,
+        # from a nominal model a change is the purpose
+        neutral=d.changed and not refused and not (d.a.saved and d.b.saved),
         stamp="Changed" if d.changed else "Undecided" if refused else "No change",
         level=Level.WRONG if d.changed else Level.DOUBTFUL,
         figures=_cards(d),

@@ -63,14 +63,14 @@ class MachineDocument(Head):
 class Verdict(Schema):
     """Judgement at the top of a report.
 
-    tone : good, partial (usable, with exceptions) or bad.
+    tone : good, partial (usable, with exceptions), bad, or neutral (nothing is judged).
     stamp : one to three words.
     explanation : line below the headline.
     reasons : points below both.
     comparison : magnitudes before and after.
     """
 
-    tone: Literal["good", "partial", "bad"]
+    tone: Literal["good", "partial", "bad", "neutral"]
     stamp: Text
     headline: Text
     explanation: Text

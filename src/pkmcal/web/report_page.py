@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from datetime import datetime
 from importlib.metadata import version
+from typing import Literal
 
 from pkmcal.outcome import Outcome, Part
 from pkmcal.outcome.blocks.text import CheckLine, Checks, Fact, Paragraph
@@ -26,10 +27,19 @@ def report_page(outcome: Outcome, made: datetime | None = None) -> str:
     return standalone_page(report_document(outcome, made))
 
 
+def _tone(outcome: Outcome) -> Literal["good", "partial", "bad", "neutral"]:
+    """Tone of the verdict."""
+    if outcome.neutral:
+        return "neutral"
+    if not outcome.verdict.usable:
+        return "bad"
+    return "partial" if outcome.partial else "good"
+
+
 def report_document(outcome: Outcome, made: datetime | None = None) -> shapes.ReportDocument:
     """Document of the page; see :func:`report_page`."""
     verdict, program = outcome.verdict, f"pkmcal {version('pkmcal')}"
-    usable, partial = verdict.usable, outcome.partial
+    usable = verdict.usable
     date = (f"{made.day} {made:%B %Y, %H:%M}",) if made else ()
     stamp = outcome.stamp or ("Usable" if usable else "Do not use")
     headline, explanation, points = verdict_lines(verdict.headline, stamp)
@@ -45,7 +55,7 @@ def report_document(outcome: Outcome, made: datetime | None = None) -> shapes.Re
         origin=(*date, program, *outcome.origin),
         notes=outcome.notes,
         verdict=shapes.Verdict(
-            tone="bad" if not usable else "partial" if partial else "good",
+            tone=_tone(outcome),
             stamp=stamp,
             headline=headline,
             explanation=outcome.explanation or explanation,

@@ -11,10 +11,11 @@ import { connectTips } from "../tips";
 import { contents } from "./contents";
 import { certificate, connectPrint } from "./print";
 
-const TONE_MARKS: Record<ReportDocument["verdict"]["tone"], Mark> = {
+const TONE_MARKS: Record<ReportDocument["verdict"]["tone"], Mark | null> = {
   good: "good",
   partial: "doubtful",
   bad: "wrong",
+  neutral: null,
 };
 
 export function reportView(host: HTMLElement, content: ReportDocument): void {
@@ -41,8 +42,9 @@ export function reportView(host: HTMLElement, content: ReportDocument): void {
 }
 
 function verdictOf({ verdict }: ReportDocument): HTMLElement {
+  const mark = TONE_MARKS[verdict.tone];
   return h("section", { class: `verdict ${verdict.tone}`, "aria-labelledby": "verdict" },
-    h("p", { class: "stamp" }, sign(TONE_MARKS[verdict.tone]), ` ${verdict.stamp}`),
+    h("p", { class: "stamp" }, ...(mark ? [sign(mark), " "] : []), verdict.stamp),
     h("h2", { id: "verdict" }, verdict.headline),
     ...(verdict.explanation ? [h("p", { class: "explanation" }, verdict.explanation)] : []),
     ...(verdict.reasons.length ? [h("ul", { class: "reasons" }, ...items(verdict.reasons))] : []),
