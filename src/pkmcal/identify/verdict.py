@@ -361,7 +361,7 @@ def _undetermined(
     large = [
         s for s in causes if s.matters and s.moves_platform > options.large_cause_share * shift
     ]
-    for one in large or causes[:1]:
+    for one in large or causes[: int(refused)]:
         yield finding(
             "machine.undetermined",
             Level.WRONG if refused else Level.DOUBTFUL,
