@@ -12,8 +12,6 @@ from typing import Any, Literal
 
 from pkmcal.outcome.finding import Finding, Level
 
-FigureSource = Literal["paper", "prototype", "ours"]
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -92,13 +90,11 @@ class Row:
     """Row of a table.
 
     cells : text of each column after the first.
-    source : origin of the row's figures.
     mark : sign before the row's name; None for no sign.
     """
 
     name: str
     cells: tuple[str, ...]
-    source: FigureSource = "ours"
     mark: Mark | None = None
 
 
@@ -151,21 +147,6 @@ class Plot:
 
 
 @dataclass(frozen=True)
-class Check:
-    """Comparison of a reproduced value with the expected one."""
-
-    what: str
-    found: str
-    expected: str
-    passed: bool
-
-    @property
-    def sentence(self) -> str:
-        """The comparison in one line."""
-        return f"{self.what}: {self.found}, expected {self.expected}"
-
-
-@dataclass(frozen=True)
 class Part:
     """Section of the page; its contents follow the title in the order of the fields.
 
@@ -183,7 +164,6 @@ class Part:
     plots: tuple[Plot, ...] = ()
     html: str = ""
     tables: tuple[Table, ...] = ()
-    checks: tuple[Check, ...] = ()
     notes: tuple[str, ...] = ()
     menu: str = ""
 

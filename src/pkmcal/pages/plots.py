@@ -81,21 +81,6 @@ def trace(
     }
 
 
-def bars(name: str, x: Iterable[Any], y: Iterable[float], **marker: Any) -> dict[str, Any]:
-    """Trace of bars.
-
-    marker : entries of Plotly's marker.
-    """
-    return {
-        "type": "bar",
-        "name": name,
-        "x": _plot_values(x),
-        "y": _plot_values(y),
-        "marker": marker,
-        "hovertemplate": "%{x}: %{y:.3g}",
-    }
-
-
 def _plot_values(values: Iterable[Any]) -> list[Any]:
     """Names unchanged; numbers with five digits, None for those that are not finite."""
     return [

@@ -1,30 +1,33 @@
-"""Reproduction of a paper's figures as an outcome: what all papers have in common.
+"""Reproduction of a paper's figures: one table for the terminal, Markdown and JSON.
 
-The text of a paper's report is in ``paper_x.yaml``, with figures in braces as in ``str.format``;
-its tables, checks and plots are code. Terminal, page and JSON show the same content. Figures are
-compared with those that the paper reports, or with those of an independent prototype.
+A row is a claim of the paper with the value that the paper prints and the value found here. Where
+something is expected of the value, the row is also a check. Expectations come from the paper, or
+from an independent prototype that shares no code with this program.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from math import degrees, isfinite
-from pathlib import Path
+from math import degrees
 from typing import Any, NamedTuple
 
-from pkmcal.files import read_yaml
-from pkmcal.outcome import Check, Figure, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.outcome.finding import finding, note, wrong
+from pkmcal.outcome import Level, Mark, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome.finding import doubtful, note, wrong
 from pkmcal.studies.engine import StudyProgress, StudyResult
 from pkmcal.studies.statistics import Summary
-from pkmcal.studies.tasks import Key, StudySetting
-from pkmcal.wording import brief, count, number
+from pkmcal.studies.tasks import Key
+from pkmcal.wording import count, number, with_unit
 
 PrintedFigures = Mapping[Key, Mapping[str, str]]
 """Figures of a prototype as printed, by key and quantity."""
-MONTE_CARLO_NOTE = ", its Monte-Carlo error aside"
+TWO_SIGMA = " + 2σ"
+"""What is allowed beyond a limit: two Monte-Carlo standard errors."""
+MARKS: Mapping[bool | None, Mark | None] = {True: "good", False: Level.WRONG, None: None}
+"""Mark of a row by whether it is as expected."""
+NOT_PRINTED = "–"
+"""The paper's value where the paper prints none."""
 
 
 @dataclass(frozen=True)
@@ -46,192 +49,113 @@ class Options:
         return lambda text, share: self.progress(text, first + (last - first) * share)
 
 
+@dataclass(frozen=True)
+class Claim:
+    """Row of a reproduction's table.
+
+    place : equation, table, figure or section of the paper. what : the claim. here : value found.
+    paper : value in the paper. expected : of the value found. passed : whether it is as expected;
+    None if nothing is expected.
+    """
+
+    place: str
+    what: str
+    here: str
+    paper: str = NOT_PRINTED
+    expected: str = ""
+    passed: bool | None = None
+
+    @property
+    def text(self) -> str:
+        """The claim with its place in the paper and what is expected."""
+        return f"{self.place}: {self.what}" + (f"; {self.expected}" if self.expected else "")
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """A paper's table.
+
+    paper : its letter in lower case. cited : authors, title, place and section. headline : one
+    sentence, if every check passes. not_reproduced : sentences on what of the paper does not hold
+    here. numbers : figures for programs.
+    """
+
+    paper: str
+    cited: str
+    claims: Sequence[Claim]
+    headline: str
+    not_reproduced: Sequence[str]
+    numbers: Mapping[str, Any]
+
+    def outcome(self) -> Outcome:
+        """Outcome with the table; its files are the table in Markdown and the document."""
+        checks = [claim for claim in self.claims if claim.passed is not None]
+        failed = [check for check in checks if not check.passed]
+        open_ = [f"Not reproduced: {text}" for text in self.not_reproduced]
+        headline = self.headline
+        if failed:  # the headline may praise what is missed here
+            headline = f"Not reproduced: {len(failed)} of {count(len(checks), 'check')} failed."
+        table = Table(
+            "",
+            ("", "paper", "here"),
+            tuple(
+                Row(claim.text, (claim.paper, claim.here), mark=MARKS[claim.passed])
+                for claim in self.claims
+            ),
+            words=(1, 2),
+        )
+        missed = (wrong("study.missed", c.what, found=c.here, expected=c.expected) for c in failed)
+        return Outcome(
+            command="reproduce",
+            title=f"Reproduction of paper {self.paper.upper()}",
+            subject=self.cited,
+            verdict=Verdict(not failed, headline, tuple(missed)),
+            partial=bool(open_),
+            parts=(Part("table", "", tables=(table,)),),
+            findings=tuple(doubtful("study.remark", text=text) for text in open_),
+            texts={f"paper-{self.paper}.md": self._markdown(headline, open_)},
+            document={
+                "paper": self.paper,
+                "title": self.cited,
+                "passed": not failed,
+                "headline": headline,
+                "table": [
+                    {"claim": c.text, "paper": c.paper, "here": c.here, "passed": c.passed}
+                    for c in self.claims
+                ],
+                "checks": [
+                    {"what": c.what, "found": c.here, "expected": c.expected, "passed": c.passed}
+                    for c in checks
+                ],
+                "not_reproduced": open_,
+                **self.numbers,
+            },
+        )
+
+    def _markdown(self, headline: str, open_: Sequence[str]) -> str:
+        """The table in Markdown, with the list of what is not reproduced."""
+        signs = {True: "✓", False: "✕", None: ""}
+        rows = [(c.text, c.paper, c.here, signs[c.passed]) for c in self.claims]
+        cells = [("claim", "paper", "here", "✓"), ("---",) * 4, *rows]
+        lines = [f"| {' | '.join(row)} |" for row in cells]
+        lines += ["", *(f"- {text}" for text in open_)]
+        title = f"# Reproduction of paper {self.paper.upper()}"
+        return "\n".join([title, "", self.cited, "", headline, "", *lines]) + "\n"
+
+
 def reproduce_paper(paper: str, options: Options) -> Outcome:
     """Reproduce the figures of a paper. paper : its letter in lower case.
 
     With fewer than the default number of runs, a missed expectation comes with a note on that
     number.
     """
-    outcome: Outcome = import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
+    module = import_module(f"pkmcal.studies.paper_{paper}_table")
+    outcome: Outcome = module.reproduce(options).outcome()
     if outcome.verdict.usable or options.runs >= Options.runs:
         return outcome
     few = note("study.few_runs", runs=options.runs, usual=Options.runs)
     verdict = replace(outcome.verdict, findings=(*outcome.verdict.findings, few))
     return replace(outcome, verdict=verdict)
-
-
-class DisplayNumber(float):
-    """Number with format specifications ``{:3}`` for three decimals and ``{:~}`` for two digits."""
-
-    def __format__(self, spec: str) -> str:
-        """Format for display; other specifications are those of float."""
-        if spec == "~":
-            return brief(self)
-        return number(self, int(spec)) if spec.isdigit() else super().__format__(spec)
-
-
-@dataclass(frozen=True)
-class Words:
-    """Text of a paper's report. document : content of its file. values : by the names in the
-    text.
-    """
-
-    letter: str
-    document: Mapping[str, Any]
-    values: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, letter: str, study: StudyResult[Any], **values: Any) -> Words:
-        """Text with the values of a study.
-
-        ``found`` and ``error`` hold each method's figures and standard errors in their units.
-        values : further values that the text names.
-        """
-        units = study.setting.quantities
-        figures = {
-            ", ".join(key): {
-                name: summary.times(units[name].factor) for name, summary in accuracy.items()
-            }
-            for key, accuracy in study.accuracy.items()
-        }
-        numbers: dict[str, Any] = {
-            "found": {
-                m: {q: DisplayNumber(s.value) for q, s in a.items()} for m, a in figures.items()
-            },
-            "error": {
-                m: {q: DisplayNumber(s.error) for q, s in a.items()} for m, a in figures.items()
-            },
-            "setting": study.setting,
-            "runs": study.runs,
-            "seed": study.seed,
-            "workers": study.workers,
-        }
-        times = {"wall": study.wall, "solving": study.solving, "cpu": study.cpu}
-        for name, value in {**times, **values}.items():
-            numbers[name] = DisplayNumber(value) if isinstance(value, float) else value
-        document = read_yaml(Path(__file__).with_name(f"paper_{letter}.yaml")).data
-        return cls(letter, document, numbers)
-
-    def say(self, text: str) -> str:
-        """Text with its values filled in."""
-        return text.format_map(self.values)
-
-    def part(
-        self,
-        name: str,
-        *tables: Table,
-        plots: Mapping[str, Mapping[str, Any]] | None = None,
-        more: Iterable[str] = (),
-    ) -> Part:
-        """Section of the report. plots : by name, the ``figure`` and sizes of each. more : names of
-        optional paragraphs.
-        """
-        own = self.document["parts"][name]
-        texts = [*own["text"], *(own[key] for key in more)]
-        figures = tuple(
-            Plot(key, **own["plots"][key], **plot) for key, plot in (plots or {}).items()
-        )
-        title, text = own["title"], tuple(self.say(t) for t in texts)
-        return Part(name, title, text, plots=figures, tables=tables)
-
-    def reproduction(
-        self,
-        parts: Sequence[Part],
-        checks: Sequence[Check],
-        remarks: Iterable[str],
-        numbers: Mapping[str, Any],
-    ) -> Outcome:
-        """Outcome of the reproduction. remarks : names of those that apply. numbers : figures for
-        programs.
-        """
-        passed = all(check.passed for check in checks)
-        failed = tuple(
-            wrong("study.missed", check.what, found=check.found, expected=check.expected)
-            for check in checks
-            if not check.passed
-        )
-        headline, cited = self.say(self.document["headline"]), self.document["cited"]
-        if failed:  # the headline of the text may praise what is missed here
-            headline = (
-                f"Not reproduced: this run misses {len(failed)} of the"
-                f" {count(len(checks), 'expectation')} that it is held against."
-            )
-        words = {name: self.say(self.document["remarks"][name]) for name in remarks}
-        open_ = [words[name] for name in self.document["not_reproduced"] if name in words]
-        return Outcome(
-            command="reproduce",
-            title=self.document["title"],
-            kicker=f"reproduction of paper {self.letter.upper()}",
-            subject=cited,
-            verdict=Verdict(passed, headline, failed),
-            stamp=("Reproduced in part" if open_ else "Reproduced") if passed else "Not reproduced",
-            partial=bool(open_),
-            figures=tuple(
-                Figure(
-                    card["question"],
-                    tuple((self.say(value), unit) for value, unit in card["values"]),
-                    self.say(card["note"]),
-                )
-                for card in self.document["cards"]
-            ),
-            parts=(*parts, Part("checks", "Expectations", checks=tuple(checks))),
-            findings=tuple(
-                finding(
-                    "study.remark",
-                    Level.DOUBTFUL if text in open_ else Level.NOTE,
-                    name,
-                    text=text,
-                )
-                for name, text in words.items()
-            ),
-            document={
-                "paper": self.letter,
-                "title": cited,
-                "passed": passed,
-                "headline": headline,
-                "checks": [vars(check) for check in checks],
-                "remarks": list(words.values()),
-                "not_reproduced": open_,
-                **numbers,
-            },
-        )
-
-
-class Column(NamedTuple):
-    """Column of a table of accuracies: quantity, decimals of its value and of its error."""
-
-    quantity: str
-    places: int
-    error_places: int
-
-
-def accuracy_rows(
-    study: StudyResult[Any],
-    key: Key,
-    name: str,
-    columns: Sequence[Column],
-    printed: Mapping[str, str] | None = None,
-    *,
-    errors: bool = True,
-) -> list[Row]:
-    """Rows of one method: figures in the quantities' units, Monte-Carlo errors if ``errors``, and
-    the figures ``printed`` by an independent prototype.
-    """
-    setting: StudySetting = study.setting
-    figures = [
-        (column, study.accuracy[key][column.quantity].times(quantity.factor))
-        for column in columns
-        for quantity in [setting.quantities[column.quantity]]
-    ]
-    cells = (number(s.value, c.places) if isfinite(s.value) else "" for c, s in figures)
-    rows = [Row(name, tuple(cells))]
-    if errors:
-        cells = (number(s.error, c.error_places) for c, s in figures)
-        rows.append(Row("  ± Monte-Carlo error", tuple(cells), "prototype"))
-    prototype = tuple((printed or {}).get(c.quantity, "") for c in columns)
-    if any(prototype):
-        rows.append(Row("  independent prototype", prototype, "prototype"))
-    return rows
 
 
 class Compared(NamedTuple):
@@ -296,7 +220,7 @@ def compared(
     return out
 
 
-def prototype_check(figures: list[Compared], within: str) -> Check:
+def prototype_claim(figures: list[Compared], within: str) -> Claim:
     """Check that all comparable figures agree with the prototype's.
 
     The others, which depend on what the paper leaves open, are only counted. within : the tolerance
@@ -313,25 +237,32 @@ def prototype_check(figures: list[Compared], within: str) -> Check:
     if others:
         differ = sum(not f.tolerable for f in others)
         text += f"; of {len(others)} that depend on what is left open {differ} differ"
-    return Check("figures of the independent prototype", text, within, not bad)
+    what = "figures of the independent prototype"
+    return Claim("errata", what, text, expected=within, passed=not bad)
 
 
-def at_most(what: str, unit: str, summary: Summary, most: float, places: int) -> Check:
+def at_most(
+    place: str, what: str, unit: str, summary: Summary, most: float, places: int,
+    paper: str = NOT_PRINTED,
+) -> Claim:  # fmt: skip
     """Check of an upper limit, within two Monte-Carlo errors. most : in the summary's unit."""
-    space = "" if unit == "°" else " "
-    return Check(
-        what,
-        f"{number(summary.value, places)} ± {number(summary.error, places)}{space}{unit}",
-        f"≤ {most:g}{space}{unit}{MONTE_CARLO_NOTE}",
-        summary.value - 2 * summary.error <= most,
-    )
+    limit = with_unit(f"{most:g}", unit)
+    passed = summary.value - 2 * summary.error <= most
+    here = with_error(summary, unit, places)
+    return Claim(place, what, here, paper, f"≤ {limit}{TWO_SIGMA}", passed)
 
 
-def mm(value: float, places: int = 3) -> str:
-    """Number in mm or mrad, from m or rad, without its unit."""
-    return number(1e3 * value, places)
+def with_error(summary: Summary, unit: str, places: int) -> str:
+    """Value with its Monte-Carlo error, ``0.0732 ± 0.0075 mm``."""
+    error = number(summary.error, places)
+    return with_unit(f"{number(summary.value, places)} ± {error}", unit)
+
+
+def mm(*values: float, places: int = 3) -> str:
+    """Values in mm, from m: ``0.05, 0.10 mm``."""
+    return ", ".join(number(1e3 * value, places) for value in values) + " mm"
 
 
 def deg(value: float, places: int) -> str:
-    """Number in degrees, from rad, without its unit."""
-    return number(degrees(value), places)
+    """Value in degrees, from rad, ``0.12°``."""
+    return f"{number(degrees(value), places)}°"
