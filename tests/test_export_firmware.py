@@ -14,11 +14,12 @@ import pytest
 from export_sources import built, calibration, source_of
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
-from pkmcal.exporters import klipper, linuxcnc, reprap
+from pkmcal.exporters import linuxcnc
 from pkmcal.exporters.contract import exporters, make_export
 from pkmcal.exporters.delta import DEGREES_A_RADIAN, Freedoms, delta_of, nearest_fit
 from pkmcal.exporters.linuxcnc import linear_joints, rotary_joints
 from pkmcal.exporters.samples import samples
+from pkmcal.firmware import klipper, reprap
 from pkmcal.geometry.rigid import rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level
