@@ -39,11 +39,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import BATCH, bundle
 from pkmcal.identify.gauge import ThreeCentres
+from pkmcal.identify.methods.four_step import solve_from_centres
+from pkmcal.identify.methods.leg_axes import centres_from_axes
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.papers.four_step import solve_from_centres
-from pkmcal.papers.leg_axes import centres_from_axes
 from pkmcal.solver.search import STEP_TOLERANCE, minimise
 from pkmcal.studies import paper_a
 from pkmcal.studies.engine import batches

@@ -29,13 +29,13 @@ from pkmcal.geometry.rigid import (
 from pkmcal.identify.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
+from pkmcal.identify.methods.four_step import FourStepForm, parameters_of, solve_from_centres
+from pkmcal.identify.methods.leg_axes import Axes, centres_from_axes
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.closure import by_own, closure, dense
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.papers.four_step import FourStepForm, parameters_of, solve_from_centres
-from pkmcal.papers.leg_axes import Axes, centres_from_axes
 from pkmcal.studies.calibrations import CALIBRATED_QUANTITIES as CALIBRATED
 from pkmcal.studies.calibrations import JOINT_ESTIMATE_KEY, judged
 from pkmcal.studies.engine import StudyResult

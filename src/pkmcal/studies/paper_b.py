@@ -23,10 +23,10 @@ from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.cameras.unified import Unified
 from pkmcal.geometry.rigid import apply, look_at, register
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.methods import linear
 from pkmcal.identify.state import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, with_exact_scales
-from pkmcal.papers import linear
 from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import true_machine
 from pkmcal.studies.estimates import Fitted

@@ -16,12 +16,17 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.hand_eye import size_of, solve_pairs
+from pkmcal.identify.methods.inverse_kinematic import (
+    PoseFit,
+    PoseFitForm,
+    fit_machine_to_poses,
+    pose_problem,
+)
 from pkmcal.identify.rotation_axis import rotation_axis
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, on_manifold, readings_at_poses
-from pkmcal.papers.inverse_kinematic import PoseFit, PoseFitForm, fit_machine_to_poses, pose_problem
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.estimates import (
     Fitted,
