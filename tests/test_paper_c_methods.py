@@ -27,8 +27,7 @@ from pkmcal.identify.rotation_axis import (
 from pkmcal.measurements import Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
-from pkmcal.studies.paper_c import H4ByBoard, at_poses, start
-from pkmcal.studies.paper_c_machine import Deviations, model
+from pkmcal.papers.paper_c import Deviations, H4ByBoard, at_poses, model, start
 from pkmcal.studies.simulated import measurements
 from test_hand_eye import anywhere, measured, platform_poses, simulated_poses, true_machine
 

@@ -12,16 +12,16 @@ from conftest import run
 from document_keys import assert_keys
 from pkmcal.commands.reproduce import Paper
 from pkmcal.identify.axis_measurements import AxisNoise
-from pkmcal.studies import engine
-from pkmcal.studies import paper_a_expected as expected
-from pkmcal.studies.paper_a import (
+from pkmcal.papers import paper_a as expected
+from pkmcal.papers.paper_a import (
+    BOUND,
     FOUR_STEPS_PRINTED,
-    PAPER_A_BOUND,
-    PAPER_A_JOINT,
-    PAPER_A_METHODS,
+    JOINT,
+    METHODS,
     HexapodByAxes,
 )
-from pkmcal.studies.reproduction import Claim, Compared, Options, Reproduction, reproduce_paper
+from pkmcal.papers.reproduction import Claim, Compared, Options, Reproduction, reproduce_paper
+from pkmcal.studies import engine
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Sample
 
@@ -56,11 +56,11 @@ def test_the_command(tmp_path):
     assert a == json.loads((out / "paper-a.json").read_text())
     assert_keys("paper-a.json", a)
     assert (a["runs"], a["seed"], a["converged"]) == (RUNS, 0, RUNS)
-    assert set(a["methods"]) == set(PAPER_A_METHODS)
-    joint = a["methods"][PAPER_A_JOINT]
+    assert set(a["methods"]) == set(METHODS)
+    joint = a["methods"][JOINT]
     assert 5e-5 < joint["found"]["displacement"] < 1.4e-4
     assert joint["standard_error"]["displacement"] < 2e-5
-    assert len(a["mean_error"][PAPER_A_JOINT]) == 30
+    assert len(a["mean_error"][JOINT]) == 30
     assert a["seconds"]["cpu"] > 0
 
 
@@ -127,7 +127,7 @@ def test_where_an_expectation_is_missed_nothing_is_called_reproduced():
 
 def test_few_runs_that_miss_are_reported_to_be_more(monkeypatch):
     failed = Reproduction("a", "Cited.", [claim(False)], "Reproduced.", (), {})
-    monkeypatch.setattr("pkmcal.studies.paper_a_table.reproduce", lambda _options: failed)
+    monkeypatch.setattr("pkmcal.papers.paper_a.reproduce", lambda _options: failed)
     assert reproduce_paper("a", Options(runs=100)).verdict.advice == ()
     (advice,) = reproduce_paper("a", Options(runs=8)).verdict.advice
     assert advice.startswith("8 runs are few")
@@ -135,7 +135,7 @@ def test_few_runs_that_miss_are_reported_to_be_more(monkeypatch):
 
 
 def test_another_seed_draws_anew():
-    first, again, other = (study(runs=3, seed=seed).of(PAPER_A_JOINT) for seed in (1, 1, 2))
+    first, again, other = (study(runs=3, seed=seed).of(JOINT) for seed in (1, 1, 2))
     assert first == again != other
 
 
@@ -189,22 +189,22 @@ def test_every_paper_of_the_command_has_its_module():
     from importlib import import_module
 
     for paper in Paper:
-        assert callable(import_module(f"pkmcal.studies.paper_{paper}_table").reproduce)
+        assert callable(import_module(f"pkmcal.papers.paper_{paper}").reproduce)
 
 
 # ------------------------------------------------------------------ what is expected
 
 
 def test_every_figure_of_the_prototype_is_compared(short):
-    figures = expected.paper_a_figures(short)
+    figures = expected.prototype_figures(short)
     assert len(figures) == 4 * 5 + 3 * 2
     assert all(f.measured.error >= 0 and f.rounding > 0 for f in figures)
     assert all(f.tolerable for f in figures)
     by_name = {(*f.key, f.quantity): f for f in figures}
-    assert by_name[PAPER_A_JOINT, "displacement"].expected == 0.091
-    assert by_name[PAPER_A_JOINT, "displacement"].rounding == pytest.approx(0.0005)
+    assert by_name[JOINT, "displacement"].expected == 0.091
+    assert by_name[JOINT, "displacement"].rounding == pytest.approx(0.0005)
     assert by_name[FOUR_STEPS_PRINTED, "base_z"].rounding == pytest.approx(0.005)
-    assert by_name[PAPER_A_BOUND, "base_z"].measured.value == pytest.approx(0.060, abs=0.002)
+    assert by_name[BOUND, "base_z"].measured.value == pytest.approx(0.060, abs=0.002)
 
 
 def test_what_differs_and_what_fails():
@@ -216,7 +216,7 @@ def test_what_differs_and_what_fails():
         allowed = expected.tolerance((method,), quantity)
         return Compared((method,), quantity, Summary(value, error), wanted, rounding, allowed)
 
-    offset = figure(PAPER_A_JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
+    offset = figure(JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
     assert not offset.differs
     assert offset._replace(measured=Summary(0.0640, 0.0010)).differs
     assert offset._replace(measured=Summary(0.0640, 0.0010)).tolerable
@@ -227,33 +227,33 @@ def test_what_differs_and_what_fails():
 
 
 def test_checks_pass_and_each_can_fail(short):
-    assert all(check.passed for check in expected.paper_a_checks(short))
+    assert all(check.passed for check in expected.checks(short))
 
     def of_joint(**changes):
-        own = short.of(PAPER_A_JOINT)
+        own = short.of(JOINT)
         changed = {name: own[name]._replace(value=value) for name, value in changes.items()}
-        return replace(short, accuracy={**short.accuracy, (PAPER_A_JOINT,): {**own, **changed}})
+        return replace(short, accuracy={**short.accuracy, (JOINT,): {**own, **changed}})
 
-    sample = short.samples[PAPER_A_JOINT,]
+    sample = short.samples[JOINT,]
     lost = {**sample.values, "chi2": np.append(sample.values["chi2"][1:], 100.0)}
     broken = [
-        replace(short, samples={**short.samples, (PAPER_A_JOINT,): Sample(lost)}),
+        replace(short, samples={**short.samples, (JOINT,): Sample(lost)}),
         of_joint(displacement=1.2e-4),
         of_joint(orientation=np.radians(0.019)),
-        of_joint(parameters=1.5 * short.of(PAPER_A_JOINT)["parameters"].value),
-        of_joint(chi2=short.of(PAPER_A_JOINT)["chi2"].value + 0.1),
+        of_joint(parameters=1.5 * short.of(JOINT)["parameters"].value),
+        of_joint(chi2=short.of(JOINT)["chi2"].value + 0.1),
         of_joint(offset=0.12e-3),
     ]
     for place, spoilt in enumerate(broken):
-        assert not expected.paper_a_checks(spoilt)[place].passed, place
-        assert expected.paper_a_checks(short)[place].passed
+        assert not expected.checks(spoilt)[place].passed, place
+        assert expected.checks(short)[place].passed
 
 
 def test_noise_larger_than_table_1_is_not_a_reproduction():
     """Angles three times as noisy: the end-effector and the prototype's figures are missed."""
     noise = AxisNoise(psi=3 * AxisNoise().psi, theta=3 * AxisNoise().theta)
     spoilt = study(runs=RUNS, noise=noise)
-    failed = [check.what for check in expected.paper_a_checks(spoilt) if not check.passed]
+    failed = [check.what for check in expected.checks(spoilt) if not check.passed]
     assert any("displacement" in what for what in failed)
     assert "figures of the independent prototype" in failed
 

@@ -13,8 +13,8 @@ from pkmcal.api.result import NUMBERS_DESCRIPTION, Progress, Result, no_progress
 from pkmcal.errors import InputError
 from pkmcal.files import write_folder
 from pkmcal.outcome import Outcome, Verdict
+from pkmcal.papers.reproduction import Options, reproduce_paper
 from pkmcal.ranges import check_number, default
-from pkmcal.studies.reproduction import Options, reproduce_paper
 from pkmcal.wording import count, listed
 
 PAPERS = ("a", "b", "c")

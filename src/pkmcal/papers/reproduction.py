@@ -149,7 +149,7 @@ def reproduce_paper(paper: str, options: Options) -> Outcome:
     With fewer than the default number of runs, a missed expectation comes with a note on that
     number.
     """
-    module = import_module(f"pkmcal.studies.paper_{paper}_table")
+    module = import_module(f"pkmcal.papers.paper_{paper}")
     outcome: Outcome = module.reproduce(options).outcome()
     if outcome.verdict.usable or options.runs >= Options.runs:
         return outcome
