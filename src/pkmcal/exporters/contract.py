@@ -91,7 +91,7 @@ def exporters() -> dict[str, Exporter]:
         for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
             importlib.import_module(f"{package}.{module.name}")
     kinds: list[type[Exporter]] = [Exporter]
-    for kind in kinds:
+    for kind in kinds:  # grows on the way: subclasses of subclasses too
         kinds += kind.__subclasses__()
     formats: list[Callable[[], Exporter]] = [kind for kind in kinds if not isabstract(kind)]
     return {one.name: one for one in sorted((make() for make in formats), key=lambda one: one.name)}
