@@ -7,7 +7,7 @@ writing share the firmware's names, units, signs and formulas.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,7 +78,7 @@ class Printer:
     __repr__ = short_repr
 
 
-class Firmware(Exporter):
+class Firmware(Exporter, ABC):
     """Firmware of delta printers. Firmwares are stateless, as all exporters.
 
     program : its name.
