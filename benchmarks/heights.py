@@ -32,9 +32,9 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.exporters.contract import make_export
+from pkmcal.firmware.klipper import sections
+from pkmcal.firmware.session import write_printer_session
 from pkmcal.mechanisms import Machine
-from pkmcal.printers.klipper import sections
-from pkmcal.printers.session import write_printer_session
 
 RADIUS = 90.0
 """mm, of the bed."""

@@ -201,7 +201,7 @@ def klipper_printer(points: int) -> Callable[[Path, int], Session]:
     """Heights of a bed as Klipper's DELTA_CALIBRATE keeps them."""
 
     def make(folder: Path, seed: int) -> Session:
-        from pkmcal.printers.session import write_printer_session
+        from pkmcal.firmware.session import write_printer_session
 
         rng = np.random.default_rng(seed)
         readings = printers.felt(true_printer(rng), printers.bed(points), HEIGHT_SIGMA, rng)
@@ -218,7 +218,7 @@ def reprap_printer(ticks: int) -> Callable[[Path, int], Session]:
     """A height map of a bed as RepRapFirmware writes it, over a grid of ticks by ticks."""
 
     def make(folder: Path, seed: int) -> Session:
-        from pkmcal.printers.session import write_printer_session
+        from pkmcal.firmware.session import write_printer_session
 
         rng = np.random.default_rng(seed)
         true, describe = true_printer(rng), printers.machine(printers.Settings())

@@ -39,13 +39,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import BATCH, bundle
 from pkmcal.identify.gauge import ThreeCentres
+from pkmcal.identify.methods.four_step import solve_from_centres
+from pkmcal.identify.methods.leg_axes import centres_from_axes
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.papers.four_step import solve_from_centres
-from pkmcal.papers.leg_axes import centres_from_axes
+from pkmcal.papers import paper_a
 from pkmcal.solver.search import STEP_TOLERANCE, minimise
-from pkmcal.studies import paper_a
 from pkmcal.studies.engine import batches
 from test_identify_scene import guess, make_scene
 
@@ -282,7 +282,7 @@ def study(runs: int) -> tuple[Callable[[], Any], Callable[[Any], tuple[float, fl
     data = setting.draw(batches(setting, runs, seed=0)[0])
     axes = paper_a.measured_axes(data)
     steps = solve_from_centres(
-        data.machine, axes, *centres_from_axes(axes, paper_a.PAPER_A_STATIONS), "corrected"
+        data.machine, axes, *centres_from_axes(axes, paper_a.STATIONS), "corrected"
     )
     start = paper_a.Start(paper_a.parameters_of(data.machine, steps), steps.T_camera_base)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import printers
-from pkmcal.printers.session import write_printer_session
+from pkmcal.firmware.session import write_printer_session
 
 CALIPER = 0.02
 """mm."""

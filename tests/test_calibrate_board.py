@@ -17,7 +17,7 @@ from pkmcal.calibration.results import calibration_document
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.hand_eye import solve_pairs
-from pkmcal.papers.methods import by_paper
+from pkmcal.identify.methods.estimates import by_method
 from pkmcal.report.calibration import save
 from pkmcal.report.corners import board_corners
 from pkmcal.report.provenance import used_images
@@ -187,7 +187,7 @@ def test_the_method_of_paper_c_does_not_estimate_the_size(folder):
     change(folder, lambda station: station.update(observe="board"))
     joint = calibrate_session(folder)
     method, machine = "inverse-kinematic", joint.session.machine
-    estimate = by_paper(method, machine, joint.measurements, joint.estimate, repetitions=3)
+    estimate = by_method(method, machine, joint.measurements, joint.estimate, repetitions=3)
     (target,) = calibration_document(replace(joint, estimate=estimate, method=method))["targets"]
     assert "size" not in target
 

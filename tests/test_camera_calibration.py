@@ -11,7 +11,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from pkmcal.pages.page import page_html
 
 from page_documents import page_blocks, page_document
 from pkmcal.boards.board import Detection, chessboard

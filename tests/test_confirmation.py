@@ -9,12 +9,12 @@ import pytest
 
 import printers
 from pkmcal.calibration.calibrate import calibrate_session
+from pkmcal.firmware.session import write_printer_session
 from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.confirmation import rejections_of
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE
 from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.measurements.rows import Kinds
-from pkmcal.printers.session import write_printer_session
 from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_loss
 from pkmcal.solver.search import minimise
 

@@ -14,11 +14,13 @@ import pytest
 from export_sources import built, calibration, source_of
 from pkmcal.calibration.machine_source import load_source
 from pkmcal.errors import InputError
-from pkmcal.exporters import klipper, linuxcnc, reprap
+from pkmcal.exporters import linuxcnc
 from pkmcal.exporters.contract import exporters, make_export
 from pkmcal.exporters.delta import DEGREES_A_RADIAN, Freedoms, delta_of, nearest_fit
 from pkmcal.exporters.linuxcnc import linear_joints, rotary_joints
 from pkmcal.exporters.samples import samples
+from pkmcal.firmware import klipper, reprap
+from pkmcal.firmware.contract import firmwares
 from pkmcal.geometry.rigid import rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level
@@ -90,6 +92,21 @@ def test_an_ideal_linear_delta_is_recovered():
     config.read_string(text)
     assert config.getfloat("stepper_b", "arm_length") == pytest.approx(271.2, abs=1e-3)
     assert config.getfloat("printer", "delta_radius") == pytest.approx(110, abs=1e-3)
+
+
+@pytest.mark.parametrize("firmware", firmwares(), ids=lambda one: one.name)
+def test_a_firmware_reads_what_it_writes(firmware):
+    (text,) = firmware.files(source_of(with_radius(ideal_linear(), 0.0905))).values()
+    assert [one for one in firmwares() if one.reads(text)] == [firmware]
+    printer = firmware.printer(text, "x")
+    assert printer.radius == pytest.approx(110, abs=1e-3)
+    assert printer.reach == 90.5
+    np.testing.assert_allclose(np.sort(printer.rod), [269.5, 270, 271.2], atol=1e-3)
+    # carriages at the bed's centre, from the rods' lengths and the towers' circle
+    heights = printer.carriages(np.zeros((1, 3)))[0]
+    np.testing.assert_allclose(heights, np.sqrt(printer.rod**2 - 110**2), atol=2e-3)
+    # each tower stands 1 mm higher than the last
+    assert np.ptp(printer.homed) == pytest.approx(2, abs=5e-3)
 
 
 def test_an_ideal_rotary_delta_is_recovered():

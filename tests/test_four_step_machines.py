@@ -18,6 +18,8 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import centre_index, default_gauge, in_gauge
+from pkmcal.identify.methods import estimates
+from pkmcal.identify.methods.four_step import four_step
 from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.identify.state import State
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
@@ -30,8 +32,6 @@ from pkmcal.mechanisms import (
     with_exact_scales,
 )
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.papers import methods
-from pkmcal.papers.four_step import four_step
 
 MACHINES = ("gough-stewart", "3-rpr", "3-rps", "3-upu", "6-spu-passive", "constant-legs")
 NOISE = 1e-4
@@ -415,7 +415,7 @@ def test_the_method_as_a_result_of_its_own(name, tmp_path):
     measurements = noisy(measurements, rng)
     reference_values = start_state(scene.nominal, measurements, scene.truth.T_camera_base)
     joint = bundle(scene.nominal, measurements, reference_values)
-    values = methods.by_paper("four-step", scene.nominal, measurements, joint, repetitions=20)
+    values = estimates.by_method("four-step", scene.nominal, measurements, joint, repetitions=20)
     sigma = np.sqrt(np.diag(values.covariance))
     free = sigma > 1e-9
     ratio = ((values.state.theta - scene.truth.theta)[free] / sigma[free]) ** 2

@@ -10,11 +10,11 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.conditions import Condition, conditions
+from pkmcal.identify.methods import four_step_checks as checks
+from pkmcal.identify.methods.four_step import four_step
 from pkmcal.identify.nominal_joints import nominal_joints
 from pkmcal.mechanisms import load_mechanism, machine_from_document
 from pkmcal.mechanisms.document import MechanismDocument
-from pkmcal.papers import four_step_checks as checks
-from pkmcal.papers.four_step import four_step
 from test_four_step_machines import (
     THREE_BY_THREE,
     THREE_BY_TWO,
@@ -164,7 +164,7 @@ def test_lengths_that_the_distances_do_not_determine():
     rng = np.random.default_rng(7)
     u = np.array([0.0, 0, 1]) + 0.3 * rng.normal(size=(12, 3))
     u = u / np.linalg.norm(u, axis=-1, keepdims=True)
-    from pkmcal.papers.leg_axes import Axes
+    from pkmcal.identify.methods.leg_axes import Axes
 
     k = np.arange(12)
     u = np.broadcast_to(u[None, :, None], (1, 12, 6, 3)).copy()

@@ -9,8 +9,7 @@ import pytest
 
 from pkmcal.geometry.rigid import apply, dot, perturb, pose, rotation
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.measurements import PoseSet
-from pkmcal.papers.four_step_base import (
+from pkmcal.identify.methods.four_step_base import (
     Items,
     base_by_products,
     base_by_registration,
@@ -18,7 +17,7 @@ from pkmcal.papers.four_step_base import (
     mean_pose,
     with_signs,
 )
-from pkmcal.papers.four_step_platform import (
+from pkmcal.identify.methods.four_step_platform import (
     joint_distance_deviations,
     joint_distance_offsets,
     passive_centres,
@@ -28,14 +27,15 @@ from pkmcal.papers.four_step_platform import (
     torsion,
     universal_axes,
 )
-from pkmcal.papers.leg_axes import (
+from pkmcal.identify.methods.leg_axes import (
     Axes,
     in_base,
     nearest_points,
     plane_normals,
     revolute_axes,
 )
-from pkmcal.papers.registration import fixes_pose, loose, poses_laying_items
+from pkmcal.identify.methods.registration import fixes_pose, loose, poses_laying_items
+from pkmcal.measurements import PoseSet
 from test_four_step_machines import make_scene
 
 SPATIAL, PLANAR, TRANSLATION = np.eye(6), np.eye(6)[:, [2, 3, 4]], np.eye(6)[:, 3:]
@@ -539,7 +539,7 @@ def test_several_images_of_one_configuration_count_as_one():
 
 def test_three_centres_stay_the_frame_of_a_spatial_machine():
     """The result of the steps obeys the gauge's constraints."""
-    from pkmcal.papers.four_step import four_step
+    from pkmcal.identify.methods.four_step import four_step
 
     scene = make_scene("6-spu-passive", np.random.default_rng(24), 20)
     value = four_step(scene.nominal, scene.measurements)

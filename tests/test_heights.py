@@ -16,17 +16,16 @@ from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.machine_source import MachineSource, load_source
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.errors import InputError
-from pkmcal.exporters import reprap
 from pkmcal.exporters.contract import make_export
-from pkmcal.exporters.klipper import Klipper
 from pkmcal.files import read_csv
+from pkmcal.firmware import klipper, reprap
+from pkmcal.firmware.contract import read_printer
+from pkmcal.firmware.klipper import Klipper
+from pkmcal.firmware.probed import read_touches
+from pkmcal.firmware.session import write_printer_session
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.placement.configurations import draw_configurations
-from pkmcal.printers import klipper
-from pkmcal.printers.probed import read_touches
-from pkmcal.printers.read import read_printer
-from pkmcal.printers.session import write_printer_session
 from pkmcal.session.load import load_session
 from pkmcal.simulation.cylinders import to_simulate
 from pkmcal.starter import untouched_files
@@ -673,6 +672,6 @@ def test_of_a_value_above_and_in_saved_lines_klipper_takes_the_one_above():
     """As its own reader does; who pastes above and leaves SAVE_CONFIG's lines has the new value."""
     text = printers.calibrated_cfg()
     changed = text.replace("[stepper_a]\n", "[stepper_a]\nposition_endstop: 299.5\n", 1)
-    before, after = (klipper.printer(t, "printer.cfg") for t in (text, changed))
+    before, after = (Klipper().printer(t, "printer.cfg") for t in (text, changed))
     assert before.homed[0] - after.homed[0] == pytest.approx(0.5)
     np.testing.assert_array_equal(before.homed[1:], after.homed[1:])

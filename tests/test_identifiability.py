@@ -18,6 +18,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, generators, in_gauge
+from pkmcal.identify.methods.four_step import four_step
 from pkmcal.identify.start import start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import explain, observed_legs
@@ -25,7 +26,6 @@ from pkmcal.identify.verdict import assess
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.papers.four_step import four_step
 from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from pkmcal.placement.stations import default_stations
 from pkmcal.simulation import Settings, true_machine

@@ -11,8 +11,8 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply, perturb
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import ThreeCentres, centre_index, in_gauge
-from pkmcal.papers.four_step import four_step
-from pkmcal.papers.linear import centres, procrustes_scale, scale_ratio
+from pkmcal.identify.methods.four_step import four_step
+from pkmcal.identify.methods.linear import centres, procrustes_scale, scale_ratio
 from test_identify_scene import exact, guess
 from test_identify_scene import make_scene as scene_of
 

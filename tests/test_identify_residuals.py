@@ -19,8 +19,8 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.measurements.effects import EDGE_SHIFT, FOCAL_EXCESS, INTRINSICS, SHADING
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.papers.paper_a import HexapodByAxes
 from pkmcal.session.load import load_session
-from pkmcal.studies.paper_a import HexapodByAxes
 from pkmcal.studies.simulated import joint_problem
 from pkmcal.studies.tasks import Batch
 from test_identify_scene import FOCAL, guess, make_scene

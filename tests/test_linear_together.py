@@ -13,13 +13,13 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply, look_at, perturb, register
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.gauge import BestFit, centre_index, generators, transformation
+from pkmcal.identify.methods import linear
+from pkmcal.identify.methods.estimates import linear_estimate
+from pkmcal.identify.methods.linear_together import base_together
 from pkmcal.identify.unidentified import Findings
 from pkmcal.identify.verdict import assess
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
-from pkmcal.papers import linear
-from pkmcal.papers.linear_together import base_together
-from pkmcal.papers.methods import linear_estimate
 from pkmcal.placement.edges import EdgeNoise, simulate_edges
 from test_identify_scene import exact
 

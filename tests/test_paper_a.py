@@ -14,13 +14,12 @@ from pkmcal.identify.axis_measurements import (
     from_coordinates,
     to_coordinates,
 )
-from pkmcal.studies import engine
-from pkmcal.studies.paper_a import (
+from pkmcal.papers.paper_a import (
+    BOUND,
     END_EFFECTOR_QUANTITIES,
-    PAPER_A_BOUND,
-    PAPER_A_JOINT,
-    PAPER_A_METHODS,
-    PAPER_A_PARAMETER_GROUPS,
+    JOINT,
+    METHODS,
+    PARAMETER_GROUPS,
     HexapodByAxes,
     converged,
     hexapod_with_held_radii,
@@ -29,6 +28,7 @@ from pkmcal.studies.paper_a import (
     start_off_nominal,
     thirty,
 )
+from pkmcal.studies import engine
 from pkmcal.studies.simulated import Noise
 from pkmcal.studies.statistics import covered, mean, rms_over_runs
 from pkmcal.studies.tasks import Batch
@@ -44,7 +44,7 @@ def reduced():
 
 
 def millimetres(accuracy):
-    return 1e3 * np.array([accuracy[name].value for name in PAPER_A_PARAMETER_GROUPS])
+    return 1e3 * np.array([accuracy[name].value for name in PARAMETER_GROUPS])
 
 
 def test_joint_estimate_reaches_its_bound(reduced):
@@ -57,7 +57,7 @@ def test_joint_estimate_reaches_its_bound(reduced):
 
 
 def test_chi2_is_its_degrees_of_freedom(reduced):
-    chi2 = reduced.values("chi2", PAPER_A_JOINT)
+    chi2 = reduced.values("chi2", JOINT)
     assert chi2.mean() == pytest.approx(1, abs=0.02)
     assert 0.95 < np.median(chi2) < 1.05
     assert converged(reduced) == 75
@@ -65,7 +65,7 @@ def test_chi2_is_its_degrees_of_freedom(reduced):
 
 def test_what_it_states_is_what_it_errs_by(reduced):
     """Intervals of 95 % hold 95 of 100 errors, and smaller ones as many as they promise."""
-    value = reduced.samples[PAPER_A_JOINT,]
+    value = reduced.samples[JOINT,]
     errors, sigma = value.values["parameters"], value.sigma["parameters"]
     assert sigma.shape == errors.shape == (75, 30)
     for share in (0.5, 0.95):
@@ -109,7 +109,7 @@ def test_end_effector(reduced):
 
 def test_the_bound_has_its_own_end_effector(reduced):
     """Errors drawn from the bound move the end-effector as far as the joint estimate's."""
-    joint, bound = (reduced.of(name)["displacement"] for name in (PAPER_A_JOINT, PAPER_A_BOUND))
+    joint, bound = (reduced.of(name)["displacement"] for name in (JOINT, BOUND))
     assert abs(joint.value - bound.value) < 3 * np.hypot(joint.error, bound.error)
     assert bound.error < 0.75 * joint.error
 
@@ -124,8 +124,8 @@ def test_depth_as_printed_is_that_of_the_nominal_model(reduced):
 
 def test_standard_errors_are_the_scatter_of_studies():
     """Eight small studies scatter by each one's standard error."""
-    studies = [study(runs=12, poses=6, seed=seed).of(PAPER_A_JOINT) for seed in range(8)]
-    names = (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
+    studies = [study(runs=12, poses=6, seed=seed).of(JOINT) for seed in range(8)]
+    names = (*PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES)
     values = np.array([[s[name].value for name in names] for s in studies])
     message = np.array([[s[name].error for name in names] for s in studies]).mean(axis=0)
     ratio = values.std(axis=0, ddof=1) / message
@@ -142,7 +142,7 @@ def test_a_batch_depends_on_its_own_seed_alone():
     last = pickle.loads(pickle.dumps(engine.batches(setting, 7, 3)[-1]))
     data = setting.draw(last)
     again = setting.judge(last, data, setting.solve(last, data))
-    for name in PAPER_A_METHODS:
+    for name in METHODS:
         values = again[name,].values["parameters"]
         np.testing.assert_array_equal(values, whole.values("parameters", name)[6:])
 
@@ -173,7 +173,7 @@ def test_groups_of_parameters():
     results = {
         name: rms_over_runs(errors[:, at]) for name, at in parameters_by_group(machine).items()
     }
-    assert list(results) == list(PAPER_A_PARAMETER_GROUPS)
+    assert list(results) == list(PARAMETER_GROUPS)
     assert [s.value for s in results.values()] == pytest.approx([0, 0, 0, 1e-3, 0])
     assert rms_over_runs(errors).value == pytest.approx(1e-3 * np.sqrt(3 / 30))
     assert max(s.error for s in results.values()) == 0
@@ -189,10 +189,10 @@ def test_thirty_of_thirty_starts(near, error):
     """Without the four steps: stations a few degrees, parameters up to 20 mm off."""
     value = study(runs=30, start_error=error, seed=5)
     assert converged(value) == 30
-    for name in (*PAPER_A_PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES):
+    for name in (*PARAMETER_GROUPS, *END_EFFECTOR_QUANTITIES):
         there, here = (s.of("joint")[name] for s in (value, near))
         assert there.value == pytest.approx(here.value, rel=1e-5)
-    assert near.of(PAPER_A_JOINT)["steps"].value < value.of(PAPER_A_JOINT)["steps"].value
+    assert near.of(JOINT)["steps"].value < value.of(JOINT)["steps"].value
 
 
 def test_accuracy_grows_with_the_square_root_of_the_poses():

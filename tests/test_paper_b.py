@@ -11,8 +11,8 @@ import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
+from pkmcal.identify.methods import linear
 from pkmcal.judge.against_truth import compare_with_truth
-from pkmcal.papers import linear
 from pkmcal.placement.stations import StationPose
 from pkmcal.simulation import Settings
 from rendered import rendered

@@ -12,6 +12,11 @@ from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotat
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.measured_platform import measured_platform, taken
+from pkmcal.identify.methods.inverse_kinematic import (
+    inverse_kinematic,
+    pose_problem,
+    turn_between,
+)
 from pkmcal.identify.rotation_axis import (
     MOST_TURN_PAIRS,
     _pairs,
@@ -22,13 +27,7 @@ from pkmcal.identify.rotation_axis import (
 from pkmcal.measurements import Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
-from pkmcal.papers.inverse_kinematic import (
-    inverse_kinematic,
-    pose_problem,
-    turn_between,
-)
-from pkmcal.studies.paper_c import H4ByBoard, at_poses, start
-from pkmcal.studies.paper_c_machine import Deviations, model
+from pkmcal.papers.paper_c import Deviations, H4ByBoard, at_poses, model, start
 from pkmcal.studies.simulated import measurements
 from test_hand_eye import anywhere, measured, platform_poses, simulated_poses, true_machine
 

@@ -9,9 +9,9 @@ import pytest
 
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information, identifiability, reduced_rows
+from pkmcal.identify.methods import linear
 from pkmcal.identify.noise import components
 from pkmcal.measurements.rows import Kinds
-from pkmcal.papers import linear
 from pkmcal.solver import elimination
 from pkmcal.solver.elimination import condensed, rows_on_shared
 from test_identify_scene import make_scene

@@ -28,9 +28,9 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.hand_eye import solve_pairs, start_from_poses
+from pkmcal.identify.methods import estimates
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.outcome import Level
-from pkmcal.papers import methods
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
@@ -300,7 +300,7 @@ def test_inverse_kinematic_is_a_method(folder):
     made = make(folder, "gough-stewart", n=30)
     joint = calibrate_session(folder)
     machine, measurements = joint.session.machine, joint.measurements
-    estimate = methods.by_paper(
+    estimate = estimates.by_method(
         "inverse-kinematic", machine, measurements, joint.estimate, repetitions=3
     )
     assert tool_error(estimate.machine, made) < 0.1 * tool_error(made.nominal, made)

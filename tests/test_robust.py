@@ -10,11 +10,11 @@ import pytest
 import printers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of, refinement_of
+from pkmcal.firmware.session import write_printer_session
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.robust import anneal, robust_cost, robust_start
 from pkmcal.identify.start import start_state
-from pkmcal.printers.session import write_printer_session
 from pkmcal.session.load import load_session
 from pkmcal.solver.kernels import (
     FULL_WEIGHT_DISTANCE,

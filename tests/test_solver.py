@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from pkmcal.identify.bundle import solve_batch
-from pkmcal.papers.registration import Dense, minimise_dense
+from pkmcal.identify.methods.registration import Dense, minimise_dense
 from pkmcal.solver.elimination import Linear, eliminate, rows_on_shared
 from pkmcal.solver.kernels import final_weights, geman_mcclure_weights
 from pkmcal.solver.marquardt import Damping

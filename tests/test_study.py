@@ -18,6 +18,7 @@ from page_documents import page_blocks, page_document
 from pkmcal.api.study import study
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.papers.paper_a import study_subject
 from pkmcal.studies import engine
 from pkmcal.studies.calibrations import (
     JOINT_ESTIMATE_KEY,
@@ -373,7 +374,7 @@ def test_what_chance_does_is_no_gain():
                     position=Summary(pair.mean(), abs(np.diff(pair)[0]) / 2))
             for k, pair in zip((3, 4, 5), means, strict=True)
         )  # fmt: skip
-        subject = subject_of("a")
+        subject = study_subject()
         calls += SweepResult(subject, {"legs": (3, 4, 5)}, (), (), cells, 20, 0).gains[0].sure
     assert calls <= 0.05 * 400
 

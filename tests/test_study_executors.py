@@ -18,13 +18,14 @@ import pytest
 from conftest import have_cores, run
 from pkmcal.api.study import study
 from pkmcal.errors import InputError, ResultError
+from pkmcal.papers.paper_a import study_subject
 from pkmcal.studies import cluster, engine, tasks
 from pkmcal.studies.calibrations import (
     JOINT_ESTIMATE_KEY,
 )
 from pkmcal.studies.store import Store
 from pkmcal.studies.study_report import runs_csv, study_document
-from pkmcal.studies.sweep import cells_of, subject_of
+from pkmcal.studies.sweep import cells_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
 from test_study import SMALL, batch_of
 
@@ -165,7 +166,7 @@ def test_a_script_needs_no_guard(tmp_path):
         "os.sched_getaffinity = lambda _pid: {0, 1}\n"
         "os.cpu_count = lambda: 2\n"
         "from pkmcal.studies import engine\n"
-        "from pkmcal.studies.paper_a import JointByAxes\n"
+        "from pkmcal.papers.paper_a import JointByAxes\n"
         "print(engine.run(JointByAxes(poses=4, batch=2), 4, 0).workers)\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -209,7 +210,7 @@ def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, one_process):
     first.wait()
     with pytest.raises(InputError, match="the batches of another study"):
         study("a", (), runs=4, out=tmp_path)
-    settings = [cell.setting for cell in cells_of(subject_of("a"), {"configurations": (5, 6)})]
+    settings = [cell.setting for cell in cells_of(study_subject(), {"configurations": (5, 6)})]
     with Store.opened(tmp_path, "the same", settings, 0) as store:
         assert store.load(0, 0, batch_of(settings[0], 1000)) is not None
 

@@ -17,9 +17,9 @@ from pkmcal.calibration.results import calibration_document
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.checks.check import check_session
 from pkmcal.files import json_value
+from pkmcal.firmware.session import write_printer_session
 from pkmcal.geometry.rigid import pose
 from pkmcal.outcome import Level
-from pkmcal.printers.session import write_printer_session
 from pkmcal.report.calibration import report_of, save
 from pkmcal.session.station_movement import how_far
 

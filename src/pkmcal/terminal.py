@@ -22,8 +22,6 @@ MARK_SIGNS = {
     "doubtful": "[yellow]![/]",
     "wrong": "[red]✗[/]",
 }
-ROW_SOURCE_STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
-"""Styles of a table's rows by the source of their figures."""
 WIDEST_NAME = 32
 """Maximum number of characters of a row's name that is not wrapped."""
 
@@ -104,7 +102,7 @@ def print_table(console: Console, table: Table) -> None:
     for row in table.rows:
         mark = [MARK_SIGNS[row.mark] if row.mark else ""] if marked else []
         cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])
-        grid.add_row(*mark, *cells, style=ROW_SOURCE_STYLES[row.source])
+        grid.add_row(*mark, *cells)
     console.print()
     if table.title:
         console.print(legible(table.title), style="bold", markup=False)
@@ -121,7 +119,7 @@ def escaped(text: str) -> str:
 
 
 def print_outcome(out: Console, outcome: Outcome) -> None:
-    """Print an outcome for people: verdict, figures, tables, findings and checks."""
+    """Print an outcome for people: verdict, figures, tables and findings."""
     verdict, findings = outcome.verdict, outcome.findings
     if outcome.subject:
         print_points(out, [("", outcome.subject)])
@@ -142,18 +140,14 @@ def print_outcome(out: Console, outcome: Outcome) -> None:
         if part.terminal_text:
             out.print()
             print_points(out, [("", text) for text in part.terminal_text])
-    checks = [check for part in outcome.parts for check in part.checks]
-    for points in (
-        [
-            *((MARK_SIGNS[finding.level], finding.text) for finding in findings),
-            *((MARK_SIGNS["doubtful"], text) for text in verdict.warnings),
-            *(("[cyan]→[/]", text) for text in verdict.advice),
-        ],
-        [(MARK_SIGNS["good" if c.passed else "wrong"], c.sentence) for c in checks],
-    ):
-        if points:
-            out.print()
-            print_points(out, points)
+    points = [
+        *((MARK_SIGNS[finding.level], finding.text) for finding in findings),
+        *((MARK_SIGNS["doubtful"], text) for text in verdict.warnings),
+        *(("[cyan]→[/]", text) for text in verdict.advice),
+    ]
+    if points:
+        out.print()
+        print_points(out, points)
     if outcome.closing:
         out.print()
         out.print(outcome.closing, style="yellow", markup=False)

@@ -11,8 +11,8 @@ from typing import Any
 
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
+from pkmcal.firmware.session import printer_session_texts
 from pkmcal.outcome import Outcome, Verdict
-from pkmcal.printers.session import printer_session_texts
 from pkmcal.ranges import check_number
 from pkmcal.starter import check_new_folder, session_texts, write_texts
 

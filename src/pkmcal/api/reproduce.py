@@ -9,15 +9,20 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from pkmcal.api.result import Progress, Result, no_progress, page_and_numbers
+from pkmcal.api.result import NUMBERS_DESCRIPTION, Progress, Result, no_progress
 from pkmcal.errors import InputError
 from pkmcal.files import write_folder
 from pkmcal.outcome import Outcome, Verdict
+from pkmcal.papers.reproduction import Options, reproduce_paper
 from pkmcal.ranges import check_number, default
-from pkmcal.studies.reproduction import Options, reproduce_paper
-from pkmcal.wording import listed
+from pkmcal.wording import count, listed
 
 PAPERS = ("a", "b", "c")
+
+
+def table_and_numbers(paper: str) -> Mapping[str, str]:
+    """Files of a paper, with their descriptions."""
+    return {f"paper-{paper}.md": "the table", f"paper-{paper}.json": NUMBERS_DESCRIPTION}
 
 
 @dataclass(frozen=True)
@@ -27,11 +32,7 @@ class ReproductionResult(Result):
     outcomes: Mapping[str, Outcome]
 
     own_files: ClassVar[Mapping[str, str]] = MappingProxyType(
-        {
-            name: what
-            for paper in PAPERS
-            for name, what in page_and_numbers(f"paper-{paper}").items()
-        }
+        {name: what for paper in PAPERS for name, what in table_and_numbers(paper).items()}
     )
     kind: ClassVar[tuple[str, str | None]] = ("reproductions", "earlier reproductions")
 
@@ -39,12 +40,14 @@ class ReproductionResult(Result):
     def outcome(self) -> Outcome:
         """Verdict on all papers, and their documents."""
         verdicts = [one.verdict for one in self.outcomes.values()]
+        good = sum(verdict.usable for verdict in verdicts)
+        several = f"{good} of {count(len(verdicts), 'paper')} pass every check."
         return Outcome(
             command="reproduce",
             title="Reproduction of papers",
             verdict=Verdict(
-                usable=all(verdict.usable for verdict in verdicts),
-                headline=" ".join(verdict.headline for verdict in verdicts),
+                usable=good == len(verdicts),
+                headline=verdicts[0].headline if len(verdicts) == 1 else several,
                 findings=tuple(one for verdict in verdicts for one in verdict.findings),
             ),
             findings=tuple(one for each in self.outcomes.values() for one in each.findings),
@@ -58,19 +61,15 @@ class ReproductionResult(Result):
 
     @property
     def file_list(self) -> Mapping[str, str]:
-        """A page and a document for each paper."""
-        return {
-            name: what
-            for paper in self.outcomes
-            for name, what in page_and_numbers(f"paper-{paper}").items()
-        }
+        """The table and the document of each paper."""
+        return {n: what for paper in self.outcomes for n, what in table_and_numbers(paper).items()}
 
     def contents(self) -> dict[str, str | bytes]:
-        """Pages and documents by name."""
+        """Tables and documents by name."""
         return {
             name: text
             for paper, outcome in self.outcomes.items()
-            for name, text in self.contents_of(outcome, page_and_numbers(f"paper-{paper}")).items()
+            for name, text in self.contents_of(outcome, table_and_numbers(paper)).items()
         }
 
     def save(self, folder: Path | str, *, force: bool = False) -> None:

@@ -13,13 +13,14 @@ import numpy as np
 
 from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, Progress, Result
 from pkmcal.outcome import Outcome
+from pkmcal.papers.paper_a import study_subject
 from pkmcal.ranges import check_number, default
 from pkmcal.studies.cluster import on_cluster
 from pkmcal.studies.engine import run_all
 from pkmcal.studies.findings import SweepResult, findings_of
 from pkmcal.studies.store import BATCHES_FOLDER, Store
 from pkmcal.studies.study_report import outcome_of
-from pkmcal.studies.sweep import Value, cells_of, in_words, parsed, subject_of
+from pkmcal.studies.sweep import STUDIED_PAPER, Value, cells_of, in_words, parsed, subject_of
 from pkmcal.studies.tasks import Runner
 
 RUN_ROWS_DESCRIPTION = "one row a run"
@@ -99,7 +100,7 @@ def study(
     check_number("study", "runs", runs)
     check_number("study", "seed", seed)
     runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
-    studied = subject_of(str(subject))
+    studied = study_subject() if str(subject) == STUDIED_PAPER else subject_of(str(subject))
     varied = parsed(studied, vary)
     cells = cells_of(studied, varied)
     settings = [cell.setting for cell in cells]

@@ -61,6 +61,7 @@ from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
+from pkmcal.identify.methods import AlternativeMethod
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
@@ -75,7 +76,6 @@ from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import Ranked, decide, refuse
-from pkmcal.papers import PaperMethod
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session, load_session
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -85,8 +85,8 @@ if TYPE_CHECKING:
     from pkmcal.calibration.holdout import Holdout
     from pkmcal.identify.bed import Bed
 
-CalibrationMethod = Literal["bundle"] | PaperMethod
-CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
+CalibrationMethod = Literal["bundle"] | AlternativeMethod
+CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(AlternativeMethod))
 
 
 @dataclass(frozen=True, repr=False)
@@ -458,10 +458,10 @@ def _estimated(
         turns = estimate_without(nominal, turns, region)
     estimate = turns.estimate
     if method != "bundle":
-        from pkmcal.papers.methods import by_paper
+        from pkmcal.identify.methods.estimates import by_method
 
         clock.progress("Repeating the paper's method", 0.9)
-        estimate = by_paper(method, nominal, turns.measurements, estimate, seed)
+        estimate = by_method(method, nominal, turns.measurements, estimate, seed)
     return _Identified(turns, estimate, richer, out)
 
 

@@ -464,7 +464,7 @@ def initial_guess(machine: Machine, measurements: Measurements, prior_state: Sta
     estimate that is far off. Compared by the median misfit, which is robust to wrong edges. Where
     the steps refuse the data, ``prior_state`` remains.
     """
-    from pkmcal.papers.four_step import four_step
+    from pkmcal.identify.methods.four_step import four_step
 
     try:
         steps = four_step(machine, measurements, T_camera_base_guess=prior_state.T_camera_base)

@@ -45,7 +45,7 @@ def reproduce(
     images: Annotated[
         bool, typer.Option("--photographs", help="Measure Table 1 on rendered images.")
     ] = False,
-    out: Annotated[Path, console.folder("Where the pages go.")] = REPRODUCTION_FOLDER,
+    out: Annotated[Path, console.folder("Where the tables go.")] = REPRODUCTION_FOLDER,
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""

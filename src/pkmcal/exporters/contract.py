@@ -1,6 +1,7 @@
 """Contract of export formats, and an export from start to end.
 
-A format is one file in this folder with a subclass of :class:`Exporter`. It turns a
+A format is one file in this folder, or in that of the firmwares, with a subclass of
+:class:`Exporter`. It turns a
 :class:`~pkmcal.calibration.machine_source.MachineSource` into texts and reads them again
 independently, as the target program would: with that program's units, signs and formulas, from the
 text alone. :func:`make_export` returns only texts that agree with the machine.
@@ -14,6 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
+from inspect import isabstract
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,6 +26,9 @@ from pkmcal.errors import InputError, ResultError, legible
 from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.outcome.finding import Finding
 from pkmcal.wording import listed
+
+FORMAT_PACKAGES = ("pkmcal.exporters", "pkmcal.firmware")
+"""Folders of plug-ins, each module of which may define a format."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +86,14 @@ class Exporter(ABC):
 @cache
 def exporters() -> dict[str, Exporter]:
     """All formats by name, in alphabetical order."""
-    package = __name__.rpartition(".")[0]
-    # import every module of this folder, so that its subclasses exist
-    for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
-        importlib.import_module(f"{package}.{module.name}")
-    formats: list[Callable[[], Exporter]] = [*Exporter.__subclasses__()]
+    # import every module of the folders, so that its subclasses exist
+    for package in FORMAT_PACKAGES:
+        for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
+            importlib.import_module(f"{package}.{module.name}")
+    kinds: list[type[Exporter]] = [Exporter]
+    for kind in kinds:  # grows on the way: subclasses of subclasses too
+        kinds += kind.__subclasses__()
+    formats: list[Callable[[], Exporter]] = [kind for kind in kinds if not isabstract(kind)]
     return {one.name: one for one in sorted((make() for make in formats), key=lambda one: one.name)}
 
 

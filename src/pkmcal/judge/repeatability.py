@@ -523,7 +523,7 @@ def part_of(study: RepeatStudy) -> Part:
     rows.append(Row("upper bound", ("", *_cells(study.bound))))
     noise = PAPER_AXIS_NOISE
     paper = (_degrees(noise.psi), _degrees(noise.theta), _mm(noise.x), _mm(noise.z))
-    rows.append(Row("[A] Table 1", ("", "", *paper, "", ""), "paper"))
+    rows.append(Row("[A] Table 1", ("", "", *paper, "", "")))
     columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
     table = Table("Scatter of repeated images", columns, tuple(rows), legend=REPEATS_TABLE_LEGEND)
     return Part("repeats", "Repeats", tables=(table,))

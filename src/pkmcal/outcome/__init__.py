@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pkmcal.outcome.blocks import Block
     from pkmcal.outcome.blocks.log_bar import LogBar
 
-FigureSource = Literal["paper", "prototype", "ours"]
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -96,14 +94,12 @@ class Row:
     """Row of a table.
 
     cells : text of each column after the first.
-    source : origin of the row's figures.
     mark : sign before the row's name; None for no sign.
     key : what the row belongs to, for the page's selection (``outcome.blocks.base``).
     """
 
     name: str
     cells: tuple[str, ...]
-    source: FigureSource = "ours"
     mark: Mark | None = None
     key: str = ""
 
@@ -137,43 +133,6 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Plot:
-    """Plotly figure (data, layout, config and frames) as plain data; the page's script draws it.
-
-    Colours are names of the page's CSS variables, which the script replaces by their values in the
-    light or the dark theme.
-
-    alt : description for readers who cannot see the plot.
-    width : px below which the plot scrolls sideways.
-    frames : frames of an animation.
-    """
-
-    name: str
-    title: str
-    caption: str
-    alt: str
-    figure: dict[str, Any]
-    height: int = 460
-    width: int = 0
-    frames: tuple[dict[str, Any], ...] = ()
-
-
-@dataclass(frozen=True)
-class Check:
-    """Comparison of a reproduced value with the expected one."""
-
-    what: str
-    found: str
-    expected: str
-    passed: bool
-
-    @property
-    def sentence(self) -> str:
-        """The comparison in one line."""
-        return f"{self.what}: {self.found}, expected {self.expected}"
-
-
-@dataclass(frozen=True)
 class Part:
     """Section of the page; its contents follow the title in the order of the fields.
 
@@ -191,9 +150,7 @@ class Part:
     text: tuple[str, ...] = ()
     terminal_text: tuple[str, ...] = ()
     blocks: tuple[Block, ...] = ()
-    plots: tuple[Plot, ...] = ()
     tables: tuple[Table, ...] = ()
-    checks: tuple[Check, ...] = ()
     notes: tuple[str, ...] = ()
     menu: str = ""
     expert: bool = False

@@ -1,1 +1,1 @@
-"""Monte-Carlo studies: one engine, and the papers' simulations as settings of the engine."""
+"""Monte-Carlo studies: one engine, and settings of the engine for a design that is varied."""

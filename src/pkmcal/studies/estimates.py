@@ -1,6 +1,6 @@
 """Estimators for simulated runs, the Cramér-Rao bound, and the tool's errors.
 
-All functions are batched over B runs. The papers' own methods are in the papers' studies.
+All functions are batched over B runs.
 """
 
 from __future__ import annotations

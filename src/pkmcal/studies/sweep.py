@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
-from pkmcal.studies.paper_a import JointByAxes
+from pkmcal.studies.tasks import StudySetting
 from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED, Varied
 from pkmcal.wording import listed
 
@@ -42,24 +42,37 @@ MIRROR_FOCAL, MIRROR_XI = 0.35, 1.0
 degrees from its axis.
 """
 Value = float | int | str
-SweptSetting = SimulatedCalibrations | JointByAxes
+
+
+class PaperSetting(StudySetting, Protocol):
+    """Setting of a paper's simulated calibrations. parameters : their names and units."""
+
+    @property
+    def parameters(self) -> tuple[tuple[str, str], ...]: ...
+
+    def varied(self, values: Mapping[str, Value]) -> PaperSetting:
+        """Setting with other values of the names in PAPER_NAMES_VARIED."""
+        ...
+
+
+SweptSetting = SimulatedCalibrations | PaperSetting
 
 
 @dataclass(frozen=True)
 class StudySubject:
-    """Subject of a study: a design, or the setting of [A] 4.3.
+    """Subject of a study: a design, or the setting of a paper.
 
     name : description in words. findings : remarks on how the subject differs from the session.
     """
 
     name: str
-    design: Design | JointByAxes
+    design: Design | PaperSetting
     findings: tuple[Finding, ...] = ()
 
     @property
     def names(self) -> Mapping[str, Varied]:
         """Names that can be varied."""
-        return PAPER_NAMES_VARIED if isinstance(self.design, JointByAxes) else DESIGN_NAMES_VARIED
+        return DESIGN_NAMES_VARIED if isinstance(self.design, Design) else PAPER_NAMES_VARIED
 
 
 @dataclass(frozen=True)
@@ -81,13 +94,10 @@ def in_words(values: Mapping[str, Value]) -> str:
 
 
 def subject_of(origin: str) -> StudySubject:
-    """Subject by a paper's letter, a session's folder, a mechanism file or a built-in machine's
-    name.
+    """Subject by a session's folder, a mechanism file or a built-in machine's name.
 
     Raises InputError if the origin is none of these.
     """
-    if origin == STUDIED_PAPER:
-        return StudySubject("the joint calibration of [A] 4.3", JointByAxes())
     folder = session_folder(origin)
     if folder is not None:
         session = load_session(folder, measured=False)
@@ -227,29 +237,11 @@ def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> li
     out: list[Cell] = []
     for values in product(*varied.values()):
         chosen = dict(zip(varied, values, strict=True))
-        if isinstance(subject.design, JointByAxes):
-            out.append(Cell(chosen, _paper_setting(subject.design, chosen)))
-        else:
+        if isinstance(subject.design, Design):
             out.append(Cell(chosen, SimulatedCalibrations(_design(subject.design, chosen))))
+        else:
+            out.append(Cell(chosen, subject.design.varied(chosen)))
     return out
-
-
-def _paper_setting(setting: JointByAxes, values: Mapping[str, Value]) -> JointByAxes:
-    """Setting of [A] 4.3 with other values."""
-    own: dict[str, Any] = {
-        {
-            "configurations": "poses",
-            "legs": "legs_observed",
-            "reading_noise": "joint_noise",
-            "drawing_error": "nominal_error",
-        }.get(name, name): value
-        for name, value in values.items()
-        if name != "axis_noise"
-    }
-    factor = float(values.get("axis_noise", 1.0))
-    noise = setting.noise
-    sizes = {f.name: factor * getattr(noise, f.name) for f in fields(noise) if f.name != "images"}
-    return replace(setting, noise=replace(noise, **sizes), **own)
 
 
 def _design(design: Design, values: Mapping[str, Value]) -> Design:

@@ -96,7 +96,6 @@ class Section(Schema):
     """Section of a report.
 
     menu : its name in the table of contents.
-    mark : the worst of its checks; null without one.
     expert : collapsed, among the sections for the metrologist.
     void : its figures mean nothing, because the result must not be used.
     """
@@ -104,7 +103,6 @@ class Section(Schema):
     name: str
     title: Text
     menu: Text
-    mark: Mark | None
     expert: bool
     void: bool
     blocks: tuple[Block, ...]

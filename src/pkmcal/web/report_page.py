@@ -8,7 +8,7 @@ from importlib.metadata import version
 from typing import Literal
 
 from pkmcal.outcome import Outcome, Part
-from pkmcal.outcome.blocks.text import CheckLine, Checks, Fact, Paragraph
+from pkmcal.outcome.blocks.text import Fact, Paragraph
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.web import document as shapes
 from pkmcal.web.page import standalone_page
@@ -102,20 +102,16 @@ def is_remark(finding: Finding) -> bool:
 
 
 def _section(part: Part, usable: bool) -> shapes.Section:
-    checks = tuple(CheckLine(text=one.sentence, passed=one.passed) for one in part.checks)
-    mark = None if not checks else "good" if all(one.passed for one in checks) else Level.WRONG
     blocks = (
         *(Paragraph(text=text) for text in (*part.text, *part.terminal_text)),
         *part.blocks,
         *map(table_block, part.tables),
-        *((Checks(checks=checks),) if checks else ()),
         *(Paragraph(text=text, small=True) for text in part.notes),
     )
     return shapes.Section(
         name=part.name,
         title=part.title,
         menu=part.menu or part.title,
-        mark=mark,
         expert=part.expert,
         void=part.of_result and not usable,
         blocks=blocks,

@@ -7,7 +7,7 @@ import { logBar } from "./log_bar";
 import { panels, plot } from "./plot";
 import { space } from "./space";
 import { dataTable } from "./table";
-import { checks, downloads, facts, listing, paragraph } from "./text";
+import { downloads, facts, listing, paragraph } from "./text";
 import { tool_map } from "./tool_map";
 
 export type Block = Section["blocks"][number];
@@ -22,7 +22,6 @@ const DRAWERS: Drawers = {
   paragraph,
   listing,
   facts,
-  checks,
   downloads,
   table: dataTable,
   log_bar: logBar,

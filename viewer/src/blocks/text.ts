@@ -1,6 +1,6 @@
 /** Blocks of text. */
 
-import type { Checks, Downloads, Facts, Listing, Paragraph } from "../document";
+import type { Downloads, Facts, Listing, Paragraph } from "../document";
 import { h } from "../dom";
 import { sign } from "../marks";
 
@@ -21,10 +21,6 @@ export const facts = (block: Facts): HTMLElement =>
     ...(block.title ? [h("h3", {}, block.title)] : []),
     h("dl", { class: "facts" },
       ...block.facts.flatMap((one) => [h("dt", {}, one.name), h("dd", {}, one.value)])));
-
-export const checks = (block: Checks): HTMLElement =>
-  h("ul", { class: "checks" },
-    ...block.checks.map((one) => h("li", {}, sign(one.passed ? "good" : "wrong"), " ", one.text)));
 
 export function downloads(block: Downloads): HTMLElement {
   const links = block.files.map((file) => {

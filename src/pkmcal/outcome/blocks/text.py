@@ -1,4 +1,4 @@
-"""Blocks of text: paragraphs, lists, facts, checks, and files to download."""
+"""Blocks of text: paragraphs, lists, facts, and files to download."""
 
 from __future__ import annotations
 
@@ -42,20 +42,6 @@ class Facts(Schema):
     kind: Literal["facts"] = "facts"
     title: Text
     facts: tuple[Fact, ...]
-
-
-class CheckLine(Schema):
-    """Comparison with an expected value, in one line."""
-
-    text: Text
-    passed: bool
-
-
-class Checks(Schema):
-    """Comparisons with expected values."""
-
-    kind: Literal["checks"] = "checks"
-    checks: tuple[CheckLine, ...]
 
 
 class Download(Schema):

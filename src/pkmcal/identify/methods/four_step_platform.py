@@ -18,8 +18,8 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, inverse
-from pkmcal.papers.leg_axes import Axes, across_directions, nearest_points, revolute_axes
-from pkmcal.papers.registration import (
+from pkmcal.identify.methods.leg_axes import Axes, across_directions, nearest_points, revolute_axes
+from pkmcal.identify.methods.registration import (
     ANY_MOTION,
     REGISTRATION_UNIT_SIGMA,
     fit_body,

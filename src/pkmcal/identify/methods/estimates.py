@@ -20,16 +20,16 @@ from pkmcal.identify.covariance import data_share, prior_in_gauge
 from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.hand_eye import start_from_poses
+from pkmcal.identify.methods import AlternativeMethod
+from pkmcal.identify.methods.four_step import four_step
+from pkmcal.identify.methods.four_step_base import with_boards
+from pkmcal.identify.methods.inverse_kinematic import inverse_kinematic
+from pkmcal.identify.methods.linear_together import base_together
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
-from pkmcal.papers import PaperMethod
-from pkmcal.papers.four_step import four_step
-from pkmcal.papers.four_step_base import with_boards
-from pkmcal.papers.inverse_kinematic import inverse_kinematic
-from pkmcal.papers.linear_together import base_together
 from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE
 
 Repeated = Literal["four-step", "inverse-kinematic"]
@@ -37,8 +37,8 @@ SIGMA_REPETITIONS = 60
 """Number of repetitions for the standard deviations, which are then accurate to 9 %."""
 
 
-def by_paper(
-    method: PaperMethod,
+def by_method(
+    method: AlternativeMethod,
     machine: Machine,
     measurements: Measurements,
     joint: Estimate,

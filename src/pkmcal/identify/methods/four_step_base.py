@@ -24,17 +24,17 @@ from pkmcal.geometry.rigid import (
     perturb,
     pose_difference,
 )
-from pkmcal.identify.state import State
-from pkmcal.measurements import Measurements, PoseSet
-from pkmcal.mechanisms import Machine
-from pkmcal.papers.leg_axes import Axes
-from pkmcal.papers.registration import (
+from pkmcal.identify.methods.leg_axes import Axes
+from pkmcal.identify.methods.registration import (
     extent,
     fit_body,
     fixes_pose,
     points_by,
     poses_laying_items,
 )
+from pkmcal.identify.state import State
+from pkmcal.measurements import Measurements, PoseSet
+from pkmcal.mechanisms import Machine
 
 
 class StationViews(NamedTuple):

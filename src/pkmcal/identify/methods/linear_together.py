@@ -34,13 +34,13 @@ from pkmcal.geometry.rigid import cross, dot, perturb, register
 from pkmcal.identify.bundle import BATCH
 from pkmcal.identify.gauge import centre_index
 from pkmcal.identify.line_shading import common_shading
+from pkmcal.identify.methods import linear
 from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE, LEAST_SCALE, clean_norm
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
 from pkmcal.measurements.effects import EDGE_SHIFT, SHADING, SHIFT_SIGMA
 from pkmcal.mechanisms import Machine
-from pkmcal.papers import linear
 from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_weights
 
 MOST_GAUSS_NEWTON_STEPS, MOST_VARIANCE_ROUNDS = 30, 30
@@ -282,7 +282,7 @@ def _rows(system: _System, state: _State) -> tuple[Array, Array]:
     """Whitened residuals n.A + R (N,) and their derivatives (N, na).
 
     The standard deviation of n.A, from the normal's noise, grows with A: without its derivative A
-    is biased towards the camera, as in :func:`pkmcal.papers.linear.errors_in_variables`.
+    is biased towards the camera, as in :func:`pkmcal.identify.methods.linear.errors_in_variables`.
     """
     edges, u, theta = system.edges, system.unknowns, system.theta(state)
     station = state.T_camera_base[edges.station]

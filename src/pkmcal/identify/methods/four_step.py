@@ -25,13 +25,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot, nearest_rotation
 from pkmcal.identify.gauge import BestFit, centre_index, default_gauge, in_gauge
-from pkmcal.identify.nominal_joints import NominalJoints, base_gauge, nominal_joints, platform_gauge
-from pkmcal.identify.state import State
-from pkmcal.measurements import Measurements
-from pkmcal.mechanisms import Machine
-from pkmcal.papers import four_step_checks as checks
-from pkmcal.papers import linear
-from pkmcal.papers.four_step_base import (
+from pkmcal.identify.methods import four_step_checks as checks
+from pkmcal.identify.methods import linear
+from pkmcal.identify.methods.four_step_base import (
     Base,
     Items,
     StationViews,
@@ -46,7 +42,7 @@ from pkmcal.papers.four_step_base import (
     with_boards,
     with_signs,
 )
-from pkmcal.papers.four_step_platform import (
+from pkmcal.identify.methods.four_step_platform import (
     joint_distance_offsets,
     passive_centres,
     platform_axes,
@@ -54,7 +50,7 @@ from pkmcal.papers.four_step_platform import (
     platform_by_registration,
     universal_axes,
 )
-from pkmcal.papers.leg_axes import (
+from pkmcal.identify.methods.leg_axes import (
     Axes,
     axes_from_edges,
     centres_from_axes,
@@ -63,7 +59,16 @@ from pkmcal.papers.leg_axes import (
     revolute_axes,
     through_centres,
 )
-from pkmcal.papers.registration import RegisteredBody, extent, fixes_pose, poses_laying_items
+from pkmcal.identify.methods.registration import (
+    RegisteredBody,
+    extent,
+    fixes_pose,
+    poses_laying_items,
+)
+from pkmcal.identify.nominal_joints import NominalJoints, base_gauge, nominal_joints, platform_gauge
+from pkmcal.identify.state import State
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
 
 FourStepForm = Literal["corrected", "printed"]
 VAGUE_CENTRE_SHARE = 0.1

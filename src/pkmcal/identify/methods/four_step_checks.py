@@ -12,12 +12,15 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
+from pkmcal.identify.methods.four_step_base import Items, StationViews
+from pkmcal.identify.methods.four_step_platform import (
+    COLLAPSED_LENGTH_SHARE,
+    joint_distance_deviations,
+)
+from pkmcal.identify.methods.leg_axes import Axes, in_base
+from pkmcal.identify.methods.registration import fixes_pose, loose, parts_of
 from pkmcal.identify.nominal_joints import NominalJoints, nominal_joints
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.four_step_base import Items, StationViews
-from pkmcal.papers.four_step_platform import COLLAPSED_LENGTH_SHARE, joint_distance_deviations
-from pkmcal.papers.leg_axes import Axes, in_base
-from pkmcal.papers.registration import fixes_pose, loose, parts_of
 from pkmcal.wording import named
 
 FREE_OFFSETS_SINGULAR_VALUE = 1e-3

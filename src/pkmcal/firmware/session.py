@@ -9,10 +9,9 @@ import numpy as np
 
 from pkmcal.errors import InputError, legible
 from pkmcal.files import csv_text, parse_yaml, validated_document
+from pkmcal.firmware.contract import CARRIAGE_STEP, Printer, Touches, read_printer
+from pkmcal.firmware.probed import FEWEST_BED_POINTS, read_touches
 from pkmcal.mechanisms import MechanismDocument, checked_machine
-from pkmcal.printers.printer import CARRIAGE_STEP, Printer, Touches
-from pkmcal.printers.probed import FEWEST_BED_POINTS, read_touches
-from pkmcal.printers.read import read_printer
 from pkmcal.starter import (
     STARTER_SQUARE_CHOICES,
     board_text,
@@ -77,10 +76,6 @@ joints:
 #   New belts.
 
 """
-WHERE_CARRIAGES_STAND = {
-    "Klipper": "what Klipper's\n#                          GET_POSITION prints behind stepper:",
-    "RepRapFirmware": "what M114\n#                          prints behind Count, divided by M92",
-}
 FIRMWARE_FIXED_TEXT = """\
 # What the firmware can hold: towers upright, motors that go as far as it says.
 fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
@@ -154,12 +149,12 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     nominal = nominal_text(printer) + PLATFORM_FIXED_TEXT
     document = parse_yaml(nominal, Path("mechanism.yaml"))
     machine = checked_machine(validated_document(document, MechanismDocument), document)
-    heads = [f"{motor} [mm]" for motor in printer.motors]
+    heads = [f"{motor} [mm]" for motor in printer.firmware.motors]
     # the corners of 7 by 5 squares stay within the print radius while the tool goes half as far:
     # only there no tower is in the way
     square = int(printer.reach / np.hypot(7, 5))
     head = CARRIED_BOARD_SESSION_TEXT.format(
-        where=WHERE_CARRIAGES_STAND[printer.program],
+        where=printer.firmware.carriage_source.replace("\n", "\n#" + 26 * " "),
         reach=_mm(printer.reach),
         **_resolution(printer),
     )
@@ -203,13 +198,14 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
             found=count(len(touches.heights), "point"),
             expected=f"{FEWEST_BED_POINTS} or more, spread to the edge of the bed",
         )
+    motors = printer.firmware.motors
     above = touches.carriages.max(axis=0) - printer.homed
     if above.max() > 0:
         motor = int(np.argmax(above))
         raise InputError(
             "a carriage would have been above its end switch when the bed was felt",
             where=touches.origin,
-            found=f"{printer.motors[motor]} {above[motor]:.1f} mm above it",
+            found=f"{motors[motor]} {above[motor]:.1f} mm above it",
             expected=f"points that belong to the values in {printer.label}",
         )
     # the upper end of a rod is above the bed when the lower one touches it; a bed may hang lower
@@ -220,7 +216,7 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
         raise InputError(
             "a carriage would have been far below the bed when the bed was felt",
             where=touches.origin,
-            found=f"{printer.motors[motor]} {-touches.carriages[:, motor].min():.4g} mm below it",
+            found=f"{motors[motor]} {-touches.carriages[:, motor].min():.4g} mm below it",
             expected=f"points that belong to the values in {printer.label}",
         )
     return touches
@@ -229,11 +225,13 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
 def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
     """Files by name of a session of bed heights."""
     names = [f"{k + 1:03d}" for k in range(len(touches.heights))]
-    to = "klipper" if printer.program == "Klipper" else "reprap"
-    heads = [f"{motor} [mm]" for motor in printer.motors]
+    heads = [f"{motor} [mm]" for motor in printer.firmware.motors]
     return {
         "session.yaml": PROBED_SESSION_TEXT.format(
-            n=len(names), origin=legible(touches.origin), to=to, **_resolution(printer)
+            n=len(names),
+            origin=legible(touches.origin),
+            to=printer.firmware.name,
+            **_resolution(printer),
         ),
         "mechanism.yaml": nominal_text(printer, touches) + FIRMWARE_FIXED_TEXT,
         "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
@@ -261,7 +259,7 @@ def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
         for (x, y), high, rod in zip(towers, printer.homed, printer.rod, strict=True)
     ]
     return PRINTER_NOMINAL_TEXT.format(
-        name=printer.program.lower() + "-delta",
+        name=printer.firmware.program.lower() + "-delta",
         label=legible(printer.label),
         legs="\n".join(legs),
         home=_mm(top / 2),

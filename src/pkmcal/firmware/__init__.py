@@ -1,0 +1,1 @@
+"""Firmwares of delta printers: configurations read and written, and sessions made from them."""

@@ -1,0 +1,421 @@
+"""RepRapFirmware: M665, M666 and M669 of deltas, read from config.g or config-override.g (which
+M500 writes) and written by ``export --to reprap``, and bed points of G29 and G30.
+
+M665 and M666 belong to linear deltas, M669 K10 and M666 to rotary ones; only printers of the first
+are read. Semantics: Duet3D's G-code reference, and the firmware's LinearDeltaKinematics and
+RotaryDeltaKinematics. Towers X, Y, Z are at -150, -30 and 90 degrees, with corrections counted
+anticlockwise. A homed carriage is at ``H + sqrt(L^2 - R^2)`` plus its endstop adjustment, a homed
+arm at the larger angle of A plus its adjustment. B is the print radius, beyond which the firmware
+accepts no position; if omitted it remains as it was, 80 mm by default.
+
+``G29`` writes heightmap.csv, and a sequence of ``G30 Pn X Y Z-99999`` that ends with S-1 prints
+``G32 bed probe heights: ...``: tool heights at contact.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.machine_source import MachineSource
+from pkmcal.errors import InputError
+from pkmcal.exporters.contract import Difference, commented, largest
+from pkmcal.exporters.delta import (
+    DEGREES_A_RADIAN,
+    MM_A_METRE,
+    SWITCH_ROUNDING,
+    Fit,
+    Freedoms,
+    about,
+    end_switches,
+    firmware_angle,
+    firmware_length,
+    firmware_tool_difference,
+    fit_of,
+    proportional_switches,
+    readings_elsewhere,
+    redo,
+    switch_values,
+    workspace_radius,
+)
+from pkmcal.files import quoted
+from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, NUMBER, Firmware, Printer
+from pkmcal.outcome.finding import Finding
+from pkmcal.wording import listed
+
+FILE = "pkmcal_delta.g"
+REPRAP_TOWER_ANGLES = (-150.0, -30.0, 90.0)
+STEEPEST_ARM_ANGLE = 90.0
+NO_REPRAP_PRINT_RADIUS = (
+    "There is no print radius, B: it stays the printer's own; where none was set it is 80 mm."
+)
+_WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
+_M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
+_OURS = re.compile(r"\s*M66[56]\b")
+HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
+_G30 = re.compile(r"^[^\S\n]*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
+_G30_WORD = re.compile(rf"([PXY])\s*{NUMBER}", re.IGNORECASE)
+_HEIGHTS = re.compile(rf"bed probe heights:((?:\s+{NUMBER})+)", re.IGNORECASE)
+
+
+@final
+class RepRap(Firmware):
+    """RepRapFirmware's commands."""
+
+    name: ClassVar = "reprap"
+    title: ClassVar = "RepRapFirmware: lines for config.g"
+    program: ClassVar = "RepRapFirmware"
+    motors: ClassVar = ("X", "Y", "Z")
+    carriage_source: ClassVar = "what M114\nprints behind Count, divided by M92"
+
+    def reads(self, text: str) -> bool:
+        """Whether a text has a line M665."""
+        return bool(_M665.search(text))
+
+    def printer(self, text: str, label: str) -> Printer:
+        """Printer of a file with M665 and M666; of repeated values the last counts.
+
+        Raises InputError for missing, malformed or impossible values.
+        """
+        words, places = _checked_words(text, label)
+        rod, radius, height, reach = (
+            _words(words, label, "665" + letter, size)
+            for letter, size in (("L", 3), ("R", 1), ("H", 1), ("B", 1))
+        )
+        for name, values in (("665L", rod), ("665R", radius), ("665H", height), ("665B", reach)):
+            if values.min() <= 0:
+                raise InputError(
+                    f"M665 {name[-1]} is no number that a printer can have",
+                    where=places[name],
+                    found=f"{values.min():g}",
+                    expected="a number above zero",
+                )
+        # complete command: corrections and adjustments default to 0
+        command = dict(words)
+        command["665L"] = rod
+        for name in ("665X", "665Y", "665Z", "666X", "666Y", "666Z", "666A", "666B"):
+            command.setdefault(name, np.zeros(1))
+        command["665R"], command["665H"] = radius[:1], height[:1]
+        with np.errstate(invalid="ignore"):
+            ends = homed_carriages(command)
+        corrections = np.array([command[f"665{letter}"][0] for letter in "XYZ"])
+        return Printer(
+            firmware=self,
+            label=label,
+            radius=float(radius[0]),
+            angle=np.array(REPRAP_TOWER_ANGLES) + corrections,
+            rod=rod,
+            homed=ends,
+            reach=float(reach[0]),
+            carriages=partial(reprap_carriage_heights, command),
+        )
+
+    def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
+        """Points of a height map, or of lines G30 with the heights that they printed."""
+        del printer
+        if text.startswith(HEIGHT_MAP_TITLE):
+            return _height_map_points(text, label), 0.0
+        if values := _HEIGHTS.findall(text):
+            return _sequence_points(text, label, values[-1][0]), 0.0
+        return None
+
+    def files(self, source: MachineSource) -> dict[str, str]:
+        """One file of G-code."""
+        fit = self._fit(source)
+        unit = "mm" if fit.kind == "linear" else "degree"
+        correcting = f"Divide its steps per {unit} (M92) by that."
+        lines = about(source, fit, "XYZ", correcting)
+        names = [f"M666 {letter}" for letter in "XYZ"]
+        lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
+        radius = workspace_radius(source)
+        if radius is None:
+            lines.append(NO_REPRAP_PRINT_RADIUS)
+        commands = (_linear if fit.kind == "linear" else _rotary)(fit, radius)
+        return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
+
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
+        """Differences by the firmware's formulas, with values read as the firmware reads them."""
+        fit = self._fit(source)
+        text = files[FILE]
+        words = read_words(text)
+        ends = fit.rate * fit.delta.ends[fit.order]
+        linear = fit.kind == "linear"
+        homed = (homed_carriages if linear else homed_arms)(words)
+        move = reprap_carriage_heights if linear else reprap_arm_angles
+        # switches at other readings: homing with the value that the text gives for them
+        elsewhere = [
+            (homed_carriages if linear else homed_arms)(
+                {**words, **{f"666{c}": np.array([v]) for c, v in zip("XYZ", values, strict=True)}}
+            )
+            - (fit.rate * readings + fit.zero)
+            for readings in readings_elsewhere(fit)
+            for values in [switch_values(text, readings)]
+        ]
+        radius = workspace_radius(source)
+        read_radius = [*words.get("665B", words.get("669B", []))]
+        same = read_radius == ([] if radius is None else [float(radius)])
+        return [
+            firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends),
+            Difference(
+                "motors at end switches elsewhere",
+                largest(elsewhere),
+                SWITCH_ROUNDING,
+                "mm or degrees",
+            ),
+            Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
+        ]
+
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
+        """Agreement of settings and machine, and the steps after installing them."""
+        return (self._fit(source).following, *redo(source))
+
+    def _fit(self, source: MachineSource) -> Fit:
+        """RepRapFirmware's parameters of a source's machine."""
+        towers = Freedoms(REPRAP_TOWER_ANGLES)
+        return fit_of(source, self.program, towers, towers)
+
+
+# The firmware's words and formulas
+
+
+def read_words(text: str) -> dict[str, Array]:
+    """Values by command and letter, as ``665L``; text after a semicolon is a comment."""
+    out: dict[str, Array] = {}
+    for line in text.splitlines():
+        command, _, rest = line.partition(";")[0].strip().partition(" ")
+        for letter, values in _WORD.findall(rest):
+            out[command[1:] + letter] = np.array([float(v) for v in values.split(":")])
+    return out
+
+
+def _xyz(words: dict[str, Array], command: str) -> Array:
+    """Values (3,) of the letters X, Y and Z."""
+    return np.array([words[command + letter][0] for letter in "XYZ"])
+
+
+def homed_arms(words: dict[str, Array]) -> Array:
+    """Arm angles (3,) degrees at the end switches."""
+    return words["669A"][1] + _xyz(words, "666")
+
+
+def homed_carriages(words: dict[str, Array]) -> Array:
+    """Carriage heights (3,) mm at the end switches."""
+    rise = np.sqrt(words["665L"] ** 2 - words["665R"] ** 2)
+    return words["665H"] + rise + _xyz(words, "666")
+
+
+def reprap_carriage_heights(words: dict[str, Array], points: Array) -> Array:
+    """Carriage heights (n, 3) mm at points (n, 3) mm, by the firmware's linear Transform."""
+    x, y, z, tower = *_xyz(words, "665"), words["665R"][0]
+    towers = tower * np.array(
+        [
+            [-np.cos((30 + x) / DEGREES_A_RADIAN), -np.sin((30 + x) / DEGREES_A_RADIAN)],
+            [np.cos((30 - y) / DEGREES_A_RADIAN), -np.sin((30 - y) / DEGREES_A_RADIAN)],
+            [-np.sin(z / DEGREES_A_RADIAN), np.cos(z / DEGREES_A_RADIAN)],
+        ]
+    )
+    d = points[:, None, :2] - towers
+    tilt = points[:, 0] * words["666A"][0] / 100 + points[:, 1] * words["666B"][0] / 100
+    rise = np.sqrt(words["665L"] ** 2 - d[..., 0] ** 2 - d[..., 1] ** 2)
+    return rise + points[:, 2:] + tilt[:, None]
+
+
+def reprap_arm_angles(words: dict[str, Array], points: Array) -> Array:
+    """Arm angles (n, 3) degrees at points (n, 3) mm, by the firmware's rotary Transform.
+
+    The arcsine limits angles to 90 degrees from the horizontal.
+    """
+    angle = (np.array(REPRAP_TOWER_ANGLES) + _xyz(words, "669")) / DEGREES_A_RADIAN
+    along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle)
+    across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
+    r, h = words["669R"] - along, words["669H"] - points[:, 2:]
+    a, b = 2 * words["669U"] * r, 2 * words["669U"] * h
+    c = words["669L"] ** 2 - words["669U"] ** 2 - (h**2 + r**2 + across**2)
+    square = a**2 + b**2
+    return np.arcsin((b * c - a * np.sqrt(square - c**2)) / square) * DEGREES_A_RADIAN
+
+
+# Reading
+
+
+def _checked_words(text: str, label: str) -> tuple[dict[str, Array], dict[str, str]]:
+    """Values by command and letter, of M665 and M666 only, and the line of each.
+
+    Raises InputError for a line that holds no numbers within bounds.
+    """
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if _OURS.match(line)]
+    words: dict[str, Array] = {}
+    places: dict[str, str] = {}
+    for n, line in lines:
+        try:
+            value = read_words(line)
+        except ValueError:
+            value = {"": np.array([np.inf])}
+        # NaN and infinity fail this comparison as well
+        if any(not np.abs(v).max() <= LARGEST_PRINTER_VALUE for v in value.values()):
+            raise InputError(
+                "a value of this line is no number that a printer can have",
+                where=f"{label}, line {n}",
+                found=quoted(line.strip()),
+                expected="numbers in mm, or degrees",
+            )
+        words.update({name.upper(): values for name, values in value.items()})
+        places.update({name.upper(): f"{label}, line {n}" for name in value})
+    return words, places
+
+
+def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:
+    """Values (size,) of a word; a single one stands for all.
+
+    Raises InputError for any other number of values.
+    """
+    values = words.get(name, np.zeros(0))
+    if len(values) not in (1, size):
+        raise InputError(
+            f"M{name[:-1]} has no value {name[-1]} that could be used",
+            where=label,
+            found=f"{len(values)} numbers",
+            expected="one, or one for each tower" if size > 1 else "one",
+            next_step="Name the file in which M665 has L, R, H and B: after M500 that is"
+            " config-override.g",
+        )
+    return np.broadcast_to(values, (size,)).copy()
+
+
+def _height_map_points(text: str, label: str) -> Array:
+    """Points (n, 3) of heightmap.csv, mm. Raises InputError for a map without a valid grid."""
+    lines = [line for line in text.splitlines()[1:] if line.strip()]
+    names = [word.strip() for word in (lines[0] if lines else "").split(",")]
+    values = [word.strip() for word in (lines[1] if len(lines) > 1 else "").split(",")]
+    numbers = dict(zip(names, values, strict=False))
+
+    def number_under(*called: str, above: float = -LARGEST_PRINTER_VALUE) -> float:
+        """Number of the map's grid, under the first of several names that the map has."""
+        text = next((numbers[name] for name in called if name in numbers), "")
+        try:
+            value = float(text)
+        except ValueError:
+            value = np.nan
+        if not above < value <= LARGEST_PRINTER_VALUE:
+            raise InputError(
+                "the height map does not define its grid",
+                where=f"{label}, line 3",
+                found=", ".join(values) or "nothing",
+                expected=f"a number{'' if above else ' above zero'} under {called[0]}",
+            )
+        return value
+
+    # names of newer and older versions of RepRapFirmware
+    x0, y0 = number_under("xmin", "min0"), number_under("ymin", "min1")
+    dx = number_under("xspacing", "spacing0", "spacing", above=0.0)
+    dy = number_under("yspacing", "spacing1", "spacing", above=0.0)
+    # RepRapFirmware writes a plain 0 for a point that was not probed
+    out: list[tuple[float, float, float]] = []
+    for row, line in enumerate(lines[2:]):
+        for column, word in enumerate(line.split(",")):
+            if word.strip() in ("0", ""):
+                continue
+            try:
+                out.append((x0 + column * dx, y0 + row * dy, float(word)))
+            except ValueError:
+                raise InputError(
+                    "a height is no number",
+                    where=f"{label}, row {row + 1} of heights",
+                    found=word.strip(),
+                    expected="millimetres",
+                ) from None
+    return np.array(out).reshape(-1, 3)
+
+
+def _sequence_points(text: str, label: str, heights: str) -> Array:
+    """Points (n, 3), mm, from the lines ``G30 Pn`` and the heights of the last reply.
+
+    Raises InputError if the numbers of the points do not match the heights.
+    """
+    z = [float(word) for word in heights.split()]
+    places: dict[int, tuple[float, float]] = {}
+    for words in _G30.findall(text):
+        word_values = {letter.upper(): float(number) for letter, number in _G30_WORD.findall(words)}
+        if word_values.keys() >= {"P", "X", "Y"}:
+            places[int(word_values["P"])] = word_values["X"], word_values["Y"]
+    if sorted(places) != list(range(len(z))):
+        raise InputError(
+            "heights and points do not belong together",
+            where=label,
+            found=f"{len(z)} heights, and lines G30 of the points"
+            f" {listed([str(p) for p in sorted(places)]) or 'none'}",
+            expected=f"lines G30 P0 to P{len(z) - 1} with X and Y, as in bed.g",
+        )
+    return np.array([(*places[k], height) for k, height in enumerate(z)])
+
+
+# Writing
+
+
+def _adjustments(fit: Fit) -> Array:
+    """Endstop adjustments (3,), mm or degrees, relative to H or to the larger angle of A."""
+    homed = fit.end_motors
+    if fit.kind == "linear":
+        homed = homed - np.sqrt(fit.rod**2 - fit.radius**2)
+    return homed - homed.mean()
+
+
+def _linear(fit: Fit, radius: str | None) -> list[str]:
+    """Commands of a linear delta."""
+    heights = fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
+    homed = float(heights.mean())
+    corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
+    return [
+        "M669 K3 ; linear delta",
+        f"M665 L{_by_tower(fit.rod)} R{firmware_length(fit.radius)} H{firmware_length(homed)}"
+        + ("" if radius is None else f" B{radius}")
+        + f" {_letters(corrections, firmware_angle)}"
+        " ; L rods, R radius, H homed height"
+        + ("" if radius is None else ", B the printer's own print radius"),
+        f"M666 {_letters(_adjustments(fit), firmware_length)} A0 B0"
+        " ; endstop adjustments, mm; no tilt",
+    ]
+
+
+def _rotary(fit: Fit, radius: str | None) -> list[str]:
+    """Commands of a rotary delta. Raises InputError for arms beyond 90 degrees."""
+    delta = fit.delta
+    homed = float(fit.end_motors.mean())
+    ranges = delta.machine.joint_ranges[delta.joint][fit.order]
+    lowest = float((fit.rate[:, None] * ranges + fit.zero[:, None]).min())
+    if lowest < -STEEPEST_ARM_ANGLE or homed > STEEPEST_ARM_ANGLE:
+        raise InputError(
+            "RepRapFirmware's rotary delta takes arms up to 90 degrees from the horizontal",
+            found=f"arms from {lowest:.1f} to {homed:.1f} degrees",
+            next_step="Give the cranks a smaller range in the mechanism file",
+        )
+    corrections = fit.angle - np.array(REPRAP_TOWER_ANGLES)
+    low = float(MM_A_METRE * delta.positions[:, 2].min() + MM_A_METRE * fit.T_firmware_base[2, 3])
+    high = float(MM_A_METRE * delta.positions[:, 2].max() + MM_A_METRE * fit.T_firmware_base[2, 3])
+    return [
+        f"M669 K10 U{_by_tower(fit.arm)} L{_by_tower(fit.rod)} H{_by_tower(fit.height)}"
+        f" R{firmware_length(fit.radius)} A{firmware_angle(lowest)}:{firmware_angle(homed)}"
+        + ("" if radius is None else f" B{radius}")
+        + f" {_letters(corrections, firmware_angle)}"
+        " ; U arms, L rods, H bearings' heights, R radius",
+        f"M666 {_letters(_adjustments(fit), firmware_angle)}"
+        " ; homed angles beyond A's larger one, degrees",
+        f"; M208 Z{firmware_length(max(low, 0.0))}:{firmware_length(high)}"
+        " ; Z of the workspace at most; set your own",
+        "; M92: microsteps per degree of the arm, on X, Y and Z",
+    ]
+
+
+def _by_tower(values: Array) -> str:
+    """Three lengths, separated by colons."""
+    return ":".join(firmware_length(v) for v in values)
+
+
+def _letters(values: Array, write: Callable[[float], str]) -> str:
+    """Values after the letters X, Y and Z."""
+    return " ".join(f"{letter}{write(float(v))}" for letter, v in zip("XYZ", values, strict=True))

@@ -1,1 +1,0 @@
-"""Calibration sessions of delta printers, made from the data that their firmware holds."""
