@@ -191,12 +191,13 @@ def test_parameters_of_short_docstrings_are_tabulated():
     docstrings = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(docstrings)
     text = "Write files.\n\nfolder : a new one. force, keep : replace others\nthere. Raises Fault."
-    parts = docstrings.with_section(text, ["self", "folder", "force", "keep"]).splitlines()
-    assert parts == [
+    parts = docstrings.with_section(text, "Parameters", ["folder", "force", "keep"])
+    assert parts.splitlines() == [
         "Write files.", "", "Raises Fault.", "", "Parameters", "----------", "folder :",
         "    A new one.", "force, keep :", "    Replace others there.",
     ]  # fmt: skip
-    assert docstrings.with_section("A note : nothing.", ["folder"]) == "A note : nothing."
+    assert docstrings.with_section(parts, "Parameters", ["folder"]) == parts
+    assert docstrings.with_section("A note : no.", "Parameters", ["folder"]) == "A note : no."
 
 
 def test_every_page_stands_in_the_menu_once():
