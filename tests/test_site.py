@@ -135,7 +135,6 @@ def shown(site: Path, url: str, folder: Path) -> str:
         pytest.skip("NO CHROMIUM: the site was not opened in a browser (apt install chromium)")
     command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
                f"--user-data-dir={folder / 'profile'}", "--virtual-time-budget=10000",
-               "--blink-settings=primaryHoverType=2,availableHoverTypes=2",  # a mouse
                "--window-size=500,900", "--dump-dom", site.as_uri() + url]  # fmt: skip
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
 
