@@ -130,9 +130,9 @@ def test_examples_run(name, request, monkeypatch, quick_plans):
 
 def test_every_function_has_an_example():
     entries = text_of("docs/api.md").split("\n::: pkmcal.")[1:]
-    shown = {entry.split()[0]: blocks(entry, "python runnable") for entry in entries}
+    examples = {entry.split()[0]: blocks(entry, "python runnable") for entry in entries}
     for name in set(pkmcal.__all__) - {"__version__", "errors", "Machine"}:
-        assert any(re.search(rf"\bpkmcal\.{name}\(", body) for body in shown[name]), name
+        assert any(re.search(rf"\bpkmcal\.{name}\(", body) for body in examples[name]), name
 
 
 def test_runnable_examples_are_where_readers_look():

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import pkmcal
+from pkmcal.ranges import default
 from test_report_page import CHROMIUM
 
 ROOT = Path(__file__).parents[1]
@@ -129,7 +130,7 @@ def test_equations_are_mathml(site):
     assert count > 100
 
 
-def shown(site: Path, url: str, folder: Path) -> str:
+def opened(site: Path, url: str, folder: Path) -> str:
     """The document of a page, opened from its file, after its scripts ran."""
     if CHROMIUM is None:
         pytest.skip("NO CHROMIUM: the site was not opened in a browser (apt install chromium)")
@@ -140,7 +141,7 @@ def shown(site: Path, url: str, folder: Path) -> str:
 
 
 def test_code_can_be_copied_and_scrolled_by_the_keyboard(site, tmp_path):
-    document = shown(site, "/control.html", tmp_path)
+    document = opened(site, "/control.html", tmp_path)
     code = re.findall(r"<pre[^>]*>.*?</pre>", document, re.DOTALL)
     assert code
     assert all("data-clipboard-target" in block for block in code)
@@ -148,7 +149,7 @@ def test_code_can_be_copied_and_scrolled_by_the_keyboard(site, tmp_path):
 
 
 def test_the_search_works_from_a_file(site, tmp_path):
-    document = shown(site, "/index.html?q=gauge", tmp_path)
+    document = opened(site, "/index.html?q=gauge", tmp_path)
     assert re.search(r'href="[^"]*conventions\.html[^"]*" class="md-search-result__link"', document)
 
 
@@ -183,6 +184,17 @@ def test_docstrings_are_typeset(site):
         table = own[own.index("Parameters:") :].partition("</table>")[0]
         assert own.index("Parameters:") < 12_000, name
         assert all(f"<th>{head}</th>" in table for head in ("Name", "Type", "Description")), name
+
+
+def test_defaults_and_choices_are_values(site):
+    text = (site / "api.html").read_text("utf-8")
+    cells = [re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", cell)).strip()
+             for cell in re.findall(r"<td[^>]*>(.*?)</td>", text, re.DOTALL)]  # fmt: skip
+    rows = {cells[i]: cells[i : i + 4] for i in range(len(cells))}
+    assert rows["count"][3] == str(default("plan", "configurations"))
+    assert rows["corner_noise"][3] == str(default("plan", "corner_noise"))
+    assert "&#39;O1&#39;" in rows["index"][1]
+    assert "default(" not in re.sub(r"<[^>]+>", "", text)
 
 
 def test_parameters_of_short_docstrings_are_tabulated():
