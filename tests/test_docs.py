@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import re
+import shutil
 from functools import cache, reduce
 from pathlib import Path
 
 import pytest
 
+import pkmcal
 from conftest import run
 from document_keys import assert_keys
 from pkmcal.cameras import camera_models
@@ -17,6 +19,8 @@ from pkmcal.commands.cli import COMMANDS_IN_ORDER, app
 from pkmcal.files import parse_yaml, read_json, validated_document
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
 from pkmcal.session.schema import session_schema
+from test_cli_camera import boards  # noqa: F401 - a fixture
+from test_pose_sessions import make
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -99,13 +103,36 @@ def workplace(demo, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def quick_workplace(boards, tmp_path_factory) -> Path:  # noqa: F811 - the fixture
+    """A folder with two sessions of a machine by a tracker, ``session`` and ``monday``, the
+    calibration ``out`` of the first, and images of a board.
+    """
+    folder = tmp_path_factory.mktemp("functions")
+    make(folder / "session", "gough-stewart")
+    make(folder / "monday", "gough-stewart", n=12)
+    pkmcal.calibrate(folder / "session").save(folder / "out")
+    (folder / "boards").mkdir()
+    for name in ("board.yaml", "p0.png", "p1.png", "p2.png", "p3.png"):
+        shutil.copy(boards / name, folder / "boards" / name)
+    return folder
+
+
 @pytest.mark.parametrize("name", [n for n in NAMES if blocks(text_of(n), "python runnable")])
-def test_examples_run(name, workplace, monkeypatch):
+def test_examples_run(name, request, monkeypatch, quick_plans):
     """Blocks of one page share their names, as a reader who types them in would have it."""
-    monkeypatch.chdir(workplace)
+    quick = name == "docs/api.md"
+    monkeypatch.chdir(request.getfixturevalue("quick_workplace" if quick else "workplace"))
     namespace: dict[str, object] = {}
     for body in blocks(text_of(name), "python runnable"):
         exec(compile(body, name, "exec"), namespace)
+
+
+def test_every_function_has_an_example():
+    entries = text_of("docs/api.md").split("\n::: pkmcal.")[1:]
+    examples = {entry.split()[0]: blocks(entry, "python runnable") for entry in entries}
+    for name in set(pkmcal.__all__) - {"__version__", "errors", "Machine"}:
+        assert any(re.search(rf"\bpkmcal\.{name}\(", body) for body in examples[name]), name
 
 
 def test_runnable_examples_are_where_readers_look():

@@ -8,7 +8,7 @@ hold the same tables and figures.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from pkmcal.outcome.finding import Finding, Level, Mark
 

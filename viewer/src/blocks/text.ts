@@ -2,7 +2,6 @@
 
 import type { Downloads, Facts, Listing, Paragraph } from "../document";
 import { h } from "../dom";
-import { sign } from "../marks";
 
 export const paragraph = (block: Paragraph): HTMLElement =>
   h("p", block.small ? { class: "small" } : {}, block.text);
