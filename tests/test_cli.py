@@ -66,9 +66,54 @@ def test_as_a_module():
 
 
 def test_help_imports_nothing_heavy():
-    heavy = ("numpy", "scipy", "cv2", "pydantic", "yaml", "rich.progress")
-    code = f"import sys, pkmcal.commands.cli; print([m for m in {heavy} if m in sys.modules])"
-    assert python("-c", code).stdout == "[]\n"
+    """Of the libraries, the help of the program and of every command needs typer alone."""
+    heavy = ("numpy", "scipy", "cv2", "pydantic", "yaml", "ruamel", "rich", "pkmcal.api")
+    code = f"""
+import sys
+from pkmcal.commands import cli
+for words in ([], *([name] for name in cli.COMMANDS_IN_ORDER)):
+    assert cli.main([*words, "--help"]) == 0
+    print(words, [m for m in {heavy} if m in sys.modules], file=sys.stderr)
+"""
+    lines = python("-c", code).stderr.splitlines()
+    assert lines == [f"{words} []" for words in ([], *([name] for name in COMMANDS))]
+
+
+def test_the_first_bar_is_drawn_before_anything_heavy_is_imported():
+    """Each command ends at the first character that it writes to a terminal."""
+    cases = [
+        ["demo"], ["check", "none"], ["board"], ["camera", "none"], ["plan", "none"],
+        ["calibrate", "none"], ["validate", "none", "none"], ["servo", "none"],
+        ["export", "none", "--to", "c"], ["watch", "none", "none"], ["diff", "none", "none"],
+        ["simulate", "none"], ["study", "none"], ["reproduce"],
+    ]  # fmt: skip
+    heavy = ("numpy", "scipy", "cv2", "yaml", "pkmcal.api", "pkmcal.files", "pkmcal.session")
+    code = f"""
+import sys
+from pkmcal.commands import cli
+
+class Drawn(BaseException):
+    pass
+
+class Terminal:
+    encoding = "utf-8"
+    def isatty(self):
+        return True
+    def flush(self):
+        pass
+    def write(self, text):
+        raise Drawn
+
+sys.stderr = Terminal()
+for words in {cases}:
+    try:
+        cli.main(words)
+    except Drawn:
+        print(words[0], "rich.progress" in sys.modules, [m for m in {heavy} if m in sys.modules])
+"""
+    done = python("-c", code, env={**os.environ, "TERM": "xterm"})
+    assert done.stdout.splitlines() == [f"{words[0]} True []" for words in cases]
+    assert {words[0] for words in cases} == {*COMMANDS} - {"new", "show", "view"}
 
 
 def test_a_command_loads_no_other():

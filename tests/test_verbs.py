@@ -205,12 +205,14 @@ def test_a_result_is_findings_a_document_and_a_summary(both):
         assert result.outcome.verdict.headline.split()[0] in result.summary()
 
 
-def test_progress_is_a_text_and_a_share(both):
+def test_progress_goes_from_0_to_1_and_never_backwards(both):
     if not both.has_progress:
         assert "progress" not in inspect.signature(getattr(pkmcal, both.verb)).parameters
         return
-    assert both.progress
-    assert all(text and 0 <= share <= 1 for text, share in both.progress)
+    texts, shares = zip(*both.progress, strict=True)
+    assert all(texts)
+    assert (shares[0], shares[-1]) == (0, 1)
+    assert list(shares) == sorted(shares)
 
 
 def test_a_folder_with_other_files_is_left_alone(both, tmp_path):

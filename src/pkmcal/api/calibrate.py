@@ -8,11 +8,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from pkmcal.api.result import PAGE_DESCRIPTION, Progress, Result
+from pkmcal.api.result import PAGE_DESCRIPTION, Result
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import default
 from pkmcal.report.calibration import outcome_of, save
 from pkmcal.session.load import Session
@@ -100,14 +101,15 @@ def calibrate(
         These data do not allow a result.
 
     """
-    calibration = calibrate_session(
-        session,
-        method=method,
-        seed=seed,
-        refine_camera=refine_camera,
-        holdout=holdout,
-        progress=progress,
-    )
+    with whole(progress, "Reading the session") as report:
+        calibration = calibrate_session(
+            session,
+            method=method,
+            seed=seed,
+            refine_camera=refine_camera,
+            holdout=holdout,
+            progress=report,
+        )
     # release the images, which a long-lived result need not keep in memory
     return CalibrationResult.of(replace(calibration, images={}))
 

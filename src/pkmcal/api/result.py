@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import webbrowser
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from datetime import datetime
 from functools import cached_property
@@ -22,8 +22,6 @@ from pkmcal.outcome import Outcome
 from pkmcal.outcome.finding import Finding
 from pkmcal.terminal import outcome_text
 
-Progress = Callable[[str, float], None]
-"""Callback with a text and the share done, 0 to 1."""
 PAGE_DESCRIPTION = "open it in a browser"
 NUMBERS_DESCRIPTION = "everything, for programs"
 
@@ -31,10 +29,6 @@ NUMBERS_DESCRIPTION = "everything, for programs"
 def page_and_numbers(stem: str) -> Mapping[str, str]:
     """A page and a document of the same name, with their descriptions."""
     return MappingProxyType({f"{stem}.html": PAGE_DESCRIPTION, f"{stem}.json": NUMBERS_DESCRIPTION})
-
-
-def no_progress(text: str, share: float) -> None:
-    """Progress callback that does nothing."""
 
 
 class Result(ABC):

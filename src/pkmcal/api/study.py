@@ -11,8 +11,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, Progress, Result
+from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, Result
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import check_number, default
 from pkmcal.studies.cluster import on_cluster
 from pkmcal.studies.engine import run_all
@@ -106,7 +107,7 @@ def study(
     title = " ".join([str(subject), *vary])
     names = [in_words(cell.values) for cell in cells]
     opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
-    with opened as store:
-        results = run_all(settings, runs, seed, progress, runner, store, names)
+    with opened as store, whole(progress, "Simulating") as report:
+        results = run_all(settings, runs, seed, report, runner, store, names)
     found = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
     return StudyResult(studied, varied, tuple(cells), tuple(results), found, runs, seed)

@@ -12,6 +12,7 @@ from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.finish import answer
 from pkmcal.errors import InputError
+from pkmcal.outcome.progress import part
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,7 +24,7 @@ DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME = "session", "calibration"
 FAST_SIZE = (480, 360)
 FAST_CONFIGURATIONS = 4
 SIMULATING_SHARE = 0.85
-"""Share of rendering in the progress."""
+"""Share of rendering in the progress of the work."""
 
 EXAMPLES = """\
 pkmcal demo
@@ -44,13 +45,14 @@ def demo(
     from dataclasses import asdict, replace
 
     import pkmcal
-    from pkmcal.judge.against_truth import compare_with_truth
-    from pkmcal.placement.default_camera import camera_of_size, default_camera
-    from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
 
-    session, folder = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
-    _make_room(out)
     with console.progress(as_json) as progress:
+        from pkmcal.judge.against_truth import compare_with_truth
+        from pkmcal.placement.default_camera import camera_of_size, default_camera
+        from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
+
+        session, folder = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
+        _make_room(out)
         simulated = pkmcal.simulate(
             session,
             DEMO_MECHANISM,
@@ -58,13 +60,10 @@ def demo(
             stations=DEMO_SETTINGS.stations,
             configurations=FAST_CONFIGURATIONS if fast else DEMO_SETTINGS.configurations,
             seed=DEMO_SEED,
-            progress=lambda text, share: progress(text, SIMULATING_SHARE * share),
+            progress=part(progress.work, 0, SIMULATING_SHARE),
         )
-        rest = 0.97 - SIMULATING_SHARE
-        result = pkmcal.calibrate(
-            simulated, progress=lambda text, share: progress(text, SIMULATING_SHARE + rest * share)
-        )
-        progress("Writing the report", 0.98)
+        result = pkmcal.calibrate(simulated, progress=part(progress.work, SIMULATING_SHARE, 1))
+        progress.writing()
         result.save(folder)
     # The truth is read only now, when everything is written.
     comparison = compare_with_truth(result, session)

@@ -114,7 +114,7 @@ class Table:
     first : number of leading columns that a terminal prints, the rows' names included; None for
         all.
     words : indices of the columns that hold text and are aligned to the left.
-    legend : lines under the table on a terminal.
+    legend : paragraph under the table on a terminal.
     """
 
     title: str
@@ -125,7 +125,7 @@ class Table:
     folded: bool = False
     first: int | None = None
     words: tuple[int, ...] = ()
-    legend: tuple[str, ...] = ()
+    legend: str = ""
 
 
 @dataclass(frozen=True)
