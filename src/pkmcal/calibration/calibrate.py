@@ -59,7 +59,7 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
@@ -241,7 +241,7 @@ def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
             return None
         return doubtful("camera.refinement_rejects", kept=retained, of=taken, by_files=more)
     by_refined, by_held = refined.estimate.statistics, held.estimate.statistics
-    chance = SESSION_FALSE_ALARM.scale(by_refined.dof) ** 2
+    chance = SESSION_FALSE_ALARM.scale(Search.INTRINSICS, by_refined.dof) ** 2
     if by_refined.chi2_as_stated > chance * by_held.chi2_as_stated:
         return doubtful(
             "camera.refinement_fits_worse",
