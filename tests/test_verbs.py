@@ -18,7 +18,7 @@ import pytest
 
 import pkmcal
 from conftest import have_cores, run
-from pkmcal.api.result import Result, printed_document
+from pkmcal.api.result import FolderResult, Result, printed_document
 from pkmcal.control.study import HAND_ROTATION
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
@@ -223,6 +223,18 @@ def test_a_folder_with_other_files_is_left_alone(both, tmp_path):
     with pytest.raises(InputError):
         both.result.save(tmp_path)
     assert {(tmp_path / name).read_text() for name in names} == {"mine"}
+
+
+def test_a_result_of_fixed_names_has_a_folder_that_can_be_checked_before_the_work(both):
+    """The files of an export and of a board are named after the format and the board's file."""
+    kind = type(both.result)
+    checked = issubclass(kind, FolderResult)
+    assert checked == (both.verb not in ("new", "board", "export", "simulate"))
+    if checked:
+        assert {*both.result.file_list} <= {*kind.own_files}
+        assert kind.check_folder(both.folder)
+    elif both.verb in ("board", "export"):
+        assert not hasattr(kind, "check_folder")
 
 
 def test_a_result_opens_its_page(both, monkeypatch):

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from pkmcal.api.result import PAGE_DESCRIPTION, Result
+from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
@@ -22,7 +22,7 @@ Method = Literal["bundle", "four-step", "linear", "inverse-kinematic"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CalibrationResult(Calibration, Result):
+class CalibrationResult(Calibration, FolderResult):
     """Calibration with its files.
 
     ``summary()``, ``parameters``, ``machine``, ``verdict``, ``tool_error(poses)``,

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from pkmcal.api.result import PAGE_DESCRIPTION, Result
+from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
 from pkmcal.boards.board import Board, load_board
 from pkmcal.camera_calibration.calibrate import CameraCalibration, calibrate_images
 from pkmcal.camera_calibration.image_files import board_file_of, image_files, session_board_images
@@ -29,7 +29,7 @@ OTHER_CAMERA_FILES = {
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CameraResult(Result, CameraCalibration):
+class CameraResult(FolderResult, CameraCalibration):
     """Calibration of a camera with its files: ``camera``, ``covariance``, ``held_out``.
 
     images : files of the board. formats : other programs for which the camera is written as well.

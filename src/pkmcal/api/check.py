@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
-from pkmcal.api.result import Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.checks.check import check_session
 from pkmcal.checks.pictures import picture_names, with_pictures, write_pictures
 from pkmcal.checks.results import SessionCheck
@@ -18,7 +18,7 @@ from pkmcal.outcome.progress import Progress, part, whole
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CheckResult(Result, SessionCheck):
+class CheckResult(FolderResult, SessionCheck):
     """Check of a session, with its files: ``stations``, ``joints``, ``forecast``, ``advice``.
 
     repeat : whether repeated images were studied as well. repeats : their study; None without one,

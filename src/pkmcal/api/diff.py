@@ -8,7 +8,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from pkmcal.api.result import Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.calibration.archive import keep_earlier
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.files import json_text, output_lock
@@ -20,7 +20,7 @@ from pkmcal.report.difference import outcome_of
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class DiffResult(Result, MachineDifference):
+class DiffResult(FolderResult, MachineDifference):
     """Difference of two machines with its files: ``change``, ``centres``, ``tool``, ``verdict``."""
 
     own_files = page_and_numbers("diff")

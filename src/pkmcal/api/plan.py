@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from threadpoolctl import threadpool_limits
 
-from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, Result
+from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, FolderResult
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
@@ -32,7 +32,7 @@ PlanIndex = Literal["tool", "D", "E", "O1"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class PlanResult(Result, MeasurementPlan):
+class PlanResult(FolderResult, MeasurementPlan):
     """Plan with its files: ``joints``, ``names``, ``promised``, ``now``."""
 
     own_files = MappingProxyType(

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from pkmcal.api.result import Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.errors import InputError
 from pkmcal.files import write_folder
 from pkmcal.outcome import Outcome, Verdict
@@ -22,7 +22,7 @@ PAPERS = ("a", "b", "c")
 
 
 @dataclass(frozen=True)
-class ReproductionResult(Result):
+class ReproductionResult(FolderResult):
     """Reproductions of papers. outcomes : by the paper's letter."""
 
     outcomes: Mapping[str, Outcome]

@@ -32,14 +32,9 @@ def page_and_numbers(stem: str) -> Mapping[str, str]:
 
 
 class Result(ABC):
-    """Result of a function of :mod:`pkmcal`, with the text, the files and the JSON of its command.
-
-    own_files : all files that a result of this kind may write, with their descriptions. kind : the
-    result's and an earlier result's name in the message about a folder with other files.
+    """Result of a function of :mod:`pkmcal`, with the text, the files and the JSON of its
+    command.
     """
-
-    own_files: ClassVar[Mapping[str, str]]
-    kind: ClassVar[tuple[str, str | None]]
 
     @classmethod
     def of(cls, value: Any, **more: Any) -> Self:
@@ -52,9 +47,9 @@ class Result(ABC):
         """Verdict, tables, figures and sections of the page; made when first needed."""
 
     @property
+    @abstractmethod
     def file_list(self) -> Mapping[str, str]:
         """Names of the files that ``save`` writes, with their descriptions."""
-        return self.own_files
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -96,27 +91,13 @@ class Result(ABC):
                 texts[name] = page_html(outcome, made) if page else json_text(outcome.document)
         return texts
 
-    @classmethod
-    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
-        """Names of an earlier result's files in a folder.
-
-        Raises InputError where the folder holds anything else, or cannot be written. Call it before
-        the work whose result goes there. force : the earlier result need not be kept.
-        """
-        del force
-        return check_own_folder(Path(folder), cls.own_files, *cls.kind)
-
+    @abstractmethod
     def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
-        """Write the command's files, all or none; they replace those of an earlier result.
+        """Write the command's files, all or none.
 
-        folder : a new or empty one, or one of an earlier result of this kind. force : replace an
-        earlier calibration or difference too, which is otherwise kept in a dated folder beside it;
-        that folder is returned, None if nothing was kept. Raises InputError if the folder holds
-        anything else, or cannot be written.
+        Raises InputError if the folder holds anything but an earlier result that may be replaced,
+        or cannot be written. force : replace an earlier result that would be kept.
         """
-        over = self.check_folder(folder, force=force)
-        write_folder(Path(folder), self.contents(), over)
-        return None
 
     def show(self) -> Path:
         """Write the files into a temporary folder, open the page in a browser, and return its path.
@@ -141,6 +122,44 @@ class Result(ABC):
         """Line that follows the saved files on a terminal; empty for none."""
         del folder
         return ""
+
+
+class FolderResult(Result):
+    """Result in a folder of its own, whose files have fixed names.
+
+    own_files : all files that a result of this kind may write, with their descriptions. kind : the
+    result's and an earlier result's name in the message about a folder with other files.
+    """
+
+    own_files: ClassVar[Mapping[str, str]]
+    kind: ClassVar[tuple[str, str | None]]
+
+    @property
+    def file_list(self) -> Mapping[str, str]:
+        """Names of the files that ``save`` writes, with their descriptions."""
+        return self.own_files
+
+    @classmethod
+    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
+        """Names of an earlier result's files in a folder.
+
+        Raises InputError where the folder holds anything else, or cannot be written. Call it before
+        the work whose result goes there. force : the earlier result need not be kept.
+        """
+        del force
+        return check_own_folder(Path(folder), cls.own_files, *cls.kind)
+
+    def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
+        """Write the command's files, all or none; they replace those of an earlier result.
+
+        folder : a new or empty one, or one of an earlier result of this kind. force : replace an
+        earlier calibration or difference too, which is otherwise kept in a dated folder beside it;
+        that folder is returned, None if nothing was kept. Raises InputError if the folder holds
+        anything else, or cannot be written.
+        """
+        over = self.check_folder(folder, force=force)
+        write_folder(Path(folder), self.contents(), over)
+        return None
 
 
 def printed_document(outcome: Outcome) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from pkmcal.api.result import Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.arrays import Array
 from pkmcal.control.laws import law_named
 from pkmcal.control.simulation import LoopSettings
@@ -28,7 +28,7 @@ MOST_SAMPLES = 5000
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class ServoResult(Result, Study):
+class ServoResult(FolderResult, Study):
     """Study of servoing, with its files: ``outcomes``, ``choices``, ``equilibria``."""
 
     own_files = page_and_numbers("servo")

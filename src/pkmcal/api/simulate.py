@@ -68,16 +68,10 @@ class SimulationResult(Session, Result):
         """No list: the files are those of a session."""
         return {}
 
-    @classmethod
-    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
-        """No names: a session is written into a new or empty folder only."""
-        del force
-        check_new_folder(folder)
-        return []
-
     def save(self, folder: Path | str, *, force: bool = False) -> None:
         """Copy the session into a new or empty folder; InputError for another one."""
-        self.check_folder(folder, force=force)
+        del force
+        check_new_folder(folder)
         if resolved(Path(folder)).is_relative_to(resolved(self.folder)):
             raise InputError(
                 "a session is not copied into itself",

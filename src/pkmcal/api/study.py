@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, Result
+from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, FolderResult
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import check_number, default
@@ -27,7 +27,7 @@ RUN_ROWS_DESCRIPTION = "one row a run"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class StudyResult(SweepResult, Result):
+class StudyResult(SweepResult, FolderResult):
     """Study with its files: ``found``, ``gains``."""
 
     own_files = MappingProxyType(

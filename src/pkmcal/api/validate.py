@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pkmcal.api.result import Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.judge.validate import Validation, validate_calibration
 from pkmcal.outcome import Outcome
@@ -17,7 +17,7 @@ from pkmcal.session.load import Session
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class ValidationResult(Result, Validation):
+class ValidationResult(FolderResult, Validation):
     """Validation with its files: ``judged``, ``regions``, ``paths``, ``verdict``."""
 
     own_files = page_and_numbers("validation")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pkmcal.api.result import Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.judge.watch import Watch, watch_machine
 from pkmcal.outcome import Outcome
@@ -18,11 +18,11 @@ from pkmcal.session.load import Session
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class WatchResult(Result, Watch):
+class WatchResult(FolderResult, Watch):
     """Tests of a calibrated machine, with their files: ``judged``, ``verdict``."""
 
     own_files = page_and_numbers("watch")
-    kind = ("what watch writes", "an earlier look")
+    kind = ("what watch writes", "an earlier test of the machine")
 
     @cached_property
     def outcome(self) -> Outcome:

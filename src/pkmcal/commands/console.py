@@ -25,7 +25,7 @@ from pkmcal.terminal import err, print_points
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.api.result import Result
+    from pkmcal.api.result import FolderResult
 
 OUTPUT_GROUP = "Output"
 """Heading of the options of outputs in the help."""
@@ -142,7 +142,7 @@ def parsed_size(text: str) -> tuple[int, int]:
 
 
 def output_folder(
-    out: Path | None, usual: Path, kind: type[Result], *, force: bool = False
+    out: Path | None, usual: Path, kind: type[FolderResult], *, force: bool = False
 ) -> Path:
     """Folder of a result, ``usual`` if none is given, checked before the work.
 
