@@ -166,7 +166,7 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         parts = (
             Part(
                 "session",
-                "What was looked at",
+                "What was checked",
                 terminal_text=(text,) if text else (),
                 tables=tuple(table for table in tables if table.rows),
             ),
