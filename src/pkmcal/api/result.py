@@ -124,7 +124,7 @@ class Result(ABC):
         return ""
 
 
-class FolderResult(Result):
+class FolderResult(Result, ABC):
     """Result in a folder of its own, whose files have fixed names.
 
     own_files : all files that a result of this kind may write, with their descriptions. kind : the
