@@ -9,6 +9,7 @@ test_diagnose.py has the other mistakes of this kind.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,6 +18,8 @@ import yaml
 
 from conftest import run
 from faults import replaced
+from pkmcal.api.calibrate import CalibrationResult
+from pkmcal.errors import InputError
 from pkmcal.session.load import load_session
 
 
@@ -266,14 +269,12 @@ def test_no_work_is_spent_before_the_output_is_known_to_be_writable(session, mon
 
 
 def test_a_disk_that_fills_up_leaves_nothing(session, calibrated, monkeypatch):
-    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: calibrated)
-
     def full(_self, _content):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    done = run("calibrate", session)
-    assert done.code == 2
-    assert "cannot be written (No space left on device)" in done.err
+    result = CalibrationResult.of(replace(calibrated, images={}))
+    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\)"):
+        result.save(session / "calibration")
     assert not (session / "calibration").exists()
     assert not list(session.glob(".*"))

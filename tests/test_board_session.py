@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ import pytest
 
 from conftest import run
 from faults import replaced
+from pkmcal.api.check import CheckResult
 from pkmcal.boards.prints import Print
 from pkmcal.boards.stations import find_boards
 from pkmcal.boards.views import Boards, StationBoard
@@ -200,7 +200,7 @@ def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
 # the commands
 
 
-def test_check_reports_the_board(folder, monkeypatch):
+def test_check_reports_the_board(folder):
     checked = check_session(folder)
     assert not [finding for finding in checked.findings if finding.station]
     for station in checked.stations:
@@ -211,11 +211,10 @@ def test_check_reports_the_board(folder, monkeypatch):
         assert station.board.rms < 0.03
         assert station.board.scatter < 0.03
         assert 0.5 < station.board.distance < 3
-    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked)
-    display = run("check", folder).out
-    assert "4 of 4" in display
-    assert "Wander" in display
-    assert json.loads(run("check", folder, "--json").out)["stations"][0]["board"]["found"] == 4
+    result = CheckResult.of(checked)
+    assert "4 of 4" in result.summary()
+    assert "Wander" in result.summary()
+    assert result.document["stations"][0]["board"]["found"] == 4
 
 
 def test_calibrating_with_the_board(folder):

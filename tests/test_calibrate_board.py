@@ -18,6 +18,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.hand_eye import solve_pairs
 from pkmcal.identify.methods.estimates import by_method
+from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.report.calibration import save
 from pkmcal.report.corners import board_corners
 from pkmcal.report.provenance import used_images
@@ -181,15 +182,18 @@ def test_a_missing_board_file_and_another_camera(folder):
 
 
 def test_the_method_of_paper_c_does_not_estimate_the_size(folder):
-    """Without an estimate of the size none is reported, though the tolerance in board.yaml adds to
-    sigma.
-    """
+    """The joint estimate reports the board's size, which the method takes from board.yaml."""
+    path = folder / "board.yaml"  # a simulated board has its size exactly
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), "tolerance": 0.001}))
     change(folder, lambda station: station.update(observe="board"))
     joint = calibrate_session(folder)
     method, machine = "inverse-kinematic", joint.session.machine
     estimate = by_method(method, machine, joint.measurements, joint.estimate, repetitions=3)
-    (target,) = calibration_document(replace(joint, estimate=estimate, method=method))["targets"]
-    assert "size" not in target
+    alone = replace(joint, estimate=estimate, method=method)
+    targets = [calibration_document(one)["targets"] for one in (joint, alone)]
+    assert ["size" in target for (target,) in targets] == [True, False]
+    assert BOARD_SIZE in joint.estimate.state.columns
+    assert BOARD_SIZE not in estimate.state.columns
 
 
 def test_inverse_of_a_known_station_is_reported(rendered):

@@ -57,12 +57,6 @@ def test_a_good_session(checked):
     assert all(0.6 < joint.used < 1 for joint in count.joints)
 
 
-def test_progress_is_reported_in_order(checked):
-    text, shares = zip(*checked.steps, strict=True)
-    assert list(shares) == sorted(shares)
-    assert text[-1] == "What such images will give"
-
-
 def test_a_workspace_blurred_and_overexposed_images(session):
     """Three cases that are no mistakes, and do not stop the check."""
     with (session / "session.yaml").open("a") as file:

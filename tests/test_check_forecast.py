@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from conftest import run
+from pkmcal.api.check import CheckResult
 from pkmcal.checks import advice as words
 from pkmcal.checks.check import check_session
 from pkmcal.checks.forecast import Forecast, LegForecast, forecast
@@ -26,7 +27,7 @@ from pkmcal.checks.pictures import (
     write_pictures,
 )
 from pkmcal.checks.sentences import outcome_of
-from pkmcal.errors import ResultError
+from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.observe.images import binned
@@ -319,30 +320,23 @@ def test_a_page_with_images(checked_session):
     assert len(block.images) == len(lost.images.images)
 
 
-@pytest.fixture
-def check_once(alone_checked, monkeypatch):
-    """The command has the session checked already."""
-    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: alone_checked)
-
-
-def test_the_command_writes_page_and_pictures(alone, check_once, tmp_path):
-    done = run("check", alone, "-o", tmp_path / "out", "--pictures", tmp_path / "drawn", "--json")
-    assert done.json["exit_code"] == done.code
+def test_a_check_writes_page_and_pictures(alone_checked, tmp_path):
+    result = CheckResult.of(alone_checked)
+    result.save(tmp_path / "out")
+    assert result.save_pictures(tmp_path / "drawn")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "check.html",
         "check.json",
     ]
     assert len(list((tmp_path / "drawn").iterdir())) == 3
-    assert all(Path(path).exists() for path in done.json["files"].values())
     page = (tmp_path / "out" / "check.html").read_text()
     assert "The nominal model over the images" in page
     assert "What a full capture would give" in page
     # again, over the same; but not beside what is somebody's
-    assert run("check", alone, "--pictures", tmp_path / "drawn").code == done.code
+    assert result.save_pictures(tmp_path / "drawn")
     (tmp_path / "drawn" / "mine.txt").write_text("mine")
-    refused = run("check", alone, "--pictures", tmp_path / "drawn")
-    assert refused.code == 2
-    assert "something other than pictures of a check" in refused.err
+    with pytest.raises(InputError, match="something other than pictures of a check"):
+        result.save_pictures(tmp_path / "drawn")
 
 
 def test_without_these_options_nothing_is_drawn(alone, check_once):

@@ -21,13 +21,16 @@ import pytest
 import pkmcal
 from conftest import run
 from document_keys import assert_keys
+from pkmcal.api.calibrate import CalibrationResult
+from pkmcal.api.check import CheckResult
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.saved_calibration import load
 from pkmcal.cameras import load_camera
-from pkmcal.commands import cli
+from pkmcal.commands import cli, console
 from pkmcal.commands.cli import main
+from pkmcal.commands.finish import answer, finish
 from pkmcal.errors import InputError
-from pkmcal.files import read_csv
+from pkmcal.files import json_text, read_csv
 from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.verdict import assess
 from pkmcal.mechanisms import catalogue, load_mechanism
@@ -66,9 +69,54 @@ def test_as_a_module():
 
 
 def test_help_imports_nothing_heavy():
-    heavy = ("numpy", "scipy", "cv2", "pydantic", "yaml", "rich.progress")
-    code = f"import sys, pkmcal.commands.cli; print([m for m in {heavy} if m in sys.modules])"
-    assert python("-c", code).stdout == "[]\n"
+    """Of the libraries, the help of the program and of every command needs typer alone."""
+    heavy = ("numpy", "scipy", "cv2", "pydantic", "yaml", "ruamel", "rich", "pkmcal.api")
+    code = f"""
+import sys
+from pkmcal.commands import cli
+for words in ([], *([name] for name in cli.COMMANDS_IN_ORDER)):
+    assert cli.main([*words, "--help"]) == 0
+    print(words, [m for m in {heavy} if m in sys.modules], file=sys.stderr)
+"""
+    lines = python("-c", code).stderr.splitlines()
+    assert lines == [f"{words} []" for words in ([], *([name] for name in COMMANDS))]
+
+
+def test_the_first_bar_is_drawn_before_anything_heavy_is_imported():
+    """Each command ends at the first character that it writes to a terminal."""
+    cases = [
+        ["demo"], ["check", "none"], ["board"], ["camera", "none"], ["plan", "none"],
+        ["calibrate", "none"], ["validate", "none", "none"], ["servo", "none"],
+        ["export", "none", "--to", "c"], ["watch", "none", "none"], ["diff", "none", "none"],
+        ["simulate", "none"], ["study", "none"], ["reproduce"],
+    ]  # fmt: skip
+    heavy = ("numpy", "scipy", "cv2", "yaml", "pkmcal.api", "pkmcal.files", "pkmcal.session")
+    code = f"""
+import sys
+from pkmcal.commands import cli
+
+class Drawn(BaseException):
+    pass
+
+class Terminal:
+    encoding = "utf-8"
+    def isatty(self):
+        return True
+    def flush(self):
+        pass
+    def write(self, text):
+        raise Drawn
+
+sys.stderr = Terminal()
+for words in {cases}:
+    try:
+        cli.main(words)
+    except Drawn:
+        print(words[0], "rich.progress" in sys.modules, [m for m in {heavy} if m in sys.modules])
+"""
+    done = python("-c", code, env={**os.environ, "TERM": "xterm"})
+    assert done.stdout.splitlines() == [f"{words[0]} True []" for words in cases]
+    assert {words[0] for words in cases} == {*COMMANDS} - {"new", "show", "view"}
 
 
 def test_a_command_loads_no_other():
@@ -391,16 +439,16 @@ def test_new_in_a_folder_that_is_not_empty(demo):
 # check
 
 
-def test_check_of_a_good_session(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
-    done = run("check", session)
-    assert done.code == 0
-    assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
-    rows = [line for line in done.out.splitlines() if line[1:].startswith("  station")]
+def test_check_of_a_good_session(demo, checked):
+    result = CheckResult.of(checked.result)
+    assert result.exit_code == 0
+    lines = result.summary().splitlines()
+    assert "Nothing is wrong. Next: pkmcal calibrate" in result.summary()
+    rows = [line for line in lines if line[1:].startswith("  station")]
     assert len(rows) == 3
     assert all(row.startswith("✓") for row in rows)
-    assert max(map(len, done.out.splitlines())) <= 80 + len(str(session))
-    assert "Wander" not in done.out  # of a board, where there is none
+    assert max(map(len, lines)) <= 80 + len(str(demo.session))
+    assert "Wander" not in result.summary()  # of a board, where there is none
 
 
 def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path):
@@ -412,9 +460,8 @@ def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path
     assert "Check of ." not in title
 
 
-def test_check_as_json(session, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
-    count = run("check", session, "--json").json
+def test_check_as_json(checked):
+    count = json.loads(json_text(CheckResult.of(checked.result).document))
     assert count["exit_code"] == 0
     assert_keys("check --json", count)
     names = [station["name"] for station in count["stations"]]
@@ -460,29 +507,31 @@ def test_calibrate(session, demo):
     assert np.array_equal(machine.values, load(demo.calibration).machine.values)
 
 
-def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "pkmcal.api.calibrate.calibrate_session",
-        lambda *_, seed, **_more: replace(calibrated, seed=seed),
-    )
+def test_calibrate_again_keeps_the_result(demo, calibrated, tmp_path, monkeypatch, capsys):
+    def finished(seed, folder, **options):
+        """Exit code and text of the command with a result of this seed."""
+        result = CalibrationResult.of(replace(calibrated, seed=seed, images={}))
+        with console.progress(quiet=True) as progress:
+            code = finish(result, folder, progress, **options)
+        return code, capsys.readouterr().out
+
     out = shutil.copytree(demo.calibration, tmp_path / "result")
     assert load(out).seed == 0
-    done = run("calibrate", session, "-o", out, "--seed", 5, "--quiet")
-    assert (done.code, done.out, done.err) == (0, "", "")
+    assert finished(5, out, quiet=True) == (0, "")
     assert load(out).seed == 5
     (retained,) = tmp_path.glob("result-*")
     assert load(retained).seed == 0
     # the same again: nothing is kept, and no note
-    assert "kept" not in run("calibrate", session, "-o", out, "--seed", 5, "--json").json
+    assert "kept" not in json.loads(finished(5, out, as_json=True)[1])
     assert len(list(tmp_path.glob("result-*"))) == 1
-    value = run("calibrate", session, "-o", out, "--json").json
+    value = json.loads(finished(0, out, as_json=True)[1])
     assert load(value["kept"]).seed == 5
     before = set(tmp_path.iterdir())
-    assert run("calibrate", session, "-o", out, "--seed", 6, "--force", "--quiet").code == 0
+    assert finished(6, out, force=True, quiet=True) == (0, "")
     assert set(tmp_path.iterdir()) == before
     monkeypatch.chdir(tmp_path)
-    done = run("calibrate", session, "-o", "result")
-    assert re.search(r"^  result-\S+ +the earlier result, kept$", done.out, re.MULTILINE)
+    _, text = finished(0, Path("result"))
+    assert re.search(r"^  result-\S+ +the earlier result, kept$", text, re.MULTILINE)
 
 
 def test_calibrate_as_json_in_a_process_of_its_own(tmp_path):
@@ -509,20 +558,21 @@ def test_the_four_steps_on_four_configurations_a_station(session):
         assert "[A] 3.3" in done.json["expected"]
 
 
-def test_an_unusable_result_is_reported_and_written(session, calibrated, monkeypatch):
-    value = calibrated
+def test_an_unusable_result_is_reported_and_written(calibrated, tmp_path, capsys):
+    value, folder = calibrated, tmp_path / "calibration"
     others = (Finding("machine.other", Level.WRONG, saved_text="Somebody ran into the machine."),)
     verdict = assess(value.observation, value.estimate, value.identification, others=others)
-    value = replace(value, verdict=verdict)
-    monkeypatch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: value)
-    done = run("calibrate", session)
-    assert done.code == 1
-    assert "This calibration should not be used" in done.out
-    assert "Written all the same" in done.out
-    assert not load(session / "calibration").verdict.usable
-    assert "# NOT TO BE USED: " in (session / "calibration" / "mechanism.yaml").read_text()
-    quiet = run("calibrate", session, "--quiet")
-    assert (quiet.code, quiet.out) == (1, "")
+    result = CalibrationResult.of(replace(value, verdict=verdict, images={}))
+    with console.progress(quiet=True) as progress:
+        assert finish(result, folder, progress) == 1
+    display = capsys.readouterr().out
+    assert "This calibration should not be used" in display
+    assert "Written all the same" in display
+    assert not load(folder).verdict.usable
+    assert "# NOT TO BE USED: " in (folder / "mechanism.yaml").read_text()
+    assert answer(result, folder, quiet=True) == 1
+    quiet = capsys.readouterr()
+    assert quiet.out == ""
     assert quiet.err.startswith("Error: This calibration should not be used")
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pkmcal
 from pkmcal.calibration.discrepancy_basis import discrepancy_components
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.discrepancy import DiscrepancyOptions, discrepancy_of
-from pkmcal.identify.false_alarm import FalseAlarm
+from pkmcal.identify.false_alarm import FalseAlarm, Search
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.score import ScoreTests
 from pkmcal.measurements import Column
@@ -42,7 +45,7 @@ class LinearProblem(Problem):
 
 def test_a_session_gives_a_false_alarm_at_most_at_its_level():
     """Linear sessions without any violation; the searches for violations, for a discrepancy, and,
-    with p-values drawn for them, for tubes and poses.
+    with p-values or residuals drawn for them, the others.
     """
     rng = np.random.default_rng(0)
     _, data, estimate, _ = right_session(5, 10)
@@ -52,7 +55,7 @@ def test_a_session_gives_a_false_alarm_at_most_at_its_level():
     families = [0] * 6 + [1] * 6
     components = discrepancy_components(data, estimate)
     level = FalseAlarm(LEVEL)
-    alarms = np.zeros((SESSIONS, 4), dtype=bool)
+    alarms = np.zeros((SESSIONS, len(Search)), dtype=bool)
     for k in range(SESSIONS):
         problem = LinearProblem.of(info.problem, rows, rng)
         here = replace(assembled, problem=problem), Information(problem, info.state)
@@ -61,11 +64,14 @@ def test_a_session_gives_a_false_alarm_at_most_at_its_level():
             *here, components, options=DiscrepancyOptions(false_alarm=level, scales=31)
         )
         tubes, poses = rng.uniform(size=(2, 15))
+        noise, camera = rng.normal(size=(2, 40)).std(axis=1)
         alarms[k] = (
             bool(tests.significant()),
             bool(estimated.scales),
-            tubes.min() < level.of_test(15),
-            level.adjusted(poses.min(), 15) < LEVEL,
+            tubes.min() < level.of_test(Search.OUTLINES, 15),
+            level.adjusted(Search.OUTLIERS, poses.min(), 15) < LEVEL,
+            noise > level.scale(Search.POSE_NOISE, 39),
+            camera > level.scale(Search.INTRINSICS, 39),
         )
     most = LEVEL * SESSIONS
     assert np.any(alarms, axis=1).sum() < most + 2 * np.sqrt(most * (1 - LEVEL))
@@ -73,15 +79,29 @@ def test_a_session_gives_a_false_alarm_at_most_at_its_level():
 
 
 def test_tests_of_one_search_share_its_level():
-    level = FalseAlarm(0.01, searches=2)
-    assert level.of_test(5) == 0.001
-    assert level.of_test(0) == 0.005
-    np.testing.assert_allclose(level.adjusted(np.array([1e-3, 0.5]), np.array([5, 5])), [0.01, 1.0])
+    level, search = FalseAlarm(0.01, {Search.VIOLATIONS: 0.5}), Search.VIOLATIONS
+    assert level.of_test(search, 5) == 0.001
+    assert level.of_test(search, 0) == 0.005
+    adjusted = level.adjusted(search, np.array([1e-3, 0.5]), np.array([5, 5]))
+    np.testing.assert_allclose(adjusted, [0.01, 1.0])
+
+
+def test_every_search_that_uses_the_level_has_a_share_of_it():
+    """A search names itself, in one module, where it uses the level; nothing else has a share."""
+    used = [
+        name
+        for path in Path(pkmcal.__file__).parent.rglob("*.py")
+        for name in set(re.findall(r"\bSearch\.([A-Z_]+)\b", path.read_text(encoding="utf-8")))
+    ]
+    assert sorted(used) == sorted(one.name for one in Search)
+    assert sum(FalseAlarm().shares.values()) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("dof", [5, 60])
 def test_noise_exceeds_its_scale_as_often_as_the_level_states(dof):
-    level, runs = FalseAlarm(0.02, searches=2), 20000
+    level, runs = FalseAlarm(0.02, {Search.POSE_NOISE: 0.5}), 20000
     rng = np.random.default_rng(0)
     rms = np.sqrt(np.mean(rng.normal(size=(runs, dof)) ** 2, axis=1))
-    assert np.mean(rms > level.scale(dof)) == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / runs))
+    assert np.mean(rms > level.scale(Search.POSE_NOISE, dof)) == pytest.approx(
+        0.01, abs=4 * np.sqrt(0.01 / runs)
+    )

@@ -191,7 +191,7 @@ def test_configurations_along_a_line_are_reported():
     body = np.broadcast_to(np.eye(4), (12, 4, 4)).copy()
     body[:, 0, 3] = np.linspace(-0.1, 0.1, 12)
     in_view = anywhere(rng, 1.0) @ body @ anywhere(rng, 0.05)
-    with pytest.raises(ResultError, match="do not tell how the camera stands"):
+    with pytest.raises(ResultError, match="do not determine how the camera stands"):
         solve_pairs(body[None], in_view[None], 0.4)
 
 

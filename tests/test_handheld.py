@@ -173,7 +173,7 @@ def test_a_pose_of_a_camera_by_hand(folder):
 def test_a_board_alone_by_hand(folder):
     replaced(folder / "session.yaml", "observe: legs", "observe: board")
     replaced(folder / "session.yaml", "stations:", "board: cameras/phone.yaml\nstations:")
-    assert "images by hand of a board alone tell nothing of the machine" in fault(
+    assert "images by hand of a board alone determine nothing of the machine" in fault(
         load_session, folder
     )
 
@@ -209,14 +209,14 @@ def test_an_image_without_a_focal_length(folder):
     replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0000-2.jpg", Exif(6, None))
     message = fault(load_session, folder)
-    assert "0000-2.jpg: the image does not tell the focal length" in message
+    assert "0000-2.jpg: the image does not state the focal length" in message
 
 
 def test_images_by_different_lenses(folder):
     replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0001-1.jpg", Exif(6, 52.0))
     message = fault(load_session, folder)
-    assert "tell different focal lengths or sizes" in message
+    assert "state different focal lengths or sizes" in message
     assert "52 mm at 8x6, where images/phone/0000-1.jpg has 26 mm at 8x6" in message
 
 

@@ -70,7 +70,7 @@ def test_a_terminal_gets_rich_colours_and_no_others(monkeypatch):
         terminal.print_points(out, [(terminal.MARK_SIGNS["wrong"], HOSTILE)])
         terminal.print_files(out, [(HOSTILE, "a file")])
         row = Row(HOSTILE, (HOSTILE,), mark="good")
-        terminal.print_table(out, Table(HOSTILE, (HOSTILE, HOSTILE), (row,), legend=(HOSTILE,)))
+        terminal.print_table(out, Table(HOSTILE, (HOSTILE, HOSTILE), (row,), legend=HOSTILE))
         out.print(HOSTILE, markup=False)
         out.print(terminal.escaped(HOSTILE))
     text = heard.getvalue()
@@ -85,7 +85,7 @@ def test_progress_is_legible_and_takes_no_markup(monkeypatch, capsys):
         monkeypatch.setenv("FORCE_COLOR", value)
         monkeypatch.setenv("TTY_COMPATIBLE", value)
         with console.progress() as progress:
-            progress(f"Looking at {HOSTILE}[/]", 0.5)
+            progress.report(f"Measuring {HOSTILE}[/]", 0.5)
     spoken = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
     assert not invisible(spoken, keep="\n\r")
 

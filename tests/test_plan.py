@@ -378,7 +378,7 @@ def test_a_session_before_any_image(demo, quick_plans, tmp_path):
     assert result.code == 0, result.out + result.err
     values = result.json
     assert sum(place["chosen"] for place in values["places_tried"]) == 2
-    assert "no image tells it yet" in values["assumptions"][0]
+    assert "no image determines it yet" in values["assumptions"][0]
     assert (session / "plan" / "stations.yaml").is_file()
     # and calibrate still needs images
     assert run("calibrate", str(session)).code == 2
@@ -392,7 +392,7 @@ def test_a_session_without_places(demo, quick_plans, tmp_path):
     (session / "session.yaml").write_text(head + rest[rest.index("  station2") :])
     result = run("plan", str(session))
     assert result.code == 2
-    assert "nothing tells where station station1 stands" in (result.out + result.err).replace(
+    assert "nothing determines where station station1 stands" in (result.out + result.err).replace(
         "\n", " "
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from html import unescape
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import pytest
 
 import pkmcal
 from page_documents import page_document
+from pkmcal.api.calibrate import CalibrationResult
 from pkmcal.arrays import short_repr
 from pkmcal.calibration import plots
 from pkmcal.errors import InputError
@@ -30,11 +31,9 @@ LONGEST = 500
 
 
 @pytest.fixture(scope="module")
-def result(demo, calibrated) -> pkmcal.api.calibrate.CalibrationResult:
+def result(calibrated) -> CalibrationResult:
     """Python's result of the calibration that these tests share."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.api.calibrate.calibrate_session", lambda *_, **_more: calibrated)
-        return pkmcal.calibrate(demo.session)
+    return CalibrationResult.of(replace(calibrated, images={}))
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import dataclass, replace
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from conftest import FEW_IMPUTATIONS, run
+from pkmcal.api.check import CheckResult
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.errors import InputError
+from pkmcal.files import json_text
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
 from pkmcal.identify.axis_measurements import to_coordinates
@@ -26,6 +29,7 @@ from pkmcal.judge.repeatability import (
     repeat_findings,
     require_repeats,
     scatter_of_repeats,
+    study_repeats,
 )
 from pkmcal.measurements import concatenate
 from pkmcal.mechanisms import load_mechanism
@@ -415,36 +419,29 @@ def measured_repeats(repeats):
 
 
 @pytest.fixture
-def once(measured_repeats, checked, monkeypatch):
-    """Commands share one measurement of the repeats, as it does not depend on their outputs; the
-    rest of the check is the demonstration's, which is not tested here.
-    """
-    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
-    monkeypatch.setattr(
-        "pkmcal.judge.repeatability.study_repeats", lambda *_, **_more: measured_repeats.study
-    )
+def with_repeats(measured_repeats, checked):
+    """Result of ``check --repeat``; its other part is the demonstration's, not tested here."""
+    return CheckResult.of(checked.result, repeat=True, repeats=measured_repeats.study)
 
 
-@pytest.mark.usefixtures("once")
-def test_check_repeat_gives_table_1(repeats):
-    values = run("check", repeats, "--repeat")
-    assert values.code == run("check", repeats).code
-    assert "upper bound" in values.out
-    row = next(line for line in values.out.splitlines() if line.startswith("[A] Table 1"))
+def test_check_repeat_gives_table_1(with_repeats, checked):
+    text = with_repeats.summary()
+    assert with_repeats.exit_code == CheckResult.of(checked.result).exit_code
+    assert "upper bound" in text
+    row = next(line for line in text.splitlines() if line.startswith("[A] Table 1"))
     assert row.split()[3:] == ["0.05°", "0.06°", "0.05", "mm", "0.1", "mm"]
-    assert "neither the camera nor the machine moves: sensor noise" in " ".join(values.out.split())
-    assert "more repeats will hardly help" in " ".join(values.out.split())
+    assert "neither the camera nor the machine moves: sensor noise" in " ".join(text.split())
+    assert "more repeats will hardly help" in " ".join(text.split())
 
 
-@pytest.mark.usefixtures("once")
-def test_check_repeat_as_json(repeats):
+def test_check_repeat_as_json(with_repeats, checked):
     plain, values = (
-        run("check", repeats, "--json").json,
-        run("check", repeats, "--repeat", "--json"),
+        json.loads(json_text(one.document))
+        for one in (CheckResult.of(checked.result), with_repeats)
     )
-    value = values.json["repeats"]
+    value = values["repeats"]
     assert "repeats" not in plain
-    assert {k: v for k, v in values.json.items() if k != "repeats"} == plain
+    assert {k: v for k, v in values.items() if k != "repeats"} == plain
     assert value["paper"]["psi"] == pytest.approx(np.radians(0.05))
     legs = value["legs"]
     assert {(row["station"], row["leg"]) for row in legs} == {
@@ -460,27 +457,25 @@ def test_check_repeat_as_json(repeats):
 
 
 @pytest.mark.slow
-def test_a_shaken_camera_is_reported(tmp_path, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
+def test_a_shaken_camera_is_reported(tmp_path, checked):
     shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3, "size": (360, 270)}
     folder = simulated(tmp_path / "session", 3, **shaken)
-    values = run("check", folder, "--repeat", "--json")
-    assert values.code == 1
-    (station,) = values.json["repeats"]["stations"]
+    result = CheckResult.of(checked.result, repeat=True, repeats=study_repeats(folder))
+    assert result.exit_code == 1
+    repeats = result.document["repeats"]
+    (station,) = repeats["stations"]
     assert station["cause"] == "camera"
     assert station["camera"] > 0.7
     assert station["promised"] > 1
-    text = values.json["repeats"]["findings"][0]["text"]
+    text = repeats["findings"][0]["text"]
     assert "as if the camera moved: fix the camera" in text
 
 
-def test_check_repeat_without_repeats_states_what_to_write(demo, checked, monkeypatch):
-    monkeypatch.setattr("pkmcal.api.check.check_session", lambda *_, **_more: checked.result)
-    values = run("check", demo.session, "--repeat")
-    assert values.code == 2
-    assert "the session has no repeated images" in values.err
-    assert "images/station1/{configuration}_{repeat}.png" in values.err
-    assert "images/station1/0001_1.png" in values.err
+def test_a_study_of_repeats_without_repeats_states_what_to_write(demo):
+    with pytest.raises(InputError, match="the session has no repeated images") as caught:
+        study_repeats(demo.session)
+    assert "images/station1/{configuration}_{repeat}.png" in str(caught.value)
+    assert "images/station1/0001_1.png" in str(caught.value)
 
 
 def test_repeats_are_asked_of_cameras_that_stand(demo):

@@ -98,8 +98,8 @@ class Counting:
     doing = "Counting"
     quantities = {"x": tasks.Quantity("mean")}  # noqa: RUF012 - a test's
 
-    def __init__(self, fails: str = "", takes: float = 0.0) -> None:
-        self.fails, self.takes = fails, takes
+    def __init__(self, fails: str = "", takes: float = 0.0, ballast: int = 0) -> None:
+        self.fails, self.takes, self.ballast = fails, takes, bytes(ballast)
 
     def populations(self, runs):
         return [Population("numbers", runs, 5)]
@@ -120,7 +120,9 @@ class Counting:
 
 
 def test_processes_that_die_are_replaced(monkeypatch):
-    """All are killed in the middle: the same numbers, and no batch twice."""
+    """All are killed in the middle: the same numbers, and no batch twice. The setting is larger
+    than a pipe's buffer.
+    """
     have_cores(monkeypatch, 2)
     shares, begun = [], set[int]()
 
@@ -132,7 +134,7 @@ def test_processes_that_die_are_replaced(monkeypatch):
                 process.kill()
 
     # long enough for the pool in the place of the first to begin, too
-    many = engine.run(Counting(takes=0.02), 200, 1, report)
+    many = engine.run(Counting(takes=0.02, ballast=200_000), 200, 1, report)
     assert len(shares) == 40
     assert len(begun) == 4
     assert not active_children()

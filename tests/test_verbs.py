@@ -18,7 +18,7 @@ import pytest
 
 import pkmcal
 from conftest import have_cores, run
-from pkmcal.api.result import Result, printed_document
+from pkmcal.api.result import FolderResult, Result, printed_document
 from pkmcal.control.study import HAND_ROTATION
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
@@ -205,12 +205,14 @@ def test_a_result_is_findings_a_document_and_a_summary(both):
         assert result.outcome.verdict.headline.split()[0] in result.summary()
 
 
-def test_progress_is_a_text_and_a_share(both):
+def test_progress_goes_from_0_to_1_and_never_backwards(both):
     if not both.has_progress:
         assert "progress" not in inspect.signature(getattr(pkmcal, both.verb)).parameters
         return
-    assert both.progress
-    assert all(text and 0 <= share <= 1 for text, share in both.progress)
+    texts, shares = zip(*both.progress, strict=True)
+    assert all(texts)
+    assert (shares[0], shares[-1]) == (0, 1)
+    assert list(shares) == sorted(shares)
 
 
 def test_a_folder_with_other_files_is_left_alone(both, tmp_path):
@@ -221,6 +223,18 @@ def test_a_folder_with_other_files_is_left_alone(both, tmp_path):
     with pytest.raises(InputError):
         both.result.save(tmp_path)
     assert {(tmp_path / name).read_text() for name in names} == {"mine"}
+
+
+def test_a_result_of_fixed_names_has_a_folder_that_can_be_checked_before_the_work(both):
+    """The files of an export and of a board are named after the format and the board's file."""
+    kind = type(both.result)
+    checked = issubclass(kind, FolderResult)
+    assert checked == (both.verb not in ("new", "board", "export", "simulate"))
+    if checked:
+        assert {*both.result.file_list} <= {*kind.own_files}
+        assert kind.check_folder(both.folder)
+    elif both.verb in ("board", "export"):
+        assert not hasattr(kind, "check_folder")
 
 
 def test_a_result_opens_its_page(both, monkeypatch):

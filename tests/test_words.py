@@ -198,7 +198,7 @@ def test_a_passive_leg_nobody_sees_moves_nothing():
     values, _, sentences = identified(make("6-spu-passive"), *[[1, 2, 3, 4, 5, 6]] * 3)
     assert len(sentences) == 1
     assert sentences[0].text == (
-        "Leg 7 is in no image, so that nothing tells where its joints are."
+        "Leg 7 is in no image, so that nothing determines where its joints are."
         " This does not move the platform."
     )
     assert not sentences[0].matters

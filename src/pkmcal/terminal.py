@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import textwrap
 from collections.abc import Iterable
 from functools import cache
 from io import StringIO
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pkmcal.errors import legible
@@ -61,7 +63,7 @@ def err() -> Console:
     return _legible_console()(stderr=True, highlight=False)
 
 
-def print_points(console: Console, points: Iterable[tuple[str, str]]) -> None:
+def print_points(console: Console, points: Iterable[tuple[str, str]], style: str = "") -> None:
     """Print sentences that wrap beside their marks: pairs of mark (in markup) and text."""
     from rich.text import Text
 
@@ -75,15 +77,27 @@ def print_points(console: Console, points: Iterable[tuple[str, str]]) -> None:
             break_on_hyphens=False,
         )
         rest = ("\n" + " " * before.cell_len).join(lines)
-        console.print(before + Text(rest), soft_wrap=True)
+        console.print(before + Text(rest), soft_wrap=True, style=style)
 
 
 def print_files(console: Console, files: Iterable[tuple[str, str]]) -> None:
-    """Print paths with their descriptions."""
-    files = [(legible(path), what) for path, what in files]
-    widest = max(len(path) for path, _ in files)
-    for path, what in files:
-        console.print(f"  {escaped(path):{widest}}  [dim]{what}[/]", soft_wrap=True)
+    """Print paths, each a link to its file where the terminal has links, with descriptions."""
+    from rich.style import Style
+    from rich.text import Text
+
+    rows = [(legible(path), _link(path), what) for path, what in files]
+    widest = max(len(path) for path, _, _ in rows)
+    for path, link, what in rows:
+        line = Text("  ")
+        line.append(path, Style(link=link))
+        line.append(" " * (widest - len(path) + 2))
+        line.append(what, "dim")
+        console.print(line, soft_wrap=True)
+
+
+def _link(path: str) -> str | None:
+    """Address of an existing file or folder."""
+    return Path(path).absolute().as_uri() if os.path.lexists(path) else None
 
 
 def print_table(console: Console, table: Table) -> None:
@@ -107,8 +121,8 @@ def print_table(console: Console, table: Table) -> None:
     if table.title:
         console.print(legible(table.title), style="bold", markup=False)
     console.print(grid)
-    for line in table.legend:
-        console.print(f"   {line}", style="dim", markup=False)
+    if table.legend:
+        print_points(console, [("  ", table.legend)], style="dim")
 
 
 def escaped(text: str) -> str:

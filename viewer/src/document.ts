@@ -207,14 +207,14 @@ export interface ReportDocument {
 /**
  * Judgement at the top of a report.
  *
- * tone : good, partial (usable, with exceptions) or bad.
+ * tone : good, partial (usable, with exceptions), bad, or neutral (nothing is judged).
  * stamp : one to three words.
  * explanation : line below the headline.
  * reasons : points below both.
  * comparison : magnitudes before and after.
  */
 export interface Verdict {
-  tone: "good" | "partial" | "bad";
+  tone: "good" | "partial" | "bad" | "neutral";
   stamp: string;
   headline: string;
   explanation: string;
@@ -266,7 +266,6 @@ export interface Fact {
  * Section of a report.
  *
  * menu : its name in the table of contents.
- * mark : the worst of its checks; null without one.
  * expert : collapsed, among the sections for the metrologist.
  * void : its figures mean nothing, because the result must not be used.
  */
@@ -274,22 +273,10 @@ export interface Section {
   name: string;
   title: string;
   menu: string;
-  mark: "good" | Level | null;
   expert: boolean;
   void: boolean;
   blocks: (
-    | Paragraph
-    | Listing
-    | Facts
-    | Checks
-    | Downloads
-    | DataTable
-    | LogBar
-    | Plot
-    | Panels
-    | Images
-    | Space
-    | ToolMapBlock
+    Paragraph | Listing | Facts | Downloads | DataTable | LogBar | Plot | Panels | Images | Space | ToolMapBlock
   )[];
 }
 /**
@@ -319,20 +306,6 @@ export interface Facts {
   kind: "facts";
   title: string;
   facts: Fact[];
-}
-/**
- * Comparisons with expected values.
- */
-export interface Checks {
-  kind: "checks";
-  checks: CheckLine[];
-}
-/**
- * Comparison with an expected value, in one line.
- */
-export interface CheckLine {
-  text: string;
-  passed: boolean;
 }
 /**
  * Files that the page holds.

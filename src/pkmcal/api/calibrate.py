@@ -8,11 +8,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from pkmcal.api.result import PAGE_DESCRIPTION, Progress, Result
+from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import default
 from pkmcal.report.calibration import outcome_of, save
 from pkmcal.session.load import Session
@@ -21,7 +22,7 @@ Method = Literal["bundle", "four-step", "linear", "inverse-kinematic"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CalibrationResult(Calibration, Result):
+class CalibrationResult(Calibration, FolderResult):
     """Calibration with its files.
 
     ``summary()``, ``parameters``, ``machine``, ``verdict``, ``tool_error(poses)``,
@@ -45,7 +46,7 @@ class CalibrationResult(Calibration, Result):
 
     def _repr_html_(self) -> str:
         """The report in a frame; a calibration that was loaded has a table instead."""
-        return Result._repr_html_(self) or ""
+        return FolderResult._repr_html_(self) or ""
 
     @classmethod
     def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
@@ -104,14 +105,15 @@ def calibrate(
         These data do not allow a result.
 
     """
-    calibration = calibrate_session(
-        session,
-        method=method,
-        seed=seed,
-        refine_camera=refine_camera,
-        holdout=holdout,
-        progress=progress,
-    )
+    with whole(progress, "Reading the session") as report:
+        calibration = calibrate_session(
+            session,
+            method=method,
+            seed=seed,
+            refine_camera=refine_camera,
+            holdout=holdout,
+            progress=report,
+        )
     # release the images, which a long-lived result need not keep in memory
     return CalibrationResult.of(replace(calibration, images={}))
 

@@ -9,12 +9,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
-from pkmcal.api.result import PAGE_DESCRIPTION, Progress, Result, no_progress
+from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
 from pkmcal.boards.board import Board, load_board
 from pkmcal.camera_calibration.calibrate import CameraCalibration, calibrate_images
 from pkmcal.camera_calibration.image_files import board_file_of, image_files, session_board_images
 from pkmcal.errors import InputError
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.report.camera import outcome_of
 from pkmcal.wording import listed
 
@@ -28,7 +29,7 @@ OTHER_CAMERA_FILES = {
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CameraResult(Result, CameraCalibration):
+class CameraResult(FolderResult, CameraCalibration):
     """Calibration of a camera with its files: ``camera``, ``covariance``, ``held_out``.
 
     images : files of the board. formats : other programs for which the camera is written as well.
@@ -104,13 +105,20 @@ def camera(
             found=unknown[0],
             expected=listed(list(OTHER_CAMERA_FILES)),
         )
+    with whole(progress, "Reading the board") as report:
+        paths, described = _images_and_board(images, board)
+        calibration = calibrate_images(paths, described, model, report)
+    return CameraResult.of(calibration, images=tuple(paths), formats=tuple(dict.fromkeys(to)))
+
+
+def _images_and_board(
+    images: Path | str | Sequence[Path | str], board: Board | Path | str | None
+) -> tuple[list[Path], Board]:
+    """Image files and the board that they show, by default the one beside them."""
     given = [Path(path) for path in ([images] if isinstance(images, Path | str) else images)]
     if len(given) == 1 and (given[0] / "session.yaml").is_file():
         paths, there = session_board_images(given[0])
     else:
         paths = image_files(given)
         there = None if board is not None else board_file_of(given)
-    described = board if isinstance(board, Board) else load_board(board or there or "")
-    (progress or no_progress)(f"Looking for the board in {len(paths)} images", 0.1)
-    calibration = calibrate_images(paths, described, model)
-    return CameraResult.of(calibration, images=tuple(paths), formats=tuple(dict.fromkeys(to)))
+    return paths, board if isinstance(board, Board) else load_board(board or there or "")

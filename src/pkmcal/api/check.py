@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
-from pkmcal.api.result import Progress, Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.checks.check import check_session
 from pkmcal.checks.pictures import picture_names, with_pictures, write_pictures
 from pkmcal.checks.results import SessionCheck
@@ -14,10 +14,11 @@ from pkmcal.checks.sentences import outcome_of
 from pkmcal.files import check_own_folder
 from pkmcal.judge.repeatability import RepeatStudy, study_repeats
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, part, whole
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class CheckResult(Result, SessionCheck):
+class CheckResult(FolderResult, SessionCheck):
     """Check of a session, with its files: ``stations``, ``joints``, ``forecast``, ``advice``.
 
     repeat : whether repeated images were studied as well. repeats : their study; None without one,
@@ -89,8 +90,10 @@ def check(
         less accurate than it could be, 2 cannot be calibrated), ``summary()``, ``save(folder)``.
 
     """
-    value = check_session(session, seed=seed, progress=progress)
     study = None
-    if repeat and value.exit_code < 2:
-        study = study_repeats(session, seed=seed, progress=progress)
+    with whole(progress, "Reading the session") as report:
+        own = part(report, 0, 0.4 if repeat else 1)
+        value = check_session(session, seed=seed, progress=own)
+        if repeat and value.exit_code < 2:
+            study = study_repeats(session, seed=seed, progress=part(report, 0.4, 1))
     return CheckResult.of(value, repeat=repeat, repeats=study)

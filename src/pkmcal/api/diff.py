@@ -8,18 +8,19 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from pkmcal.api.result import Progress, Result, no_progress, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.calibration.archive import keep_earlier
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.files import json_text, output_lock
 from pkmcal.judge.difference import MachineDifference, difference
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.report.difference import outcome_of
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class DiffResult(Result, MachineDifference):
+class DiffResult(FolderResult, MachineDifference):
     """Difference of two machines with its files: ``change``, ``centres``, ``tool``, ``verdict``."""
 
     own_files = page_and_numbers("diff")
@@ -68,6 +69,5 @@ def diff(
         They are not of the same machine.
 
     """
-    (progress or no_progress)("Comparing", 0.1)
-    with threadpool_limits(1, "blas"):
+    with threadpool_limits(1, "blas"), whole(progress, "Comparing"):
         return DiffResult.of(difference(a, b))

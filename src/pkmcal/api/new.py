@@ -70,12 +70,10 @@ class NewResult(Result):
         """Contents of the files by name."""
         return dict(self.texts)
 
-    @classmethod
-    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
+    @staticmethod
+    def check_folder(folder: Path | str) -> None:
         """Raise InputError for a folder that is not empty."""
-        del force
         check_new_folder(folder)
-        return []
 
     def save(self, folder: Path | str, *, force: bool = False) -> None:
         """Write the files into a new or empty folder; InputError for another one."""

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
 from threadpoolctl import threadpool_limits
 
-from pkmcal.api.result import (
-    NUMBERS_DESCRIPTION,
-    PAGE_DESCRIPTION,
-    Progress,
-    Result,
-    no_progress,
-)
+from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, FolderResult
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, part, whole
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE, STATIONS_AROUND_A_MACHINE
@@ -37,7 +32,7 @@ PlanIndex = Literal["tool", "D", "E", "O1"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class PlanResult(Result, MeasurementPlan):
+class PlanResult(FolderResult, MeasurementPlan):
     """Plan with its files: ``joints``, ``names``, ``promised``, ``now``."""
 
     own_files = MappingProxyType(
@@ -141,11 +136,9 @@ def plan(
         The subject or an option does not allow a plan.
 
     """
-    report = progress or no_progress
-    report("Looking at what there is", 0.0)
     folder = None if isinstance(subject, Session | Machine) else session_folder(str(subject))
     region, where = None, None
-    with threadpool_limits(1, "blas"):
+    with threadpool_limits(1, "blas"), whole(progress, "Reading the nominal model") as report:
         if isinstance(subject, Session) or folder is not None:
             _check_options(
                 "a machine", {"--camera": camera, "--board": board, "--tracker": tracker}
@@ -156,11 +149,14 @@ def plan(
                 else load_session(folder or "", measured=False)
             )
             region = session.workspace
+            report("Reading the measurements", 0.02)
+            begin = 0.3
             planned = as_it_stands(
                 session, after, from_nominal=from_drawing, same_place=same_place,
                 anywhere=places is not None, edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
         else:
+            begin = 0.05
             _check_options(
                 "a session", {"--after": after, "--same-place": same_place, "--best-of": best_of}
             )
@@ -168,11 +164,12 @@ def plan(
                 subject, camera, board, bool(places), tracker=tracker, joint_noise=joint_noise,
                 edge=edge_noise, corner=corner_noise, seed=seed,
             )  # fmt: skip
+        choosing = partial(part(report, begin, 1), "Choosing configurations")
         try:
             value = plan_measurements(
                 planned, count=count, index=index, region=region, together=together,
                 free_stations=places, best_of=best_of, seed=seed,
-                progress=lambda share: report("Choosing configurations", 0.1 + 0.85 * share),
+                progress=choosing,
             )  # fmt: skip
         except InputError as error:
             raise error if where is None else error.located(where) from None

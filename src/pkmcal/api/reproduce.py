@@ -9,10 +9,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from pkmcal.api.result import NUMBERS_DESCRIPTION, Progress, Result, no_progress
+from pkmcal.api.result import NUMBERS_DESCRIPTION, FolderResult
 from pkmcal.errors import InputError
 from pkmcal.files import write_folder
 from pkmcal.outcome import Outcome, Verdict
+from pkmcal.outcome.progress import Progress, part, whole
 from pkmcal.papers.reproduction import Options, reproduce_paper
 from pkmcal.ranges import check_number, default
 from pkmcal.wording import count, listed
@@ -26,7 +27,7 @@ def table_and_numbers(paper: str) -> Mapping[str, str]:
 
 
 @dataclass(frozen=True)
-class ReproductionResult(Result):
+class ReproductionResult(FolderResult):
     """Reproductions of papers. outcomes : by the paper's letter."""
 
     outcomes: Mapping[str, Outcome]
@@ -126,16 +127,9 @@ def reproduce(
         raise InputError(
             "there is no such paper", where="papers", found=unknown[0], expected=listed(PAPERS)
         )
-    report = progress or no_progress
     outcomes: dict[str, Outcome] = {}
-    for paper in wanted:
-        first, each = len(outcomes) / len(wanted), 1 / len(wanted)
-        options = Options(
-            runs,
-            seed,
-            long,
-            images,
-            lambda text, share, first=first, each=each: report(text, first + each * share),
-        )
-        outcomes[paper] = reproduce_paper(paper, options)
+    with whole(progress, "Simulating") as report:
+        for number, paper in enumerate(wanted):
+            own = part(report, number / len(wanted), (number + 1) / len(wanted))
+            outcomes[paper] = reproduce_paper(paper, Options(runs, seed, long, images, own))
     return ReproductionResult(outcomes)

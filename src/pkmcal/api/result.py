@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import webbrowser
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from datetime import datetime
 from functools import cached_property
@@ -22,8 +22,6 @@ from pkmcal.outcome import Outcome
 from pkmcal.outcome.finding import Finding
 from pkmcal.terminal import outcome_text
 
-Progress = Callable[[str, float], None]
-"""Callback with a text and the share done, 0 to 1."""
 PAGE_DESCRIPTION = "open it in a browser"
 NUMBERS_DESCRIPTION = "everything, for programs"
 
@@ -33,19 +31,10 @@ def page_and_numbers(stem: str) -> Mapping[str, str]:
     return MappingProxyType({f"{stem}.html": PAGE_DESCRIPTION, f"{stem}.json": NUMBERS_DESCRIPTION})
 
 
-def no_progress(text: str, share: float) -> None:
-    """Progress callback that does nothing."""
-
-
 class Result(ABC):
-    """Result of a function of :mod:`pkmcal`, with the text, the files and the JSON of its command.
-
-    own_files : all files that a result of this kind may write, with their descriptions. kind : the
-    result's and an earlier result's name in the message about a folder with other files.
+    """Result of a function of :mod:`pkmcal`, with the text, the files and the JSON of its
+    command.
     """
-
-    own_files: ClassVar[Mapping[str, str]]
-    kind: ClassVar[tuple[str, str | None]]
 
     @classmethod
     def of(cls, value: Any, **more: Any) -> Self:
@@ -58,9 +47,9 @@ class Result(ABC):
         """Verdict, tables, figures and sections of the page; made when first needed."""
 
     @property
+    @abstractmethod
     def file_list(self) -> Mapping[str, str]:
         """Names of the files that ``save`` writes, with their descriptions."""
-        return self.own_files
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -102,27 +91,13 @@ class Result(ABC):
                 texts[name] = report_page(outcome, made) if page else json_text(outcome.document)
         return texts
 
-    @classmethod
-    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
-        """Names of an earlier result's files in a folder.
-
-        Raises InputError where the folder holds anything else, or cannot be written. Call it before
-        the work whose result goes there. force : the earlier result need not be kept.
-        """
-        del force
-        return check_own_folder(Path(folder), cls.own_files, *cls.kind)
-
+    @abstractmethod
     def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
-        """Write the command's files, all or none; they replace those of an earlier result.
+        """Write the command's files, all or none.
 
-        folder : a new or empty one, or one of an earlier result of this kind. force : replace an
-        earlier calibration or difference too, which is otherwise kept in a dated folder beside it;
-        that folder is returned, None if nothing was kept. Raises InputError if the folder holds
-        anything else, or cannot be written.
+        Raises InputError if the folder holds anything but an earlier result that may be replaced,
+        or cannot be written. force : replace an earlier result that would be kept.
         """
-        over = self.check_folder(folder, force=force)
-        write_folder(Path(folder), self.contents(), over)
-        return None
 
     def show(self) -> Path:
         """Write the files into a temporary folder, open the page in a browser, and return its path.
@@ -156,6 +131,44 @@ class Result(ABC):
         """Line that follows the saved files on a terminal; empty for none."""
         del folder
         return ""
+
+
+class FolderResult(Result, ABC):
+    """Result in a folder of its own, whose files have fixed names.
+
+    own_files : all files that a result of this kind may write, with their descriptions. kind : the
+    result's and an earlier result's name in the message about a folder with other files.
+    """
+
+    own_files: ClassVar[Mapping[str, str]]
+    kind: ClassVar[tuple[str, str | None]]
+
+    @property
+    def file_list(self) -> Mapping[str, str]:
+        """Names of the files that ``save`` writes, with their descriptions."""
+        return self.own_files
+
+    @classmethod
+    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
+        """Names of an earlier result's files in a folder.
+
+        Raises InputError where the folder holds anything else, or cannot be written. Call it before
+        the work whose result goes there. force : the earlier result need not be kept.
+        """
+        del force
+        return check_own_folder(Path(folder), cls.own_files, *cls.kind)
+
+    def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
+        """Write the command's files, all or none; they replace those of an earlier result.
+
+        folder : a new or empty one, or one of an earlier result of this kind. force : replace an
+        earlier calibration or difference too, which is otherwise kept in a dated folder beside it;
+        that folder is returned, None if nothing was kept. Raises InputError if the folder holds
+        anything else, or cannot be written.
+        """
+        over = self.check_folder(folder, force=force)
+        write_folder(Path(folder), self.contents(), over)
+        return None
 
 
 def printed_document(outcome: Outcome) -> dict[str, Any]:

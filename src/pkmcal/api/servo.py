@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from pkmcal.api.result import Progress, Result, no_progress, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.arrays import Array
 from pkmcal.control.laws import law_named
 from pkmcal.control.simulation import LoopSettings
@@ -18,6 +18,7 @@ from pkmcal.control.source import load_plant
 from pkmcal.control.study import HAND_ROTATION, Plan, Study, study_servoing
 from pkmcal.errors import InputError
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.placement.edges import EdgeNoise
 from pkmcal.ranges import check_number, default
 from pkmcal.report.servo import outcome_of
@@ -27,7 +28,7 @@ MOST_SAMPLES = 5000
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class ServoResult(Result, Study):
+class ServoResult(FolderResult, Study):
     """Study of servoing, with its files: ``outcomes``, ``choices``, ``equilibria``."""
 
     own_files = page_and_numbers("servo")
@@ -138,15 +139,18 @@ def servo(
             found=str(loop.samples), expected=f"at most {MOST_SAMPLES}, a rate times a duration",
         )  # fmt: skip
     plan = Plan(loop, runs, seed, hand_position, hand_rotation, start, goal)
-    plant = load_plant(
-        str(machine),
-        session=None if session is None else Path(session),
-        station=station,
-        camera=None if camera is None else Path(camera),
-        legs=None if legs is None else tuple(number - 1 for number in legs),
-        seed=seed,
-    )
-    try:
-        return ServoResult.of(study_servoing(plant, plan, progress or no_progress))
-    except InputError as error:  # located at the camera's file, which determines what is in view
-        raise error if error.where or camera is None else error.located(str(camera)) from None
+    with whole(progress, "Reading the machine") as report:
+        plant = load_plant(
+            str(machine),
+            session=None if session is None else Path(session),
+            station=station,
+            camera=None if camera is None else Path(camera),
+            legs=None if legs is None else tuple(number - 1 for number in legs),
+            seed=seed,
+        )
+        try:
+            return ServoResult.of(study_servoing(plant, plan, report))
+        except (
+            InputError
+        ) as error:  # located at the camera's file, which determines what is in view
+            raise error if error.where or camera is None else error.located(str(camera)) from None

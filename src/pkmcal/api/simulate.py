@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pkmcal.api.result import Progress, Result
+from pkmcal.api.result import Result
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
@@ -19,6 +19,7 @@ from pkmcal.files import closest, resolved, staged_folder
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.outcome import Outcome, Verdict
 from pkmcal.outcome.finding import note
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.placement.default_camera import camera_of_size, default_camera
 from pkmcal.ranges import RANGES, check_number, default
 from pkmcal.session.load import Session, load_session
@@ -67,16 +68,10 @@ class SimulationResult(Session, Result):
         """No list: the files are those of a session."""
         return {}
 
-    @classmethod
-    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
-        """No names: a session is written into a new or empty folder only."""
-        del force
-        check_new_folder(folder)
-        return []
-
     def save(self, folder: Path | str, *, force: bool = False) -> None:
         """Copy the session into a new or empty folder; InputError for another one."""
-        self.check_folder(folder, force=force)
+        del force
+        check_new_folder(folder)
         if resolved(Path(folder)).is_relative_to(resolved(self.folder)):
             raise InputError(
                 "a session is not copied into itself",
@@ -172,17 +167,16 @@ def simulate(
     given |= {"board": fixed, "board_on": place}
     setting = Settings(**given)
     eye = planned.cameras if planned else _camera(camera)
-    truth = simulate_session(
-        folder,
-        machine,
-        eye,
-        _rehearsed(setting, planned) if planned else setting,
-        seed=seed,
-        progress=lambda done, total: (
-            progress(f"Image {done} of {total}", done / total) if progress else None
-        ),
-    )
-    session = load_session(folder)
+    with whole(progress, "Rendering") as report:
+        truth = simulate_session(
+            folder,
+            machine,
+            eye,
+            _rehearsed(setting, planned) if planned else setting,
+            seed=seed,
+            progress=lambda done, total: report(f"Image {done} of {total}", done / total),
+        )
+        session = load_session(folder)
     return SimulationResult.of(session, truth=truth, cylinders_added=machine is not nominal)
 
 

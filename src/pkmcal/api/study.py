@@ -11,8 +11,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, Progress, Result
+from pkmcal.api.result import NUMBERS_DESCRIPTION, PAGE_DESCRIPTION, FolderResult
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.papers.paper_a import study_subject
 from pkmcal.ranges import check_number, default
 from pkmcal.studies.cluster import on_cluster
@@ -27,7 +28,7 @@ RUN_ROWS_DESCRIPTION = "one row a run"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class StudyResult(SweepResult, Result):
+class StudyResult(SweepResult, FolderResult):
     """Study with its files: ``found``, ``gains``."""
 
     own_files = MappingProxyType(
@@ -107,7 +108,7 @@ def study(
     title = " ".join([str(subject), *vary])
     names = [in_words(cell.values) for cell in cells]
     opened = nullcontext() if out is None else Store.opened(Path(out), title, settings, seed)
-    with opened as store:
-        results = run_all(settings, runs, seed, progress, runner, store, names)
+    with opened as store, whole(progress, "Simulating") as report:
+        results = run_all(settings, runs, seed, report, runner, store, names)
     found = tuple(findings_of(cell, result) for cell, result in zip(cells, results, strict=True))
     return StudyResult(studied, varied, tuple(cells), tuple(results), found, runs, seed)

@@ -6,17 +6,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pkmcal.api.result import Progress, Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.judge.validate import Validation, validate_calibration
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import default
 from pkmcal.report.validation import outcome_of
 from pkmcal.session.load import Session
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class ValidationResult(Result, Validation):
+class ValidationResult(FolderResult, Validation):
     """Validation with its files: ``judged``, ``regions``, ``paths``, ``verdict``."""
 
     own_files = page_and_numbers("validation")
@@ -63,7 +64,8 @@ def validate(
         The two do not belong together, or the session has no new data.
 
     """
-    value = validate_calibration(
-        calibration, session, regions=regions, seed=seed, progress=progress
-    )
+    with whole(progress, "Reading the calibration") as report:
+        value = validate_calibration(
+            calibration, session, regions=regions, seed=seed, progress=report
+        )
     return ValidationResult.of(value)

@@ -7,21 +7,22 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pkmcal.api.result import Progress, Result, page_and_numbers
+from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.judge.watch import Watch, watch_machine
 from pkmcal.outcome import Outcome
+from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import default
 from pkmcal.report.watch import outcome_of
 from pkmcal.session.load import Session
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class WatchResult(Result, Watch):
+class WatchResult(FolderResult, Watch):
     """Tests of a calibrated machine, with their files: ``judged``, ``verdict``."""
 
     own_files = page_and_numbers("watch")
-    kind = ("what watch writes", "an earlier look")
+    kind = ("what watch writes", "an earlier test of the machine")
 
     @cached_property
     def outcome(self) -> Outcome:
@@ -66,7 +67,8 @@ def watch(
         The two do not belong together, or the session has no new data.
 
     """
-    value = watch_machine(
-        calibration, session, alpha=alpha, seed=seed, same_place=same_place, progress=progress
-    )
+    with whole(progress, "Reading the calibration") as report:
+        value = watch_machine(
+            calibration, session, alpha=alpha, seed=seed, same_place=same_place, progress=report
+        )
     return WatchResult.of(value)

@@ -32,6 +32,7 @@ from pkmcal.boards.layout import (
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.observe.images import decode
+from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.image_files import image_header
 from pkmcal.wording import listed
 
@@ -69,21 +70,27 @@ NO_SIZE = 9999
 
 
 def detect_boards(
-    paths: Sequence[Path | str], board: Board, options: OtherBoardOptions = OTHER_BOARD_OPTIONS
+    paths: Sequence[Path | str],
+    board: Board,
+    options: OtherBoardOptions = OTHER_BOARD_OPTIONS,
+    progress: Progress = no_progress,
 ) -> tuple[Detection, ...]:
     """Detect the board in images; one detection each, with corners or with a reason.
+
+    progress : called with each image.
 
     Raises `InputError` if the images differ in size, or if some or all of them show another board.
     """
     files = [Path(path) for path in paths]
     size = _common_size(files)
     with ThreadPoolExecutor(THREADS) as pool:
-        detections = list(
-            pool.map(
-                lambda path: _detect_in_file(path, size, board, options.detection, quick=True),
-                files,
-            )
-        )
+        detections: list[Detection] = []
+        for detection in pool.map(
+            lambda path: _detect_in_file(path, size, board, options.detection, quick=True), files
+        ):
+            detections.append(detection)
+            done = len(detections)
+            progress(f"Detecting the board: {done} of {len(files)} images", done / len(files) / 2)
         if not any(detection.success for detection in detections):
             # Check for another board before the slow methods run on all images.
             check_boards(files, detections, board, options=options)
@@ -91,8 +98,10 @@ def detect_boards(
         again = pool.map(
             lambda k: _detect_in_file(files[k], size, board, options.detection, quick=False), missed
         )
-        for k, detection in zip(missed, again, strict=True):
+        for done, (k, detection) in enumerate(zip(missed, again, strict=True), start=1):
             detections[k] = detection
+            text = f"Searching the rest for the board: {done} of {len(missed)} images"
+            progress(text, (1 + done / len(missed)) / 2)
     check_any(detections, board)  # a different board was reported above
     check_boards(files, detections, board, options=options)
     return tuple(detections)

@@ -33,7 +33,6 @@ from pkmcal.calibration.handheld import inconsistent_poses, localize_case, witho
 from pkmcal.calibration.image_rotation import UpsideDown, rotation_finding, upside_down
 from pkmcal.calibration.leg_numbering import numbering_note
 from pkmcal.calibration.localization import (
-    CalibrationProgress,
     boards_of,
     check_observable,
     legs_stations,
@@ -60,7 +59,7 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.methods import AlternativeMethod
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
@@ -76,6 +75,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import Ranked, decide, refuse
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session, load_session
 from pkmcal.solver.kernels import INLIER_WEIGHT
@@ -155,7 +155,7 @@ def calibrate_session(
     seed: int = 0,
     refine_camera: bool = False,
     holdout: int = 0,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
     options: RefinementOptions = REFINEMENT,
     case: Case | None = None,
 ) -> Calibration:
@@ -182,15 +182,18 @@ def calibrate_session(
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
         session = _load(session, refine_camera, clock)
-        located = case or _observe(session, seed, clock)
+        located = case or _observe(session, seed, clock.part(0, 0.25))
 
-        def calibrated(refine: bool) -> Calibration:
-            settled = settle(session, located, refine, seed, clock, options)
-            return _finished(settled, method, seed, holdout, clock)
+        def calibrated(refine: bool, first: float, last: float) -> Calibration:
+            own = clock.part(first, last)
+            settled = settle(session, located, refine, seed, own.part(0, 0.5), options)
+            return _finished(settled, method, seed, holdout, own.part(0.5, 1))
 
         if not refine_camera or refinement_of(session, False).refines_all:
-            return calibrated(refine_camera)
-        return better_refined(partial(calibrated, True), partial(calibrated, False))
+            return calibrated(refine_camera, 0.25, 1)
+        return better_refined(
+            partial(calibrated, True, 0.25, 0.6), partial(calibrated, False, 0.6, 1)
+        )
 
 
 def better_refined(
@@ -238,7 +241,7 @@ def worse_refined(refined: Calibration, held: Calibration) -> Finding | None:
             return None
         return doubtful("camera.refinement_rejects", kept=retained, of=taken, by_files=more)
     by_refined, by_held = refined.estimate.statistics, held.estimate.statistics
-    chance = SESSION_FALSE_ALARM.scale(by_refined.dof) ** 2
+    chance = SESSION_FALSE_ALARM.scale(Search.INTRINSICS, by_refined.dof) ** 2
     if by_refined.chi2_as_stated > chance * by_held.chi2_as_stated:
         return doubtful(
             "camera.refinement_fits_worse",
@@ -259,7 +262,7 @@ def calibrate_measurements(
     measurements: Measurements,
     T_camera_base: Array,
     *,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Calibration:
     """Calibrate the machine of a session from edges that are given, such as simulated ones.
 
@@ -328,10 +331,11 @@ def settle(
     """
     repairs: list[Ranked[UpsideDown]] = []
     while True:
+        now, clock = clock.part(0, 0.8), clock.part(0.8, 1)
         # mistakes in the readings, without which no estimate means anything
         refuse(partial(explain_closure, case.session, case.boards))
         try:
-            turns = _identify(case, refine_camera, clock, options)
+            turns = _identify(case, refine_camera, now.part(0, 0.9), options)
         except ResultError:
             refuse(partial(explain_radii, case, None, refine_camera, seed))
             raise
@@ -346,7 +350,7 @@ def settle(
             repaired = session
             for one in repairs:
                 repaired = one.hypothesis.apply(repaired)
-            case = _observe(repaired, seed, clock)
+            case = _observe(repaired, seed, now.part(0.9, 1))
             continue
         # stations that are not where they were localized
         wrong = by_chance(case.session, turns) or inconsistent_poses(
@@ -356,7 +360,7 @@ def settle(
             break
         case = without_misplaced(case, wrong, turns.measurements.edges, turns.estimate)
     # mistakes that a user has to correct
-    clock.progress("Looking for mistakes that explain the data", 0.86)
+    now.progress("Testing hypotheses about the data", 0.9)
     stated = refit_fixed_noise(case.session.machine, turns.measurements, turns.estimate)
     richer, failed = richer_model(case.session, turns.measurements, stated)
     untested = refuse(
@@ -375,7 +379,7 @@ def _finished(
     """The calibration of a session after all repairs."""
     case, turns, stated, richer, repairs, found = settled
     machine = case.session.machine
-    turns = imputation_variance(case, turns, np.random.default_rng(0), clock.progress)
+    turns = imputation_variance(case, turns, np.random.default_rng(0), clock.part(0, 0.85).progress)
     clock.lap("identify")
     if turns is not settled.turns:
         stated = refit_fixed_noise(machine, turns.measurements, turns.estimate)
@@ -414,9 +418,10 @@ def _observe(session: Session, seed: int, clock: Clock) -> Case:
     images = read_images(session)
     clock.lap("decode")
     if any("board" in station.observe for station in session.stations):
-        clock.progress("Looking for the board", 0.1)
+        clock.progress("Detecting the board", 0.1)
     boards = boards_of(session, images)
-    case = localize_case(session, images, boards, np.random.default_rng(seed), clock.progress)
+    rng, localizing = np.random.default_rng(seed), clock.part(0.3, 1).progress
+    case = localize_case(session, images, boards, rng, localizing)
     clock.lap("observe")
     return case
 
@@ -460,7 +465,7 @@ def _estimated(
     if method != "bundle":
         from pkmcal.identify.methods.estimates import by_method
 
-        clock.progress("Repeating the paper's method", 0.9)
+        clock.progress("Repeating the paper's method", 0.85)
         estimate = by_method(method, nominal, turns.measurements, estimate, seed)
     return _Identified(turns, estimate, richer, out)
 
@@ -478,7 +483,7 @@ def _judge(
 
     repairs : that were made. found : on hypotheses, see :class:`Settled`.
     """
-    clock.progress("Judging", 0.95)
+    clock.progress("Judging", 0.9)
     session, turns = _as_measured(case.session, value.turns), value.turns
     detections: tuple[DetectedViolation, ...] = ()
     errors: tuple[ModelError, ...] = ()
@@ -600,16 +605,20 @@ def _findings(
     return explain(values, estimate, observed_by_boards(observed, measurements), counted, bed)
 
 
+@dataclass(frozen=True)
 class Clock:
-    """Seconds by step, each of which may have several laps; progress : called with each step."""
+    """Progress of a step, and the seconds by step, each of which may have several laps."""
 
-    def __init__(self, progress: CalibrationProgress | None) -> None:
-        self.progress: CalibrationProgress = progress or (lambda _text, _share: None)
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
+    progress: Progress = no_progress
+    laps: dict[str, float] = field(default_factory=dict)
+    _last: list[float] = field(default_factory=lambda: [time.perf_counter()])
 
     def lap(self, name: str) -> None:
         """Count the time since the last lap to a step."""
         now = time.perf_counter()
-        self.laps[name] = self.laps.get(name, 0.0) + now - self._last
-        self._last = now
+        self.laps[name] = self.laps.get(name, 0.0) + now - self._last[0]
+        self._last[0] = now
+
+    def part(self, first: float, last: float) -> Clock:
+        """The clock of a part, from share to share; see :func:`pkmcal.outcome.progress.part`."""
+        return replace(self, progress=part(self.progress, first, last))

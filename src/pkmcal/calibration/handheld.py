@@ -26,7 +26,7 @@ import numpy as np
 from pkmcal.arrays import THREADS, Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.case import Case, PriorScene
-from pkmcal.calibration.localization import CalibrationProgress, LegLocalization, locate_stations
+from pkmcal.calibration.localization import LegLocalization, locate_stations
 from pkmcal.calibration.pose_scoring import ScoredPoses, register_images, rescore_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import angle_between, inverse
@@ -42,6 +42,7 @@ from pkmcal.observe.pose_candidates import SAME_POSE_TURN, same_pose
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera
 from pkmcal.outcome.finding import Finding, note
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, listed
@@ -95,7 +96,7 @@ def localize_case(
     images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Case:
     """Case with the poses of all stations, by :func:`localize`.
 
@@ -113,7 +114,7 @@ def localize(
     images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Localization:
     """Poses of all stations; hand-held images that are not localized are rejected with a reason.
 
@@ -122,7 +123,8 @@ def localize(
     """
     # stations on tripods first; if they fail, hand-held images are not searched
     fixed = [p for p in images if not session.stations[p.station].handheld]
-    search = locate_stations(session, fixed, boards, rng, progress)
+    by_hand = 1 - len(fixed) / max(len(images), 1)
+    search = locate_stations(session, fixed, boards, rng, part(progress, 0, 1 - by_hand))
     places: dict[int, PoseHypotheses] = {}
     if search.error is not None:
         return Localization(search.leg_localization, places, search.error)
@@ -130,7 +132,9 @@ def localize(
     # hand-held images, and the reasons of those without a pose or with a contradictory one
     lost: dict[int, str] = {}
     if len(fixed) < len(images):
-        places, scene = search_by_hand(session, images, boards, scene, progress)
+        places, scene = search_by_hand(
+            session, images, boards, scene, part(progress, 1 - by_hand, 1)
+        )
         nowhere = {k for k in places if np.isnan(scene.T_camera_base[k]).any()}
         sure = _sure(places, len(places))
         lost = {k: EDGES_DISAGREE_REASON if k in sure else why_lost(places[k]) for k in nowhere}
@@ -154,7 +158,7 @@ def search_by_hand(
     images: list[StationImages],
     boards: Boards,
     scene: PriorScene,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> tuple[dict[int, PoseHypotheses], PriorScene]:
     """Pose hypotheses of each hand-held image, by station number, and the scene with accepted
     poses.
@@ -176,10 +180,6 @@ def search_by_hand(
     def hypotheses() -> dict[int, PoseHypotheses]:
         return {k: answer.places for k, answer in answers.items() if answer.scores is not None}
 
-    def step(text: str, share: float) -> None:
-        if progress is not None:
-            progress(text, share)
-
     def rescore(some: Sequence[int]) -> None:
         search = partial(_search, session, room, so_far)
         now = pool.map(search, [at[k] for k in some], [answers[k] for k in some])
@@ -193,24 +193,29 @@ def search_by_hand(
         alone = pool.map(partial(_image_hypotheses, session, scene), [at[k] for k in by_hand])
         for k, one in zip(by_hand, alone, strict=True):
             answers[k] = _CachedHypotheses(one, one)
-            step(f"Placing images by hand: {len(answers)} of {len(by_hand)}", 0.2)
+            done = len(answers)
+            progress(
+                f"Localizing images by hand: {done} of {len(by_hand)}", 0.4 * done / len(by_hand)
+            )
         # score the less ambiguous half, estimate the machine, then score the others with it
         clearer = sorted(by_hand, key=lambda k: answers[k].hypotheses.rival_probability)
         half = (len(clearer) + 1) // 2
-        step(f"Asking the {half} clearest of {len(by_hand)} images", 0.25)
+        progress(f"Scoring the {half} least ambiguous of {len(by_hand)} images", 0.4)
         rescore(clearer[:half])
         so_far = _with_sure(session, at, room, so_far, believed(), boards)
-        step(f"Asking the others, with {len(so_far.placed)} images placed", 0.25)
+        progress(f"Scoring the others, with {len(so_far.placed)} images localized", 0.55)
         rescore(clearer[half:])
         # join the images of a board, and repeat until no image is added
         for k, one in _on_board(hypotheses(), boards).items():
             answers[k] = replace(answers[k], places=one)
         before, so_far = drawn, _with_sure(session, at, room, so_far, believed(), boards)
+        rest = part(progress, 0.6, 1)
         while so_far.scene is not before.scene:
             before, T = so_far, believed()
             unsure = [k for k in by_hand if np.isnan(T[k]).any() or k in so_far.bare]
             placed = len(by_hand) - len(unsure)
-            step(f"Asking again, with {placed} of {len(by_hand)} images placed", 0.3)
+            rest = part(rest, 0.3, 1)
+            rest(f"Scoring again, with {placed} of {len(by_hand)} images localized", 0)
             rescore(unsure)
             so_far = _with_sure(session, at, room, so_far, believed(), boards)
     out = believed()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import log
@@ -27,14 +27,13 @@ from pkmcal.observe.images import CACHED_IMAGE_BYTES, Pictures, fitting
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.station_localization import LocalizedPose, find_station
 from pkmcal.outcome.hypotheses import EvidenceLevel, decide, log_likelihood, posterior
+from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, Station
 from pkmcal.session.poses import check_lengths
 from pkmcal.session.readings import frozen
 from pkmcal.wording import listed
 
-CalibrationProgress = Callable[[str, float], None]
-"""Called with a sentence about the present step and the share done, 0 to 1."""
 ALLOWED_LEG_MISS = 2.0
 """Prior sigmas of a centre by which legs may miss the platform at the nearest nominal pose."""
 
@@ -369,7 +368,7 @@ def localize_stations(
     images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, as of :func:`locate_stations`.
 
@@ -386,7 +385,7 @@ def locate_stations(
     images: list[StationImages],
     boards: Boards,
     rng: np.random.Generator,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> StationSearch:
     """Poses of all stations, each by the first source that determines it: the session and boards,
     localization by the legs, measured poses. Nothing is raised.
@@ -403,11 +402,10 @@ def locate_stations(
         return StationSearch(None, nowhere, error)
     if images:
         rngs = rng.spawn(len(images) + 1)
-        progress = progress or (lambda _text, _share: None)
         count = sum(len(p.images) for p in images)
-        progress(f"Localizing the stations by {count} images", 0.2)
+        progress(f"Localizing the stations by {count} images", 0.0)
         value = localize_by_legs(session, images, poses, rngs[1:], boards, start_poses)
-        progress("Testing hypotheses about the images", 0.3)
+        progress("Testing hypotheses about the images", 0.8)
         mixed_up = mistake_in(session, images, value, rngs[0])
         if mixed_up is not None:
             return StationSearch(value, start_poses, mixed_up)

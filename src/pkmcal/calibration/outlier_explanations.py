@@ -21,7 +21,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.pose_hypotheses import HOPELESS_POSE_SCALE
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.measurements import Measurements
 from pkmcal.measurements.effects import BOARD_SIZE
 from pkmcal.mechanisms import Machine
@@ -105,7 +105,7 @@ def outlier_explanations(
     if usual > HOPELESS_POSE_SCALE**2:
         return  # no pose fits, so there are no outliers
     measured = measured._replace(noise=usual * measured.noise)
-    least = SESSION_FALSE_ALARM.of_test(len(which))
+    least = SESSION_FALSE_ALARM.of_test(Search.OUTLIERS, len(which))
     rejected = estimate.pose_weights[which] < INLIER_WEIGHT
     odd = np.unique(measured.configuration[rejected & (_chance(m, squares / usual) < least)])
     named: set[int] = set()

@@ -22,7 +22,6 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import CameraRefinement, measurements_of
 from pkmcal.calibration.camera_responses import ResponseComparison, responses_by_edges
 from pkmcal.calibration.case import Case, PriorScene
-from pkmcal.calibration.localization import CalibrationProgress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.assembly import state_of
 from pkmcal.identify.bundle import bundle
@@ -54,6 +53,7 @@ from pkmcal.observe.quality import quality
 from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.silhouettes import silhouette_edges
 from pkmcal.outcome.finding import Finding, note, wrong
+from pkmcal.outcome.progress import Progress, part
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.ranks import nonzero
@@ -149,7 +149,7 @@ class RefinementResult(NamedTuple):
 def refine_alternating(
     case: Case,
     cameras: CameraRefinement,
-    progress: CalibrationProgress,
+    progress: Progress,
     lap: Callable[[str], None],
     options: RefinementOptions = REFINEMENT,
 ) -> RefinementResult:
@@ -159,16 +159,16 @@ def refine_alternating(
     """
     session, images, boards, _ = case
     total, machine = sum(len(p.images) for p in images), session.machine
-    estimate = _first_estimate(case, total, progress, lap, options)
+    estimate = _first_estimate(case, total, part(progress, 0, 0.2), lap, options)
     blur: BlurByStation = {}
     passes: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
     responses = ResponseComparison()
     scatter, start = case.scene.scatter, estimate.state
-    change = 0.0
+    change, rest = 0.0, part(progress, 0.2, 1)
     for turn in range(options.most_passes):
-        share = 0.45 + 0.35 * min(turn / options.passes, 0.9)
-        done = _counted(progress, "Measuring edges", total, share)
+        now, rest = part(rest, 0, 0.5), part(rest, 0.5, 1)
+        done = _counted(part(now, 0, 0.3), "Measuring edges", total)
         cameras = cameras.updated(estimate)
         images = [replace(p, camera=cameras.at_station(p.station)) for p in images]
         passes, images, blur = _checked_pass(
@@ -176,7 +176,7 @@ def refine_alternating(
         )
         measurements = measurements_of(session, boards, _edges(passes, options), cameras)
         lap("observe")
-        progress("Identifying", share + 0.05)
+        now("Identifying", 0.3)
         before = estimate
         start, shifted = (
             _without_camera_changes(estimate.state),
@@ -188,7 +188,7 @@ def refine_alternating(
         scatter *= _scatter_of(measurements.edges.coarse, estimate)
         lap("identify")
         if turn == 0:
-            progress("Comparing the responses of images", share + 0.1)
+            now("Comparing the responses of images", 0.7)
             responses = _responses(case, images, measurements, before, estimate, cameras, blur, lap)
             if results := responses.by_entry:
                 images = [
@@ -252,7 +252,7 @@ def _responses(
 
 
 def imputation_variance(
-    case: Case, turns: RefinementResult, rng: np.random.Generator, progress: CalibrationProgress
+    case: Case, turns: RefinementResult, rng: np.random.Generator, progress: Progress
 ) -> RefinementResult:
     """Add the variance due to the choice of edges to the covariance, by multiple imputation.
 
@@ -272,7 +272,8 @@ def imputation_variance(
     offsets: list[Array] = []
     failures: list[str] = []
     for number, drawn in enumerate(_as_likely(session, estimate, options.imputations, rng)):
-        progress(f"Looking by a machine as likely: {number + 1} of {options.imputations}", 0.87)
+        text = f"Measuring edges from a drawn machine: {number + 1} of {options.imputations}"
+        progress(text, number / options.imputations)
         cameras = turns.cameras.updated(drawn)
         images = [replace(p, camera=cameras.at_station(p.station)) for p in turns.images]
         try:
@@ -436,16 +437,15 @@ def _binned(
     return out if changed else []
 
 
-def _counted(
-    progress: CalibrationProgress, text: str, total: int, share: float
-) -> legs.ImageBatchesInUse:
+def _counted(progress: Progress, text: str, total: int) -> legs.ImageBatchesInUse:
     """Callback that reports the number of measured images out of the total."""
     lock, done_count = Lock(), [0]
-    progress(text, share)
+    progress(text, 0.0)
 
     def done(more: int) -> None:
         with lock:  # stations are measured in parallel
             done_count[0] += more
+            share = min(done_count[0] / max(total, 1), 1.0)  # larger images are measured twice
             progress(f"{text}: {done_count[0]} of {total} images", share)
 
     return done
@@ -478,21 +478,21 @@ def identify_poses(
     boards: Boards,
     T_camera_base: Array,
     cameras: CameraRefinement,
-    progress: CalibrationProgress,
+    progress: Progress,
     options: RefinementOptions = REFINEMENT,
 ) -> RefinementResult:
     """Identification by boards, trackers and links alone.
 
     Their measurements do not depend on the estimate, except through refined cameras.
     """
-    progress("Identifying", 0.6)
+    progress("Identifying", 0.0)
     machine = session.machine
     measurements = measurements_of(session, boards, None, cameras)
     start = start_state(machine, measurements, T_camera_base, session.forward)
     start = _feasible_start(session, measurements, start)
     estimate = bundle(machine, measurements, start)
     for turn in range(1, options.passes if cameras.active else 1):
-        progress("Identifying with the cameras", 0.6 + 0.3 * turn / options.passes)
+        progress("Identifying with the cameras", turn / options.passes)
         cameras = cameras.updated(estimate)
         measurements = measurements_of(session, boards, None, cameras)
         estimate = bundle(machine, measurements, _without_camera_changes(estimate.state))
@@ -530,7 +530,7 @@ def _feasible_start(session: Session, measurements: Measurements, start: State) 
 def _first_estimate(
     case: Case,
     total: int,
-    progress: CalibrationProgress,
+    progress: Progress,
     lap: Callable[[str], None],
     options: RefinementOptions,
 ) -> Estimate:
@@ -553,10 +553,10 @@ def _first_estimate(
         return bundle(session.machine, measurements, begin(measurements))
     start: State | None = None
     for text, reach, share in (
-        ("Finding the legs", legs.LEG_SEARCH_OPTIONS.reach, 0.35),
-        ("Finding the legs again", legs.LEG_SEARCH_OPTIONS.repeated_reach, 0.4),
+        ("Finding the legs", legs.LEG_SEARCH_OPTIONS.reach, 0.0),
+        ("Finding the legs again", legs.LEG_SEARCH_OPTIONS.repeated_reach, 0.5),
     ):
-        done = _counted(progress, text, total, share)
+        done = _counted(part(progress, share, share + 0.5), text, total)
         search = partial(_whole_legs, scene=scene, reach=reach, done=done)
         passes = _search_pass(images, search)
         measurements = measurements_of(session, boards, _edges(passes, options))

@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm, Search
 from pkmcal.identify.line_shading import LINE_SHADING
 from pkmcal.identify.score import Score
 from pkmcal.measurements import Column, Measurements
@@ -78,7 +78,9 @@ def outlines(
         scale = float(np.hypot(own, edge * np.median(size[mine])))
         z = float(abs(value) / np.hypot(scale, table.tolerance[radius]))
         chance = float(2 * ndtr(-z))
-        score = Score(z**2, 1, chance, float(false_alarm.adjusted(chance, 2 * len(tubes))))
+        score = Score(
+            z**2, 1, chance, float(false_alarm.adjusted(Search.OUTLINES, chance, 2 * len(tubes)))
+        )
         # as told: lines of one tube can be as unlike as its light and what covers it
         spread = OF_MEDIAN * OF_MIDDLE * np.median(np.abs(each - value)) / np.sqrt(len(mine))
         results.append((score, mine, value, float(max(scale, spread))))
@@ -98,7 +100,7 @@ def outlines(
         np.isin(np.arange(len(keys)), outlined), 1.0, 2 * stdtr(LINE_SHADING.freedom, -z)
     )
     for k in np.argsort(chance, kind="stable").tolist():
-        adjusted = float(false_alarm.adjusted(chance[k], 2 * len(keys)))
+        adjusted = float(false_alarm.adjusted(Search.OUTLINES, chance[k], 2 * len(keys)))
         if adjusted > false_alarm.level:
             break
         score = Score(float(z[k] ** 2), 1, float(chance[k]), adjusted)

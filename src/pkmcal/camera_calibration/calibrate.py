@@ -41,6 +41,7 @@ from pkmcal.files import closest
 from pkmcal.geometry.rigid import dot
 from pkmcal.levels import MAJORITY
 from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import listed
 
@@ -189,10 +190,13 @@ def calibrate_images(
     paths: Sequence[Path | str],
     board: Board,
     model: str = "auto",
+    progress: Progress = no_progress,
 ) -> CameraCalibration:
     """Detect the board in images of one size and calibrate their camera."""
     _check_model_name(model)
-    return calibrate_camera(detect_boards(paths, board), board, model)
+    detections = detect_boards(paths, board, progress=part(progress, 0, 0.6))
+    progress("Calibrating the camera", 0.6)
+    return calibrate_camera(detections, board, model)
 
 
 def calibrate_camera(

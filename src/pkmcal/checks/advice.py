@@ -28,15 +28,15 @@ INFORMATION_LOST_SHARE = 1 - 1 / RELEVANT_FACTOR**2
 POOR_LEG = 0.5
 """Information of a leg, relative to the mean of all legs, below which the leg is named."""
 EDGE_SHARES_LEGEND = (
-    "Shares of the edges' information about the machine, by leg and station.",
-    "Variance: of the platform's position, what comes from the leg's edges: where",
-    "it is large, a better view of that leg gains most.",
+    "Shares of the edges' information about the machine, by leg and station. Variance: of the"
+    " platform's position, what comes from the leg's edges: where it is large, a better view of"
+    " that leg gains most."
 )
 ONE_LEGEND = (
-    "Seen: of its edges, what nothing hides. Found: of these, measured, agreeing",
-    "with the others. Sigma: of an edge, across. Share: of the edges' information",
-    "about the machine. Variance: of the platform's position, what comes from its",
-    "edges: where it is large, a better view of that leg gains most.",
+    "Seen: of its edges, what nothing hides. Found: of these, measured, agreeing with the others."
+    " Sigma: of an edge, across. Share: of the edges' information about the machine. Variance: of"
+    " the platform's position, what comes from its edges: where it is large, a better view of that"
+    " leg gains most."
 )
 
 
@@ -221,7 +221,7 @@ def forecast_part(forecast: Forecast) -> Part:
             Row(str(leg.leg), _cells(leg), mark=Level.NOTE if leg.leg in poor else "good")
             for leg in forecast.legs
         )
-        tables = (Table("", ("Leg", *columns), rows, " ".join(ONE_LEGEND), legend=ONE_LEGEND),)
+        tables = (Table("", ("Leg", *columns), rows, ONE_LEGEND, legend=ONE_LEGEND),)
     else:
         rows = tuple(
             Row(
@@ -242,7 +242,7 @@ def forecast_part(forecast: Forecast) -> Part:
         )
         head = ("Leg", *stations, "Together", "Variance")
         shares = Table(
-            "", head, (*rows, all_), " ".join(EDGE_SHARES_LEGEND), legend=EDGE_SHARES_LEGEND,
+            "", head, (*rows, all_), EDGE_SHARES_LEGEND, legend=EDGE_SHARES_LEGEND,
             shaded=tuple(range(1, 1 + len(stations))),
         )  # fmt: skip
         tables = (shares, details)

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.stations import board_of, station_board
 from pkmcal.boards.views import Boards, StationBoard
-from pkmcal.calibration.calibrate import CalibrationProgress, Clock, Settled, settle
+from pkmcal.calibration.calibrate import Clock, Settled, settle
 from pkmcal.calibration.camera_refinement import measurements_of
 from pkmcal.calibration.case import Case
 from pkmcal.calibration.discrepancy_basis import discrepancy_findings, explains_heights
@@ -55,6 +55,7 @@ from pkmcal.observe.pose_candidates import SAME_POSE_TURN
 from pkmcal.observe.quality import Quality, quality, unlocalized_quality
 from pkmcal.observe.station_localization import LocalizedPose
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, of_error
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.session.image_files import label_of
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.starter import untouched_files
@@ -65,7 +66,7 @@ BROKEN_IMAGES_NAMED = 10
 
 
 def check_session(
-    folder: Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
+    folder: Path | str, *, seed: int = 0, progress: Progress = no_progress
 ) -> SessionCheck:
     """Check a session; faults are returned as findings, never raised.
 
@@ -73,10 +74,10 @@ def check_session(
     """
     # as in `calibrate`: threads inside the linear algebra would hinder each other
     with threadpool_limits(1, "blas"):
-        return _check(Path(folder), seed, progress or (lambda _text, _share: None))
+        return _check(Path(folder), seed, progress)
 
 
-def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionCheck:
+def _check(folder: Path, seed: int, progress: Progress) -> SessionCheck:
     """Steps of :func:`check_session`."""
     progress("Reading the session", 0.0)
     findings = [*untouched_files(folder)]
@@ -85,12 +86,12 @@ def _check(folder: Path, seed: int, progress: CalibrationProgress) -> SessionChe
     except PkmcalError as error:
         return SessionCheck(str(folder), (of_error(error), *findings))
     findings += [replace(one, level=Level.NOTE) for one in session.findings] + _workspace(session)
-    progress("Reading images", 0.1)
+    progress("Reading images", 0.05)
     images, broken = _decode_images(session)
-    progress("Localizing the stations", 0.4)
+    progress("Localizing the stations", 0.1)
     motion = _kinematics(session, np.random.default_rng(seed))
     # Images, readings, links and numbering of the legs.
-    observed = _check_images(session, images, motion.poses, seed, progress)
+    observed = _check_images(session, images, motion.poses, seed, part(progress, 0.2, 0.8))
     stations, joints = observed.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *observed.findings, *joint_findings(session, joints)]
     findings += link_findings(session, motion.poses)
@@ -233,7 +234,7 @@ def _check_images(
     images: list[StationImages | None],
     poses: Array | None,
     seed: int,
-    progress: CalibrationProgress,
+    progress: Progress,
 ) -> _ImageChecks:
     """Checks of the images of every station: boards, localization, and the start of a
     calibration.
@@ -259,7 +260,7 @@ def _check_images(
         whole,
         boards.boards,
         np.random.default_rng(seed),
-        lambda text, share: progress(text, 0.4 + 0.4 * share),
+        part(progress, 0, 0.3),
     )
     settled: Settled | PkmcalError | None = None
     if isinstance(located.result, PkmcalError):
@@ -332,12 +333,11 @@ def _searched(
 
 
 def _calibration_start(
-    session: Session, case: Case, seed: int, progress: CalibrationProgress
+    session: Session, case: Case, seed: int, progress: Progress
 ) -> Settled | PkmcalError:
     """Start of a calibration as `calibrate` computes it, or the error with which it would end."""
-    clock = Clock(lambda text, share: progress(text, 0.4 + 0.4 * share))
     try:
-        return settle(session, case, False, seed, clock)
+        return settle(session, case, False, seed, Clock(part(progress, 0.3, 1)))
     except PkmcalError as error:
         return error
 

@@ -30,14 +30,14 @@ BLUR_STILL_MEASURED = 1.7
 POOR_CORNERS = 0.5
 """Residual of corners (px rms) beyond that of any sharp image of a flat board."""
 STATION_LEGEND = (
-    "By chance: probability of other readings fitting as well (of an image by",
-    "hand, another place); good below 0.001, or 0.01 near a pose or by hand.",
-    "Moved: from the pose by hand to the one found. Legs: found in an image.",
-    "White, black: of the legs' pixels. Blur: of the sharpest edges.",
+    "By chance: probability of other readings fitting as well (of an image by hand, another place);"
+    " good below 0.001, or 0.01 near a pose or by hand. Moved: from the pose by hand to the one"
+    " found. Legs: found in an image. White, black: of the legs' pixels. Blur: of the sharpest"
+    " edges."
 )
 BOARD_LEGEND = (
-    "Seen: images that show it. Off: corners from their predicted places.",
-    "Wander: of the board on the base between images; a still one stays below 0.1 px.",
+    "Seen: images that show it. Off: corners from their predicted places. Wander: of the board on"
+    " the base between images; a still one stays below 0.1 px."
 )
 KINEMATICS_SENTENCE = (
     "The nominal machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
@@ -166,7 +166,7 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         parts = (
             Part(
                 "session",
-                "What was looked at",
+                "What was checked",
                 terminal_text=(text,) if text else (),
                 tables=tuple(table for table in tables if table.rows),
             ),
@@ -212,7 +212,7 @@ def _stations_table(check: SessionCheck) -> Table:
         )
         rows.append(Row(station.name, cells, mark=mark))
     columns = ("Station", "Photos", "By chance", "Moved", "Legs", "White", "Black", "Blur")
-    return Table("", columns, tuple(rows), " ".join(STATION_LEGEND), legend=STATION_LEGEND)
+    return Table("", columns, tuple(rows), STATION_LEGEND, legend=STATION_LEGEND)
 
 
 def _boards_table(check: SessionCheck) -> Table:

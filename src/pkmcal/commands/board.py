@@ -33,5 +33,7 @@ def board(
     """Write a board as a PDF page to print in true size."""
     import pkmcal
 
-    result = pkmcal.board(file, paper=paper)
-    return finish(result, out or result.file.with_suffix(".pdf"), as_json=as_json)
+    with console.progress(as_json) as progress:
+        result = pkmcal.board(file, paper=paper)
+        path = out or result.file.with_suffix(".pdf")
+        return finish(result, path, progress, as_json=as_json)

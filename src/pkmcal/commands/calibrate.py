@@ -59,15 +59,16 @@ def calibrate(
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
     import pkmcal
-    from pkmcal.api.calibrate import CalibrationResult
 
-    loaded = pkmcal.load_session(session, model)
-    folder = console.output_folder(
-        out, loaded.folder / "calibration", CalibrationResult, force=force
-    )
     with console.progress(quiet or as_json) as progress:
+        from pkmcal.api.calibrate import CalibrationResult
+
+        loaded = pkmcal.load_session(session, model)
+        folder = console.output_folder(
+            out, loaded.folder / "calibration", CalibrationResult, force=force
+        )
         result = pkmcal.calibrate(
             loaded, method=method, seed=seed, refine_camera=refine_camera, holdout=holdout,
-            progress=progress,
+            progress=progress.work,
         )  # fmt: skip
-    return finish(result, folder, force=force, as_json=as_json, quiet=quiet)
+        return finish(result, folder, progress, force=force, as_json=as_json, quiet=quiet)

@@ -54,14 +54,15 @@ def camera(
 ) -> int:
     """Calibrate a camera from images of a board."""
     import pkmcal
-    from pkmcal.api.camera import CameraResult
 
-    folder = console.output_folder(
-        None if out == CAMERA_FOLDER else out, CAMERA_FOLDER, CameraResult
-    )
     with console.progress(as_json) as progress:
+        from pkmcal.api.camera import CameraResult
+
+        folder = console.output_folder(
+            None if out == CAMERA_FOLDER else out, CAMERA_FOLDER, CameraResult
+        )
         result = pkmcal.camera(
             images, board=board, model=model, to=[form.value for form in to or ()],
-            progress=progress,
+            progress=progress.work,
         )  # fmt: skip
-    return finish(result, folder, as_json=as_json)
+        return finish(result, folder, progress, as_json=as_json)

@@ -39,28 +39,29 @@ def check(
 ) -> int:
     """Find what is wrong with a session before any work is spent."""
     import pkmcal
-    from pkmcal.api.check import CheckResult
     from pkmcal.errors import InputError
-    from pkmcal.files import check_writable, resolved
 
-    if out is not None:
-        CheckResult.check_folder(out)
-    if pictures is not None:
-        check_writable(pictures)
-        if out is not None and resolved(pictures) == resolved(out):
-            raise InputError(
-                "the page and the pictures need folders of their own",
-                where="--pictures",
-                found=str(pictures),
-                next_step=f"Name another folder, such as {out}-pictures",
-            )
     with console.progress(as_json) as progress:
-        result = pkmcal.check(session, repeat=repeat, seed=seed, progress=progress)
+        from pkmcal.api.check import CheckResult
+        from pkmcal.files import check_writable, resolved
+
+        if out is not None:
+            CheckResult.check_folder(out)
+        if pictures is not None:
+            check_writable(pictures)
+            if out is not None and resolved(pictures) == resolved(out):
+                raise InputError(
+                    "the page and the pictures need folders of their own",
+                    where="--pictures",
+                    found=str(pictures),
+                    next_step=f"Name another folder, such as {out}-pictures",
+                )
+        result = pkmcal.check(session, repeat=repeat, seed=seed, progress=progress.work)
         more: dict[str, str] = {}
         if pictures is not None:
-            progress("Drawing", 0.95)
+            progress.report("Drawing", console.WORK_SHARE)
             if result.save_pictures(pictures):
                 more[str(pictures)] = OVERLAYS_DESCRIPTION
-    if out is None:
-        return answer(result, None, more=more, as_json=as_json)
-    return finish(result, out, more=more, as_json=as_json)
+        if out is not None:
+            return finish(result, out, progress, more=more, as_json=as_json)
+    return answer(result, None, more=more, as_json=as_json)

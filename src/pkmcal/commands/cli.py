@@ -42,6 +42,8 @@ that live until it ends.
 _UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
 """Base class of typer's errors about options, which has no public name."""
 
+CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
+
 COMMANDS_IN_ORDER = (
     "demo",
     "new",
@@ -113,7 +115,9 @@ def _typer_command(name: str) -> Any:
     epilog = f"Examples:\n{examples}" if examples else ""
     if further := getattr(module, "FURTHER_HELP", ""):
         epilog += f"\n{further}"
-    alone.command(name, cls=_Command, epilog=epilog)(getattr(module, name))
+    alone.command(name, cls=_Command, epilog=epilog, context_settings=CONTEXT_SETTINGS)(
+        getattr(module, name)
+    )
     return typer.main.get_command(alone)
 
 
@@ -122,7 +126,7 @@ app = typer.Typer(
     cls=_Commands,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT_SETTINGS,
     epilog="Begin with: pkmcal demo. With your own machine: pkmcal new my-machine.",
 )
 
@@ -163,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with withstanding(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"PIL\.")  # such as of EXIF that is cut short
         try:
-            code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
+            code = _run(words or ["--help"])
             sys.stdout.flush()
         except KeyboardInterrupt:
             code = INTERRUPTED_EXIT
@@ -172,6 +176,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if code == INTERRUPTED_EXIT:  # typer turns Ctrl-C into this code
             return _report_error(KeyboardInterrupt(), words)
         return code if isinstance(code, int) else 0
+
+
+def _run(words: list[str]) -> Any:
+    """Exit code of the program's arguments, None for 0.
+
+    A command runs without the group of all, whose own options would load another tenth of a second.
+    """
+    if words[0] not in COMMANDS_IN_ORDER:
+        return app(words, prog_name="pkmcal", standalone_mode=False)
+    command = _typer_command(words[0])
+    return command(words[1:], prog_name=f"pkmcal {words[0]}", standalone_mode=False)
 
 
 def _report_error(error: BaseException, words: list[str]) -> int:

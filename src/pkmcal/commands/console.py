@@ -9,19 +9,23 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pkmcal.errors import InputError, legible
+from pkmcal.outcome.progress import Progress, no_progress, part, whole
 from pkmcal.ranges import RANGES, check_number
 from pkmcal.terminal import err, print_points
 
 if TYPE_CHECKING:
-    from pkmcal.api.result import Progress, Result
+    from rich.console import Console
+
+    from pkmcal.api.result import FolderResult
 
 OUTPUT_GROUP = "Output"
 """Heading of the options of outputs in the help."""
@@ -69,6 +73,8 @@ def quantity(text: str, unit: str, where: str) -> float:
 
     unit : that of a number without one, m, rad, "m or rad" or deg. where : the option.
     """
+    with suppress(ValueError):
+        return float(text)  # such as every default: units are loaded for others alone
     from pkmcal.files.quantities import read_quantity
 
     try:
@@ -109,6 +115,10 @@ memory does not suffice.
 """
 PROGRESS_LINE_INTERVAL = 10.0
 """Seconds between two lines of progress without a terminal."""
+WORK_SHARE = 0.95
+"""Share of a command's progress before its files are written."""
+SMALLEST_SHARE_FOR_ESTIMATE, SHORTEST_TIME_FOR_ESTIMATE = 0.05, 2.0
+"""Share and seconds from which on the remaining time is estimated."""
 
 
 def folder(given: str) -> Any:
@@ -132,7 +142,7 @@ def parsed_size(text: str) -> tuple[int, int]:
 
 
 def output_folder(
-    out: Path | None, usual: Path, kind: type[Result], *, force: bool = False
+    out: Path | None, usual: Path, kind: type[FolderResult], *, force: bool = False
 ) -> Path:
     """Folder of a result, ``usual`` if none is given, checked before the work.
 
@@ -162,32 +172,64 @@ def print_json(data: Mapping[str, Any]) -> None:
     sys.stdout.write(json_text(data))
 
 
-@contextmanager
-def progress(quiet: bool = False) -> Generator[Progress]:
-    """Context with a progress callback, which draws a bar on stderr.
+@dataclass(frozen=True)
+class CommandProgress:
+    """Progress of a whole command: its work, and the writing of its files.
 
-    If stderr is not a terminal but a log or a pipe, it prints a plain line every
-    PROGRESS_LINE_INTERVAL seconds.
+    report : callback for the whole command. close : ends the progress, before anything is printed.
     """
-    if quiet:
-        yield lambda _text, _share: None
-        return
-    console = err()
-    if not console.is_terminal:
-        with _progress_lines() as report:
-            yield report
-        return
+
+    report: Progress
+    close: Callable[[], None]
+
+    @property
+    def work(self) -> Progress:
+        """Callback for the work before the files are written."""
+        return part(self.report, 0.0, WORK_SHARE)
+
+    def writing(self) -> None:
+        """Report that the files are written."""
+        self.report("Writing the report", WORK_SHARE)
+
+
+@contextmanager
+def progress(quiet: bool = False) -> Generator[CommandProgress]:
+    """Context of a command with its progress, drawn as a bar on stderr.
+
+    A command opens it before it imports what it needs, which takes a second. If stderr is not a
+    terminal but a log or a pipe, a plain line is printed every PROGRESS_LINE_INTERVAL seconds.
+    """
+    with ExitStack() as stack:
+        draw = no_progress
+        if not quiet:
+            console = err()
+            lines = _progress_bar(console) if console.is_terminal else _progress_lines()
+            draw = stack.enter_context(lines)
+        report = stack.enter_context(whole(draw, "Starting"))
+        yield CommandProgress(report, stack.close)
+
+
+@contextmanager
+def _progress_bar(console: Console) -> Generator[Progress]:
+    """Context with a progress callback that draws a bar, the time and the remaining time."""
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
+    estimate = RemainingTime()
     columns = (
         BarColumn(bar_width=24),
         TimeElapsedColumn(),
+        TextColumn("{task.fields[remaining]}", style="dim", markup=False),
         TextColumn("{task.description}", markup=False),
     )
     with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda text, share: bar.update(task, description=text, completed=share)
+        task = bar.add_task("", total=1.0, remaining="")
+
+        def report(text: str, share: float) -> None:
+            remaining = estimate.text(share, time.monotonic())
+            bar.update(task, description=text, completed=share, remaining=remaining)
+
+        yield report
 
 
 @contextmanager
@@ -195,17 +237,18 @@ def _progress_lines() -> Generator[Progress]:
     """Context with a progress callback that prints lines at intervals; short commands print
     none.
     """
-    begin, over, step = time.monotonic(), threading.Event(), [("", 0.0)]
+    begin, over, step = time.monotonic(), threading.Event(), [("", 0.0, "")]
+    estimate = RemainingTime()
 
     def report(text: str, share: float) -> None:
-        step[0] = text, share
+        step[0] = text, share, estimate.text(share, time.monotonic())
 
     def print_lines() -> None:
         while not over.wait(PROGRESS_LINE_INTERVAL):
-            text, share = step[0]
+            text, share, remaining = step[0]
             if text:
-                passed = f"{share:.0%}, {time.monotonic() - begin:.0f} s"
-                sys.stderr.write(f"{legible(text)} ({passed})\n")
+                times = [f"{time.monotonic() - begin:.0f} s", *([remaining] if remaining else [])]
+                sys.stderr.write(f"{legible(text)} ({', '.join([f'{share:.0%}', *times])})\n")
 
     # in a thread, because a step may take minutes without a call of report
     thread = threading.Thread(target=print_lines, daemon=True)
@@ -215,6 +258,28 @@ def _progress_lines() -> Generator[Progress]:
     finally:
         over.set()
         thread.join()
+
+
+class RemainingTime:
+    """Estimate of a task's remaining time from the time since its first step.
+
+    Until that step the program is loaded, which takes no share.
+    """
+
+    def __init__(self) -> None:
+        self._began: float | None = None
+
+    def text(self, share: float, now: float) -> str:
+        """Remaining time in words, empty where too little is done; now : clock, s."""
+        began = self._began
+        if began is None or not share:
+            self._began = now
+            return ""
+        passed = now - began
+        if share < SMALLEST_SHARE_FOR_ESTIMATE or passed < SHORTEST_TIME_FOR_ESTIMATE:
+            return ""
+        minutes, seconds = divmod(round(passed * (1 - share) / share), 60)
+        return f"{minutes}:{seconds:02d} left"
 
 
 def can_show() -> bool:

@@ -11,13 +11,14 @@ from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.finish import answer
 from pkmcal.errors import InputError
+from pkmcal.outcome.progress import part
 
 DEMO_FOLDER = Path("pkmcal-demo")
 DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME = "session", "calibration"
 FAST_SIZE = (480, 360)
 FAST_CONFIGURATIONS = 4
 SIMULATING_SHARE = 0.85
-"""Share of rendering in the progress."""
+"""Share of rendering in the progress of the work."""
 
 EXAMPLES = """\
 pkmcal demo
@@ -39,17 +40,18 @@ def demo(
     from datetime import datetime
 
     import pkmcal
-    from pkmcal.calibration.results import CALIBRATION_REPORT_FILE
-    from pkmcal.files import write_text
-    from pkmcal.judge.against_truth import compare_with_truth
-    from pkmcal.placement.default_camera import camera_of_size, default_camera
-    from pkmcal.report.truth import truth_sentence, truth_table, with_truth
-    from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
-    from pkmcal.web.report_page import report_page
 
-    session, folder = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
-    _make_room(out)
     with console.progress(as_json) as progress:
+        from pkmcal.calibration.results import CALIBRATION_REPORT_FILE
+        from pkmcal.files import write_text
+        from pkmcal.judge.against_truth import compare_with_truth
+        from pkmcal.placement.default_camera import camera_of_size, default_camera
+        from pkmcal.report.truth import truth_sentence, truth_table, with_truth
+        from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
+        from pkmcal.web.report_page import report_page
+
+        session, folder = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
+        _make_room(out)
         simulated = pkmcal.simulate(
             session,
             DEMO_MECHANISM,
@@ -57,13 +59,10 @@ def demo(
             stations=DEMO_SETTINGS.stations,
             configurations=FAST_CONFIGURATIONS if fast else DEMO_SETTINGS.configurations,
             seed=DEMO_SEED,
-            progress=lambda text, share: progress(text, SIMULATING_SHARE * share),
+            progress=part(progress.work, 0, SIMULATING_SHARE),
         )
-        rest = 0.97 - SIMULATING_SHARE
-        result = pkmcal.calibrate(
-            simulated, progress=lambda text, share: progress(text, SIMULATING_SHARE + rest * share)
-        )
-        progress("Writing the report", 0.98)
+        result = pkmcal.calibrate(simulated, progress=part(progress.work, SIMULATING_SHARE, 1))
+        progress.writing()
         result.save(folder)
     # The truth is read only now, when the result is written; the report gets a section on it.
     comparison = compare_with_truth(result, session)

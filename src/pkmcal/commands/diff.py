@@ -44,15 +44,16 @@ def diff(
 ) -> int:
     """Difference of two calibrations or nominal models at the tool."""
     import pkmcal
-    from pkmcal.api.diff import DiffResult
-    from pkmcal.files import default_output
 
-    if out is not None:
-        DiffResult.check_folder(out)
     with console.progress(as_json) as progress:
-        result = pkmcal.diff(a, b, progress=progress)
-    folder = out or default_output(_default_folder(result))
-    return finish(result, folder, force=force, as_json=as_json)
+        from pkmcal.api.diff import DiffResult
+        from pkmcal.files import default_output
+
+        if out is not None:
+            DiffResult.check_folder(out)
+        result = pkmcal.diff(a, b, progress=progress.work)
+        folder = out or default_output(_default_folder(result))
+        return finish(result, folder, progress, force=force, as_json=as_json)
 
 
 def _default_folder(result: DiffResult) -> Path:

@@ -42,11 +42,13 @@ def export(
 ) -> int:
     """Write the machine for a controller, a firmware or a simulator."""
     import pkmcal
-    from pkmcal.files import default_output
 
-    result = pkmcal.export(calibration, to, session=session, force=force)
-    folder = out or default_output(_default_folder(calibration, to))
-    return finish(result, folder, as_json=as_json)
+    with console.progress(as_json) as progress:
+        from pkmcal.files import default_output
+
+        result = pkmcal.export(calibration, to, session=session, force=force)
+        folder = out or default_output(_default_folder(calibration, to))
+        return finish(result, folder, progress, as_json=as_json)
 
 
 def _default_folder(calibration: str, to: str) -> Path:

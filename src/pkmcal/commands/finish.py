@@ -22,19 +22,21 @@ NO_FILES: Mapping[str, str] = MappingProxyType({})
 def finish(
     result: Result,
     folder: Path,
+    progress: console.CommandProgress,
     *,
     force: bool = False,
     more: Mapping[str, str] = NO_FILES,
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Save a result, print it, and return the exit code; arguments as for `answer`.
+    """Save a result, end the command's progress, print the result, and return the exit code;
+    arguments as for `answer`.
 
     force : replace an earlier result that would be kept.
     """
-    with console.progress(as_json or quiet) as progress:
-        progress("Writing the report", 0.97)
-        archive_folder = result.save(folder, force=force)
+    progress.writing()
+    archive_folder = result.save(folder, force=force)
+    progress.close()
     return answer(
         result, folder, more=more, archive_folder=archive_folder, as_json=as_json, quiet=quiet
     )

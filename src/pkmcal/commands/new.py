@@ -55,10 +55,11 @@ def new(
     plain = not (machine or board or legs or places or printer or probed)
     if plain and not as_json and on_terminal():
         machine, board, legs, places = _dialogue()
-    result = pkmcal.new(
-        machine, board=board, legs=legs, places=places, printer=printer, probed=probed
-    )
-    return finish(result, folder, as_json=as_json)
+    with console.progress(as_json) as progress:
+        result = pkmcal.new(
+            machine, board=board, legs=legs, places=places, printer=printer, probed=probed
+        )
+        return finish(result, folder, progress, as_json=as_json)
 
 
 def on_terminal() -> bool:

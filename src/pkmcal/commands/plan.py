@@ -138,21 +138,22 @@ def plan(
 ) -> int:
     """The next configurations worth measuring."""
     import pkmcal
-    from pkmcal.api.plan import PlanResult
-    from pkmcal.session.load import session_folder
 
-    session = session_folder(subject)
-    folder = console.output_folder(out, (session or Path()) / "plan", PlanResult)
-    assumed = None if session is not None else console.parsed_size(size)
     with console.progress(as_json) as progress:
+        from pkmcal.api.plan import PlanResult
+        from pkmcal.session.load import session_folder
+
+        session = session_folder(subject)
+        folder = console.output_folder(out, (session or Path()) / "plan", PlanResult)
+        assumed = None if session is not None else console.parsed_size(size)
         result = pkmcal.plan(
             subject, count=configurations, index=index, places=places, best_of=best_of,
             after=after, from_drawing=from_drawing, same_place=same_place, together=together,
             camera=camera or assumed, board=board,
             tracker=None if tracker is None else _tracker(tracker), edge_noise=edge_noise,
-            corner_noise=corner_noise, joint_noise=joint_noise, seed=seed, progress=progress,
+            corner_noise=corner_noise, joint_noise=joint_noise, seed=seed, progress=progress.work,
         )  # fmt: skip
-    return finish(result, folder, as_json=as_json)
+        return finish(result, folder, progress, as_json=as_json)
 
 
 def _tracker(text: str) -> tuple[float, float | None]:

@@ -50,13 +50,14 @@ def reproduce(
 ) -> int:
     """Compute the papers' tables and figures again."""
     import pkmcal
-    from pkmcal.api.reproduce import ReproductionResult
 
-    given = None if out == REPRODUCTION_FOLDER else out
-    folder = console.output_folder(given, REPRODUCTION_FOLDER, ReproductionResult)
-    wanted = [paper.value for paper in papers or Paper]
     with console.progress(as_json) as progress:
+        from pkmcal.api.reproduce import ReproductionResult
+
+        given = None if out == REPRODUCTION_FOLDER else out
+        folder = console.output_folder(given, REPRODUCTION_FOLDER, ReproductionResult)
+        wanted = [paper.value for paper in papers or Paper]
         result = pkmcal.reproduce(
-            wanted, runs=runs, seed=seed, long=long, images=images, progress=progress
+            wanted, runs=runs, seed=seed, long=long, images=images, progress=progress.work
         )
-    return finish(result, folder, as_json=as_json)
+        return finish(result, folder, progress, as_json=as_json)

@@ -122,11 +122,12 @@ def servo(
     from math import radians
 
     import pkmcal
-    from pkmcal.api.servo import ServoResult
-    from pkmcal.control.source import legs_of_text, pose_of_text
 
-    folder = console.output_folder(out, Path("servo"), ServoResult)
     with console.progress(as_json) as progress:
+        from pkmcal.api.servo import ServoResult
+        from pkmcal.control.source import legs_of_text, pose_of_text
+
+        folder = console.output_folder(out, Path("servo"), ServoResult)
         result = pkmcal.servo(
             machine, session=session, station=station, camera=camera, law=law,
             legs=None if legs is None else legs_of_text(legs), runs=runs, gain=gain, rate=rate,
@@ -134,6 +135,6 @@ def servo(
             hand_position=hand_position, hand_rotation=radians(hand_rotation),
             start=None if start is None else pose_of_text(start, "--start"),
             goal=None if goal is None else pose_of_text(goal, "--goal"), seed=seed,
-            progress=progress,
+            progress=progress.work,
         )  # fmt: skip
-    return finish(result, folder, as_json=as_json)
+        return finish(result, folder, progress, as_json=as_json)

@@ -115,7 +115,7 @@ def simulate(
     with console.progress(as_json) as progress:
         result = pkmcal.simulate(
             folder, mechanism, camera=eye, board=board, on_platform=on_platform, noise=noise,
-            blur=blur, plan=plan, seed=seed, progress=progress, stations=stations,
+            blur=blur, plan=plan, seed=seed, progress=progress.report, stations=stations,
             configurations=configurations, shared=shared, repeats=repeats, tolerance=tolerance,
             joint_noise=joint_noise, finish=finish, light=light, as_built=as_built,
             handheld=handheld,

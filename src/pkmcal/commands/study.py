@@ -65,16 +65,18 @@ def study(
 ) -> int:
     """Estimate by simulation how accurate calibrations would be."""
     import pkmcal
-    from pkmcal.api.study import StudyResult
 
-    given = None if out == STUDY_FOLDER else out
-    folder = console.output_folder(given, STUDY_FOLDER, StudyResult)
     try:
         with console.progress(as_json) as progress:
+            from pkmcal.api.study import StudyResult
+
+            given = None if out == STUDY_FOLDER else out
+            folder = console.output_folder(given, STUDY_FOLDER, StudyResult)
             result = pkmcal.study(
                 subject, vary or (), runs=runs, seed=seed, out=folder, scheduler=scheduler,
-                progress=progress,
+                progress=progress.work,
             )  # fmt: skip
+            return finish(result, folder, progress, as_json=as_json)
     except KeyboardInterrupt:
         if not as_json:
             terminal.print_points(
@@ -82,4 +84,3 @@ def study(
                 [("", f"What is finished lies in {out}; the same command goes on from there.")],
             )
         raise
-    return finish(result, folder, as_json=as_json)

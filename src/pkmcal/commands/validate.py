@@ -34,10 +34,13 @@ def validate(
 ) -> int:
     """Errors on data that the calibration did not see."""
     import pkmcal
-    from pkmcal.api.validate import ValidationResult
 
-    loaded = pkmcal.load_session(session)
-    folder = console.output_folder(out, loaded.folder / "validation", ValidationResult)
     with console.progress(as_json) as progress:
-        result = pkmcal.validate(calibration, loaded, regions=regions, seed=seed, progress=progress)
-    return finish(result, folder, as_json=as_json)
+        from pkmcal.api.validate import ValidationResult
+
+        loaded = pkmcal.load_session(session)
+        folder = console.output_folder(out, loaded.folder / "validation", ValidationResult)
+        result = pkmcal.validate(
+            calibration, loaded, regions=regions, seed=seed, progress=progress.work
+        )
+        return finish(result, folder, progress, as_json=as_json)

@@ -42,13 +42,14 @@ def watch(
 ) -> int:
     """Is the machine still as calibrated? Tests each leg."""
     import pkmcal
-    from pkmcal.api.watch import WatchResult
 
-    loaded = pkmcal.load_session(session)
-    folder = console.output_folder(out, loaded.folder / "watch", WatchResult)
     with console.progress(as_json) as progress:
+        from pkmcal.api.watch import WatchResult
+
+        loaded = pkmcal.load_session(session)
+        folder = console.output_folder(out, loaded.folder / "watch", WatchResult)
         result = pkmcal.watch(
             calibration, loaded, alpha=alpha, same_place=same_place or (), seed=seed,
-            progress=progress,
+            progress=progress.work,
         )  # fmt: skip
-    return finish(result, folder, as_json=as_json)
+        return finish(result, folder, progress, as_json=as_json)

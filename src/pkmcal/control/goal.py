@@ -99,7 +99,7 @@ def vague_sentence(machine: Machine, sigma: Array) -> str:
     """Sentence on the motor whose distance to the goal has the largest sigma (m,)."""
     k = int(np.nanargmax(sigma))
     return (
-        f"what is seen tells where the motor of {motor_name(machine, k)} should be"
+        f"what is seen determines where the motor of {motor_name(machine, k)} should be"
         f" to {sigma[k] * 1e3:.2g} m{machine.joint_units[k]} only"
     )
 

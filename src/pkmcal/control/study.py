@@ -9,8 +9,8 @@ camera pose. The true geometry is the reference.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome.finding import Finding
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.ranges import default
 
@@ -246,9 +247,7 @@ class Study:
         return next(o for o in self.outcomes if o.estimate.name == name)
 
 
-def study_servoing(
-    scene: Plant, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
-) -> Study:
+def study_servoing(scene: Plant, plan: Plan, progress: Progress = no_progress) -> Study:
     """Simulate the loop with every estimate, and analyse visibility and equilibria.
 
     Raises InputError if the loop would be unstable with perfect knowledge, if a start or goal is
@@ -258,7 +257,7 @@ def study_servoing(
     # workspace, and starts and goals of the runs
     seeds = np.random.SeedSequence(plan.seed).spawn(5)
     eye = Eye.of(scene.view(), scene.camera)
-    progress("Looking at the workspace", 0.02)
+    progress("Sampling the workspace", 0.02)
     drawn = draw_configurations(
         scene.machine, VISIBILITY_POSES, 0.2, np.random.default_rng(seeds[0])
     )
@@ -271,13 +270,15 @@ def study_servoing(
     )  # fmt: skip
     outcomes: list[Trials] = []
     for k, belief in enumerate(beliefs):
-        subprogress = _subprogress(progress, f"Servoing: {belief.title.lower()}", 0.05 + 0.2 * k)
+        own = partial(
+            part(progress, 0.05 + 0.2 * k, 0.25 + 0.2 * k), f"Servoing: {belief.title.lower()}"
+        )
         # the same noise for all estimates, so that differences are due to the estimates
         rng = np.random.default_rng(seeds[3])
-        runs = simulate_servo_runs(eye, belief.view, starts, goals, plan.loop, rng, subprogress)
+        runs = simulate_servo_runs(eye, belief.view, starts, goals, plan.loop, rng, own)
         ideal = outcomes[0].runs if outcomes else runs
         outcomes.append(outcome(eye.true.machine, belief, runs, ideal))
-    progress("Looking for other equilibria", 0.87)
+    progress("Searching for other equilibria", 0.87)
     # noise at the goals
     ends, joints = np.concatenate([starts, goals]), np.nan_to_num(scene.machine.inverse(goals))
     rng, loop = np.random.default_rng(seeds[4]), plan.loop
@@ -360,12 +361,6 @@ def _settling(runs: ServoRuns) -> Array:
     after = np.where(far.any(axis=1), after, 0)
     time = np.append(runs.time, np.nan)[after]
     return np.where(runs.reached, time, np.nan)
-
-
-def _subprogress(
-    progress: Callable[[str, float], None], text: str, first: float
-) -> Callable[[float], None]:
-    return lambda share: progress(text, first + 0.2 * share)
 
 
 def _ways(eye: Eye, plan: Plan, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -51,7 +51,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import Information
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm, Search
 from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.score import (
     columns_of,
@@ -96,7 +96,7 @@ class DiscrepancyOptions:
         """
         from scipy.special import chdtri
 
-        return float(chdtri(1.0, 2 * self.false_alarm.of_test(components)))
+        return float(chdtri(1.0, 2 * self.false_alarm.of_test(Search.DISCREPANCY, components)))
 
 
 @dataclass(frozen=True)

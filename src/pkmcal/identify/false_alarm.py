@@ -8,42 +8,60 @@ holds however the tests depend on each other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 
 
+class Search(StrEnum):
+    """Searches that share the level of a session; each names itself where it tests."""
+
+    VIOLATIONS = "score tests of model violations"
+    OUTLINES = "tubes of another outline"
+    DISCREPANCY = "components of the model discrepancy"
+    OUTLIERS = "measured poses that disagree with all others"
+    POSE_NOISE = "poses that scatter more than stated"
+    INTRINSICS = "the cameras' intrinsics of the files, compared with refined ones"
+
+
+EQUAL_SHARES = MappingProxyType(dict.fromkeys(Search, 1 / len(Search)))
+
+
 @dataclass(frozen=True)
 class FalseAlarm:
-    """Level of a session, and the number of searches that share it."""
+    """Level of a session, and the searches that share it."""
 
     # chance that a session that agrees with its model shows any named violation, any discrepancy,
     # or any measured pose that disagrees with all others: one session of two hundred
     level: float = 0.005
-    # searches that share it: score tests of model violations (score.py), tubes' outlines,
-    # components of the discrepancy, and measured poses that disagree with the others
-    searches: int = 4
+    # share of the level that each search has
+    shares: Mapping[Search, float] = field(default_factory=lambda: EQUAL_SHARES)
 
-    def of_test(self, tests: int) -> float:
+    def of_test(self, search: Search, tests: int) -> float:
         """Level of each of the tests of one search."""
-        return self.level / (self.searches * max(tests, 1))
+        return self.level * self.shares[search] / max(tests, 1)
 
-    def scale(self, dof: float) -> float:
+    def scale(self, search: Search, dof: float) -> float:
         """Root mean square of normal errors, in their standard deviations, that one search exceeds
         by chance at its level.
         """
         from scipy.special import chdtri
 
         dof = max(dof, 1.0)
-        return float(np.sqrt(chdtri(dof, self.of_test(1)) / dof))
+        return float(np.sqrt(chdtri(dof, self.of_test(search, 1)) / dof))
 
-    def adjusted(self, chance: Array | float, tests: Array | Integers | int) -> Array:
+    def adjusted(
+        self, search: Search, chance: Array | float, tests: Array | Integers | int
+    ) -> Array:
         """P-values among all tests of a session, from the p-values of tests and the number of tests
         that share the level of their search.
         """
-        return np.minimum(self.searches * np.asarray(tests) * chance, 1.0)
+        return np.minimum(np.asarray(tests) * chance / self.shares[search], 1.0)
 
 
 SESSION_FALSE_ALARM = FalseAlarm()

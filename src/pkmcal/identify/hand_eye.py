@@ -171,7 +171,7 @@ def _check_identifiable(problem: PairProblem, pair: Pair) -> None:
     turn = np.linalg.inv(normal)[:, :3, :3]
     if np.sqrt(np.linalg.eigvalsh(turn)[:, -1]).max() > UNKNOWN_CAMERA_TURN:
         raise ResultError(
-            what="the boards' poses do not tell how the camera stands to the machine",
+            what="the boards' poses do not determine how the camera stands to the machine",
             found="configurations along a line, or all alike",
             expected="configurations that move the platform in two directions, or turn it",
             next_step="add such configurations, or give the station's rough pose",

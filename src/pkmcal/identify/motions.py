@@ -211,8 +211,8 @@ def _unseen(s: Situation, leg: int) -> NamedChanges:
     read = "; its readings alone leave {n} of its values {open}"
     all_read = "; their readings alone leave {n} of each one's values {open}"
     if not s.rows(leg, "length").size:
-        read = ", so that nothing tells where its joints are"
-        all_read = ", so that nothing tells where their joints are"
+        read = ", so that nothing determines where its joints are"
+        all_read = ", so that nothing determines where their joints are"
     return NamedChanges(
         (leg,),
         s.one_hot(s.rows(leg, "")),

@@ -46,7 +46,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import ROWS_RANK_TOLERANCE, Information
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm, Search
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import NEGLIGIBLE, ROUNDING
 from pkmcal.measurements import Column
@@ -146,7 +146,9 @@ class ScoreTests:
         tests = np.bincount(self._family, weights=dof > 0)
         times = np.count_nonzero(tests) * tests[self._family]
         chance = np.where(dof > 0, chdtrc(np.maximum(dof, 1), chi2), 1.0)
-        adjusted = np.where(dof > 0, self._false_alarm.adjusted(chance, times), 1.0)
+        adjusted = np.where(
+            dof > 0, self._false_alarm.adjusted(Search.VIOLATIONS, chance, times), 1.0
+        )
         every = zip(*(x.tolist() for x in (chi2, dof.astype(int), chance, adjusted)), strict=True)
         return [Score(*one) for one in every]
 

@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM
+from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import negligible_shift
 from pkmcal.identify.tool import centres_and_tool, platform_sigma
@@ -321,7 +321,7 @@ def _poses_misfit(
     )
     if share > options.too_many_rejected:
         yield wrong("poses.rejected_share", share=share, limit=options.too_many_rejected)
-    least = max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(s.dof_poses))
+    least = max(POOR_MODEL_POSE_SCALE, SESSION_FALSE_ALARM.scale(Search.POSE_NOISE, s.dof_poses))
     if least < s.pose_scale <= options.too_noisy:
         yield doubtful("poses.scatter", scale=s.pose_scale, **better)
 

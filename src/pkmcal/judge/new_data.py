@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans
-from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
+from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.cameras.files import load_camera, written_camera
 from pkmcal.errors import InputError
+from pkmcal.outcome.progress import Progress
 from pkmcal.session.load import Session, Station, digests
 from pkmcal.session.readings import same_pose
 
@@ -68,19 +69,17 @@ def measured_new_data(
     saved: SavedCalibration,
     session: Session,
     seed: int,
-    progress: CalibrationProgress,
-    share: float,
+    progress: Progress,
 ) -> Calibration:
     """Measure a session and estimate all poses; see the module.
 
     The session of the result lacks hand-held images that were not localized, and numbers its
-    stations accordingly. seed : of the localization. progress : callback for the first ``share`` of
-    the progress.
+    stations accordingly. seed : of the localization.
     """
     return calibrate_session(
         replace(session, machine=saved.machine, stations=_as_calibrated(saved, session)),
         seed=seed,
-        progress=lambda text, part: progress(text, share * part),
+        progress=progress,
     )
 
 

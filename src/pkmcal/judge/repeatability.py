@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers, rms
-from pkmcal.calibration.calibrate import Calibration, CalibrationProgress, calibrate_session
+from pkmcal.calibration.calibrate import Calibration, calibrate_session
 from pkmcal.calibration.localization import read_images
 from pkmcal.errors import InputError
 from pkmcal.files import json_value
@@ -37,6 +37,7 @@ from pkmcal.observe.repeats import (
 )
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.outcome.finding import Finding, Level, doubtful, finding, note
+from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.solver.ranks import nonzero
 
@@ -52,11 +53,10 @@ to a few hundredths."""
 PAPER_AXIS_NOISE = AxisNoise(images=1)
 """[A] Table 1, upper bounds, in degrees where the paper prints rad (errata)."""
 REPEATS_TABLE_LEGEND = (
-    "Standard deviations of one image, pooled over the configurations.",
-    "ψ: of the leg's direction in the image. θ: towards the camera. x, z: of its",
-    "point with y = 0, camera frame; – for a leg level in the image, without one.",
-    "θ and z come from the leg's width in the image, so they scatter most.",
-    "Shift, tilt: of its edges, as a whole and at their ends.",
+    "Standard deviations of one image, pooled over the configurations. ψ: of the leg's direction in"
+    " the image. θ: towards the camera. x, z: of its point with y = 0, camera frame; – for a leg"
+    " level in the image, without one. θ and z come from the leg's width in the image, so they"
+    " scatter most. Shift, tilt: of its edges, as a whole and at their ends."
 )
 
 
@@ -144,7 +144,7 @@ class RepeatStudy:
 
 
 def study_repeats(
-    session: Session | Path | str, *, seed: int = 0, progress: CalibrationProgress | None = None
+    session: Session | Path | str, *, seed: int = 0, progress: Progress = no_progress
 ) -> RepeatStudy:
     """Scatter of images of the same configurations, by station and leg.
 

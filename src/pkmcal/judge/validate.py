@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
-from pkmcal.calibration.calibrate import CalibrationProgress
 from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.errors import PkmcalError
@@ -29,6 +28,7 @@ from pkmcal.judge.sentences import validation_verdict
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, note
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session
 
@@ -89,7 +89,7 @@ def validate_calibration(
     *,
     regions: int = 0,
     seed: int = 0,
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Validation:
     """Errors of a calibration on a session that it did not use, without writing files.
 
@@ -102,19 +102,18 @@ def validate_calibration(
 
     check_number("validate", "regions", regions)
     check_number("validate", "seed", seed)
-    report = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
         lines, calibrated = paths_of(session), calibrated_rows(saved, session)
         if not regions:
             check_new(calibrated, _has_image(session), *NOT_INDEPENDENT)
-        remeasured = measured_new_data(saved, session, seed, report, 0.8)
+        remeasured = measured_new_data(saved, session, seed, part(progress, 0, 0.8))
         session = replace(remeasured.session, machine=session.machine)
         estimate = remeasured.estimate
         data = estimate.stated_edge_noise(remeasured.measurements)
 
-        report("Predicting the readings", 0.8)
+        progress("Predicting the readings", 0.8)
         nominal = nominal_of(saved)
         prediction = predict(saved.machine, data, estimate.state)
         if not regions:
@@ -134,7 +133,7 @@ def validate_calibration(
                 nominal, saved.covariance, data, prediction, by_nominal, new
             )
 
-        report("Holding out regions", 0.9)
+        progress("Holding out regions", 0.85)
         held_out = by_regions(nominal, data, estimate, regions) if regions else ()
         verdict = validation_verdict(judged, held_out, saved.machine, data, repeated)
         return Validation(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
-from pkmcal.calibration.calibrate import Calibration, CalibrationProgress
+from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.holdout import select
 from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.saved_calibration import CalibrationPrior, SavedCalibration
@@ -31,6 +31,7 @@ from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.measurements.rows import Kinds
 from pkmcal.outcome import Verdict
+from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.ranges import check_number
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
@@ -104,7 +105,7 @@ def watch_machine(
     alpha: float = CHANGE_ALPHA,
     seed: int = 0,
     same_place: Sequence[str] = (),
-    progress: CalibrationProgress | None = None,
+    progress: Progress = no_progress,
 ) -> Watch:
     """Test a calibrated machine on new data, without writing files.
 
@@ -118,7 +119,6 @@ def watch_machine(
 
     check_number("watch", "alpha", alpha)
     check_number("watch", "seed", seed)
-    report = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
@@ -126,12 +126,12 @@ def watch_machine(
         session = _with_fixed_poses(saved, session, same_place)
         calibrated = calibrated_rows(saved, session)
         check_new(calibrated, np.ones_like(calibrated), *NOTHING_NEW)
-        remeasured = measured_new_data(saved, session, seed, report, 0.9)
+        remeasured = measured_new_data(saved, session, seed, part(progress, 0, 0.9))
         session = replace(remeasured.session, machine=session.machine)
         observed = observed_configurations(remeasured.measurements)
         check_new(calibrated, observed, *NOTHING_NEW)
 
-        report("Testing for changes", 0.9)
+        progress("Testing for changes", 0.9)
         # Weights and noise of the new data, with the machine free; then the fit with it fixed.
         old = saved.document.get("statistics") or {}
         factors = ("noise_scale", "pose_scale", "link_scale")

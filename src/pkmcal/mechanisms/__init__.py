@@ -155,7 +155,7 @@ def check_plausible(value: float, machine: Machine, where: str, what: str) -> No
     if value <= most:
         return
     raise InputError(
-        f"{what} of the machine's own size tells nothing",
+        f"{what} of the machine's own size determines nothing",
         where=where,
         found=f"{value:g} m",
         expected=f"at most {most:.2g} m, a quarter of the machine's size",

@@ -9,7 +9,7 @@ images. A second list (units, signs, zeros) is decided by the ranges of the read
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import log, pi
 from typing import Any
@@ -21,17 +21,24 @@ from pkmcal.errors import InputError
 from pkmcal.outcome.hypotheses import Hypothesis, parameter_cost
 from pkmcal.wording import DISPLAY_UNITS, listed, number
 
-RANGE_MARGIN = 0.05
-"""Part of a stroke by which a reading may leave its range: homing shifts a range by the offset's
-tolerance."""
-CONSTANTS_IN_A_STROKE = 16
-"""Constants that are tried for a reversed motor in one stroke. One that is half a step off moves
-the platform by a thirtieth of the stroke, a tenth of what the reversed readings do."""
 
-SLIP_SHARE = 0.01
-"""Prior share of single readings that are wrong, such as mistyped ones."""
-SLIP_DECADES = 6
-"""Decades about the width of a range over which a wrong reading may be."""
+@dataclass(frozen=True)
+class ReadingHypothesisOptions:
+    """Constants of the hypotheses about readings and of the likelihood of their ranges."""
+
+    # part of a stroke by which a reading may leave its range: homing shifts a range by the offset's
+    # tolerance
+    range_margin: float = 0.05
+    # constants that are tried for a reversed motor in one stroke: one that is half a step off moves
+    # the platform by a thirtieth of the stroke, a tenth of what the reversed readings do
+    constants_in_a_stroke: int = 16
+    # prior share of single readings that are wrong, such as mistyped ones
+    slip_share: float = 0.01
+    # decades about the width of a range over which a wrong reading may be
+    slip_decades: float = 6.0
+
+
+READING_HYPOTHESIS_OPTIONS = ReadingHypothesisOptions()
 OTHER_UNITS = {"m": 1e-3, "rad": pi / 180}
 """Factor to each SI unit from the one in which readings are often written, mm or degrees."""
 
@@ -42,13 +49,17 @@ value that it stands for, 0 for a wrong sign alone; ``order`` (m,), the column o
 ``step``, by how many rows the readings come late."""
 
 
-def reading_hypotheses(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
+def reading_hypotheses(
+    joints: Array,
+    ranges: Array,
+    options: ReadingHypothesisOptions = READING_HYPOTHESIS_OPTIONS,
+) -> list[ReadingHypothesis]:
     """Mistakes in readings that measurements can show, with equal prior odds of each explanation.
 
     joints : (K, m). ranges : (m, 2) smallest and largest reading, NaN where unknown.
     """
     hypotheses = [
-        *reversed_motors(joints, ranges),
+        *reversed_motors(joints, ranges, options),
         *exchanged_motors(joints.shape[1]),
         *renumbered_legs(joints.shape[1]),
         *shifted_rows(len(joints)),
@@ -57,7 +68,12 @@ def reading_hypotheses(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
     return [replace(one, log_prior=prior) for one in hypotheses]
 
 
-def range_hypotheses(joints: Array, ranges: Array, units: Sequence[str]) -> list[ReadingHypothesis]:
+def range_hypotheses(
+    joints: Array,
+    ranges: Array,
+    units: Sequence[str],
+    options: ReadingHypothesisOptions = READING_HYPOTHESIS_OPTIONS,
+) -> list[ReadingHypothesis]:
     """Mistakes in whole columns of readings (K, m) that their ranges (m, 2) can show, with equal
     prior odds: readings in millimetres or degrees, signs, and another zero point of all joints with
     a unit, or of those that leave their range.
@@ -67,14 +83,14 @@ def range_hypotheses(joints: Array, ranges: Array, units: Sequence[str]) -> list
     """
     out, kinds = list[ReadingHypothesis](), np.array(units)
     low, high = ranges.T
-    slack = RANGE_MARGIN * (high - low)
+    slack = options.range_margin * (high - low)
     # fmax and fmin ignore NaN: an unknown range allows any constant
     least = np.fmax(low - slack - joints.min(axis=0), -np.inf)
     most = np.fmin(high + slack - joints.max(axis=0), np.inf)
     for unit, factor in OTHER_UNITS.items():
         if (kinds == unit).any():
             out.append(_linear("readings.units", kinds == unit, factor))
-    stated, turned = (range_log_likelihood(sign * joints, ranges) for sign in (1, -1))
+    stated, turned = (range_log_likelihood(sign * joints, ranges, options) for sign in (1, -1))
     reverse = (-joints.max(axis=0) >= low - slack) & (-joints.min(axis=0) <= high + slack)
     if (reverse & (turned > stated)).any():
         out.append(_linear("readings.sign", reverse & (turned > stated), -1.0))
@@ -109,34 +125,40 @@ def _linear(
     )
 
 
-def range_ratios(joints: Array, ranges: Array, hypotheses: Sequence[ReadingHypothesis]) -> Array:
+def range_ratios(
+    joints: Array,
+    ranges: Array,
+    hypotheses: Sequence[ReadingHypothesis],
+    options: ReadingHypothesisOptions = READING_HYPOTHESIS_OPTIONS,
+) -> Array:
     """Log-likelihood ratios (N,) of hypotheses about readings (K, m) by their ranges (m, 2)."""
     known = np.isfinite(ranges).all(axis=1)
-    null = range_log_likelihood(joints, ranges).sum()
-    values = [range_log_likelihood(one.apply(joints), ranges).sum() for one in hypotheses]
+    null = range_log_likelihood(joints, ranges, options).sum()
+    values = [range_log_likelihood(one.apply(joints), ranges, options).sum() for one in hypotheses]
     # density of the table's readings by that of the right ones
     scales = [np.log(np.abs(one.facts["factor"]))[known].sum() for one in hypotheses]
     return np.array(values) - null + len(joints) * np.array(scales)
 
 
-def range_log_likelihood(joints: Array, ranges: Array) -> Array:
+def range_log_likelihood(joints: Array, ranges: Array, options: ReadingHypothesisOptions) -> Array:
     """Log-likelihood (m,) of each column of readings (K, m) by its range (m, 2), relative to
     readings that are uniform over the range with its margin; constant for unknown ranges.
 
     Readings beyond their range are slips, each by any factor, or the range is stated too narrow,
-    by RANGE_MARGIN on average.
+    by ``range_margin`` on average.
     """
     low, high = ranges.T
-    width, slack = (1 + 2 * RANGE_MARGIN) * (high - low), RANGE_MARGIN * (high - low)
+    margin, decades, share = options.range_margin, options.slip_decades, options.slip_share
+    width, slack = (1 + 2 * margin) * (high - low), margin * (high - low)
     # in widths of the range; fmax ignores NaN, an unknown range
     below = np.fmax((low - slack - joints) / width, 0.0)
     above = np.fmax((joints - high - slack) / width, 0.0)
     ends = below.max(axis=0) + above.max(axis=0)
     # uniform in the logarithm, so no other unit, or sign, makes slips likelier
-    size = np.maximum(np.abs(joints) / width, 10.0 ** (-SLIP_DECADES / 2))
-    slip = np.log(SLIP_SHARE / (2 * log(10.0) * SLIP_DECADES * size))
-    slips = np.where(below + above > 0, slip, np.log1p(-SLIP_SHARE)).sum(axis=0)
-    wider = -len(joints) * np.log1p(ends) - ends / RANGE_MARGIN
+    size = np.maximum(np.abs(joints) / width, 10.0 ** (-decades / 2))
+    slip = np.log(share / (2 * log(10.0) * decades * size))
+    slips = np.where(below + above > 0, slip, np.log1p(-share)).sum(axis=0)
+    wider = -len(joints) * np.log1p(ends) - ends / margin
     return np.maximum(slips, wider)
 
 
@@ -153,7 +175,9 @@ def reversed_motor(motor: int, constant: float) -> ReadingHypothesis:
     return ReadingHypothesis(code, f"motor {motor + 1}", apply, facts=facts)
 
 
-def reversed_motors(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
+def reversed_motors(
+    joints: Array, ranges: Array, options: ReadingHypothesisOptions
+) -> list[ReadingHypothesis]:
     """Each motor that counts the other way, with constants by which its readings are in range.
 
     A wrong sign alone (constant 0) is the first of a motor where it is in range, and the only one
@@ -165,10 +189,10 @@ def reversed_motors(joints: Array, ranges: Array) -> list[ReadingHypothesis]:
         if not np.isfinite(stroke):
             out.append(reversed_motor(motor, 0.0))
             continue
-        slack = RANGE_MARGIN * stroke
+        slack = options.range_margin * stroke
         least = low - slack + joints[:, motor].max()
         most = high + slack + joints[:, motor].min()
-        count = int(np.ceil(CONSTANTS_IN_A_STROKE * (most - least) / stroke)) + 1
+        count = int(np.ceil(options.constants_in_a_stroke * (most - least) / stroke)) + 1
         constants = np.linspace(least, most, count) if least <= most else np.zeros(0)
         signs = [0.0] if least <= 0 <= most else []
         out += [reversed_motor(motor, float(c)) for c in (*signs, *constants)]

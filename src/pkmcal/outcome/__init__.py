@@ -117,7 +117,7 @@ class Table:
         all.
     words : indices of the columns that hold text and are aligned to the left.
     shaded : indices of the columns whose cells are shaded by their numbers on the page.
-    legend : lines under the table on a terminal.
+    legend : paragraph under the table on a terminal.
     """
 
     title: str
@@ -129,7 +129,7 @@ class Table:
     first: int | None = None
     words: tuple[int, ...] = ()
     shaded: tuple[int, ...] = ()
-    legend: tuple[str, ...] = ()
+    legend: str = ""
 
 
 @dataclass(frozen=True)

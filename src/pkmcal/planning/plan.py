@@ -217,7 +217,7 @@ def _check(
         raise InputError(
             "there is no camera whose place could be chosen",
             where="--places",
-            next_step="Leave it out; where a tracker stands does not change what it tells",
+            next_step="Leave it out; where a tracker stands does not change its information",
         )
     if best_of and not 1 <= best_of <= len(rig.names):
         raise InputError(

@@ -348,7 +348,7 @@ def _first_camera_session(session: Session) -> Session:
         raise InputError(
             "there is no camera whose place could be chosen",
             where="--places",
-            next_step="Leave it out; where a tracker stands does not change what it tells",
+            next_step="Leave it out; where a tracker stands does not change its information",
         )
     first = session.stations[0]
     if first.handheld:
@@ -414,7 +414,7 @@ def _station_poses(
             continue
         if station.T_camera_base is None:
             raise InputError(
-                f"nothing tells where station {station.name} stands",
+                f"nothing determines where station {station.name} stands",
                 where=f"session.yaml, stations.{station.name}",
                 expected="pose: {position: [...], look_at: [...]}, three images, or a calibration",
                 next_step="Give its pose, or let places be chosen: --places 3",
@@ -427,7 +427,7 @@ def _edge_noise(
     session: Session, legs: list[int], images: _SessionImages, T_camera_base: Array, edge: float
 ) -> tuple[tuple[int, ...], tuple[Pools, ...], float, str]:
     """Binning and pools of each station with legs, the shading, and a sentence on their source."""
-    why = "no image tells it yet"
+    why = "no image determines it yet"
     if len(images.images) == len(legs):
         rows = [
             spread_over(p.configuration, len(legs), PLAN_IMAGES_A_STATION) for p in images.images
@@ -437,7 +437,7 @@ def _edge_noise(
             first = first_edges(session, images.images, rows, T_camera_base[legs], poses)
         except (PkmcalError, np.linalg.LinAlgError):
             # `check` and `calibrate` report what is wrong with these images; the plan uses defaults
-            why = "the images that there are do not tell it; pkmcal check says why"
+            why = "the images that there are do not determine it; pkmcal check says why"
         else:
             count = sum(len(row) for row in rows)
             words = f"The accuracy of edges is measured in {count} of the images that there are."
@@ -457,7 +457,7 @@ def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
         if s.views.views.visible.any()
     ]
     if not sigma:
-        return corner, f"Corners are taken to be good to {corner:g} px: no image tells it yet."
+        return corner, f"Corners are taken to be good to {corner:g} px: no image determines it yet."
     median = float(np.median(sigma))
     return median, f"Corners of the board are good to {brief(median)} px in the images."
 

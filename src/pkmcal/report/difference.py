@@ -163,7 +163,7 @@ def _parameters(d: MachineDifference) -> tuple[Table, ...]:
     if d.significant:
         rows = tuple(_row(d, k) for k in d.significant)
         more = len(rows) - CHANGES_ON_TERMINAL
-        legend = (f"and {count(more, 'more number')}",) if more > 0 else ()
+        legend = f"and {count(more, 'more number')}" if more > 0 else ""
         out.append(Table("What changed", columns, rows[:CHANGES_ON_TERMINAL], legend=legend))
     names = range(len(d.a.machine.parameters))
     note = (

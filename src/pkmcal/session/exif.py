@@ -46,7 +46,7 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
             focal = read_exif(open_image(stream, label)).focal_35mm
         if focal is None:
             raise InputError(
-                "the image does not tell the focal length it was taken with",
+                "the image does not state the focal length it was taken with",
                 where=label,
                 found="no EXIF FocalLengthIn35mmFilm",
                 expected=f"a JPEG file as the camera wrote it, for {where} says camera: exif",
@@ -57,7 +57,7 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
     if len(labels) > 1:
         (one, first), (other, second) = list(labels.items())[:2]
         raise InputError(
-            "the images of one camera tell different focal lengths or sizes",
+            "the images of one camera state different focal lengths or sizes",
             where=second,
             found=f"{_description(*other)}, where {first} has {_description(*one)}",
             expected="one lens, not zoomed, and uncropped images",

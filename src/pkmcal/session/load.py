@@ -617,10 +617,10 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
         )
     if "legs" not in station.observe:
         raise InputError(
-            "images by hand of a board alone tell nothing of the machine",
+            "images by hand of a board alone determine nothing of the machine",
             where=document.where(*keys, "observe"),
             found="board",
-            expected="legs, or [legs, board]: only the legs tell where the board or the camera is",
+            expected="legs, or [legs, board]: only the legs determine where the board is",
         )
 
 
@@ -753,7 +753,7 @@ def _unmeasured(
             else "only one configuration has images",
             where=table.label,
             found=table.names[min(measured)],
-            expected="two at least; one cannot tell a joint's place from its offset",
+            expected="two at least; one does not distinguish a joint's place from its offset",
         )
     missing = [name for row, name in enumerate(table.names) if row not in measured]
     if not missing:

@@ -14,7 +14,11 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.measurements import Column
-from pkmcal.mechanisms.reading_hypotheses import RANGE_MARGIN, range_hypotheses, range_ratios
+from pkmcal.mechanisms.reading_hypotheses import (
+    READING_HYPOTHESIS_OPTIONS,
+    range_hypotheses,
+    range_ratios,
+)
 from pkmcal.outcome.finding import Finding, doubtful
 from pkmcal.outcome.hypotheses import EvidenceLevel, decide, posterior
 from pkmcal.wording import DISPLAY_UNITS, listed, number
@@ -53,7 +57,7 @@ def check_readings(
             "there is only one configuration",
             where=table.label,
             found=listed(table.names),
-            expected="two at least; one cannot tell a joint's place from its offset",
+            expected="two at least; one does not distinguish a joint's place from its offset",
             next_step="Move the machine and take more images; 15 configurations are usual",
         )
     _check_mistakes(table, ranges, units)
@@ -304,7 +308,9 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[Findi
     return merged, [doubtful("readings.repeated_poses", table.label, **rows)]
 
 
-def _inside(values: Array, ranges: Array, margin: float = RANGE_MARGIN) -> np.ndarray:
+def _inside(
+    values: Array, ranges: Array, margin: float = READING_HYPOTHESIS_OPTIONS.range_margin
+) -> np.ndarray:
     """Whether each reading (K, m) is inside its range, widened by `margin` of the stroke; True for
     unknown ranges.
     """

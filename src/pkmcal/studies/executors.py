@@ -17,10 +17,12 @@ from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process
 from threading import Thread
 from types import ModuleType
+from typing import TypeVar
 
 from pkmcal.errors import ResultError
 from pkmcal.studies.tasks import Finished, Job, SolvedBatch, work
 
+Task = TypeVar("Task")
 MOST_PROCESSES = 61 if sys.platform == "win32" else 1024
 """Most processes of a pool; Windows waits for no more."""
 MOST_FRUITLESS_POOLS = 3
@@ -44,12 +46,12 @@ def on_cores(tasks: Sequence[Job], finished: Finished, count: int | None = None)
         for number, task in enumerate(tasks):
             finished(number, work(task))
         return 1
-    pending, fruitless = dict(enumerate(tasks)), 0
+    pending, fruitless = {number: number for number in range(len(tasks))}, 0
     while pending:
         before = len(pending)
         try:
-            with _process_pool(count) as pool:
-                run_on(pool, work, pending, finished)
+            with _process_pool(count, tasks) as pool:
+                run_on(pool, _work_on, pending, finished)
         except BrokenProcessPool:
             # one dead process ends the pool: a new one takes the batches that were not finished
             fruitless = 0 if len(pending) < before else fruitless + 1
@@ -64,8 +66,8 @@ def on_cores(tasks: Sequence[Job], finished: Finished, count: int | None = None)
 
 def run_on(
     executor: Executor,
-    function: Callable[[Job], SolvedBatch],
-    pending: dict[int, Job],
+    function: Callable[[Task], SolvedBatch],
+    pending: dict[int, Task],
     finished: Finished,
 ) -> None:
     """Run pending tasks, and remove each from ``pending`` when ``finished`` has its result.
@@ -84,8 +86,11 @@ def run_on(
 
 
 @contextmanager
-def _process_pool(count: int) -> Generator[ProcessPoolExecutor]:
-    """Pool of new processes, which are killed where the block raises.
+def _process_pool(count: int, tasks: Sequence[Job]) -> Generator[ProcessPoolExecutor]:
+    """Pool of new processes, which have all tasks and are killed where the block raises.
+
+    The tasks are no items of the pool's queue: where processes are killed while a long item is
+    written, the shutdown of the pool hangs before Python 3.11.5.
 
     A new process runs the main module of its parent again, unless that module has no file. Batches
     need nothing of it, so it is hidden, and a user's script needs no ``if __name__ == "__main__"``.
@@ -93,7 +98,7 @@ def _process_pool(count: int) -> Generator[ProcessPoolExecutor]:
     main, others = sys.modules["__main__"], set(active_children())
     sys.modules["__main__"] = ModuleType("__main__")
     try:
-        pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process)
+        pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process, (tasks,))
         try:
             yield pool
         except BaseException:
@@ -106,8 +111,20 @@ def _process_pool(count: int) -> Generator[ProcessPoolExecutor]:
         sys.modules["__main__"] = main
 
 
-def _start_process() -> None:
-    """Ignore Ctrl-C, which the study's main process handles, and end with that process."""
+_TASKS: list[Job] = []
+"""Tasks of a process of a pool."""
+
+
+def _work_on(number: int) -> SolvedBatch:
+    """Work on one of the tasks of this process."""
+    return work(_TASKS[number])
+
+
+def _start_process(tasks: Sequence[Job]) -> None:
+    """Keep the tasks, ignore Ctrl-C, which the study's main process handles, and end with that
+    process.
+    """
+    _TASKS.extend(tasks)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
 

@@ -250,8 +250,8 @@ def _table(study: SweepResult) -> Table:
     heads += ("tool, °", "stated, °", "95 % below, °") if turns else ()
     heads += ("failed, %",)
     legend = (
-        "stated: deviation that calibrations tell of themselves; held: share of",
-        "95 % intervals that hold the truth, of all parameters and of the tool's pose",
+        "stated: standard deviation that the calibrations state; held: share of 95 % intervals that"
+        " hold the truth, of all parameters and of the tool's pose"
     )
     return Table("Errors after a calibration", heads, tuple(rows), first=5, legend=legend)
 

@@ -2,11 +2,10 @@
 
 import type { Section } from "../document";
 import { h } from "../dom";
-import { sign } from "../marks";
 
 export function contents(sections: readonly Section[], elements: readonly HTMLElement[]): HTMLElement {
   const links = sections.map((section) =>
-    h("a", { href: `#${section.name}` }, ...(section.mark ? [sign(section.mark), " "] : []), section.menu));
+    h("a", { href: `#${section.name}` }, section.menu));
   const first = sections.findIndex((section) => section.expert);
   const entries = links.flatMap((link, k) =>
     k === first ? [h("span", { class: "part" }, "For the metrologist"), link] : [link]);
