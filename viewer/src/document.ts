@@ -364,7 +364,6 @@ export interface TableRow {
   name: string;
   hint: string;
   mark: "good" | Level | null;
-  source: "paper" | "prototype" | "ours";
   tags: string[];
   quiet: boolean;
 }

@@ -30,7 +30,6 @@ def table_block(table: Table) -> DataTable:
                 values=tuple(map(leading_number, (row.name, *row.cells))),
                 key=row.key,
                 mark=row.mark if marked else None,
-                source=row.source,
             )
             for row in table.rows
         ),

@@ -150,7 +150,7 @@ function tableRow(row: TableRow, columns: Column[], most: number): HTMLTableRowE
     const attributes = { scope: "row", class: column.form, "data-tip": row.hint || false };
     return h("th", attributes, ...(row.mark ? [sign(row.mark), " "] : []), ...children);
   });
-  const classes = `of-${row.source}${row.quiet ? " quiet" : ""}`;
+  const classes = row.quiet ? "quiet" : "";
   return h("tr", { class: classes, "data-key": row.key || false }, ...cells);
 }
 

@@ -40,7 +40,6 @@ class TableRow(Schema):
     name: Text = ""
     hint: Text = ""
     mark: Mark | None = None
-    source: Literal["paper", "prototype", "ours"] = "ours"
     tags: tuple[str, ...] = ()
     quiet: bool = False
 
