@@ -294,13 +294,11 @@ def test_what_the_prior_determines_better_counts_as_far_as_data_leave_it(whole):
     assert left(1.0) == pytest.approx(0.5, rel=1e-4)
     assert left(10.0) == pytest.approx(1 / 101, rel=0.1)
     # noise, which makes the rest of the estimate's variance: refused, a warning, no finding
-    half = with_information(1.0)
-    few, least = VERDICT.least_noise_share, 1 - VERDICT.worth_reporting**2
-    levels = [Level.WRONG, Level.DOUBTFUL, Level.DOUBTFUL, None]
-    for by_noise, level in zip(
-        (0.9 * few, 1.1 * few, 0.9 * least, 1.1 * least), levels, strict=True
-    ):
-        sigma = half.undetermined_shift / np.sqrt(1 - by_noise)
+    half, few = with_information(1.0), VERDICT.least_noise_share
+    largest = max(s.moves_platform for s in (*half.unidentified, *half.weak))
+    refused, warned = (half.undetermined_shift / np.sqrt(1 - k * few) for k in (0.9, 1.1))
+    silent = 1.1 * largest / VERDICT.worth_reporting
+    for sigma, level in ((refused, Level.WRONG), (warned, Level.DOUBTFUL), (silent, None)):
         scale = (sigma / platform_sigma(estimate)) ** 2
         other = replace(estimate, joint_covariance=scale * estimate.joint_covariance)
         findings = assess(observation, other, half).findings

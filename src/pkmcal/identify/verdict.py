@@ -59,8 +59,8 @@ class VerdictOptions:
     # share of the platform's variance by the noise of the data from which that is no reason: the
     # result is hardly worse for it. More of the same images reduce noise alone
     least_noise_share: float = FEW
-    # share of the platform's standard deviation from which on what remains undetermined is worth a
-    # warning: one half makes the standard deviation larger by an eighth
+    # share of the platform's standard deviation from which on a single undetermined motion is worth
+    # a warning: one half makes the standard deviation larger by an eighth
     worth_reporting: float = 0.5
     # share of configurations near a singular pose from which on the estimate is not reliable
     singular_share: float = MAJORITY
@@ -340,27 +340,25 @@ def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
 def _undetermined(
     estimate: Estimate, findings: Findings, options: VerdictOptions
 ) -> Iterator[Finding]:
-    """Findings on the largest motions that the data leave undetermined, where errors of the nominal
-    model that remain make a noticeable part of the tool's variance.
+    """Findings on the largest motions that the data leave undetermined.
 
-    They are wrong or doubtful by the displacement of the tool by all such errors together, so that
-    no verdict depends on the names of motions.
+    They are wrong by the displacement of the tool by all such errors together, where these make
+    most of its variance, so that no refusal depends on the names of motions; otherwise doubtful
+    where a single motion makes a noticeable part of its standard deviation.
     """
     shift, sigma = findings.undetermined_shift, platform_sigma(estimate)
-    if shift <= max(negligible_shift(estimate.machine.parameters), options.worth_reporting * sigma):
+    if shift <= negligible_shift(estimate.machine.parameters):
         return
-    # where noise makes enough of the variance, the standard deviation suffices
-    by_noise = 1 - (shift / sigma) ** 2
-    refused = (
-        by_noise <= options.least_noise_share
-        and shift > options.undetermined_share * findings.by_nominal
-    )
     causes = sorted(
         (*findings.unidentified, *findings.weak), key=lambda s: s.moves_platform, reverse=True
     )
-    large = [
-        s for s in causes if s.matters and s.moves_platform > options.large_cause_share * shift
-    ]
+    # where noise makes enough of the variance, the standard deviation suffices
+    refused = (
+        sigma**2 - shift**2 <= options.least_noise_share * sigma**2
+        and shift > options.undetermined_share * findings.by_nominal
+    )
+    least = options.large_cause_share * shift if refused else options.worth_reporting * sigma
+    large = [s for s in causes if s.matters and s.moves_platform > least]
     for one in large or causes[: int(refused)]:
         yield finding(
             "machine.undetermined",
