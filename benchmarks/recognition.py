@@ -338,7 +338,7 @@ def main() -> None:
         for name, outcome in outcomes:
             counts.setdefault(name, Counter())[outcome.what] += 1
             seconds.setdefault(name, []).append(outcome.seconds)
-            print(f"{name}: {outcome.what} ({outcome.said.splitlines()[0]})", file=sys.stderr)
+            print(f"{name}: {outcome.what} ({outcome.message.splitlines()[0]})", file=sys.stderr)
     total: Counter[str] = sum(counts.values(), Counter())
     for name, count in [*counts.items(), ("all", total)]:
         words = ", ".join(f"{n} {what}" for what, n in count.most_common())
