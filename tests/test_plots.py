@@ -99,6 +99,16 @@ def test_an_axis_holds_its_values_and_its_zero():
 # ------------------------------------------------------------------ charts
 
 
+@pytest.mark.parametrize("values", [[], [0.0], [0.0, 0.0], [float("nan")]])
+def test_axes_of_nothing_but_zeros_have_labels(values):
+    zero = linear_axis("mm", values, zero=True)
+    assert zero.limits == (0.0, 1.0)
+    for axis in (zero, linear_axis("mm", values), log_axis("mm", values)):
+        low, high = axis.limits
+        assert len(axis.ticks) >= LEAST_LOG_TICKS
+        assert all(low <= tick.at <= high for tick in axis.ticks)
+
+
 def test_a_box_holds_the_quantiles_of_the_finite_values():
     values = np.concatenate([np.arange(101.0), [np.nan]])
     box = charts.box("leg 1", values, "mm", 0)

@@ -227,6 +227,7 @@ def test_a_verdict_has_two_lines(sentences, points):
 @pytest.mark.parametrize(
     ("text", "value"),
     [("−0.3 ± 0.1", -0.3), ("1\N{NARROW NO-BREAK SPACE}712 edges", 1712), ("1e-09", 1e-9),
+     ("1e999", None),
      ("+0.5 %", 0.5), ("–", None), ("leg 3", None), ("", None)],
 )  # fmt: skip
 def test_cells_are_sorted_by_their_number(text, value):

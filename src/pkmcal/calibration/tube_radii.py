@@ -33,6 +33,7 @@ from pkmcal.outcome.hypotheses import (
     harmless_misfit,
     posterior,
 )
+from pkmcal.outcome.progress import no_progress
 from pkmcal.session.load import Session
 
 RadiiHypothesis = Hypothesis[Session]
@@ -91,7 +92,7 @@ def _refined(case: Case, session: Session, refine_camera: bool, seed: int) -> Re
     rng = np.random.default_rng(seed)
     again = localize_case(session, case.images, case.boards, rng)
     cameras = refinement_of(again.session, refine_camera)
-    return refine_alternating(again, cameras, lambda _text, _share: None, lambda _step: None)
+    return refine_alternating(again, cameras, no_progress, lambda _step: None)
 
 
 def _of_half_the_radii(session: Session) -> Session:

@@ -59,11 +59,14 @@ def with_pictures(inspection: Inspection) -> Part:
     files = [(inspection.stations[s].images.images, k) for s, k in order]
     jpegs = jpegs_within(files, PAGE_JPEG_CHARACTERS)
     images = [_image(inspection, s, k, one) for (s, k), one in zip(order, jpegs, strict=False)]
+    text = NOMINAL_OVER_IMAGES_TEXT
+    if len(images) < len(order):
+        text += f" Here are {len(images)} of {len(order)} images."
     block = Images(images=tuple(images), first=len(first), legs=inspection.session.machine.n_legs)
     return Part(
         "photographs",
         "The nominal model over the images",
-        blocks=(Paragraph(text=NOMINAL_OVER_IMAGES_TEXT), block),
+        blocks=(Paragraph(text=text), block),
         menu="Images",
     )
 

@@ -18,7 +18,6 @@ PAGE_JPEG_CHARACTERS = 8_000_000
 SMALL_JPEG_WIDTH = 256
 """Width (px) of an image for which the budget holds no more."""
 PAGE_JPEG_QUALITY = 70
-""""""
 JPEGS_DECODED_AT_ONCE = 32
 """Images decoded before the remaining budget is checked again."""
 

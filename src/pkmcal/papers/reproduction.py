@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 from pkmcal.outcome import Level, Mark, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import doubtful, note, wrong
-from pkmcal.studies.engine import StudyProgress, StudyResult
+from pkmcal.outcome.progress import Progress, no_progress, part
+from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Key
 from pkmcal.wording import count, number, with_unit
@@ -42,11 +43,11 @@ class Options:
     seed: int = 0
     long: bool = False
     images: bool = False
-    progress: StudyProgress = lambda _text, _share: None
+    progress: Progress = no_progress
 
-    def within(self, first: float, last: float) -> StudyProgress:
+    def within(self, first: float, last: float) -> Progress:
         """Progress callback for a part of the work, from ``first`` to ``last`` of its share."""
-        return lambda text, share: self.progress(text, first + (last - first) * share)
+        return part(self.progress, first, last)
 
 
 @dataclass(frozen=True)

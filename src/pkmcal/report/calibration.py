@@ -337,7 +337,7 @@ def _comparison(
         return None
     tested_text = (
         " Held out: configurations that the calibration has not used, with the images' own noise."
-        if tested
+        if any(one.role == "test" for one in magnitudes)
         else ""
     )
     return LogBar(

@@ -220,8 +220,8 @@ def _image_blocks(c: CameraCalibration, paths: list[Path]) -> tuple[Block, ...]:
         for v, path in zip(order, files, strict=True)
     )
     text = (
-        "Largest held-out error first. Circles: detected corners; arrows: from where the"
-        f" calibrated camera expects them, {factor:g} times as long as they are; orange circles:"
+        "Largest held-out error first. Circles: detected corners; arrows: from there to where"
+        f" the calibrated camera expects them, {factor:g} times as long as they are; dashed:"
         " rejected."
     )
     missed = [f"{one.name}: {one.reason}" for one in c.detections if not one.success]
@@ -237,8 +237,8 @@ def _image(c: CameraCalibration, v: int, jpeg: str, factor: float, path: Path | 
     for i in finite:
         (x, y), (dx, dy) = c.pixels[v, i].tolist(), c.residuals[v, i].tolist()
         tip = (
-            f"Corner {i}: {number(dx, places, signed=True)},"
-            f" {number(dy, places, signed=True)} px; weight {c.weight[v, i]:.2f}"
+            f"Corner {i}: {number(-dx, places, signed=True)}, {number(-dy, places, signed=True)} px"
+            f" from where it is expected; weight {c.weight[v, i]:.2f}"
         )
         at, dashed = (round(x, 2), round(y, 2)), not c.inliers[v, i]
         rings.append(Ring(at=at, tip=tip, dashed=dashed))
@@ -248,7 +248,7 @@ def _image(c: CameraCalibration, v: int, jpeg: str, factor: float, path: Path | 
     n_rejected = len(finite) - int(c.inliers[v, finite].sum())
     caption = f"{count(len(finite), 'corner')}" + (f", {n_rejected} rejected" if n_rejected else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
-    caption += "" if jpeg else "; the image is not at hand"
+    caption += "" if jpeg else "; the image cannot be read, or has no room here"
     width, height = c.camera.image_size
     layers = (
         Layer(name="corners", shapes=tuple(rings)),
@@ -273,7 +273,8 @@ def _field_block(c: CameraCalibration) -> Images:
     """
     width, height = c.camera.image_size
     columns, rows = FIELD_CELLS
-    pixels, off = c.pixels[c.inliers], c.residuals[c.inliers]
+    # from the expected to the detected corner, as in the field of a calibration
+    pixels, off = c.pixels[c.inliers], -c.residuals[c.inliers]
     dx, dy = width / columns, height / rows
     # cell of each corner, and number of corners in each cell
     column = np.clip(((pixels[:, 0] + 0.5) / dx).astype(int), 0, columns - 1)

@@ -41,7 +41,7 @@ def section(estimate: Estimate) -> Part | None:
     """Section on correlations; None for fewer than two free parameters, or too many to be drawn."""
     table = estimate.machine.parameters
     free, rho, pairs = correlations(estimate)
-    if not 1 < len(free) <= MOST_CORRELATIONS:
+    if not 1 < len(free) <= MOST_CORRELATIONS or not pairs.any():
         return None
     names = [table.in_words(table.names[k]) for k in free]
     off = np.abs(rho) * pairs

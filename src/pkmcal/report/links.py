@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.outcome.blocks.base import Key, configuration_key, image_key
+from pkmcal.outcome.blocks.base import Key, image_key
 from pkmcal.session.load import Session
 
 Place = tuple[int, int]
@@ -29,10 +29,6 @@ class Links:
     def to_image(self, s: int, k: int) -> Key:
         """Key of the image of a configuration at a station."""
         return image_key(self.stations[s], self.configurations[k]) if self.stations else ""
-
-    def to_configuration(self, k: int) -> Key:
-        """Key of a configuration."""
-        return configuration_key(self.configurations[k]) if self.configurations else ""
 
     def to_largest(self, station: Integers, configuration: Integers, size: Array) -> Key:
         """Key of the image of the largest value.

@@ -43,12 +43,12 @@ At this value their combination is known 3.2 times better than each alone.
 """
 MOST_TIGHT_PAIRS = 6
 PARAMETER_SOURCES = {
-    "data": ("data", "the data decide"),
-    "drawing": ("nominal", "the nominal model decides more than the data"),
-    "frame": ("frame", "defines the frame"),
-    "fixed": ("fixed", "kept at the nominal model's value"),
+    "data": "data",
+    "drawing": "nominal",
+    "frame": "frame",
+    "fixed": "fixed",
 }
-"""Mark in the table, and sentence, by the source's key."""
+"""Mark in the table by the source's key."""
 HELD_SOURCES = ("frame", "fixed")
 HELD_TAG, SIGNIFICANT_TAG = "held", "significant"
 SIGNIFICANT_SIGMAS = 3.0
@@ -88,14 +88,9 @@ class ParameterRow:
     note: str
 
     @property
-    def source_text(self) -> str:
-        """Source in words."""
-        return PARAMETER_SOURCES[self.source][1]
-
-    @property
     def mark_text(self) -> str:
         """Mark of the source in the table."""
-        return PARAMETER_SOURCES[self.source][0]
+        return PARAMETER_SOURCES[self.source]
 
     @property
     def share_text(self) -> str:

@@ -192,8 +192,8 @@ def station_images(calibration: Calibration) -> dict[int, Sequence[Integers]]:
 def _rejected(session: Session, most: int, room: int) -> Iterator[blocks.Image]:
     """Images that could not be localized, each with the reason.
 
-    ``most`` of them are shown, in ``room`` characters of JPEGs. Images without room are listed
-    without their JPEG.
+    ``most`` of them have their JPEG, as far as ``room`` characters suffice; the others are listed
+    without.
     """
     lost = [(one, photo) for one in session.rejected for photo in one.station.images]
     files = [(_decoded(one.station), one.station.images.index(photo)) for one, photo in lost[:most]]

@@ -12,6 +12,7 @@ from pkmcal.judge.validate import Validation
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table
 from pkmcal.outcome.blocks.base import configuration_key, leg_key
 from pkmcal.outcome.blocks.plot import (
+    Box,
     DotsMark,
     Plot,
     Point,
@@ -340,10 +341,10 @@ def _by_configuration(judged: NominalComparison, session: Session) -> Plot | Non
 def _by_joint(judged: NominalComparison, session: Session) -> Plot | None:
     """Residuals of the calibrated machine, in predicted standard deviations."""
     normalized = judged.calibrated.residuals / judged.promise.expected
-    boxes = [
-        box(name, normalized[:, k], "σ", 1, leg_colour(k + 1), leg_key(k + 1))
-        for k, name in enumerate(session.document["joints"]["columns"])
-    ]
+    boxes: list[Box | None] = []
+    for k, name in enumerate(session.document["joints"]["columns"]):
+        leg = int(np.flatnonzero(session.machine.layout.actuated == k)[0]) + 1
+        boxes.append(box(name, normalized[:, k], "σ", 1, leg_colour(leg), leg_key(leg)))
     return row_plot(
         "readings-by-joint",
         "Residuals by joint",

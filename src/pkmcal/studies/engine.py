@@ -8,20 +8,18 @@ the number of workers nor on their order, and finished batches can be stored and
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.outcome.progress import Progress
 from pkmcal.studies.executors import on_cores
 from pkmcal.studies.statistics import SUMMARIES_BY_STATISTIC, Summary
 from pkmcal.studies.store import Store
 from pkmcal.studies.tasks import Batch, Job, Key, Runner, Sample, SolvedBatch, StudySetting
-
-StudyProgress = Callable[[str, float], None]
-
 
 S = TypeVar("S", bound=StudySetting)
 
@@ -54,7 +52,7 @@ class StudyResult(Generic[S]):
         return self.samples[key].values[quantity]
 
 
-def run(setting: S, runs: int, seed: int, progress: StudyProgress | None = None) -> StudyResult[S]:
+def run(setting: S, runs: int, seed: int, progress: Progress | None = None) -> StudyResult[S]:
     """Study of one setting. progress : callback with a text and the share done."""
     return run_all([setting], runs, seed, progress)[0]
 
@@ -63,7 +61,7 @@ def run_all(
     settings: Sequence[S],
     runs: int,
     seed: int,
-    progress: StudyProgress | None = None,
+    progress: Progress | None = None,
     runner: Runner | None = None,
     store: Store | None = None,
     names: Sequence[str] = (),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Literal
 
@@ -48,4 +49,5 @@ def _form(table: Table, k: int) -> Literal["text", "number", "shade"]:
 def leading_number(text: str) -> float | None:
     """Number with which a text begins, such as that of ``−0.3 ± 0.1``; None without one."""
     match = _LEADING_NUMBER.match(text.translate(_PLAIN_DIGITS))
-    return float(match[0]) if match else None
+    value = float(match[0]) if match else math.nan
+    return value if math.isfinite(value) else None

@@ -15,7 +15,7 @@ Line = tuple[Vector, ...]
 """Points of a polyline; empty where there is nothing to draw."""
 PoseRow = tuple[float, float, float, float]
 Pose = tuple[PoseRow, PoseRow, PoseRow, PoseRow]
-Key = str
+Key = Text
 """What an element belongs to, for the selection that all blocks of a page share: ``leg:3``,
 ``station:left``, ``configuration:c07`` or ``image:left/c07``; empty for nothing. Elements with the
 same key are highlighted together, and a click on one leads to the image of its key.

@@ -86,12 +86,14 @@ def linear_axis(label: str, values: Iterable[float], *, zero: bool = False) -> P
     margin = AXIS_MARGIN * (span if span > LEAST_SPAN * size else size or 1.0)
     low = low if zero and low == 0 else low - margin
     high = high if zero and high == 0 else high + margin
+    if low == high:  # nothing but zeros
+        high = 1.0
     return PlotAxis(label=label, scale="linear", limits=(low, high), ticks=linear_ticks(low, high))
 
 
 def log_axis(label: str, values: Iterable[float]) -> PlotAxis:
     """Logarithmic axis that holds all finite positive values."""
-    low, high = (math.log10(v) for v in _ends(v for v in values if v > 0))
+    low, high = (math.log10(v or 1.0) for v in _ends(v for v in values if v > 0))
     margin = max(AXIS_MARGIN * (high - low), LEAST_LOG_MARGIN)
     low, high = 10 ** (low - margin), 10 ** (high + margin)
     return PlotAxis(label=label, scale="log", limits=(low, high), ticks=log_ticks(low, high))
