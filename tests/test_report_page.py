@@ -357,6 +357,8 @@ ACTED = """
   $("#parameters .more").click();
   button("Change").click();
   out.changes = JSON.stringify(cells(4));
+  button("Nominal").click();
+  out.nominal = JSON.stringify(cells(2));
   let copied = "";
   document.execCommand = () => { copied = document.activeElement.value; return true; };
   Object.defineProperty(navigator, "clipboard", { value: undefined });
@@ -385,6 +387,9 @@ def test_page_works_in_a_browser(page, tmp_path, width, dark):
     assert json.loads(root["legs"]) == ["3"]
     changes = [abs(leading_number(text)) for text in json.loads(root["changes"])]
     assert changes == sorted(changes, reverse=True)
+    nominal = [leading_number(text) for text in json.loads(root["nominal"])]
+    assert nominal == sorted(nominal, reverse=True)
+    assert min(nominal) < 0 < max(nominal)
     lines = [line.split("\t") for line in root["tsv"].splitlines()]
     assert lines[0][0] == "Name"
     assert {line[0] for line in lines[1:]} == {row["name"] for row in free}
