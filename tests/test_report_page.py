@@ -351,6 +351,11 @@ ACTED = """
     .find((one) => one.textContent === text);
   const cells = (k) => rows().map((row) => row.cells[k].textContent);
   out.first = rows().length;
+  dispatchEvent(new Event("beforeprint"));
+  out.printed = rows().length;
+  out.sections = document.querySelectorAll("details:not([open])").length;
+  dispatchEvent(new Event("afterprint"));
+  out.restored = rows().length;
   button("Leg 3").click();
   out.legs = JSON.stringify([...new Set(cells(0))]);
   button("Leg 3").click();
@@ -370,7 +375,7 @@ ACTED = """
   out.yaml = copied;
   location.hash = "#how";
   await wait(300);
-  out.opened = $("#how dl") !== null;
+  out.opened = $("#how details").open && $("#how dl") !== null;
   rows()[0].dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
   out.selected = document.querySelectorAll("#parameters tr.hovered").length;
 """
@@ -383,7 +388,8 @@ def test_page_works_in_a_browser(page, tmp_path, width, dark):
     (table,) = page_blocks(page_document(page), "table", "parameters")
     free = [row for row in table["rows"] if "held" not in row["tags"]]
     assert len(free) > 30
-    assert int(root["first"]) == 12
+    assert [int(root[name]) for name in ("first", "printed", "restored")] == [12, len(free), 12]
+    assert root["sections"] == "0"  # all are open on paper
     assert json.loads(root["legs"]) == ["3"]
     changes = [abs(leading_number(text)) for text in json.loads(root["changes"])]
     assert changes == sorted(changes, reverse=True)
