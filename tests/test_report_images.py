@@ -235,7 +235,7 @@ INSPECTED = """
     new KeyboardEvent("keydown", { key: name, bubbles: true, cancelable: true }));
   (async () => {
     tell.few = buttons().length;
-    $("#photographs .images-all").click();
+    [...document.querySelectorAll("#photographs .images-bar button")].at(-1).click();
     tell.all = buttons().length;
     tell.captions = JSON.stringify([...document.querySelectorAll(`${grid} figcaption b`)]
       .map((one) => one.textContent));
@@ -289,11 +289,23 @@ INSPECTED = """
     tell.last = caption();
     $(".inspector-close").click();
     await wait(100);
+    $("#field details").open = true;
+    await wait(200);
     // an arrow of the field leads to its image
     const arrow = $("#field .residuals [data-key]");
     arrow.dispatchEvent(new MouseEvent("click", { bubbles: true }));
     await wait(200);
     tell.led = [arrow.dataset.key, caption()].join("|");
+    // the image stays under a pointer that moves, and keys act after a button that is gone
+    const layer = $(".inspector-bar [data-layer]");
+    layer.focus();
+    key("ArrowRight");
+    tell.focused = document.activeElement.className;
+    tell.stepped = caption();
+    $(`${grid} [data-key]`).dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
+    await wait(50);
+    tell.stayed = caption();
+    tell.dialogs = document.querySelectorAll("dialog").length;
     tell.overhang = document.documentElement.scrollWidth - document.documentElement.clientWidth;
     tell.done = "yes";
   })();"""
@@ -346,3 +358,6 @@ def test_images_are_inspected(page, tmp_path):
     assert (float(root["rows"]), float(root["fine"])) == (STRIP_ROWS, STRIP_ROWS / 8)
     key, led = root["led"].split("|")
     assert key == "image:" + led.replace(" / ", "/")
+    assert root["focused"] == "inspector"
+    assert root["stayed"] == root["stepped"] != led
+    assert root["dialogs"] == "1"

@@ -352,12 +352,19 @@ ACTED = """
     .find((one) => one.textContent === text);
   const cells = (k) => rows().map((row) => row.cells[k].textContent);
   out.first = rows().length;
+  dispatchEvent(new Event("beforeprint"));
+  out.printed = rows().length;
+  out.sections = document.querySelectorAll("details:not([open])").length;
+  dispatchEvent(new Event("afterprint"));
+  out.restored = rows().length;
   button("Leg 3").click();
   out.legs = JSON.stringify([...new Set(cells(0))]);
   button("Leg 3").click();
   $("#parameters .more").click();
   button("Change").click();
   out.changes = JSON.stringify(cells(4));
+  button("Nominal").click();
+  out.nominal = JSON.stringify(cells(2));
   let copied = "";
   document.execCommand = () => { copied = document.activeElement.value; return true; };
   Object.defineProperty(navigator, "clipboard", { value: undefined });
@@ -369,7 +376,7 @@ ACTED = """
   out.yaml = copied;
   location.hash = "#how";
   await wait(300);
-  out.opened = $("#how dl") !== null;
+  out.opened = $("#how details").open && $("#how dl") !== null;
   rows()[0].dispatchEvent(new PointerEvent("pointerover", { bubbles: true }));
   out.selected = document.querySelectorAll("#parameters tr.hovered").length;
 """
@@ -382,10 +389,14 @@ def test_page_works_in_a_browser(page, tmp_path, width, dark):
     (table,) = page_blocks(page_document(page), "table", "parameters")
     free = [row for row in table["rows"] if "held" not in row["tags"]]
     assert len(free) > 30
-    assert int(root["first"]) == 12
+    assert [int(root[name]) for name in ("first", "printed", "restored")] == [12, len(free), 12]
+    assert root["sections"] == "0"  # all are open on paper
     assert json.loads(root["legs"]) == ["3"]
     changes = [abs(leading_number(text)) for text in json.loads(root["changes"])]
     assert changes == sorted(changes, reverse=True)
+    nominal = [leading_number(text) for text in json.loads(root["nominal"])]
+    assert nominal == sorted(nominal, reverse=True)
+    assert min(nominal) < 0 < max(nominal)
     lines = [line.split("\t") for line in root["tsv"].splitlines()]
     assert lines[0][0] == "Name"
     assert {line[0] for line in lines[1:]} == {row["name"] for row in free}

@@ -341,11 +341,13 @@ export interface DataTable {
  *     leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
  *     darker the larger it is among those of all such columns.
  * hint : explanation of the heading.
+ * by_size : sorted by the size of the values, whatever their sign, as changes are.
  */
 export interface Column {
   name: string;
   form: "text" | "number" | "leg" | "share" | "shade";
   hint: string;
+  by_size: boolean;
 }
 /**
  * Row of a table.

@@ -19,11 +19,16 @@ export function h<K extends keyof HTMLElementTagNameMap>(
   return element;
 }
 
-const N_COLOURS = 8;
-
-/** Class of the colour of a leg's key, such as `leg:3`; empty for another key. */
-export function legClass(key: string): string {
-  return key.startsWith("leg:") ? `leg-${((Number(key.slice(4)) - 1) % N_COLOURS) + 1}` : "";
+/** SVG element with attributes and children. */
+export function svg<K extends keyof SVGElementTagNameMap>(
+  tag: K,
+  attributes: Record<string, string | number> = {},
+  ...children: Child[]
+): SVGElementTagNameMap[K] {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, String(value));
+  element.append(...children);
+  return element;
 }
 
 /** Factor and name of the unit in which a quantity is shown. */
@@ -31,7 +36,7 @@ export const UNITS = {
   m: { factor: 1e3, name: "mm", decimals: 1 },
   rad: { factor: 180 / Math.PI, name: "°", decimals: 2 },
 } as const;
-export type Unit = keyof typeof UNITS;
+type Unit = keyof typeof UNITS;
 
 /** Number with a true minus sign and without negative zeros. */
 export function number(value: number, decimals: number): string {

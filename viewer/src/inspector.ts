@@ -5,8 +5,9 @@
 
 import "./inspector.css";
 import type { Image, Layer } from "./document";
-import { h, number } from "./dom";
+import { h, number, svg } from "./dom";
 import { cameraPixel, imageSvg, scaleMarks, uprightSize } from "./overlay";
+import type { Key } from "./selection";
 import { stripPanel } from "./strips";
 
 const LARGEST_PIXEL = 80; // screen pixels for one of the image
@@ -36,10 +37,12 @@ export class Inspector {
   private readonly choices = h("span", { class: "inspector-choices" });
   private readonly layers = h("span", { class: "inspector-choices" });
   private readonly gamma: HTMLInputElement;
-  private readonly where = h("output", { class: "inspector-where" });
+  private readonly where = h("span", { class: "inspector-where" });
   private image: Image | null = null;
   private picture: SVGSVGElement | null = null;
   private overlay = 0;
+  /** Index of the strip that is shown, -1 for none. */
+  private chosen = -1;
   private curve: SVGElement[] = [];
   private readonly off = new Set<LayerName>();
   private readonly pointers = new Map<number, { x: number; y: number }>();
@@ -47,8 +50,11 @@ export class Inspector {
   /** Image pixel at the window's middle, and screen pixels for one of the image. */
   private view = { x: 0, y: 0, scale: 1 };
 
-  /** step : shows the image before (-1) or the next one (1). */
-  constructor(private readonly step: (by: number) => void) {
+  /**
+   * step : shows the image before (-1) or the next one (1).
+   * follow : shows the image of a key, to which an arrow leads.
+   */
+  constructor(private readonly step: (by: number) => void, private readonly follow: (key: Key) => void) {
     this.gamma = h("input", {
       type: "range", min: 0.2, max: 1.8, step: 0.05, value: 1, "aria-label": "Brightness of the dark parts",
       oninput: () => this.brighten(),
@@ -58,7 +64,7 @@ export class Inspector {
     this.strips = button("Strip", "Strip along the next edge (x), or of the edge that is clicked", () => this.nextStrip());
     this.element = h(
       "div",
-      { class: "inspector" },
+      { class: "inspector", tabindex: -1 },
       this.host,
       this.tip,
       this.strip,
@@ -84,7 +90,7 @@ export class Inspector {
   show(image: Image): void {
     this.image = image;
     this.size = { x: -0.5, y: -0.5, ...uprightSize(image) };
-    this.strip.replaceChildren();
+    this.chooseStrip(-1);
     this.replaceOverlay(Math.min(this.overlay, Math.max(image.overlays.length - 1, 0)));
     this.fit();
   }
@@ -109,16 +115,29 @@ export class Inspector {
       }, title))));
     this.addLayers(image.overlays[overlay]?.layers ?? []);
     this.brighten();
+    this.markStrip();
+    this.keepFocus();
+  }
+
+  /** Take the focus that a button had which is gone, so that keys keep their meaning. */
+  private keepFocus(): void {
+    const focused = document.activeElement as HTMLElement | null;
+    if (!focused || focused === document.body || focused.hidden) this.element.focus();
   }
 
   /** Show the strip of an edge below the image, none for an index without one. */
   private chooseStrip(index: number): void {
-    const { image, picture } = this;
-    if (!image || !picture) return;
-    const present = index >= 0 && index < image.strips.length;
-    this.strip.replaceChildren(...(present ? [stripPanel(image, index)] : []));
-    picture.querySelectorAll<SVGElement>("[data-strip]").forEach((edge) => {
-      edge.classList.toggle("chosen-strip", Number(edge.dataset.strip) === index);
+    const { image } = this;
+    if (!image) return;
+    this.chosen = index >= 0 && index < image.strips.length ? index : -1;
+    this.strip.replaceChildren(...(this.chosen < 0 ? [] : [stripPanel(image, index)]));
+    this.markStrip();
+    this.keepFocus();
+  }
+
+  private markStrip(): void {
+    this.picture?.querySelectorAll<SVGElement>("[data-strip]").forEach((edge) => {
+      edge.classList.toggle("chosen-strip", Number(edge.dataset.strip) === this.chosen);
     });
   }
 
@@ -193,20 +212,9 @@ export class Inspector {
   private addCurve(picture: SVGSVGElement): void {
     const image = picture.querySelector("image");
     if (!image) return;
-    const make = (name: string): SVGElement =>
-      document.createElementNS(picture.namespaceURI, name) as SVGElement;
-    const filter = make("filter");
-    filter.id = "inspector-tones";
-    filter.setAttribute("color-interpolation-filters", "sRGB");
-    const transfer = make("feComponentTransfer");
-    this.curve = ["R", "G", "B"].map((channel) => {
-      const one = make(`feFunc${channel}`);
-      one.setAttribute("type", "gamma");
-      return one;
-    });
-    transfer.append(...this.curve);
-    filter.append(transfer);
-    picture.prepend(filter);
+    this.curve = (["feFuncR", "feFuncG", "feFuncB"] as const).map((channel) => svg(channel, { type: "gamma" }));
+    picture.prepend(svg("filter", { id: "inspector-tones", "color-interpolation-filters": "sRGB" },
+      svg("feComponentTransfer", {}, ...this.curve)));
   }
 
   private brighten(): void {
@@ -243,8 +251,7 @@ export class Inspector {
   }
 
   private nextStrip(): void {
-    const chosen = this.picture?.querySelector<SVGElement>(".chosen-strip");
-    this.chooseStrip(chosen ? Number(chosen.dataset.strip) + 1 : 0);
+    this.chooseStrip(this.chosen + 1);
   }
 
   /** Shape of the overlay under the pointer. */
@@ -275,8 +282,9 @@ export class Inspector {
     host.addEventListener("pointerup", (event) => {
       up(event);
       if (Math.hypot(event.clientX - down.x, event.clientY - down.y) > CLICK_DISTANCE) return;
-      const strip = this.shapeAt(event)?.dataset.strip;
+      const { strip, key } = this.shapeAt(event)?.dataset ?? {};
       if (strip !== undefined) this.chooseStrip(Number(strip));
+      else if (key?.startsWith("image:")) this.follow(key);
     });
     host.addEventListener("pointerleave", () => {
       this.tip.hidden = true;

@@ -17,3 +17,5 @@ export const sign = (mark: Mark): HTMLElement =>
 const LEG_COLOURS = 8;
 /** Class with a leg's colour as `--c`; machines with more legs repeat the colours. */
 export const legClass = (leg: number): string => `leg-${((leg - 1) % LEG_COLOURS) + 1}`;
+/** Likewise of a leg's key, such as `leg:3`; empty for another key. */
+export const keyClass = (key: string): string => (key.startsWith("leg:") ? legClass(Number(key.slice(4))) : "");

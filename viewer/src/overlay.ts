@@ -2,19 +2,12 @@
 
 import "./overlay.css";
 import type { Image, Layer } from "./document";
-import { legClass } from "./dom";
+import { svg } from "./dom";
 import { toBlobUrl } from "./image_data";
+import { keyClass } from "./marks";
 
 type Shape = Layer["shapes"][number];
-const SVG = "http://www.w3.org/2000/svg";
 const ARROW_HEAD = 5; // units of a mark
-
-export function svg(tag: string, attributes: Record<string, string | number> = {}, ...children: Node[]): SVGElement {
-  const element = document.createElementNS(SVG, tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, String(value));
-  element.append(...children);
-  return element;
-}
 
 /** Size of the image as it is shown, px. */
 export function uprightSize(image: Image): { width: number; height: number } {
@@ -50,7 +43,7 @@ export function imageSvg(image: Image, overlay = 0): SVGSVGElement {
     class: "shot", role: "img", viewBox: `-0.5 -0.5 ${width} ${height}`,
     "aria-label": [image.title, image.caption].filter(Boolean).join(": "),
   }, svg("g", { transform: `matrix(${uprightMatrix(image).join(" ")})` },
-    background, ...layers.map((layer) => layerGroup(layer, image)))) as SVGSVGElement;
+    background, ...layers.map((layer) => layerGroup(layer, image))));
   scaleMarks(picture, width / 660);
   return picture;
 }
@@ -73,7 +66,7 @@ function pathData(shape: Shape): string {
 }
 
 function shapeGroup(shape: Shape, layer: Layer, image: Image): SVGElement {
-  const group = svg("g", { class: ["shape", legClass(shape.key), dashed(shape) ? "dashed" : ""].filter(Boolean).join(" ") });
+  const group = svg("g", { class: ["shape", keyClass(shape.key), dashed(shape) ? "dashed" : ""].filter(Boolean).join(" ") });
   if (shape.key) group.dataset.key = shape.key;
   if (shape.tip) group.dataset.tip = shape.tip;
   const mark = (at: [number, number], turn: number, ...children: Node[]): SVGElement =>

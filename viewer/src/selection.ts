@@ -28,6 +28,15 @@ export class Selection {
     this.tell();
   }
 
+  /** Classes of the elements with a key below a root, also of new ones. */
+  apply(root: ParentNode): void {
+    for (const element of root.querySelectorAll<HTMLElement>("[data-key]")) {
+      const key = element.dataset.key ?? "";
+      element.classList.toggle("hovered", matches(key, this.hovered));
+      element.classList.toggle("chosen", matches(key, this.chosen));
+    }
+  }
+
   private tell(): void {
     for (const listener of this.listeners) listener(this.hovered, this.chosen);
   }
@@ -58,11 +67,9 @@ export function connect(host: HTMLElement, selection: Selection): void {
     if (key && !target.closest("a, button")) selection.choose(key);
   });
   addEventListener("keydown", (event) => { if (event.key === "Escape") selection.choose(null); });
-  selection.subscribe((hovered, chosen) => {
-    for (const element of host.querySelectorAll<HTMLElement>("[data-key]")) {
-      const key = element.dataset.key ?? "";
-      element.classList.toggle("hovered", matches(key, hovered));
-      element.classList.toggle("chosen", matches(key, chosen));
-    }
+  host.addEventListener("keydown", (event) => {
+    const row = event.target as HTMLElement;
+    if (event.key === "Enter" && row.matches("tr[data-key]")) selection.choose(row.dataset.key ?? null);
   });
+  selection.subscribe(() => selection.apply(host));
 }

@@ -5,9 +5,8 @@
 
 import "./strips.css";
 import type { Image, Strip } from "./document";
-import { h } from "./dom";
+import { h, svg } from "./dom";
 import { toBlobUrl } from "./image_data";
-import { svg } from "./overlay";
 
 const ENLARGEMENTS = [8, 64]; // screen pixels for one across the edge
 

@@ -5,13 +5,22 @@ import { h } from "./dom";
 const MARGIN = 8;
 
 export function connectTips(host: HTMLElement): void {
-  const tip = h("div", { class: "tip", role: "tooltip", hidden: true });
+  const tip = h("div", { class: "tip", id: "tip", role: "tooltip", hidden: true });
   host.append(tip);
+  let described: Element | null = null;
   const show = (event: Event): void => {
-    const element = (event.target as Element).closest<HTMLElement>("[data-tip]");
+    const target = event.target as Element;
+    // a row that has the focus shows the explanation of its name
+    const row = event.type === "focusin" && target.matches("tr");
+    const element = row
+      ? target.querySelector<HTMLElement>("[data-tip]") : target.closest<HTMLElement>("[data-tip]");
+    described?.removeAttribute("aria-describedby");
+    described = element && target;
     tip.hidden = !element;
     if (!element) return;
+    target.setAttribute("aria-describedby", tip.id);
     tip.textContent = element.dataset.tip ?? "";
+    tip.style.left = tip.style.top = "0"; // the place would narrow the box that is measured
     const box = element.getBoundingClientRect(), own = tip.getBoundingClientRect();
     const left = Math.min(Math.max(box.left, MARGIN), innerWidth - own.width - MARGIN);
     const above = box.top - own.height - MARGIN;

@@ -147,9 +147,13 @@ def parameter_table(estimates: ParameterEstimates, gauge: str) -> DataTable:
             Column(name="Parameter", form="text"),
             Column(name="Nominal"),
             Column(name="Calibrated"),
-            Column(name="Change"),
+            Column(name="Change", by_size=True),
             Column(name="σ", hint="Standard deviation of the calibrated value"),
-            Column(name="Change/σ", hint="Change in standard deviations of the calibrated value"),
+            Column(
+                name="Change/σ",
+                hint="Change in standard deviations of the calibrated value",
+                by_size=True,
+            ),
             Column(name="Unit", form="text"),
             Column(
                 name="Source", form="share", hint="What decides the value, and the data's share"

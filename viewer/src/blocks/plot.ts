@@ -10,7 +10,8 @@ import * as Plot from "@observablehq/plot";
 import type {
   BarsMark, BoxesMark, CellsMark, ColourScale, DotsMark, LineMark, Panels, Plot as PlotBlock, PlotAxis as Axis, Point,
 } from "../document";
-import { h, number } from "../dom";
+import { h, number, svg } from "../dom";
+import type { Context } from "./index";
 import "./plot.css";
 
 type Mark = PlotBlock["marks"][number];
@@ -42,17 +43,18 @@ const GAP = 0.12;
 const LONGEST_NAME = 12;
 const COLOUR_STEPS = 20;
 
-export function panels(block: Panels): HTMLElement {
-  return h("div", { class: "panels" }, ...block.plots.map(plot));
+export function panels(block: Panels, context: Context): HTMLElement {
+  return h("div", { class: "panels" }, ...block.plots.map((one) => plot(one, context)));
 }
 
-export function plot(block: PlotBlock): HTMLElement {
+export function plot(block: PlotBlock, { selection }: Context): HTMLElement {
   const area = h("div", { class: "area" });
   let drawn = 0;
   const draw = (width: number) => {
     if (width === drawn) return;
     drawn = width;
     area.replaceChildren(picture(block, width));
+    selection.apply(area);
   };
   // a plot in a closed part of the page has no width yet; on paper it keeps this one
   draw(UNSEEN_WIDTH);
@@ -75,21 +77,21 @@ function legend(block: PlotBlock): HTMLElement[] {
 
 /** Small picture of a mark, for the legend. */
 function sign(mark: Mark): SVGElement {
-  const svg = shape("svg", { width: "20", height: "12", "aria-hidden": "true" });
+  const picture = svg("svg", { width: "20", height: "12", "aria-hidden": "true" });
   if (mark.mark === "line" || mark.mark === "rule") {
     const dashes = dashed(mark) ? "4,3" : "none";
-    svg.append(shape("path", {
+    picture.append(svg("path", {
       d: "M0,6H20", stroke: colour(mark.colour), "stroke-width": "2", "stroke-dasharray": dashes, fill: "none",
     }));
   } else if (mark.mark === "dots") {
-    svg.append(mark.symbol === "cross"
-      ? shape("path", { d: "M6,2L14,10M14,2L6,10", stroke: colour(mark.colour), "stroke-width": "2" })
-      : shape("circle", { cx: "10", cy: "6", r: "4", fill: colour(mark.colour) }));
+    picture.append(mark.symbol === "cross"
+      ? svg("path", { d: "M6,2L14,10M14,2L6,10", stroke: colour(mark.colour), "stroke-width": "2" })
+      : svg("circle", { cx: "10", cy: "6", r: "4", fill: colour(mark.colour) }));
   } else {
     const fill = mark.mark === "bars" ? colour(mark.colour) : "var(--band)";
-    svg.append(shape("rect", { x: "2", y: "1", width: "16", height: "10", fill }));
+    picture.append(svg("rect", { x: "2", y: "1", width: "16", height: "10", fill }));
   }
-  return svg;
+  return picture;
 }
 
 function colourLegend(scale: ColourScale): HTMLElement {
@@ -328,13 +330,13 @@ function cells(block: PlotBlock, mark: CellsMark, tips: Tip[]): Plot.Markish[] {
     }
   }
   return [(_index, scales) => {
-    const g = shape("g", { "aria-hidden": "true" });
+    const g = svg("g", { "aria-hidden": "true" });
     const px = (share: number) => (scales.x as (value: number) => number)(at(mark.x, share)).toFixed(1);
     const py = (share: number) => (scales.y as (value: number) => number)(at(mark.y, share)).toFixed(1);
     for (const [step, places] of grouped) {
       const d = places.map(([c, r]) =>
         `M${px(c / columns)},${py(r / rows)}H${px((c + 1) / columns)}V${py((r + 1) / rows)}H${px(c / columns)}Z`).join("");
-      g.append(shape("path", { d, fill: shade(colours, low + (step / (2 * COLOUR_STEPS)) * (high - low)) }));
+      g.append(svg("path", { d, fill: shade(colours, low + (step / (2 * COLOUR_STEPS)) * (high - low)) }));
     }
     return g as SVGElement;
   }];
@@ -401,10 +403,4 @@ function shade(scale: ColourScale, value: number): string {
   const [part, name] = scale.diverging
     ? [Math.abs(2 * share - 1), share < 0.5 ? "drawing" : "calibrated"] : [share, "drawing"];
   return `color-mix(in oklab, var(--${name}) ${(100 * part).toFixed(0)}%, var(--card))`;
-}
-
-function shape(tag: string, attributes: Record<string, string>): SVGElement {
-  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  return element;
 }

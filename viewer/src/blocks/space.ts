@@ -6,7 +6,7 @@ import { h, number } from "../dom";
 import type { Key } from "../selection";
 import { legTable } from "../stage/legs";
 import { type Shown, SpaceModel } from "../stage/space";
-import { PLANE_VIEW, Stage, VIEWS } from "../stage/stage";
+import { NO_WEBGL, PLANE_VIEW, Stage, VIEWS } from "../stage/stage";
 import type { Context } from "./index";
 import "./space.css";
 
@@ -17,9 +17,6 @@ const TOUR = 12_000; // ms through all poses, at most SLOWEST each
 const SLOWEST = 600;
 const BESIDE = 1.2; // largest angle between the eye and a camera, rad
 const HEIGHT = 0.4; // of the eye above the horizon, as a slope
-const NO_WEBGL =
-  "This browser draws nothing in space: it has no WebGL, or it is switched off. The tables of this" +
-  " page are complete.";
 
 export function space(block: Space, context: Context): HTMLElement {
   const figure = h("figure", { class: "space-block" });
@@ -32,7 +29,7 @@ export function space(block: Space, context: Context): HTMLElement {
       true,
     );
   } catch {
-    figure.append(h("p", { class: "note" }, NO_WEBGL), h("figcaption", { class: "small" }, block.caption));
+    figure.append(h("p", { class: "note" }, `${NO_WEBGL} The tables of this page are complete.`), h("figcaption", { class: "small" }, block.caption));
     return figure;
   }
   const model = new SpaceModel(block, stage);
@@ -46,7 +43,7 @@ export function space(block: Space, context: Context): HTMLElement {
     draw();
   });
   const change = changeBar(block, state, draw, stage.element);
-  select(block, context, stage, model, poses.go);
+  select(block, context, stage, model, poses.choose);
 
   const first = block.machine.motion.startsWith("planar") ? PLANE_VIEW : betweenCameras(block);
   const fit = (direction: Vector3, all = false): void =>
@@ -90,11 +87,12 @@ function poseBar(block: Space, onchange: (pose: number) => void) {
   const name = h("output", {});
   const slider = h("input", {
     type: "range", min: 0, max: block.poses.length - 1, step: 1, value: 0, "aria-label": "Configuration",
-    oninput: () => {
-      stop();
-      go(slider.valueAsNumber);
-    },
+    oninput: () => choose(slider.valueAsNumber),
   });
+  const choose = (pose: number): void => {
+    stop();
+    go(pose);
+  };
   const go = (pose: number): void => {
     slider.value = String(pose);
     const { label } = block.poses[pose];
@@ -120,7 +118,7 @@ function poseBar(block: Space, onchange: (pose: number) => void) {
     },
   }, "▶ Play");
   if (block.poses.length) name.textContent = block.poses[0].label;
-  return { element: h("div", { class: "bar poses" }, play, slider, name), go };
+  return { element: h("div", { class: "bar poses" }, play, slider, name), choose };
 }
 
 /** Sliders from one machine to the other, and of enlargements; none where nothing is enlarged. */
@@ -135,15 +133,19 @@ function changeBar(
   const morph = h("input", {
     type: "range", min: 0, max: 1, step: 0.01, value: 1, "aria-label": `From ${before} to ${after}`,
     oninput: () => {
+      runs += 1;
       state.share = morph.valueAsNumber;
       draw();
     },
   });
+  let runs = 0;
   const turnOver = (): void => {
     const [from, to] = [state.share, state.share < 0.5 ? 1 : 0];
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     const began = performance.now();
+    const own = (runs += 1);
     const step = (): void => {
+      if (own !== runs) return; // another motion has begun
       const t = still ? 1 : Math.min((performance.now() - began) / MORPH, 1);
       state.share = from + (to - from) * t * t * (3 - 2 * t);
       morph.value = String(state.share);

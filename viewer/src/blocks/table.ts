@@ -4,13 +4,14 @@ import "./table.css";
 import type { Column, DataTable, TableRow } from "../document";
 import { h } from "../dom";
 import { legClass, sign } from "../marks";
+import type { Context } from "./index";
 import { copyText, tsv, yaml } from "./table_text";
 
 /** Rows of a long table before all are asked for, and from how many rows on a table is long. */
 const FIRST_ROWS = 12, LONG = 18;
 const SORTABLE = 3, COPYABLE = 4;
 
-export function dataTable(block: DataTable): HTMLElement {
+export function dataTable(block: DataTable, { selection, printSteps }: Context): HTMLElement {
   const most = Math.max(...block.rows.flatMap((row) =>
     row.values.filter((_, k) => block.columns[k]?.form === "shade").map((value) => value ?? 0)));
   const drawn = block.rows.map((row) => tableRow(row, block.columns, most));
@@ -21,8 +22,9 @@ export function dataTable(block: DataTable): HTMLElement {
 
   const heads = block.columns.map((column, k) => {
     const attributes = { class: column.form, "data-tip": column.hint || false };
-    if (!column.name) return h("td", attributes);
-    if (block.rows.length < SORTABLE) return h("th", { scope: "col", ...attributes }, column.name);
+    const focus = { tabindex: column.hint ? 0 : false };
+    if (!column.name) return h("td", { ...attributes, ...focus });
+    if (block.rows.length < SORTABLE) return h("th", { scope: "col", ...attributes, ...focus }, column.name);
     const button = h("button", { type: "button", onclick: () => { sorting.next(k); update(); } }, column.name);
     return h("th", { scope: "col", ...attributes }, button);
   });
@@ -35,6 +37,7 @@ export function dataTable(block: DataTable): HTMLElement {
     const rows = passing();
     const shown = all ? rows : rows.slice(0, FIRST_ROWS);
     body.replaceChildren(...shown.map((k) => drawn[k]!));
+    selection.apply(body);
     markGroups(shown, block, drawn, sorting.column < 0);
     heads.forEach((head, k) => {
       if (k === sorting.column) head.setAttribute("aria-sort", sorting.down ? "descending" : "ascending");
@@ -75,7 +78,12 @@ export function dataTable(block: DataTable): HTMLElement {
     more,
     ...(block.note ? [h("p", { class: "small" }, block.note)] : []),
   ];
-  addEventListener("beforeprint", () => { all = true; update(); });
+  printSteps.push(() => {
+    const before = all;
+    all = true;
+    update();
+    return () => { all = before; update(); };
+  });
   if (block.folded) return h("details", {}, h("summary", {}, block.title), ...content);
   return h("div", { class: "data-table" }, ...(block.title ? [h("h3", {}, block.title)] : []), ...content);
 }
@@ -115,9 +123,8 @@ class Sorting {
     });
   }
 
-  /** Signed changes are compared by their size. */
   private size(column: number, value: number): number {
-    return this.block.columns[column]!.form === "number" ? Math.abs(value) : value;
+    return this.block.columns[column]!.by_size ? Math.abs(value) : value;
   }
 
   private numeric(column: number): boolean {
@@ -147,11 +154,13 @@ function tableRow(row: TableRow, columns: Column[], most: number): HTMLTableRowE
       if (column.form === "shade") cell.style.setProperty("--share", String((row.values[k] ?? 0) / most));
       return cell;
     }
-    const attributes = { scope: "row", class: column.form, "data-tip": row.hint || false };
+    const attributes = {
+      scope: "row", class: column.form, "data-tip": row.hint || false, tabindex: row.hint && !row.key ? 0 : false,
+    };
     return h("th", attributes, ...(row.mark ? [sign(row.mark), " "] : []), ...children);
   });
   const classes = row.quiet ? "quiet" : "";
-  return h("tr", { class: classes, "data-key": row.key || false }, ...cells);
+  return h("tr", { class: classes, "data-key": row.key || false, tabindex: row.key ? 0 : false }, ...cells);
 }
 
 function cellContent(column: Column, text: string, value: number | null): (Node | string)[] {

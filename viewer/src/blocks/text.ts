@@ -24,9 +24,12 @@ export const facts = (block: Facts): HTMLElement =>
 export function downloads(block: Downloads): HTMLElement {
   const links = block.files.map((file) => {
     const link = h("a", { download: file.name, href: "#" }, file.name);
-    link.addEventListener("click", () => {
-      link.href = URL.createObjectURL(new Blob([file.content], { type: file.media_type }));
-    });
+    let url = "";
+    const prepare = (): void => {
+      url ||= URL.createObjectURL(new Blob([file.content], { type: file.media_type }));
+      link.href = url;
+    };
+    for (const event of ["pointerdown", "focus", "click"]) link.addEventListener(event, prepare);
     return link;
   });
   return h("p", { class: "downloads small" }, "To take along: ",

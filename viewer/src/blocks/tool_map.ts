@@ -2,7 +2,7 @@
 
 import { contours } from "d3-contour";
 import type { MapLayer, MapSlice, ToolMapBlock } from "../document";
-import { h, number } from "../dom";
+import { h, number, svg } from "../dom";
 import type { Context } from "./index";
 import "./tool_map.css";
 
@@ -31,7 +31,7 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
   const layer = (): MapLayer =>
     block.layers.find((one) => one.name === state.name && one.component === state.component) ?? block.layers[0];
 
-  const picture = h("div", { class: "map-picture" });
+  const host = h("div", { class: "map-picture" });
   const level = h("output", {});
   const slider = h("input", {
     type: "range", min: 0, max: block.slices.length - 1, step: 1, value: state.slice, "aria-label": "Slice",
@@ -57,20 +57,21 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
     const wanted = limits.get(limitKey(one)) ?? one.limit;
     const slice = block.slices[state.slice];
     if (withLimit) limit.value = String(wanted);
-    level.textContent = `${slice.normal} = ${number(slice.level, 0)} mm`;
+    level.textContent = `${slice.normal} = ${number(slice.level, levelDecimals(block, slice))} mm`;
     slider.setAttribute("aria-valuetext", level.textContent);
     good.textContent = one.better === "small" ? "Good to" : "At least";
     unit.textContent = one.unit || "×";
     const within = one.evenly.filter((x) => (one.better === "small" ? x <= wanted : x >= wanted)).length;
     share.textContent = `${number((100 * within) / Math.max(one.evenly.length, 1), 0)} % of the workspace`;
-    const { svg, at } = map(slice, one, one.slices[state.slice] as Grid, wanted, block.alt);
-    svg.addEventListener("pointermove", (event) => (value.textContent = at(event)));
-    svg.addEventListener("pointerleave", () => (value.textContent = ""));
-    svg.addEventListener("click", (event) => {
+    const { picture, at } = map(slice, one, one.slices[state.slice] as Grid, wanted, block);
+    picture.addEventListener("pointermove", (event) => (value.textContent = at(event)));
+    picture.addEventListener("pointerleave", () => (value.textContent = ""));
+    picture.addEventListener("click", (event) => {
       const key = (event.target as Element).closest<SVGElement>("[data-key]")?.dataset.key;
       if (key) selection.choose(key);
     });
-    picture.replaceChildren(svg);
+    host.replaceChildren(picture);
+    selection.apply(host);
   };
   const radio = (label: string, values: string[], current: string, onchange: (one: string) => void): HTMLElement => {
     const group = `map-${(count += 1)}`;
@@ -94,15 +95,26 @@ export function tool_map(block: ToolMapBlock, { selection }: Context): HTMLEleme
           draw();
         })]
         : [])),
-    picture,
+    host,
     ...(block.slices.length > 1 ? [h("div", { class: "bar map-slice" }, h("span", {}, "Slice"), slider, level)] : []),
     h("div", { class: "bar map-limit" }, h("span", { class: "map-good" }), good, limit, unit, share),
     value,
     h("figcaption", { class: "small" }, block.caption));
 }
 
+/** Decimals that tell values apart which lie a step from each other. */
+const decimalsOf = (step: number): number => Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+
+/** Decimals of a slice's level, by its distance from the others. */
+function levelDecimals(block: ToolMapBlock, slice: MapSlice): number {
+  const distances = block.slices
+    .filter((one) => one.normal === slice.normal && one.level !== slice.level)
+    .map((one) => Math.abs(one.level - slice.level));
+  return distances.length ? decimalsOf(Math.min(...distances)) : 0;
+}
+
 /** Round levels between the smallest and the largest value. */
-export function levels(low: number, high: number): number[] {
+function levels(low: number, high: number): number[] {
   const places: number[] = [];
   if (low > 0 && high / low > WIDE_RANGE) {
     for (let k = Math.floor(Math.log10(low)); k <= Math.log10(high); k += 1) {
@@ -120,21 +132,13 @@ export function levels(low: number, high: number): number[] {
 /** Values with the empty cells filled from the nearest full one, so that contours reach the border. */
 function filled(grid: Grid): number[] {
   const full = grid.flatMap((row, y) => row.flatMap((z, x) => (z === null ? [] : [{ x, y, z }])));
+  if (!full.length) return grid.flat().map(() => 0);
   return grid.flatMap((row, y) =>
     row.map((z, x) => z ?? full.reduce((best, one) =>
       (one.x - x) ** 2 + (one.y - y) ** 2 < (best.x - x) ** 2 + (best.y - y) ** 2 ? one : best).z));
 }
 
-function s<K extends keyof SVGElementTagNameMap>(
-  tag: K, attributes: Record<string, string | number>, ...children: (Node | string)[]
-): SVGElementTagNameMap[K] {
-  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-  for (const [name, one] of Object.entries(attributes)) element.setAttribute(name, String(one));
-  element.append(...children);
-  return element;
-}
-
-function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, alt: string) {
+function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, block: ToolMapBlock) {
   const { u, v } = slice;
   const width = matchMedia("(max-width: 600px)").matches ? WIDTH.narrow : WIDTH.wide;
   const [du, dv] = [u, v].map((w) => (w.length > 1 ? w[1] - w[0] : 1));
@@ -159,26 +163,26 @@ function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, alt: 
     const worse = layer.better === "small" ? band : steps.length - band;
     return `color-mix(in srgb, var(--drawing) ${FAINTEST + ((DARKEST - FAINTEST) * worse) / Math.max(steps.length, 1)}%, var(--card))`;
   };
-  const field = s("g", { "clip-path": `url(#${clip})` });
-  const ground = s("path", { d: path(reach) });
+  const field = svg("g", { "clip-path": `url(#${clip})` });
+  const ground = svg("path", { d: path(reach) });
   ground.style.fill = ink(0);
   field.append(ground);
-  const labels = s("g", { class: "map-labels" });
+  const labels = svg("g", { class: "map-labels" });
   const taken: [number, number][] = [];
   steps.forEach((step, k) => {
     const { coordinates } = shape.contour(values, step);
-    const band = s("path", { d: path(coordinates), class: "map-band" });
+    const band = svg("path", { d: path(coordinates), class: "map-band" });
     band.style.fill = ink(k + 1);
     field.append(band);
     const spot = labelPlace(coordinates.flat().flat().map(place), inReach, taken);
     if (!spot) return;
     taken.push(spot);
-    labels.append(s("text", { x: spot[0], y: spot[1] + 4 }, `${step}`));
+    labels.append(svg("text", { x: spot[0], y: spot[1] + 4 }, `${step}`));
   });
   // where the wanted accuracy holds
   const sign = layer.better === "small" ? -1 : 1;
   const good = shape.contour(values.map((z) => sign * z), sign * wanted).coordinates;
-  field.append(s("path", { d: path(good), class: "map-good-field" }));
+  field.append(svg("path", { d: path(good), class: "map-good-field" }));
 
   function valueAt([x, y]: [number, number]): number | null {
     const column = Math.floor((x - LEFT) / (du * scale));
@@ -191,23 +195,23 @@ function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, alt: 
 
   const crosses = slice.poses.map((pose) => {
     const [x, y] = place(cellOf(pose.u, pose.v));
-    return s("path", { class: "map-pose", "data-key": pose.key, d: `M${x - 4} ${y - 4}l8 8m0 -8l-8 8` },
-      s("title", {}, pose.tip));
+    return svg("path", { class: "map-pose", "data-key": pose.key, d: `M${x - 4} ${y - 4}l8 8m0 -8l-8 8` },
+      svg("title", {}, pose.tip));
   });
-  const svg = s("svg", { viewBox: `0 0 ${width} ${height.toFixed(0)}`, role: "img", "aria-label": alt },
-    s("clipPath", { id: clip }, s("path", { d: path(reach) })),
-    field, s("path", { class: "map-border", d: path(reach) }), labels, ...crosses,
+  const picture = svg("svg", { viewBox: `0 0 ${width} ${height.toFixed(0)}`, role: "img", "aria-label": block.alt },
+    svg("clipPath", { id: clip }, svg("path", { d: path(reach) })),
+    field, svg("path", { class: "map-border", d: path(reach) }), labels, ...crosses,
     ...axis(u, du, (x) => place(cellOf(x, v[0]))[0], (x, text) =>
-      s("text", { x, y: height - BOTTOM + 18, "text-anchor": "middle" }, text)),
+      svg("text", { x, y: height - BOTTOM + 18, "text-anchor": "middle" }, text)),
     ...axis(v, dv, (y) => place(cellOf(u[0], y))[1], (y, text) =>
-      s("text", { x: LEFT - 8, y: y + 4, "text-anchor": "end" }, text)),
-    s("text", { x: (LEFT + width) / 2, y: height - 8, "text-anchor": "middle", class: "map-title" }, `${slice.across}, mm`),
-    s("text", {
+      svg("text", { x: LEFT - 8, y: y + 4, "text-anchor": "end" }, text)),
+    svg("text", { x: (LEFT + width) / 2, y: height - 8, "text-anchor": "middle", class: "map-title" }, `${slice.across}, mm`),
+    svg("text", {
       x: 14, y: (height - BOTTOM) / 2, "text-anchor": "middle", class: "map-title",
       transform: `rotate(-90 14 ${(height - BOTTOM) / 2})`,
     }, `${slice.up}, mm`));
   const at = (event: PointerEvent): string => {
-    const box = svg.getBoundingClientRect();
+    const box = picture.getBoundingClientRect();
     const p: [number, number] = [
       ((event.clientX - box.left) / box.width) * width, ((event.clientY - box.top) / box.height) * height,
     ];
@@ -215,10 +219,12 @@ function map(slice: MapSlice, layer: MapLayer, grid: Grid, wanted: number, alt: 
     if (value === null) return "";
     const x = u[0] + ((p[0] - LEFT) / (du * scale) - 0.5) * du;
     const y = v[0] + (v.length - (p[1] - TOP) / (dv * scale) - 0.5) * dv;
-    return `${slice.across} ${number(x, 0)}, ${slice.up} ${number(y, 0)}, ${slice.normal} ${number(slice.level, 0)} mm:` +
+    const level = number(slice.level, levelDecimals(block, slice));
+    return `${slice.across} ${number(x, decimalsOf(du))}, ${slice.up} ${number(y, decimalsOf(dv))},` +
+      ` ${slice.normal} ${level} mm:` +
       ` ${Number(value.toPrecision(3))} ${layer.unit || "times"}`;
   };
-  return { svg, at };
+  return { picture, at };
 }
 
 /** Point of a contour line within reach and farthest from the labels that are there. */
@@ -241,6 +247,6 @@ function axis(
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = power * ([1, 2, 5].find((m) => m * power >= rough) ?? 10);
   const out: SVGElement[] = [];
-  for (let k = Math.ceil(low / step); k * step <= high; k += 1) out.push(text(position(k * step), number(k * step, 0)));
+  for (let k = Math.ceil(low / step); k * step <= high; k += 1) out.push(text(position(k * step), number(k * step, decimalsOf(step))));
   return out;
 }

@@ -9,7 +9,7 @@ const MARGIN = 0.3; // beyond the machine, as a share of its width
 const BELOW = 0.004; // likewise, so that it does not lie in the base
 
 /** Largest of 1, 2 and 5 times a power of ten that is not above a length. */
-export function roundStep(length: number): number {
+function roundStep(length: number): number {
   const power = 10 ** Math.floor(Math.log10(length));
   const factor = [5, 2, 1].find((one) => one * power <= length * (1 + 1e-9)) ?? 1;
   return factor * power;

@@ -2,9 +2,10 @@
 
 import type { Machine } from "../document";
 import { h } from "../dom";
+import { legClass } from "../marks";
 
 export const chip = (leg: number): HTMLElement =>
-  h("span", { class: `chip leg-${(leg % 8) + 1}` }, String(leg + 1));
+  h("span", { class: `chip ${legClass(leg + 1)}` }, String(leg + 1));
 
 export function legTable(machine: Machine, leg: number): HTMLElement {
   const { rows, number: name } = machine.legs[leg];

@@ -18,6 +18,7 @@ import {
   Vector3,
 } from "three";
 import type { Configuration, Leg, Machine } from "../document";
+import { legClass } from "../marks";
 import { Grid } from "./grid";
 import type { Label } from "./labels";
 import type { Palette } from "./palette";
@@ -37,7 +38,6 @@ const FRAME = 0.17;
 const HEAD = 0.011;
 const DASH = 0.015;
 
-const LEG_COLOURS = 8;
 const DIMMED = 0.18;
 const SPHERE = new SphereGeometry(1, 24, 16);
 const BOX = new BoxGeometry(1, 1, 1);
@@ -52,12 +52,12 @@ export const LAYERS = {
 export type Layer = keyof typeof LAYERS;
 
 /** Name of a leg's colour in the style sheet. */
-export const legColour = (leg: number): string => `--leg${(leg % LEG_COLOURS) + 1}`;
+export const legColour = (leg: number): string => `--${legClass(leg + 1).replace("-", "")}`;
 
 type Side = "base" | "platform";
 const SAME_POINT = 1e-3; // m, for points that are rounded to a tenth of a millimetre
 
-const matrix = (T: Configuration["T_base_platform"]): Matrix4 =>
+export const matrix = (T: Configuration["T_base_platform"]): Matrix4 =>
   new Matrix4().set(...(T.flat() as Parameters<Matrix4["set"]>));
 
 /** Shapes of one leg. */
@@ -484,7 +484,7 @@ export class MachineModel {
       const at = [0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9];
       return {
         text: String(leg.number),
-        className: `chip leg-${(j % LEG_COLOURS) + 1}`,
+        className: `chip ${legClass(j + 1)}`,
         places: at.map((share) => a.clone().lerp(b, share)),
       };
     });
@@ -511,11 +511,11 @@ export class MachineModel {
         if (way.length < 2 || this.highlighted?.includes(j) === false) return;
         const [before, end] = way.slice(-2).map(vector);
         const ahead = end.clone().sub(before).normalize();
-        add("+", `sign leg-${(j % LEG_COLOURS) + 1}`, end.addScaledVector(ahead, 2.6 * HEAD * extent));
+        add("+", `sign ${legClass(j + 1)}`, end.addScaledVector(ahead, 2.6 * HEAD * extent));
         const zero = configuration.legs[j].zero as Point[];
         const at = vector(zero[zero.length - 1]);
         const centre = new Vector3(0, 0, 0.04 * extent);
-        add("0", `sign leg-${(j % LEG_COLOURS) + 1}`, at.clone().add(centre), at.sub(centre));
+        add("0", `sign ${legClass(j + 1)}`, at.clone().add(centre), at.sub(centre));
       });
     }
     if (this.layers.cameras.visible) {

@@ -11,7 +11,7 @@ import {
   Vector3,
 } from "three";
 import type { Configuration, LegChange, Space, SpaceArrows, SpacePoints } from "../document";
-import { MachineModel, legColour } from "./machine";
+import { MachineModel, legColour, matrix } from "./machine";
 import { Lines, type Point, lineMaterial, vector } from "./shapes";
 import type { Stage } from "./stage";
 
@@ -22,7 +22,7 @@ const BALL = new SphereGeometry(1, 12, 8);
 const ELLIPSOID = new SphereGeometry(1, 32, 24);
 
 /** Part of the stage that can be hidden. */
-export interface Item {
+interface Item {
   name: string;
   colour: string;
   shown: boolean;
@@ -39,9 +39,6 @@ export interface Shown {
   enlargement: number;
   ellipsoids: number;
 }
-
-const matrix = (T: Configuration["T_base_platform"]): Matrix4 =>
-  new Matrix4().set(...(T.flat() as Parameters<Matrix4["set"]>));
 
 /** Configuration with each point moved by a share of its change. */
 function displaced(one: Configuration, changes: LegChange[], share: number): Configuration {
@@ -68,9 +65,9 @@ export class SpaceModel {
   readonly model: MachineModel;
   private readonly before: Lines;
   private readonly ellipsoids: { mesh: Mesh; own: Space["ellipsoids"][number] }[];
-  private readonly arrows: { lines: Lines; content: SpaceArrows; item: Item }[] = [];
+  private readonly arrows: { lines: Lines; content: SpaceArrows }[] = [];
   private readonly clouds: { mesh: InstancedMesh; content: SpacePoints }[] = [];
-  private marked: string | null = null;
+  private marked: string | null | undefined;
 
   constructor(
     private readonly block: Space,
@@ -107,8 +104,8 @@ export class SpaceModel {
 
     for (const content of block.arrows) {
       const lines = new Lines(lineMaterial(palette, content.colour, { width: 1.5 }));
-      const item = this.add(content.name, content.colour, content.shown, lines.object);
-      this.arrows.push({ lines, content, item });
+      this.add(content.name, content.colour, content.shown, lines.object);
+      this.arrows.push({ lines, content });
     }
     for (const path of block.paths) {
       const dash = path.dashed ? 0.02 * extent : 0;
@@ -140,7 +137,7 @@ export class SpaceModel {
 
   /** Enlarge the points with a key. */
   mark(key: string | null): void {
-    if (key !== null && key === this.marked) return;
+    if (key === this.marked) return;
     this.marked = key;
     const size = POINT * this.model.extent;
     for (const { mesh, content } of this.clouds) {
@@ -177,13 +174,12 @@ export class SpaceModel {
   }
 
   private placeArrows(enlargement: number): void {
-    for (const { lines, content, item } of this.arrows) {
+    for (const { lines, content } of this.arrows) {
       lines.place(content.points.flatMap((p, k) => arrow(p as Point, content.vectors[k] as Point, enlargement)));
-      lines.object.visible = item.shown;
     }
   }
 
-  private add(name: string, colour: string, shown: boolean, object: Group | Mesh): Item {
+  private add(name: string, colour: string, shown: boolean, object: Group | Mesh): void {
     const parent = new Group(); // lines hide themselves where they are empty
     parent.add(object);
     parent.visible = shown;
@@ -196,7 +192,6 @@ export class SpaceModel {
       },
     };
     this.items.push(item);
-    return item;
   }
 }
 

@@ -34,6 +34,7 @@ export const VIEWS: Record<string, Vector3> = {
   "From the side": new Vector3(0, -1, 0.02),
 };
 export const PLANE_VIEW = new Vector3(0.15, -0.6, 1);
+export const NO_WEBGL = "This browser draws nothing in space: it has no WebGL, or it is switched off.";
 
 /** What is under the pointer: a leg, or a part that has a key and a text. */
 export interface Picked {
@@ -106,9 +107,12 @@ export class Stage {
 
   /** Draw at once, as a page needs that is about to be printed. */
   private drawNow(): void {
-    this.pending = false;
     const { clientWidth: width, clientHeight: height } = this.element;
     if (!width || !height) return;
+    // on paper the element has another size, before any observer is called
+    const size = this.renderer.getSize(new Vector2());
+    if (size.x !== width || size.y !== height) this.resize();
+    this.pending = false;
     this.renderer.render(this.scene, this.camera);
     this.labels.place(this.camera, width, height);
   }

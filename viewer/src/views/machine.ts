@@ -3,14 +3,11 @@
 import type { Vector3 } from "three";
 import type { Configuration, Reading, MachineDocument } from "../document";
 import { UNITS, h, number, quantity } from "../dom";
+import { legClass } from "../marks";
 import { chip, legTable } from "../stage/legs";
 import { LAYERS, type Layer, MachineModel } from "../stage/machine";
-import { PLANE_VIEW, type Picked, Stage, VIEWS } from "../stage/stage";
+import { NO_WEBGL, PLANE_VIEW, type Picked, Stage, VIEWS } from "../stage/stage";
 import { type Poses, askProgram, sweptPoses } from "./poses";
-
-const NO_WEBGL =
-  "This browser draws nothing in space: it has no WebGL, or it is switched off. The readings, the" +
-  " platform's position and the legs' values beside are complete.";
 
 export function machineView(host: HTMLElement, content: MachineDocument): void {
   const { machine } = content;
@@ -32,7 +29,8 @@ export function machineView(host: HTMLElement, content: MachineDocument): void {
     model = new MachineModel(machine, stage);
   } catch (error) {
     if (stage) throw error;
-    place.append(h("p", { class: "note" }, NO_WEBGL));
+    place.append(h("p", { class: "note" },
+      `${NO_WEBGL} The readings, the platform's position and the legs' values beside are complete.`));
   }
 
   const show = (next: Configuration): void => {
@@ -265,7 +263,7 @@ function legsList(content: MachineDocument, onchoice: (leg: number | null) => vo
     h(
       "button",
       {
-        type: "button", class: `chip leg-${(j % 8) + 1}`, "aria-pressed": "false",
+        type: "button", class: `chip ${legClass(j + 1)}`, "aria-pressed": "false",
         "aria-label": `Leg ${leg.number}`, onclick: () => choose(j),
       },
       String(leg.number),

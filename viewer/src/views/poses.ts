@@ -2,7 +2,7 @@
 
 import type { Configuration, Sweep } from "../document";
 
-export type Answer = { configuration: Configuration | null } | { message: string };
+type Answer = { configuration: Configuration | null } | { message: string };
 /** Reading k moves to a value, from the configuration that is shown; of the requests that wait, the
  * last one is answered. */
 export type Poses = (

@@ -6,6 +6,7 @@ import { logBar } from "../blocks/log_bar";
 import type { Card, ReportDocument, Section } from "../document";
 import { h } from "../dom";
 import { sign, type Mark } from "../marks";
+import { ImageViewer } from "../image_viewer";
 import { connect, Selection } from "../selection";
 import { connectTips } from "../tips";
 import { contents } from "./contents";
@@ -19,7 +20,9 @@ const TONE_MARKS: Record<ReportDocument["verdict"]["tone"], Mark | null> = {
 };
 
 export function reportView(host: HTMLElement, content: ReportDocument): void {
-  const context: Context = { selection: new Selection() };
+  const selection = new Selection();
+  const viewer = new ImageViewer(selection);
+  const context: Context = { selection, viewer, printSteps: [] };
   const sections = content.sections.map((section) => sectionOf(section, context));
   host.classList.add("report");
   host.append(
@@ -35,10 +38,11 @@ export function reportView(host: HTMLElement, content: ReportDocument): void {
       ...findingsOf(content),
       ...(content.cards.length ? [cardsOf(content.cards, content.verdict.tone === "bad")] : []),
       ...sections),
+    viewer.dialog,
   );
-  connect(host, context.selection);
+  connect(host, selection);
   connectTips(host);
-  connectPrint(host, content);
+  connectPrint(host, content, context.printSteps);
 }
 
 function verdictOf({ verdict }: ReportDocument): HTMLElement {
@@ -105,7 +109,7 @@ function sectionOf(section: Section, context: Context): HTMLElement {
   const details = h("details", { class: "expert" }, h("summary", {}, title));
   const draw = (): void => { if (details.childElementCount === 1) details.append(...blocks()); };
   details.addEventListener("toggle", draw);
-  addEventListener("beforeprint", draw);
+  context.printSteps.push(draw);
   element.append(details);
   return element;
 }

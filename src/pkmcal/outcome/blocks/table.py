@@ -16,11 +16,13 @@ class Column(Schema):
         leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
         darker the larger it is among those of all such columns.
     hint : explanation of the heading.
+    by_size : sorted by the size of the values, whatever their sign, as changes are.
     """
 
     name: Text
     form: Literal["text", "number", "leg", "share", "shade"] = "number"
     hint: Text = ""
+    by_size: bool = False
 
 
 class TableRow(Schema):
