@@ -339,7 +339,7 @@ def test_a_check_writes_page_and_pictures(alone_checked, tmp_path):
         result.save_pictures(tmp_path / "drawn")
 
 
-def test_without_these_options_nothing_is_drawn(alone, check_once):
+def test_without_these_options_nothing_is_drawn(alone):
     before = sorted(alone.rglob("*"))
     assert run("check", alone).code < 2
     assert sorted(alone.rglob("*")) == before

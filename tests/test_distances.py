@@ -12,6 +12,7 @@ import distance_sessions
 import printers
 from conftest import run
 from document_keys import assert_keys
+from page_documents import page_document
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.camera_refinement import refinement_of
@@ -162,8 +163,8 @@ def test_commands_say_what_was_measured(kit, calibrated_kit):
     assert (names[at["from"] - 1], names[at["to"] - 1]) == ("m00", "m01")
     assert at["value"] == pytest.approx(0.04, rel=0.05)
     assert {target["name"] for target in saved["targets"]} == {"probe", "distances"}
-    page = (kit / "calibration" / "report.html").read_text(encoding="utf-8")
-    assert 'id="distances"' in page
+    page = page_document((kit / "calibration" / "report.html").read_text(encoding="utf-8"))
+    assert "distances" in [section["name"] for section in page["sections"]]
 
 
 def test_too_few_distances_to_show_a_wrong_one(true, tmp_path, measured):

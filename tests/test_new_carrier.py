@@ -9,7 +9,6 @@ import importlib
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.centres import joint_centres
 from pkmcal.identify.covariance import Information, identifiability
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
@@ -34,11 +32,11 @@ from pkmcal.mechanisms.carriers.contract import base_carriers
 from pkmcal.mechanisms.carriers.crank import Crank
 from pkmcal.mechanisms.closure import closure, dense, limb_ends
 from pkmcal.mechanisms.drives import BENT_GUIDE_PIECES, drives_of
-from pkmcal.report.scene import plane_projections, scene_of
 from pkmcal.simulation import with_forearms
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Box
 from pkmcal.simulation.surfaces import SmoothNoise
+from pkmcal.web.stage import machine_shape
 
 CARRIERS = '''\
 """Carriers of one's own: a crank whose arm leaves its axis aslant, and a guide that is an arc."""
@@ -372,10 +370,10 @@ def test_it_is_drawn(machine, calibrated):
     )
     for a, foot in zip(ends.a, drives.foot, strict=True):
         assert any(np.allclose(box.centre, (a + foot) / 2, atol=1e-9) for box in boxes)
-    session = SimpleNamespace(machine=machine)
-    centres = joint_centres(machine, estimate.machine, estimate.covariance)
-    for view in plane_projections(scene_of(session, estimate, centres)):
-        assert len(view.marks) == 12
+    legs = machine_shape(estimate.machine, {}, {}).home.legs
+    for leg, foot in zip(legs, drives_of(estimate.machine).foot, strict=True):
+        np.testing.assert_allclose(leg.base[0], foot, atol=1e-6)
+        assert len(leg.base) == 2
 
 
 def test_a_way_that_bends_is_drawn_in_pieces(arcs):

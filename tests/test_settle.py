@@ -18,7 +18,7 @@ from test_pose_sessions import make, write_joints
 def settled(folder):
     session = load_session(folder)
     case = localize_case(session, [], Boards(), np.random.default_rng(0))
-    return settle(session, case, False, 0, Clock(None))
+    return settle(session, case, False, 0, Clock())
 
 
 def test_the_likeliest_explanation_is_the_reason_of_a_refusal():
