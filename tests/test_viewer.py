@@ -79,6 +79,9 @@ def project(tmp_path_factory) -> Path:
         )
     except subprocess.TimeoutExpired:
         pytest.skip("NO REGISTRY: npm ci takes too long; the viewer was not built again")
+    assert "EUSAGE" not in done.stderr, (
+        "package-lock.json does not fit package.json: " + done.stderr
+    )
     if done.returncode:
         pytest.skip(f"NO REGISTRY: the viewer was not built again: {done.stderr[-300:]}")
     return copy
