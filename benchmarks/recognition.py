@@ -27,6 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from pkmcal.errors import PkmcalError
+
 NEAR, TURNED = 0.1, np.radians(6.0)
 """Share of the camera's distance, and rad, within which a place is right."""
 SIZE = (640, 480)
@@ -39,14 +41,14 @@ HINGED = ("h4-rods",)
 
 
 class Outcome(NamedTuple):
-    """Result of a session: right, refused or wrong; its message; processor's seconds; the code of
-    the refusal.
+    """Result of a session: right, refused or wrong; its message; processor's seconds; the codes of
+    the refusal and of what the data do not exclude beside it.
     """
 
     what: str
     message: str
     seconds: float
-    code: str = ""
+    codes: tuple[str, ...] = ()
 
 
 class Mistake(NamedTuple):
@@ -83,7 +85,6 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
         localize_stations,
         read_images,
     )
-    from pkmcal.errors import PkmcalError
     from pkmcal.session.load import load_session
     from pkmcal.simulation import load_truth
 
@@ -96,7 +97,7 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
         begin = time.process_time()  # of the search alone, where it comes to that
         values = localize_stations(session, images, boards, np.random.default_rng(seed))
     except PkmcalError as error:
-        return Outcome("refused", str(error), time.process_time() - begin, error.code)
+        return _refused(error, str(error), time.process_time() - begin)
     seconds = time.process_time() - begin
     true = load_truth(folder, session.machine).T_camera_base
     if upside_down:
@@ -106,10 +107,14 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
         try:
             end = calibrate_session(session, seed=seed).estimate.state.T_camera_base
         except PkmcalError as error:
-            return Outcome("refused", f"{text} at first; {error}", seconds, error.code)
+            return _refused(error, f"{text} at first; {error}", seconds)
         right, after = _near(end, true)
         text = f"{text}; calibrated, {after}"
     return Outcome("right" if right else "wrong", text, seconds / len(session.stations))
+
+
+def _refused(error: PkmcalError, message: str, seconds: float) -> Outcome:
+    return Outcome("refused", message, seconds, (error.code, *error.rivals))
 
 
 def _near(values: np.ndarray, true: np.ndarray) -> tuple[bool, str]:
@@ -128,13 +133,12 @@ def _near(values: np.ndarray, true: np.ndarray) -> tuple[bool, str]:
 def calibrated(folder: Path, seed: int) -> Outcome:
     """Whether a session whose stations were localized is refused in the end."""
     from pkmcal.calibration.calibrate import calibrate_session
-    from pkmcal.errors import PkmcalError
 
     begin = time.process_time()
     try:
         verdict = calibrate_session(folder, seed=seed).verdict
     except PkmcalError as error:
-        return Outcome("refused", str(error), time.process_time() - begin, error.code)
+        return _refused(error, str(error), time.process_time() - begin)
     what = "wrong" if verdict.usable else "refused"
     return Outcome(what, verdict.headline, time.process_time() - begin)
 
@@ -284,7 +288,7 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
         return value._replace(what="named" if value.what == "right" else value.what)
     if value.what != "refused":
         return value._replace(what="not noticed")
-    return value._replace(what="named" if value.code == mistake.code else "refused")
+    return value._replace(what="named" if mistake.code in value.codes else "refused")
 
 
 # ------------------------------------------------------------------ results

@@ -8,18 +8,28 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pkmcal.boards.views import Boards
 from pkmcal.calibration import calibrate
+from pkmcal.calibration.calibrate import Clock, settle
+from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.chance_matches import (
     IMAGE_OFFSET,
     by_chance,
     chance_match_reason,
     chance_of_count,
 )
+from pkmcal.calibration.localization import read_images
 from pkmcal.calibration.refinement import RefinementResult
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.judge.against_truth import compare_with_truth
 from pkmcal.measurements import Observation, concatenate
+from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.legs import measure
 from pkmcal.observe.profiles import PROFILE_OPTIONS
+from pkmcal.placement.default_camera import camera_of_size
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings, simulate_session
 from pkmcal.wording import how_often
 from test_observe_measure import taken
 from test_observe_rendered_legs import FRONT, machine, poses
@@ -145,3 +155,19 @@ def test_the_machine_is_identified_by_the_other_stations(demo, monkeypatch):
     assert [station.name for station in calibration.session.stations] == ["station1", "station3"]
     assert "station2: left out, for it may stand elsewhere." in calibration.session.warnings
     assert compare_with_truth(calibration, demo.session).calibrated.centre < 1e-3
+
+
+def test_a_localization_confirmed_by_chance_is_compared_with_mistakes(tmp_path):
+    """Readings in the opposite order, and a pose at which edges match by chance."""
+    nominal, settings = load_mechanism("gough-stewart"), Settings(stations=1, configurations=8)
+    simulate_session(tmp_path, nominal, camera_of_size((640, 480)), settings, seed=101)
+    session = load_session(tmp_path)
+    reversed_readings = replace(session, joints=session.joints[:, ::-1].copy())
+    images = read_images(session)
+    station = session.stations[0].T_camera_base
+    aside = station @ pose(rotation(np.array([0.0, 0.0, 0.5])), np.array([0.1, 0.05, 0.0]))
+    scene = PriorScene.as_drawn(reversed_readings, aside[None])
+    case = Case(reversed_readings, images, Boards(), scene)
+    with pytest.raises(InputError) as error:
+        settle(reversed_readings, case, refine_camera=False, seed=0, clock=Clock())
+    assert error.value.code == "readings.numbering_reversed"

@@ -39,6 +39,8 @@ class PkmcalError(Exception):
         What the reader can do about the error, a sentence.
     code :
         Kind of fault for programs, such as readings.sign; `class_code` by default.
+    rivals :
+        Codes of other faults that the data do not exclude.
 
     """
 
@@ -54,8 +56,10 @@ class PkmcalError(Exception):
         expected: object = None,
         next_step: str | None = None,
         code: str | None = None,
+        rivals: tuple[str, ...] = (),
     ) -> None:
         self.code = code or self.class_code
+        self.rivals = rivals
         self.what = _brief(what)
         self.where = None if where is None else _brief(where)
         self.found = None if found is None else _brief(str(found), LONGEST_VALUE_QUOTED)
@@ -115,6 +119,7 @@ class PkmcalError(Exception):
             "expected": self.expected,
             "next_step": self.next_step,
             "code": None if self.code == self.class_code else self.code,
+            "rivals": self.rivals,
         }
 
 

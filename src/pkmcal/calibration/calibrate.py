@@ -17,7 +17,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import CameraRefinement, refinement_of
 from pkmcal.calibration.case import Case, PriorScene
-from pkmcal.calibration.chance_matches import by_chance, chance_match_reason
+from pkmcal.calibration.chance_matches import by_chance, chance_match_reason, explain_images
 from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
 from pkmcal.calibration.faults import (
     lens_notes,
@@ -337,7 +337,10 @@ def settle(
         try:
             turns = _identify(case, refine_camera, now.part(0, 0.9), options)
         except ResultError:
-            refuse(partial(explain_radii, case, None, refine_camera, seed))
+            refuse(
+                partial(explain_images, case, None, seed),
+                partial(explain_radii, case, None, refine_camera, seed),
+            )
             raise
         # images that are upside down; all stations begin anew, for one that was rejected before
         # may have been upside down, too
@@ -365,6 +368,7 @@ def settle(
     richer, failed = richer_model(case.session, turns.measurements, stated)
     untested = refuse(
         partial(explain_poses, case.session, turns.measurements, stated, richer),
+        partial(explain_images, case, turns, seed),
         partial(explain_radii, case, turns, refine_camera, seed),
     )
     found = (rotation_finding(one) for one in (*repairs, *rotations))

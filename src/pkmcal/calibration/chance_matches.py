@@ -18,13 +18,17 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.case import Case
+from pkmcal.calibration.localization import locate_stations, mistake_in
 from pkmcal.calibration.refinement import RefinementResult
+from pkmcal.errors import InputError
 from pkmcal.levels import FEW
 from pkmcal.observe import legs
 from pkmcal.observe.image_batches import placed_at
 from pkmcal.observe.repeats import combine_repeats
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS
 from pkmcal.outcome.finding import Finding, wrong
+from pkmcal.outcome.hypotheses import OPTIONS, Explanation
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import how_often
@@ -33,6 +37,30 @@ IMAGE_OFFSET = 2 * legs.LEG_SEARCH_OPTIONS.reach
 """Shift of the images, px: further than legs are searched."""
 OFFSET_DIRECTIONS = 8
 """Number of directions of the shift, evenly spaced; the p-value is that of one more draw."""
+
+
+def explain_images(case: Case, turns: RefinementResult | None, seed: int) -> Explanation:
+    """Mistake that explains the images of stations on tripods whose edges may be chance matches.
+
+    Their localization was confirmed by chance, so the images are compared with the hypotheses as
+    those of stations that were not localized. turns : None without an estimate, for which there
+    were too few edges. seed : for the search.
+    """
+    session = case.session
+    images = [p for p in case.images if not session.stations[p.station].handheld]
+    if not images or (turns is not None and not chance_match_reason(turns)):
+        return Explanation()
+    # another draw than the first search, which may find the mistake by itself
+    (rng,) = np.random.default_rng(seed).spawn(1)
+    search = locate_stations(session, images, case.boards, rng)
+    error = search.error
+    if error is None and (value := search.leg_localization) is not None:
+        unconfirmed = tuple(replace(pose, by_chance=1.0) for pose in value.localizations)
+        error = mistake_in(session, images, replace(value, localizations=unconfirmed), rng)
+    # that the machine is not recognised is said by the verdict, with a report to see why
+    if not isinstance(error, InputError) or error.code == "station.not_recognised":
+        return Explanation()
+    return Explanation(error, OPTIONS.report)
 
 
 class _Offered(NamedTuple):

@@ -350,7 +350,8 @@ def _likelier(
         return error
     rivals = f"fit as well if {' or '.join(distinct)}"
     return error.with_fields(
-        found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}"
+        found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}",
+        rivals=tuple(dict.fromkeys(one.code for one in errors if one.code != error.code)),
     )
 
 
