@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -23,12 +23,10 @@ from pkmcal.placement.stations import PANORAMIC_HALF_VIEW, view_angle
 from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE, STATIONS_AROUND_A_MACHINE
 from pkmcal.planning.plan import MeasurementPlan, plan_measurements
 from pkmcal.planning.subject import Subject, as_it_stands, of_machine
-from pkmcal.ranges import default
+from pkmcal.ranges import PlanIndex, default
 from pkmcal.report.plan import PLAN_STATIONS_FILE, PLAN_TABLE_FILE, outcome_of
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation import board_for
-
-PlanIndex = Literal["tool", "D", "E", "O1"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
