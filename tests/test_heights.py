@@ -656,7 +656,7 @@ def test_only_a_bed_is_level(kit, tmp_path):
         (folder / name).write_text((kit / name).read_text())
     rows = "".join(f"{k + 1:03d},0,0,0\n" for k in range(19))
     (folder / "poses.csv").write_text("configuration,x,y,z\n" + rows)
-    with pytest.raises(InputError, match="only of heights can be said that the bed is level"):
+    with pytest.raises(InputError, match="level applies to heights only"):
         calibrate_session(folder)
 
 

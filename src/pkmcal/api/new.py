@@ -48,7 +48,7 @@ class NewResult(Result):
 
     @cached_property
     def outcome(self) -> Outcome:
-        """One sentence."""
+        """Verdict in one sentence."""
         return Outcome(
             command="new",
             title="New session",
@@ -103,8 +103,8 @@ def new(
     printer: Path | str | None = None,
     probed: Path | str | None = None,
 ) -> NewResult:
-    """A session with comments, to be filled in, or the session of a delta printer; nothing is
-    written.
+    """Make a commented session to fill in, or the session of a delta printer, without writing
+    files.
 
     Parameters
     ----------

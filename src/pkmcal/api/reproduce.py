@@ -92,7 +92,7 @@ def reproduce(
     images: bool = False,
     progress: Progress | None = None,
 ) -> ReproductionResult:
-    """Compute the papers' tables and figures again, without writing files.
+    """Recompute the tables and figures of papers [A], [B] and [C], without writing files.
 
     Parameters
     ----------

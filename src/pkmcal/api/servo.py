@@ -62,7 +62,7 @@ def servo(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ServoResult:
-    """Simulate control by the legs in the image, without writing files.
+    """Simulate visual servoing by a machine's legs, without writing files.
 
     Parameters
     ----------

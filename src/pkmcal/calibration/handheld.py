@@ -531,7 +531,7 @@ def _without(case: Case, lost: Mapping[int, str], tried: Mapping[int, Array]) ->
             "the machine is recognised in none of the images by hand",
             where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
             found=f"{session.label(by_hand[0])}: {lost[by_hand[0]]}",
-            expected="one place for each where its legs lie on edges of the picture far oftener"
+            expected="one place for each where its legs lie on image edges far oftener"
             " than elsewhere",
             next_step="Check that these images show this machine's legs, large and sharp, that"
             " each bears the name of its configuration, and that the nominal model is this"

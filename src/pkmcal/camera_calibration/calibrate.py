@@ -351,7 +351,7 @@ def check_determined(
         return
     tilt = tilts(fit.T_camera_board, views.points)
     raise ResultError(
-        "the images do not tell the focal length, because the board looks much the same in"
+        "the images do not determine the focal length, because the board looks much the same in"
         " all of them",
         found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",

@@ -27,7 +27,7 @@ CARRIAGE_MARGIN_BELOW = 5.0
 The bed may hang lower than the firmware's values place it.
 """
 PRINTER_NOMINAL_TEXT = """\
-# {name}, a linear delta, by the values in {label}. A firmware knows only the difference
+# {name}, a linear delta, by the values in {label}. A firmware has only the difference
 # of the towers' radius and the tool's, so the rods' lower ends stand in the platform's origin, the
 # nozzle. Readings are the carriages' heights by these values, their range ends at the end switches.
 name: {name}
@@ -77,7 +77,7 @@ joints:
 
 """
 FIRMWARE_FIXED_TEXT = """\
-# What the firmware can hold: towers upright, motors that go as far as it says.
+# What the firmware can hold: towers upright, motors that move as far as it commands.
 fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
 """
 PLATFORM_FIXED_TEXT = """\

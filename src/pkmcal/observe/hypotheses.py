@@ -158,14 +158,13 @@ def mistake(
     at = ", nor in those of " + listed(others) if others else ""
     few = len(worst.view.configuration) < ENOUGH_IMAGES_ALONE
     return InputError(
-        f"the machine is not recognised in the images of {worst.name}{at}",
+        f"the machine was not localized in the images of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
         found=_little(worst),
-        expected="one place where its legs lie on edges of the picture far oftener than any"
-        " machine's would",
+        expected="one place where its legs lie on image edges far more often than by chance",
         next_step=(
-            f"Take more images from there, {USUAL_IMAGES} are usual: of so few it"
-            " cannot be said whether anything is mixed up. If there are more, check"
+            f"Take more images from there, {USUAL_IMAGES} are usual: with so few"
+            " no exchange of images or readings can be detected. If there are more, check"
             if few
             else "Check"
         )

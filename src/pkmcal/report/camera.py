@@ -47,7 +47,7 @@ CAMERA_SIGMA_TEXT = (
     "The standard deviations are those with which the intrinsics would scatter if other"
     " images of this kind were taken. They hold the noise of the corners and the views'"
     " disagreement beyond it. They do not contain what all images share: a board whose"
-    " squares are not as long as its file says leaves the intrinsics alone and scales every"
+    " squares are not as long as its file states leaves the intrinsics alone and scales every"
     " distance; a focus that moves afterwards makes it another camera."
 )
 

@@ -90,7 +90,7 @@ def _caption(shown: int, used: int) -> str:
     fewer = f" of {used}, evenly chosen" if shown < used else ""
     return (
         "True to scale, except for the change of the joint centres from the nominal model (blue)"
-        f" and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged as the sliders say."
+        f" and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged by the sliders."
         f" The slider takes the machine through {count(shown, 'pose')}{fewer}; a click on a pose's"
         " point leads to its images, and the space bar changes between nominal model and result."
     )

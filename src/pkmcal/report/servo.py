@@ -28,8 +28,8 @@ SERVO_METHOD_TEXT = (
     "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
     " what is seen and what was seen when the goal was taught: of the edges' normals, or of the"
     " legs' directions. The drives' rates are −gain · D N⁺ e, with the interaction matrix N and the"
-    " inverse Jacobian D by the measured directions, the readings, and the base centres that the"
-    " controller believes. The goal is taught by the true machine without noise, so a wrong"
+    " inverse Jacobian D by the measured directions, the readings, and the base centres of"
+    " the controller's model. The goal is taught by the true machine without noise, so a wrong"
     " geometry changes the way and not the end.",
     "The true machine follows its drives by forward kinematics. A run ends early where a drive"
     " leaves its range, the platform comes near a singular pose, or a leg leaves the image. A leg"
