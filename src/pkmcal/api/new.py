@@ -27,7 +27,7 @@ PRINTER_MECHANISM_DESCRIPTION = "the printer by its firmware: see whether its to
 PROBED_FILE_DESCRIPTIONS = {
     "session.yaml": "how good the probe is: see whether it is yours",
     "mechanism.yaml": PRINTER_MECHANISM_DESCRIPTION,
-    "joints.csv": "the carriages when the bed was felt",
+    "joints.csv": "the carriages when the bed was probed",
     "poses.csv": "the tool's height above the bed there",
 }
 """Descriptions of the files of a complete session of a printer."""
