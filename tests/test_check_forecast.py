@@ -316,7 +316,7 @@ def test_a_page_with_images(checked_session):
     edges = replace(checked_session.look, stations=(replace(lost, quality=None, by_hand=None),))
     block = next(one for one in with_pictures(edges).blocks if one.kind == "images")
     (overlay,) = block.images[0].overlays
-    assert overlay.title == "Best pose found, not recognised"
+    assert overlay.title == "Best candidate pose, not localized"
     assert len(block.images) == len(lost.images.images)
 
 

@@ -626,7 +626,7 @@ def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
     assert any(
         text.startswith("images/phone/0001-1.jpg: left out, for its edges") for text in words
     )
-    assert not any("not recognised" in text for text in words)
+    assert not any("not localized" in text for text in words)
     assert check.forecast is None
 
 

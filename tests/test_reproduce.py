@@ -10,7 +10,7 @@ import pytest
 
 from conftest import run
 from document_keys import assert_keys
-from pkmcal.api.reproduce import ReproductionResult
+from pkmcal.api.reproduce import PAPERS, ReproductionResult
 from pkmcal.api.result import printed_document
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.papers import paper_a as expected

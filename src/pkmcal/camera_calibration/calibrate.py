@@ -417,7 +417,7 @@ def cell_numbers(pixels: Array, image_size: tuple[int, int], cells: tuple[int, i
     return row * cells[0] + column
 
 
-def coverage(pixels: Array, image_size: tuple[int, int], cells: tuple[int, int]) -> Array:
+def coverage(pixels: Array, image_size: tuple[int, int], cells: tuple[int, int]) -> Integers:
     """Number of corners in each cell of the image, (rows, columns). cells : columns and rows."""
     flat = pixels[np.isfinite(pixels).all(axis=-1)]
     counts = np.bincount(cell_numbers(flat, image_size, cells), minlength=cells[0] * cells[1])

@@ -98,7 +98,7 @@ def _image(inspection: Inspection, s: int, k: int, jpeg: str) -> Image:
 
 def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
     """Poses T_camera_base for overlays with their captions; the given pose comes first."""
-    after = "pose found" if station.recognised else "best pose found, not recognised"
+    after = "pose found" if station.recognised else "best candidate pose, not localized"
     by_hand = () if station.by_hand is None else (("pose by hand", station.by_hand),)
     return *by_hand, (after, station.T_camera_base)
 

@@ -536,14 +536,14 @@ def _mirrored(station: SuspectStation) -> InputError:
         return InputError(
             f"this image of {station.name} is mirrored",
             where=station.files[0],
-            found="the machine is recognised with left and right exchanged",
+            found="the machine is localized with left and right exchanged",
             next_step="Flip this image, or take it again without mirroring",
             code="image.mirrored",
         )
     return InputError(
         f"the images of {station.name} are mirrored",
         where=f"session.yaml, stations.{station.name}",
-        found="the machine is recognised with left and right exchanged",
+        found="the machine is localized with left and right exchanged",
         next_step="Switch mirroring off in the camera or in the program that saved them, or flip"
         " the images and the camera's calibration alike",
         code="image.mirrored",
