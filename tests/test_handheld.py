@@ -631,12 +631,12 @@ def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
 
 
 def test_no_image_by_hand_is_localized(searched, monkeypatch):
-    with pytest.raises(InputError, match="recognised in none of the images by hand"):
+    with pytest.raises(InputError, match="localized in none of the hand-held images"):
         placed(searched, monkeypatch, [0.3, 0.3, 0.3])
 
 
 def test_images_of_one_configuration_are_localized(searched, monkeypatch):
-    with pytest.raises(InputError, match="are recognised show one configuration only"):
+    with pytest.raises(InputError, match="localized images show one configuration only"):
         placed(searched, monkeypatch, [0.3, 1e-4, 0.3])
 
 

@@ -28,7 +28,7 @@ MOST_SAMPLES = 5000
 
 @dataclass(frozen=True, repr=False, eq=False)
 class ServoResult(FolderResult, Study):
-    """Study of servoing, with its files: ``outcomes``, ``choices``, ``equilibria``."""
+    """Study of servoing, with its files: ``outcomes``, ``visibility``."""
 
     own_files = page_and_numbers("servo")
     kind = ("a study of servoing", "an earlier study")

@@ -7,8 +7,6 @@ pkmcal; 130 interrupted. No mistake of a user ends in a traceback.
 
 from __future__ import annotations
 
-import atexit
-import gc
 import json
 import os
 import re
@@ -30,10 +28,6 @@ INTERNAL_ERROR_EXIT = 70
 INTERRUPTED_EXIT = 130
 """Exit code that shells give to a program ended by Ctrl-C."""
 DEBUG_VARIABLE = "PKMCAL_DEBUG"
-UNCOLLECTED_OBJECTS_ALLOWED = 20_000
-"""Threshold of Python's garbage collector, instead of 700: loading a command creates 80,000 objects
-that live until it ends.
-"""
 
 SHELLS = ("bash", "zsh", "fish")
 """Shells that can complete commands and options."""
@@ -133,10 +127,6 @@ app = _Commands(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    # in a process of our own, reference cycles need not be collected at the end
-    if arguments is None:
-        gc.set_threshold(UNCOLLECTED_OBJECTS_ALLOWED)
-        atexit.register(gc.freeze)
     # pkmcal reports itself what OpenCV cannot read.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     with withstanding(), warnings.catch_warnings():

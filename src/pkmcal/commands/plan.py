@@ -10,7 +10,6 @@ from pkmcal.commands.finish import finish
 from pkmcal.commands.options import (
     argument,
     as_json,
-    choice,
     command,
     flag,
     number,
@@ -20,7 +19,6 @@ from pkmcal.commands.options import (
 )
 from pkmcal.errors import InputError
 from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE
-from pkmcal.ranges import PlanIndex
 
 EXAMPLES = """\
 pkmcal plan my-machine
@@ -41,10 +39,6 @@ FOR_A_SESSION, FOR_A_MACHINE = "For a SESSION", "For a MACHINE"
     number(
         "plan", "configurations", "N", "Configurations for each station.",
         flags="-n --configurations", into="count",
-    ),
-    choice(
-        "index", PlanIndex, "Criterion: variance of the tool; D, E: determinant and largest"
-        " eigenvalue of the machine's covariance; O1: noise amplification index.",
     ),
     number("plan", "places", "N", "Choose N stations as well."),
     flag(
