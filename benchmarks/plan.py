@@ -22,7 +22,7 @@ from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.planning.candidates import Configurations, configurations, neighbours
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
-from pkmcal.planning.exchange import PLAN_INDICES, exchanged
+from pkmcal.planning.exchange import exchanged
 from pkmcal.planning.information import Candidates, information_of
 from pkmcal.planning.plan import MeasurementPlan, plan_measurements
 from pkmcal.planning.subject import Subject, of_machine
@@ -84,7 +84,7 @@ def long_search(
         now = pool
         for _ in range(6):
             info = information_of(rig, pool, plan.work)
-            now = pool.only(np.sort(exchanged(info, start, PLAN_INDICES["tool"](info))))
+            now = pool.only(np.sort(exchanged(info, start)))
             pool, start = joined(now, about(rig.machine, now, rng))
         info = information_of(rig, now, plan.work)
         value = info.tool(info.covariance(info.of(np.arange(len(now.group)))))[0]

@@ -210,7 +210,7 @@ def test_images_of_something_else(session):
     only(session, "station1", "station2")
     refused_by_calibrate(
         session,
-        "session.yaml, stations.station2: the machine is not recognised in the images of"
+        "session.yaml, stations.station2: the machine was not localized in the images of"
         " station2; found legs that readings of other configurations fit as well",
         "Check that these images show this machine's legs, that each bears the name of its"
         " configuration, and that the nominal model is this machine's.",

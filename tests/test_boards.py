@@ -182,7 +182,7 @@ def test_a_board_out_of_sight_has_a_reason(tmp_path):
     board = board_of(tmp_path, FILES["charuco"])
     values = detect_board(np.full((360, 480), 90, dtype=np.uint8), board)
     assert not values.success
-    assert values.reason == "none of the board's markers is recognised"
+    assert values.reason == "none of the board's markers is detected"
     assert values.ids.shape == (0,)
     assert values.pixels.shape == (0, 2)
 
@@ -321,7 +321,7 @@ def test_no_board_anywhere(tmp_path, pictures):
         cv2.imwrite(str(path), noise.astype(np.uint8))
     with pytest.raises(InputError, match="in none of the images") as caught:
         detect_boards(paths, pictures["charuco"][0])
-    assert caught.value.found == "none of the board's markers is recognised"
+    assert caught.value.found == "none of the board's markers is detected"
 
 
 def test_images_of_two_sizes(tmp_path, pictures):

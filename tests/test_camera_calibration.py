@@ -360,7 +360,7 @@ def test_views_that_are_all_alike():
         rot = rotation(np.array([0.0, 0.0, rng.normal()]))
         middle = np.array([*rng.uniform(-0.05, 0.05, 2), 0.5])
         poses.append(pose(rot, middle - rot @ BOARD.points.mean(axis=0)))
-    with pytest.raises(ResultError, match="do not tell the focal length") as caught:
+    with pytest.raises(ResultError, match="do not determine the focal length") as caught:
         calibrate_camera(detections(true, np.stack(poses)), BOARD, "pinhole", alone("pinhole"))
     assert "tilted by" in caught.value.found
 
@@ -370,7 +370,9 @@ def test_corners_of_no_board(wide_views):
     wild = [replace(d, pixels=d.pixels + rng.normal(0, 25, d.pixels.shape)) for d in wide_views]
     with pytest.raises((ResultError, InputError)) as caught:
         calibrate_camera(wild, BOARD, options=alone("pinhole"))
-    assert "no camera model explains" in str(caught.value) or "do not tell" in str(caught.value)
+    assert "no camera model explains" in str(caught.value) or "do not determine" in str(
+        caught.value
+    )
 
 
 def test_an_image_without_a_board_is_not_dropped_silently(wide_views):

@@ -87,7 +87,7 @@ def test_black_images_of_nothing(session):
     check = check_session(session)
     assert check.exit_code == 2
     assert "station3: 100% of the pictures are black" in texts(check, Level.DOUBTFUL)[0]
-    assert "not recognised in the images of station3" in texts(check, Level.WRONG)[0]
+    assert "not localized in the images of station3" in texts(check, Level.WRONG)[0]
     assert [station.recognised for station in check.stations] == [True, False]
 
 

@@ -19,8 +19,8 @@ from pkmcal.checks.check import check_session
 from pkmcal.checks.forecast import Forecast, LegForecast, forecast
 from pkmcal.checks.pictures import (
     CAPTION_BAR_HEIGHT,
-    LEG_COLOURS,
     PANE_GAP,
+    RGB,
     picture,
     picture_names,
     with_pictures,
@@ -244,7 +244,7 @@ def test_pictures_of_all_images(checked_session, tmp_path):
     after = drawn[CAPTION_BAR_HEIGHT:, width + PANE_GAP :]
     plain = cv2.cvtColor(station.images.images[0], cv2.COLOR_GRAY2BGR)
     assert np.mean(np.any(after != plain, axis=-1)) < 0.2
-    for colour in LEG_COLOURS[:6]:  # thin lines are blended with what they cross
+    for colour in [*RGB.values()][:6]:  # thin lines are blended with what they cross
         bgr = colour & 255, colour >> 8 & 255, colour >> 16
         assert np.abs(after.astype(int) - bgr).max(axis=-1).min() < 60
 
@@ -299,7 +299,7 @@ def test_each_number_stands_once_and_apart(checked_session):
 def test_colours_are_those_of_the_viewer():
     style = Path(__file__).parents[1] / "viewer" / "src" / "overlay.css"
     colours = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", style.read_text()))
-    assert [int(colours[str(k + 1)], 16) for k in range(len(colours))] == list(LEG_COLOURS)
+    assert [int(colours[str(k + 1)], 16) for k in range(len(colours))] == list(RGB.values())
 
 
 def test_a_page_with_images(checked_session):
@@ -316,7 +316,7 @@ def test_a_page_with_images(checked_session):
     edges = replace(checked_session.look, stations=(replace(lost, quality=None, by_hand=None),))
     block = next(one for one in with_pictures(edges).blocks if one.kind == "images")
     (overlay,) = block.images[0].overlays
-    assert overlay.title == "Best pose found, not recognised"
+    assert overlay.title == "Best candidate pose, not localized"
     assert len(block.images) == len(lost.images.images)
 
 

@@ -69,7 +69,7 @@ def test_as_a_module():
 
 
 def test_help_imports_nothing_heavy():
-    """Of the libraries, the help of the program and of every command needs typer alone."""
+    """Of the libraries, the help of the program and of every command needs click alone."""
     heavy = ("numpy", "scipy", "cv2", "pydantic", "yaml", "ruamel", "rich", "pkmcal.api")
     code = f"""
 import sys
@@ -151,7 +151,7 @@ def test_the_help_has_three_examples_that_parse(command):
     for line in examples:
         program, name, *words = shlex.split(line)
         assert (program, name) == ("pkmcal", command)
-        assert cli._typer_command(command).make_context(command, words).params
+        assert cli.command_named(command).make_context(command, words).params
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_the_help_has_three_examples_that_parse(command):
 )
 def test_numbers_of_options_take_units_as_in_files(words, name, value):
     command, *rest = words
-    params = cli._typer_command(command).make_context(command, rest).params
+    params = cli.command_named(command).make_context(command, rest).params
     assert params[name] == pytest.approx(value, rel=1e-12)
 
 
@@ -650,7 +650,7 @@ def test_simulate_refuses(tmp_path, option, value, message):
         (["calibrate", "s", "--sed", "1"], "No such option: --sed, did you mean --seed. See"),
         (["calibrate", "s", "--foo"], "No such option: --foo. See pkmcal calibrate --help."),
         (["calibrate", "s", "-x"], "No such option: -x. See pkmcal calibrate --help."),
-        (["calibrate", "s", "--seed", "many"], "'--seed': it should be a valid integer. See"),
+        (["calibrate", "s", "--seed", "many"], "'--seed': 'many' is not a valid integer. See"),
         (["calibrate", "s", "--seed", "-1"], "--seed: this number cannot be used; found -1"),
         (["calibrate", "s", "--method", "best"], "'bundle', 'four-step', 'linear'"),
         (["calibrate", "s", "--method", "bundel"], "'inverse-kinematic', did you mean bundle. See"),
@@ -689,11 +689,13 @@ def test_what_was_meant_is_stated_where_it_is_likely(words, message, tmp_path):
 
 
 def test_completion_knows_commands_and_options():
-    words = {"COMP_WORDS": "pkmcal cal", "COMP_CWORD": "1", "_PKMCAL_COMPLETE": "complete_bash"}
-    assert python("-m", "pkmcal", env=os.environ | words).stdout.split() == ["calibrate"]
+    words = {"COMP_WORDS": "pkmcal cal", "COMP_CWORD": "1", "_PKMCAL_COMPLETE": "bash_complete"}
+    assert python("-m", "pkmcal", env=os.environ | words).stdout.split() == ["plain,calibrate"]
     words |= {"COMP_WORDS": "pkmcal calibrate --hold", "COMP_CWORD": "2"}
-    assert python("-m", "pkmcal", env=os.environ | words).stdout.split() == ["--holdout"]
-    assert "--install-completion" in run("--help").out
+    assert python("-m", "pkmcal", env=os.environ | words).stdout.split() == ["plain,--holdout"]
+    for shell in cli.SHELLS:
+        done = run("--completion", shell)
+        assert (done.code, f"_PKMCAL_COMPLETE={shell}_complete" in done.out) == (0, True)
 
 
 @pytest.mark.parametrize(

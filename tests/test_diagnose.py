@@ -274,7 +274,7 @@ def test_images_of_nothing_are_refused():
     """From Python; by both commands in test_bad_input.py and test_check.py."""
     rng = np.random.default_rng(0)
     error = refusal([clouds(rng) for _ in range(6)], by_hand=given(True))
-    assert "not recognised in the images of front" in str(error)
+    assert "not localized in the images of front" in str(error)
 
 
 @pytest.mark.slow
@@ -288,7 +288,7 @@ def test_another_machine_is_not_surely_localized_and_nothing_is_renamed():
     station = search(rng, pictures(), readings, mechanism=other, by_hand=given(True))
     assert not station.localization.sure
     error = mistake([station], rng)
-    assert error is None or "not recognised" in str(error)
+    assert error is None or "not localized" in str(error)
 
 
 @pytest.mark.parametrize(("by_chance", "named"), [(5e-3, False), (1e-5, True)])
@@ -309,10 +309,10 @@ def test_log_odds_of_an_exchange_grow_with_the_other_stations(monkeypatch, by_ch
     )
     error = mistake([two], rng)
     assert error is not None
-    assert ("not recognised" in error.what) != named
+    assert ("not localized" in error.what) != named
     if not named:
         assert "2 images alone" in error.found
-        assert "of so few it cannot be said whether anything is mixed up" in error.next_step
+        assert "with so few no exchange of images or readings can be detected" in error.next_step
 
 
 @pytest.mark.slow

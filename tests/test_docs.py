@@ -15,7 +15,7 @@ from conftest import run
 from document_keys import assert_keys
 from pkmcal.cameras import camera_models
 from pkmcal.cameras.files import load_camera
-from pkmcal.commands.cli import COMMANDS_IN_ORDER, app
+from pkmcal.commands.cli import COMMANDS_IN_ORDER, command_named
 from pkmcal.files import parse_yaml, read_json, validated_document
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
 from pkmcal.session.schema import session_schema
@@ -260,11 +260,8 @@ def test_keys_of_a_truth_are_explained(demo):
 
 def test_options_that_commands_share_are_theirs():
     """Options that docs/commands.md states for all commands, or for some: --json, and --quiet."""
-    from typer.main import get_command
-
-    group = get_command(app)
     options = {
-        name: {word for one in group.get_command(None, name).params for word in one.opts}
+        name: {word for one in command_named(name).params for word in one.opts}
         for name in COMMANDS_IN_ORDER
     }
     assert [name for name in options if "--json" not in options[name]] == []

@@ -79,7 +79,7 @@ def ideal_rotary(radius=0.052, angles=(90.4, 209.5, 330.8)):
 
 def test_an_ideal_linear_delta_is_recovered():
     machine = ideal_linear()
-    fit = nearest_fit(delta_of(machine, "x"), klipper.KLIPPER_LINEAR_FREEDOMS)
+    fit = nearest_fit(delta_of(machine, "x"), klipper.Klipper.linear)
     assert fit.largest < 1e-4
     assert fit.radius == pytest.approx(110, abs=1e-3)
     # turned by the base frame's tilt about z, to first order

@@ -283,6 +283,8 @@ def test_a_machine_that_does_not_close_is_refused():
 @pytest.mark.parametrize(("carrier", "side"), [(Crank, "base"), (RigidPlatform, "platform")])
 def test_joints_that_are_not_elementary_are_refused(carrier, side, monkeypatch):
     monkeypatch.setattr(carrier, "chain", lambda parameters: None)
-    values = f"leg 1 of mechanism 'delta' is carried on its {side} side by no joint that an export"
+    values = (
+        f"leg 1 of mechanism 'delta' is carried on its {side} side by no joint that can be exported"
+    )
     with pytest.raises(InputError, match=values):
         exported(machine_of("delta"))

@@ -626,17 +626,17 @@ def test_check_reports_which_images_are_sure(simulated, searched, monkeypatch):
     assert any(
         text.startswith("images/phone/0001-1.jpg: left out, for its edges") for text in words
     )
-    assert not any("not recognised" in text for text in words)
+    assert not any("not localized" in text for text in words)
     assert check.forecast is None
 
 
 def test_no_image_by_hand_is_localized(searched, monkeypatch):
-    with pytest.raises(InputError, match="recognised in none of the images by hand"):
+    with pytest.raises(InputError, match="localized in none of the hand-held images"):
         placed(searched, monkeypatch, [0.3, 0.3, 0.3])
 
 
 def test_images_of_one_configuration_are_localized(searched, monkeypatch):
-    with pytest.raises(InputError, match="are recognised show one configuration only"):
+    with pytest.raises(InputError, match="localized images show one configuration only"):
         placed(searched, monkeypatch, [0.3, 1e-4, 0.3])
 
 

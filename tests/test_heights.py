@@ -533,7 +533,7 @@ def test_heights_predict_no_readings(kit):
     """Of a pose of which only the height was measured, the rest follows from its readings."""
     done = run("calibrate", kit, "-o", kit.parent / "held", "--holdout", "5")
     assert done.code == 1
-    assert "heights tell none" in done.err
+    assert "heights determine no pose" in done.err
 
 
 def test_a_board_on_a_printers_tool(cfg):
@@ -568,8 +568,10 @@ WRONG_PRINTERS = {
     changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not give",
     "M665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer can have",
     "M665 R105 H300 B90\n": "M665 has no value L that could be used",
-    printers.printer_cfg(SAYS, np.tile(SAYS.homed + 2, (7, 1))): "stepper_a 2.0 mm above it",
-    printers.printer_cfg(SAYS): "no point of the bed is known",
+    printers.printer_cfg(
+        SAYS, np.tile(SAYS.homed + 2, (7, 1))
+    ): "stepper_a 2 mm above its end switch",
+    printers.printer_cfg(SAYS): "there is no probed point of the bed",
     printers.printer_cfg(SAYS, np.tile(SAYS.homed - 200, (6, 1))): "too few points of the bed",
 }
 
@@ -656,7 +658,7 @@ def test_only_a_bed_is_level(kit, tmp_path):
         (folder / name).write_text((kit / name).read_text())
     rows = "".join(f"{k + 1:03d},0,0,0\n" for k in range(19))
     (folder / "poses.csv").write_text("configuration,x,y,z\n" + rows)
-    with pytest.raises(InputError, match="only of heights can be said that the bed is level"):
+    with pytest.raises(InputError, match="level applies to heights only"):
         calibrate_session(folder)
 
 

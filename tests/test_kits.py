@@ -94,8 +94,8 @@ def test_heights_do_not_separate_rods_from_radius_and_a_finding_states_it(tmp_pa
     text = " ".join(f"{s.text} {s.advice}" for s in open_)
     assert max(open_, key=lambda s: s.moves_platform).text in " ".join(value.verdict.advice)
     assert "The base radius and the rod length" in text
-    assert "cannot be told apart by heights" in text
-    assert "How the guides of legs 1 to 3 lean cannot be told from where they stand" in text
+    assert "cannot be separated by heights" in text
+    assert "The tilts of the guides of legs 1 to 3 cannot be separated from their positions" in text
     assert "Measure x and y too, by a board on the platform" in text
     for word in ("camera", "tube", "hotograph", "caliper", "extreme leg lengths"):
         assert word not in text
@@ -175,7 +175,7 @@ def test_more_heights_of_one_bed_do_not_help(tmp_path):
     kit = probe_kit(tmp_path / "session", n=25)
     results = kit.calibrated()
     texts = [s.text for s in (*results.identification.unidentified, *results.identification.weak)]
-    assert any("of all legs alike, cannot be told apart by heights" in text for text in texts)
+    assert any("of all legs alike, cannot be separated by heights" in text for text in texts)
 
 
 @pytest.mark.slow

@@ -45,7 +45,9 @@ def test_markers_are_measured_in_images(images, tmp_path):
 
 @pytest.mark.parametrize("marker", [0.015, 0.019, 0.026])
 def test_a_wrong_size_is_reported_with_the_right_one(paths, tmp_path, marker):
-    with pytest.raises(InputError, match="markers have another size than its file says") as caught:
+    with pytest.raises(
+        InputError, match="markers have another size than its file states"
+    ) as caught:
         detect_boards(paths, described(tmp_path, marker))
     assert f"by marker: {marker} and square: 0.03" in str(caught.value)
     assert "found markers 0.7" in str(caught.value)

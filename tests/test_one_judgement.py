@@ -124,7 +124,7 @@ def test_images_by_hand_without_a_machine(tmp_path):
     done, other = run("check", folder, "--json"), run("calibrate", folder, "--json")
     assert done.code == other.code == 2
     assert done.json["message"] == other.json["message"]
-    assert done.json["what"] == "the machine is recognised in none of the images by hand"
+    assert done.json["what"] == "the machine was localized in none of the hand-held images"
     (wrong,) = [f for f in done.json["findings"] if f["level"] == Level.WRONG]
     assert wrong["text"] == other.json["message"]
 

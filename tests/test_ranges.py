@@ -1,59 +1,48 @@
 """Every numeric option of every command, and every number of the public functions, has a range."""
 
-import inspect
-from importlib import import_module
-from typing import get_args, get_type_hints
-
+import click
 import numpy as np
 import pytest
-from typer.models import ArgumentInfo
 
 import pkmcal
 from conftest import run
-from pkmcal.commands.cli import COMMANDS_IN_ORDER
+from pkmcal.commands.cli import COMMANDS_IN_ORDER, command_named
 from pkmcal.errors import InputError
 from pkmcal.ranges import RANGES, Range, check_number
 from pkmcal.simulation import Sensor
 
-
-def options():
-    """(command, name, flag, default, whether it is required) of every option and argument."""
-    for command in COMMANDS_IN_ORDER:
-        function = getattr(import_module(f"pkmcal.commands.{command}"), command)
-        hints = get_type_hints(function, include_extras=True)
-        for name, parameter in inspect.signature(function).parameters.items():
-            kind, *_ = get_args(hints[name])
-            kinds = {kind, *get_args(kind)}
-            flags = getattr(hints[name].__metadata__[0], "param_decls", None)
-            flag = flags[-1] if flags else f"--{name.replace('_', '-')}"
-            yield command, name, flag, kinds, hints[name].__metadata__[0], parameter.default
-
-
-OPTIONS = [(command, name, flag) for command, name, flag, kinds, *_ in options()
-           if kinds & {int, float}]  # fmt: skip
+OPTIONS = [
+    (command, option.opts[-1].lstrip("-").replace("-", "_"), option)
+    for command in COMMANDS_IN_ORDER
+    for option in command_named(command).params
+    if isinstance(option, click.Option) and not option.is_flag
+]
+"""Command, name and option with a value, of all commands."""
+RANGED = [(command, name, one.opts[-1]) for command, name, one in OPTIONS if one.callback]
 BAD = ("nan", "-inf", "0", "1e308", "x")
 
 
-def arguments(command):
+def required_words(command):
     """Arguments that a command requires; the files do not exist."""
     words = []
-    for owner, _, flag, _, info, default in options():
-        if owner == command and default is inspect.Parameter.empty:
-            words += ["no-such"] if isinstance(info, ArgumentInfo) else [flag, "c"]
+    for one in command_named(command).params:
+        if one.required:
+            words += ["no-such"] if isinstance(one, click.Argument) else [one.opts[-1], "c"]
     return words
 
 
 def test_every_numeric_option_is_in_the_table():
-    assert len(OPTIONS) > 35
-    assert {(command, name) for command, name, _ in OPTIONS} <= {
+    assert len(RANGED) > 35
+    assert {(command, name) for command, name, _ in RANGED} <= {
         (command, name) for command, each in RANGES.items() for name in each
     }
-    for command, name, _, kinds, _, default in options():
-        if kinds & {int, float} and default is not inspect.Parameter.empty:
-            check_number(command, name, default)
+    for command, name, option in OPTIONS:
+        assert option.callback or option.type not in (click.INT, click.FLOAT), (command, name)
+        if option.callback:
+            check_number(command, name, option.default)
 
 
-@pytest.mark.parametrize(("command", "name", "flag"), OPTIONS)
+@pytest.mark.parametrize(("command", "name", "flag"), RANGED)
 def test_options_out_of_their_range_are_refused_first(command, name, flag):
     allowed = RANGES[command][name]
     for text in BAD:
@@ -65,7 +54,7 @@ def test_options_out_of_their_range_are_refused_first(command, name, flag):
             allowed.above and value == allowed.least
         ):
             continue
-        done = run(command, *arguments(command), f"{flag}={text}")
+        done = run(command, *required_words(command), f"{flag}={text}")
         assert done.code == 2
         assert flag in done.err
         assert "defect" not in done.err

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from page_documents import page_blocks, page_section, page_text
 from pkmcal.calibration.calibrate import calibrate_session

@@ -63,8 +63,8 @@ def test_the_section_stands_on_the_page(case, apart):
         case.session, case.observation, case.estimate, Verdict(True, "Fine."), findings=apart
     )
     text = page_text(page_section(document, "identifiability"))
-    assert "The data fix 34 of 42 directions (54 free values less 12 that only place" in text
-    assert "8 directions no amount of such data would fix" in text
+    assert "The data determine 34 of 42 directions (54 free values less 12 that only place" in text
+    assert "8 directions no amount of such data would determine" in text
     for sentence in (*apart.unidentified, *apart.weak):
         assert sentence.text in text
         assert sentence.advice in text
@@ -80,9 +80,9 @@ def test_the_section_stands_on_the_page(case, apart):
 def test_a_whole_session_has_nothing_to_list():
     findings = findings_of(make("gough-stewart"))
     table = load_mechanism("gough-stewart").parameters
-    assert directions_headline(findings).startswith("The data fix 42 of 42 directions (")
+    assert directions_headline(findings).startswith("The data determine 42 of 42 directions (")
     assert directions_headline(findings).endswith(
-        "Each is known better from the data than from the nominal model."
+        "Each is determined better by the data than by the nominal model."
     )
     assert findings.unidentified == findings.weak == ()
     assert (held_text(findings, table), tied(table)) == ("", "")

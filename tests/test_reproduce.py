@@ -10,7 +10,8 @@ import pytest
 
 from conftest import run
 from document_keys import assert_keys
-from pkmcal.commands.reproduce import Paper
+from pkmcal.api.reproduce import PAPERS, ReproductionResult
+from pkmcal.api.result import printed_document
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.papers import paper_a as expected
 from pkmcal.papers.paper_a import (
@@ -20,7 +21,14 @@ from pkmcal.papers.paper_a import (
     METHODS,
     HexapodByAxes,
 )
-from pkmcal.papers.reproduction import Claim, Compared, Options, Reproduction, reproduce_paper
+from pkmcal.papers.reproduction import (
+    Claim,
+    Compared,
+    Options,
+    Reproduction,
+    reproduce_paper,
+    with_few_runs,
+)
 from pkmcal.studies import engine
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Sample
@@ -125,13 +133,12 @@ def test_where_an_expectation_is_missed_nothing_is_called_reproduced():
     assert (missed.subject, missed.facts) == ("bad", {"found": "5", "expected": "4 or 5"})
 
 
-def test_few_runs_that_miss_are_reported_to_be_more(monkeypatch):
-    failed = Reproduction("a", "Cited.", [claim(False)], "Reproduced.", (), {})
-    monkeypatch.setattr("pkmcal.papers.paper_a.reproduce", lambda _options: failed)
-    assert reproduce_paper("a", Options(runs=100)).verdict.advice == ()
-    (advice,) = reproduce_paper("a", Options(runs=8)).verdict.advice
-    assert advice.startswith("8 runs are few")
-    assert advice.endswith("simulate 100 or more.")
+def test_few_runs_that_miss_are_reported_to_be_more():
+    failed = table(claim(False))
+    assert with_few_runs(failed, 100) == failed
+    (few,) = with_few_runs(failed, 8).verdict.of("study.few_runs")
+    assert few.facts == {"runs": 8, "usual": 100}
+    assert with_few_runs(table(claim(True)), 8).verdict.of("study.few_runs") == ()
 
 
 def test_another_seed_draws_anew():
@@ -139,17 +146,18 @@ def test_another_seed_draws_anew():
     assert first == again != other
 
 
-def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch):
+def test_a_failed_reproduction_has_its_exit_code(tmp_path):
     failed = table(claim(True), claim(False, "bad"))
-    monkeypatch.setattr("pkmcal.api.reproduce.reproduce_paper", lambda _paper, _options: failed)
-    done = run("reproduce", "a", "-o", tmp_path)
-    assert done.code == 1
-    assert done.out.count("✗") == 2  # the verdict and the row
+    result = ReproductionResult({"a": failed})
+    assert result.exit_code == 1
+    assert result.summary().count("✗") == 2  # the verdict and the row
+    result.save(tmp_path)
     assert "✕" in (tmp_path / "paper-a.md").read_text()
-    assert run("reproduce", "a", "-o", tmp_path, "--json").json["papers"]["a"]["passed"] is False
-    done = run("reproduce", "a", "b", "-o", tmp_path, "--json")
-    assert done.code == 1
-    assert set(done.json["papers"]) == {"a", "b"}
+    document = printed_document(result.outcome)
+    assert (document["exit_code"], document["papers"]["a"]["passed"]) == (1, False)
+    both = ReproductionResult({"a": failed, "b": table(claim(True))})
+    assert both.exit_code == 1
+    assert set(both.document["papers"]) == {"a", "b"}
 
 
 @pytest.mark.parametrize(
@@ -188,7 +196,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, reproduc
 def test_every_paper_of_the_command_has_its_module():
     from importlib import import_module
 
-    for paper in Paper:
+    for paper in PAPERS:
         assert callable(import_module(f"pkmcal.papers.paper_{paper}").reproduce)
 
 

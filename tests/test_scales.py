@@ -179,7 +179,7 @@ def test_a_firmware_without_scales_gets_the_settings_to_change(name, to, words):
     text = " ".join("".join(exporters()[to].files(source_of(machine)).values()).split())
     assert words in text
     factors = [f"{s:.9g}" for s in scales(machine)]
-    assert all(f"goes {factor} times as far as its reading says." in text for factor in factors)
+    assert all(f"goes {factor} times as far as its reading." in text for factor in factors)
     exact = with_scales(load_mechanism(name), 0.0)
     assert words not in "".join(exporters()[to].files(source_of(exact)).values())
 

@@ -1,4 +1,4 @@
-"""The servoing loop in simulation, its ends, and the analysis of visibility and equilibria."""
+"""The servoing loop in simulation, its ends, and the analysis of visibility."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 
 from pkmcal.cameras import camera_models
-from pkmcal.control.analysis import equilibria, matrix_at, subsets, visibility
+from pkmcal.control.analysis import Visibility, matrix_at, visibility
 from pkmcal.control.image import Eye, edge_responses
-from pkmcal.control.laws import limited, task_of
-from pkmcal.control.machine_view import legs_at, machine_view, true_edges
+from pkmcal.control.laws import limited
+from pkmcal.control.machine_view import machine_view, true_edges
 from pkmcal.control.sentences import judgement
 from pkmcal.control.simulation import (
     End,
     LoopSettings,
     loop_factor,
     one_image,
-    outside,
     platform_joints,
     simulate_servo_runs,
 )
@@ -340,15 +339,15 @@ def test_every_end_has_a_sentence():
 def test_visibility_of_few_legs(eye):
     poses = draw_configurations(eye.true.machine, 20, 0.2, np.random.default_rng(2))[0][:20]
     matrix = matrix_at(eye.true, "directions", poses)
-    results = {choice.legs: choice for choice in subsets(matrix, eye.true.legs)}
-    assert len(results) == 2**6 - 1
-    assert all(choice.blind == (len(legs) < 3) for legs, choice in results.items())
-    every, three = results[0, 1, 2, 3, 4, 5], results[0, 2, 4]
+    every, three = Visibility.of(matrix), Visibility.of(matrix[:, [0, 2, 4]])
     assert every.worst > 0.2
+    assert not every.blind
     assert not every.fading
     assert three.fading
+    assert not three.blind
     assert three.worst < every.worst / 50
     # two rows a leg: two legs cannot show six freedoms
+    assert Visibility.of(matrix[:, :2]).blind
     assert visibility(matrix[:, :2]).max() < 1e-9
 
 
@@ -360,37 +359,6 @@ def test_directions_of_parallel_sliders_are_blind():
     poses = draw_configurations(machine, 5, 0.2, np.random.default_rng(2))[0][:5]
     assert visibility(matrix_at(case, "directions", poses)).max() < 1e-6
     assert visibility(matrix_at(case, "edges", poses)).min() > 1e-4
-
-
-def test_three_legs_leave_other_poses(eye):
-    """Legs 1, 2 and 3: poses in the workspace with the same directions, to the last digit."""
-    poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
-    goals, starts = poses[:4], poses[4:40]
-    three = eye.true.only(np.array([0, 1, 2]))
-    value = equilibria(three, "directions", goals, starts)
-    assert value.same_image > 0.05
-    assert value.same_edges.any()
-    for pose, goal in zip(value.T_base_platform, value.goal, strict=True):
-        same = true_edges(three, pose[None]) - true_edges(three, goals[goal][None])
-        assert np.abs(same).max() < 1e-6
-        assert not outside(eye.true.machine, eye.true.machine.inverse(pose[None])).any()
-    assert value.distance.min() > 1e-3
-    every = equilibria(eye.true, "directions", goals, starts)
-    assert every.same_image == 0
-    assert every.reached > 0.95
-
-
-def test_an_equilibrium_is_one(eye):
-    """N^T e vanishes at the equilibria of the search."""
-    poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
-    three = eye.true.only(np.array([0, 1, 2]))
-    value = equilibria(three, "directions", poses[:3], poses[3:40])
-    for pose, goal in zip(value.T_base_platform, value.goal, strict=True):
-        wanted = true_edges(three, poses[goal][None])
-        task = task_of("directions", three, true_edges(three, pose[None]), wanted,
-                       legs_at(three, pose[None]))  # fmt: skip
-        slope = np.swapaxes(task.matrix, -1, -2) @ task.error[..., None]
-        assert np.abs(slope).max() < 1e-6
 
 
 # ------------------------------------------------------------------ estimates and studies

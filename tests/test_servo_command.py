@@ -96,7 +96,7 @@ def test_one_way(tmp_path):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--law", "points"), "no such law of control; found points, expected edges or directions"),
+        (("--law", "points"), "'points' is not one of 'edges', 'directions'"),
         (("--gain", 0), "--gain: this number cannot be used"),
         (("--gain", 30, "--delay", 3), "--gain: the loop is unstable"),
         (("--rate", -5), "--rate: this number cannot be used"),

@@ -193,7 +193,7 @@ def test_defaults_and_choices_are_values(site):
     rows = {cells[i]: cells[i : i + 4] for i in range(len(cells))}
     assert rows["count"][3] == str(default("plan", "configurations"))
     assert rows["corner_noise"][3] == str(default("plan", "corner_noise"))
-    assert "&#39;O1&#39;" in rows["index"][1]
+    assert "&#39;directions&#39;" in rows["law"][1]
     assert "default(" not in re.sub(r"<[^>]+>", "", text)
 
 

@@ -162,7 +162,7 @@ def test_a_tilt_that_is_not_sure_is_rejected(board):
 
 def test_a_board_that_looks_the_same_turned_round():
     turnable = chessboard((8, 6), 0.03)
-    with pytest.raises(InputError, match="itself turned by half a turn") as caught:
+    with pytest.raises(InputError, match="the same when rotated by half a turn") as caught:
         corners_in_view(turnable, [])
     assert caught.value.found == "a chessboard of 8x6 inner corners"
 
@@ -188,7 +188,7 @@ def test_corners_that_are_not_this_boards(board):
     """The images' squares are half as long again in one direction."""
     stretched = replace(board, points=board.points * [1.5, 1.0, 1.0])
     value = detections(stretched, poses_around(3))
-    with pytest.raises(InputError, match="do not lie as the board file") as caught:
+    with pytest.raises(InputError, match="contradict the board file") as caught:
         corners_in_view(board, value)
     assert "px rms off their places (a ChArUco board of 9x7 squares)" in caught.value.found
 

@@ -185,7 +185,7 @@ def test_a_board_in_one_configuration_decides_nothing(h4):
     _, _, estimate, case, _ = h4
     one = select(case.measurements, np.arange(71) == 0)
     start = start_state(estimate.machine, one, T_CAMERA_BASE[None])
-    with pytest.raises(ResultError, match="too little was seen to predict readings"):
+    with pytest.raises(ResultError, match="too few measurements to predict readings"):
         predict(estimate.machine, one, start)
 
 

@@ -8,8 +8,7 @@ import inspect
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields
-from importlib import import_module
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,15 @@ import pytest
 import pkmcal
 from conftest import have_cores, run
 from pkmcal.api.result import FolderResult, Result, printed_document
-from pkmcal.control.study import HAND_ROTATION
+from pkmcal.commands.cli import command_named
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
 from pkmcal.outcome.finding import Finding
-from pkmcal.placement.default_camera import default_camera
-from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE
 from pkmcal.simulation import Settings
 from printers import calibrated_cfg
 from test_cli_camera import boards  # noqa: F401 - a fixture
 from test_pose_sessions import make
+from test_ranges import required_words
 
 VERBS = (
     "new", "check", "camera", "board", "plan", "study", "simulate", "calibrate", "validate",
@@ -248,49 +246,37 @@ def test_a_result_opens_its_page(both, monkeypatch):
 # ------------------------------------------------------------------ defaults
 
 
-RENAMED = {("plan", "configurations"): "count"}
-"""Options whose argument has another name."""
-FOR_OUTPUT = {"out", "as_json", "quiet", "model", "pictures", "folder"}
-"""Options of outputs, or of loaded files."""
-OTHERWISE = {
-    ("plan", "size"): ("camera", PLANNED_IMAGE_SIZE),
-    ("simulate", "size"): ("camera", default_camera().image_size),
-    ("servo", "hand_rotation"): ("hand_rotation", round(np.rad2deg(HAND_ROTATION), 12)),
-    ("reproduce", "papers"): ("papers", None),
-    ("study", "out"): ("out", None),
-}
-"""Options that a person types otherwise: the argument that they become, and their default."""
+FOR_OUTPUT = {"out", "as_json", "quiet", "force", "pictures", "no_browser", "port"}
+"""Options of outputs, which are arguments of a result's ``save`` or ``show``."""
+OTHERWISE = {"model": "session", "size": "camera", "folder": "folder"}
+"""Options whose value becomes a part of an argument with another name."""
 
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
-    command = inspect.signature(getattr(import_module(f"pkmcal.commands.{verb}"), verb)).parameters
+    command = command_named(verb)
+    options = {one.name: one for one in command.params}
+    values = command.make_context(verb, required_words(verb)).params
     function = inspect.signature(getattr(pkmcal, verb)).parameters
-    defaults = {name: one.default for name, one in function.items()}
-    if verb == "simulate":
-        settings = {one.name: one for one in fields(Settings)}
-        defaults |= {
-            name: one.default for name, one in settings.items() if one.default is not MISSING
-        }
-    common = set()
-    for name, option in command.items():
-        argument, usual = OTHERWISE.get(
-            (verb, name), (RENAMED.get((verb, name), name), option.default)
-        )
-        if argument not in defaults:
-            assert name in FOR_OUTPUT or (name == "force" and verb in ("calibrate", "diff")), name
+    arguments = {name: one.default for name, one in function.items()}
+    if arguments.pop("settings", None):
+        arguments |= {one.name: one.default for one in fields(Settings) if one.name in options}
+    for name in options.keys() - arguments.keys() - FOR_OUTPUT:
+        assert OTHERWISE[name] in arguments or verb == "new"
+    for name, option in options.items():
+        if name not in arguments:
             continue
-        common.add(argument)
-        if (verb, name) in OTHERWISE:
-            typed = option.default
-            size = "{}x{}".format(*usual) if isinstance(usual, tuple) else usual
-            assert typed == size or str(typed) == str(size) or usual is None
-        elif option.default is not option.empty:
-            given = defaults[argument]
-            same = option.default == given or str(option.default) == str(given)
-            assert same or not (option.default or given), name
-    if verb != "simulate":
-        assert set(function) - common <= {"progress"}
+        usual = arguments.pop(name)
+        if option.required:
+            assert usual is inspect.Parameter.empty, name
+        elif name == "hand_rotation":
+            assert values[name] == pytest.approx(np.rad2deg(usual))
+        elif verb == "reproduce" and name == "papers":
+            assert set(option.type.choices) == set(usual)
+        else:
+            given = values[name]
+            assert str(given) == str(usual) or not (given or usual), name
+    assert set(arguments) <= {"progress"}
     assert "Parameters" in inspect.getdoc(getattr(pkmcal, verb))
     for name, argument in function.items():
         assert name in inspect.getdoc(getattr(pkmcal, verb))

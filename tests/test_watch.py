@@ -459,7 +459,7 @@ def test_too_few_poses_of_a_board(h4):
     )
     verdict = watch_verdict(judged, new_data(1))
     assert not verdict.usable
-    assert "too few to tell" in verdict.headline
+    assert "too few to decide" in verdict.headline
     assert [one.facts["legs"] for one in verdict.of("watch.leg_blind")] == ["legs 1 to 4"]
     document = judged.document(estimate.machine)
     assert not document["changed"]

@@ -130,7 +130,7 @@ def test_poses_on_one_line_confound_sizes():
 
 def common_values(findings):
     every = (*findings.unidentified, *findings.weak)
-    return [s for s in every if "of all legs alike, cannot be told apart" in s.text]
+    return [s for s in every if "of all legs alike, cannot be separated" in s.text]
 
 
 def test_what_moves_with_hinges_moves_no_platform():
@@ -162,7 +162,7 @@ def test_radii_are_no_business_of_boards():
 def test_weak_and_free_are_reported_together():
     """Poses' noise mixes the two; a sentence distinguishes them by the data's information."""
     _, findings, _ = findings_of("linear-delta")
-    (lean,) = of(findings, "How the guides of legs 1 to 3 lean cannot be told from where they")
+    (lean,) = of(findings, "The tilts of the guides of legs 1 to 3 cannot be separated from their")
     assert lean.weak
     assert lean in findings.weak
     assert "better than the nominal model does" in lean.text

@@ -1,4 +1,4 @@
-"""Ranges and defaults of all numeric options of the commands, which are those of the functions of
+"""Ranges, choices and defaults of the options of the commands, which are those of the functions of
 the same names.
 
 Ranges of numbers in files are part of the files' schemas; ranges of the quantities that a study
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from pkmcal.errors import InputError
 
@@ -118,6 +118,16 @@ RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
 )
 """Ranges by command and option. Lengths in m, angles in the option's own unit, noise of images in
 px or grey levels, speed in m/s or rad/s, rates in 1/s, durations in s."""
+
+
+AlternativeMethod = Literal["four-step", "linear", "inverse-kinematic"]
+CalibrationMethod = Literal["bundle", AlternativeMethod]
+CameraFileFormat = Literal["opencv", "ros", "kalibr"]
+CameraModelChoice = Literal["auto", "pinhole", "fisheye", "unified"]
+Paper = Literal["a", "b", "c"]
+ServoLaw = Literal["edges", "directions"]
+Style = Literal["mixed", "matte", "dark", "metal"]
+Light = Literal["usual", "soft", "hard"]
 
 
 def default(command: str, name: str) -> Any:

@@ -335,7 +335,7 @@ def warm() -> None:
     for name in ("cv2", "scipy.optimize", "scipy.linalg", "scipy.stats", "rich.table",
                  "rich.markup", "rich.text"):  # fmt: skip
         importlib.import_module(name)
-    # Of the time of a refusal the half would go into Typer's reading of the command's options.
+    # Otherwise half of a refusal's time is the import of the command's module.
     with redirect_stdout(StringIO()):
         cli.main(["--help"])
     gc.collect()

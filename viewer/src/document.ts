@@ -877,7 +877,7 @@ export interface Ellipsoid {
  * colour : custom property of the style sheet.
  * keys, tips : of each point.
  * sizes : relative to others; empty for all alike.
- * shown : whether they are drawn from the start.
+ * visible : whether they are drawn from the start.
  */
 export interface SpacePoints {
   name: string;
@@ -886,7 +886,7 @@ export interface SpacePoints {
   keys: string[];
   tips: string[];
   sizes: number[];
-  shown: boolean;
+  visible: boolean;
 }
 /**
  * Small vectors at points, m; drawn enlarged.
@@ -897,7 +897,7 @@ export interface SpaceArrows {
   points: [number, number, number][];
   vectors: [number, number, number][];
   tips: string[];
-  shown: boolean;
+  visible: boolean;
 }
 /**
  * Polylines with a name in the legend, m, base frame.

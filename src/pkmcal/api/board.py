@@ -84,7 +84,7 @@ class BoardResult(Result):
 
 
 def board(file: Path | str = "board.yaml", *, paper: str | None = None) -> BoardResult:
-    """A calibration board as a PDF page to be printed in true size, without writing files.
+    """Make the PDF page of a calibration board in true size, without writing files.
 
     Parameters
     ----------

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
 from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
 from pkmcal.calibration.calibrate import Calibration, calibrate_session
@@ -14,11 +13,9 @@ from pkmcal.calibration.results import check_output
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
-from pkmcal.ranges import default
+from pkmcal.ranges import CalibrationMethod, default
 from pkmcal.report.calibration import outcome_of, save
 from pkmcal.session.load import Session
-
-Method = Literal["bundle", "four-step", "linear", "inverse-kinematic"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -66,7 +63,7 @@ class CalibrationResult(Calibration, FolderResult):
 def calibrate(
     session: Session | Path | str,
     *,
-    method: Method = "bundle",
+    method: CalibrationMethod = "bundle",
     seed: int = 0,
     refine_camera: bool = False,
     holdout: int = default("calibrate", "holdout"),

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
 from pkmcal.api.result import PAGE_DESCRIPTION, FolderResult
 from pkmcal.boards.board import Board, load_board
@@ -16,10 +15,10 @@ from pkmcal.camera_calibration.image_files import board_file_of, image_files, se
 from pkmcal.errors import InputError
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
+from pkmcal.ranges import CameraModelChoice
 from pkmcal.report.camera import outcome_of
 from pkmcal.wording import listed
 
-CameraModelChoice = Literal["auto", "pinhole", "fisheye", "unified"]
 OTHER_CAMERA_FILES = {
     "opencv": "camera.opencv.yaml",
     "ros": "camera.ros.yaml",

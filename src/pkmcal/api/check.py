@@ -68,7 +68,7 @@ def check(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> CheckResult:
-    """Find what is wrong with a session before it is calibrated, without writing files.
+    """Check a session for faults before it is calibrated, without writing files.
 
     Mistakes in the session are findings of the result, and raise no error.
 

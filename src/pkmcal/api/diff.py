@@ -48,7 +48,7 @@ def diff(
     *,
     progress: Progress | None = None,
 ) -> DiffResult:
-    """Difference of two calibrations or nominal models of one machine, without writing files.
+    """Compare two calibrations or nominal models of one machine, without writing files.
 
     Parameters
     ----------

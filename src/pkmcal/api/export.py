@@ -91,7 +91,7 @@ def export(
     session: Path | str | None = None,
     force: bool = False,
 ) -> ExportResult:
-    """Files of a machine for a controller, a firmware or a simulator; nothing is written.
+    """Make a machine's files for a controller, a firmware or a simulator, without writing them.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def export(
     session :
         The calibration's session, for its cameras, where it is not found around the folder.
     force :
-        Export a calibration that was refused; the files say so.
+        Export a calibration that was refused; the files state that.
 
     Returns
     -------

@@ -27,7 +27,7 @@ PRINTER_MECHANISM_DESCRIPTION = "the printer by its firmware: see whether its to
 PROBED_FILE_DESCRIPTIONS = {
     "session.yaml": "how good the probe is: see whether it is yours",
     "mechanism.yaml": PRINTER_MECHANISM_DESCRIPTION,
-    "joints.csv": "the carriages when the bed was felt",
+    "joints.csv": "the carriages when the bed was probed",
     "poses.csv": "the tool's height above the bed there",
 }
 """Descriptions of the files of a complete session of a printer."""
@@ -48,7 +48,7 @@ class NewResult(Result):
 
     @cached_property
     def outcome(self) -> Outcome:
-        """One sentence."""
+        """Verdict in one sentence."""
         return Outcome(
             command="new",
             title="New session",
@@ -103,8 +103,8 @@ def new(
     printer: Path | str | None = None,
     probed: Path | str | None = None,
 ) -> NewResult:
-    """A session with comments, to be filled in, or the session of a delta printer; nothing is
-    written.
+    """Make a commented session to fill in, or the session of a delta printer, without writing
+    files.
 
     Parameters
     ----------

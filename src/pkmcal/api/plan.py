@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -27,8 +27,6 @@ from pkmcal.ranges import default
 from pkmcal.report.plan import PLAN_STATIONS_FILE, PLAN_TABLE_FILE, outcome_of
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation import board_for
-
-PlanIndex = Literal["tool", "D", "E", "O1"]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -64,7 +62,6 @@ def plan(
     subject: Session | Machine | Path | str,
     *,
     count: int = default("plan", "configurations"),
-    index: PlanIndex = "tool",
     places: int | None = None,
     best_of: int | None = None,
     after: SavedCalibration | Path | str | None = None,
@@ -89,8 +86,6 @@ def plan(
         built-in one or a mechanism file, with an assumed camera.
     count :
         Number of configurations at each station.
-    index :
-        Criterion to be minimized: the tool's variance, or one of the indices D, E and O1.
     places :
         Number of stations to choose as well, on a sphere around the machine.
     best_of :
@@ -167,7 +162,7 @@ def plan(
         choosing = partial(part(report, begin, 1), "Choosing configurations")
         try:
             value = plan_measurements(
-                planned, count=count, index=index, region=region, together=together,
+                planned, count=count, region=region, together=together,
                 free_stations=places, best_of=best_of, seed=seed,
                 progress=choosing,
             )  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 from pkmcal.api.result import NUMBERS_DESCRIPTION, FolderResult
 from pkmcal.errors import InputError
@@ -15,10 +15,10 @@ from pkmcal.files import write_folder
 from pkmcal.outcome import Outcome, Verdict
 from pkmcal.outcome.progress import Progress, part, whole
 from pkmcal.papers.reproduction import Options, reproduce_paper
-from pkmcal.ranges import check_number, default
+from pkmcal.ranges import Paper, check_number, default
 from pkmcal.wording import count, listed
 
-PAPERS = ("a", "b", "c")
+PAPERS: tuple[str, ...] = get_args(Paper)
 
 
 def table_and_numbers(paper: str) -> Mapping[str, str]:
@@ -92,7 +92,7 @@ def reproduce(
     images: bool = False,
     progress: Progress | None = None,
 ) -> ReproductionResult:
-    """Compute the papers' tables and figures again, without writing files.
+    """Recompute the tables and figures of papers [A], [B] and [C], without writing files.
 
     Parameters
     ----------

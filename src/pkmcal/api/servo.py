@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from pkmcal.errors import InputError
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.placement.edges import EdgeNoise
-from pkmcal.ranges import check_number, default
+from pkmcal.ranges import ServoLaw, check_number, default
 from pkmcal.report.servo import outcome_of
 
 MOST_SAMPLES = 5000
@@ -29,7 +28,7 @@ MOST_SAMPLES = 5000
 
 @dataclass(frozen=True, repr=False, eq=False)
 class ServoResult(FolderResult, Study):
-    """Study of servoing, with its files: ``outcomes``, ``choices``, ``equilibria``."""
+    """Study of servoing, with its files: ``outcomes``, ``visibility``."""
 
     own_files = page_and_numbers("servo")
     kind = ("a study of servoing", "an earlier study")
@@ -46,7 +45,7 @@ def servo(
     session: Path | str | None = None,
     station: str | None = None,
     camera: Path | str | None = None,
-    law: Literal["edges", "directions"] | str = "edges",
+    law: ServoLaw = "edges",
     legs: Sequence[int] | None = None,
     runs: int = default("servo", "runs"),
     gain: float = default("servo", "gain"),
@@ -63,7 +62,7 @@ def servo(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ServoResult:
-    """Simulate control by the legs in the image, without writing files.
+    """Simulate visual servoing by a machine's legs, without writing files.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ PAGE_MARK = b'<meta name="generator" content="pkmcal viewer">'
 
 @dataclass(frozen=True)
 class MachineView:
-    """Machine to look at; in a notebook it shows itself.
+    """Machine in 3-D, which a notebook displays.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class MachineView:
 
 
 def show(source: Machine | Path | str) -> MachineView:
-    """Machine in space, with sliders for its readings, the zeros and positive directions drawn.
+    """Machine in 3-D with a slider for each joint reading, its zero and positive direction.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ class SimulationResult(Session, Result):
 
     @cached_property
     def outcome(self) -> Outcome:
-        """What was simulated."""
+        """Verdict with the number of images and stations."""
         images, places = self.images_taken, count(len(self.station_names), "place")
         findings = (note("session.cylinders_added", self.machine.name),)
         return Outcome(

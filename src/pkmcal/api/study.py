@@ -63,7 +63,7 @@ def study(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> StudyResult:
-    """Study the accuracy of simulated calibrations, without writing results.
+    """Predict the accuracy of calibrations by repeated simulation, without writing results.
 
     Parameters
     ----------

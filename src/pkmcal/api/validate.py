@@ -37,7 +37,7 @@ def validate(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ValidationResult:
-    """Errors of a calibration on a session that it did not use, without writing files.
+    """Measure a calibration's errors on a session that it did not use, without writing files.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ def watch(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> WatchResult:
-    """Test whether a machine is still as calibrated, without writing files.
+    """Test whether a machine has changed since its calibration, without writing files.
 
     Parameters
     ----------

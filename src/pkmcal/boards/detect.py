@@ -201,7 +201,7 @@ def _other_board_error(path: Path, other: str, board: Board) -> InputError:
         "the images show another board than the one described",
         where=path.name,
         found=other,
-        expected=f"{board.described}{first}, as the board file says",
+        expected=f"{board.described}{first}, as the board file states",
         next_step="Write what the board has into the board file",
     )
 
@@ -225,7 +225,7 @@ def _check_grid(
     # Some programs state the gap as a share of the marker's side.
     ratio = abs((1 + layout.gap) / (1 + gap) - 1) <= options.size_difference
     raise InputError(
-        "the gaps between the board's markers are not as its file says",
+        "the gaps between the board's markers differ from those in its file",
         where=paths[0].name,
         found=f"gaps of {layout.gap:.2g} times a marker's side, which is"
         f" {layout.gap * marker:.2g} m beside marker: {marker:g}",
@@ -253,7 +253,7 @@ def _check_size(
     if abs(share * square / marker - 1) <= options.size_difference:
         return
     raise InputError(
-        "the board's markers have another size than its file says",
+        "the board's markers have another size than its file states",
         where=path.name,
         found=f"markers {share:.2f} of a square wide",
         expected=f"{marker / square:.2f}, by marker: {marker:g} and square: {square:g}",

@@ -127,8 +127,8 @@ def _charuco(
             if len(count[0]) >= enough:
                 return count, mirrored, ""
             best = max(best, count, key=lambda raw: len(raw[0]))
-    why = f"{markers} of the board's markers and {len(best[0])} corners are recognised"
-    return best, False, why if markers else "none of the board's markers is recognised"
+    why = f"{markers} of the board's markers and {len(best[0])} corners are detected"
+    return best, False, why if markers else "none of the board's markers is detected"
 
 
 def charuco_detector(data: dict[str, Any], quick: bool = False) -> Any:
@@ -216,7 +216,7 @@ def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
             if once.sum() >= enough:
                 values = (4 * ids[once, None] + np.arange(4)).reshape(-1)
                 return _raw(corners[once], values, image.shape[1], mirrored), mirrored, ""
-    return _raw([], [], 0, False), False, "fewer than two of the board's markers are recognised"
+    return _raw([], [], 0, False), False, "fewer than two of the board's markers are detected"
 
 
 def _chessboard(
@@ -224,7 +224,7 @@ def _chessboard(
 ) -> tuple[Raw, bool, str]:
     pixels = find_chessboard(image, board.counts, quick, options=options)
     if pixels is None:
-        why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners is recognised"
+        why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners is detected"
         return _raw([], [], 0, False), False, why
     return (np.arange(len(pixels)), pixels), False, ""
 

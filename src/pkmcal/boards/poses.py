@@ -231,7 +231,7 @@ def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
     """Raise `InputError` for a board with a rotational symmetry, and for mirrored images."""
     if board.turnable:
         raise InputError(
-            "the board cannot be told from itself turned by half a turn, so its pose is not known",
+            "the board looks the same when rotated by half a turn, so its pose is ambiguous",
             where="board.yaml",
             found=board.described,
             expected="an odd and an even number of corners, or a board with markers (charuco)",
@@ -265,7 +265,7 @@ def _check_explained(views: BoardViews) -> None:
         return
     worst = int(np.argmax(views.rms))
     raise InputError(
-        "the board's corners do not lie as the board file and the camera file say",
+        "the board's corners contradict the board file or the camera file",
         where=views.names[worst],
         found=f"{np.median(views.rms):.2g} px rms off their places ({views.board.described})",
         expected=f"{limit:.2g} px at most, usually a hundredth of that",

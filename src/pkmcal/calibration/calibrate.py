@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import numpy as np
 
@@ -60,7 +60,6 @@ from pkmcal.identify.conditions import conditions
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
-from pkmcal.identify.methods import AlternativeMethod
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
     Findings,
@@ -76,7 +75,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, doubtful, note
 from pkmcal.outcome.hypotheses import Ranked, decide, refuse
 from pkmcal.outcome.progress import Progress, no_progress, part
-from pkmcal.ranges import check_number
+from pkmcal.ranges import CalibrationMethod, check_number
 from pkmcal.session.load import Session, load_session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import listed
@@ -85,8 +84,7 @@ if TYPE_CHECKING:
     from pkmcal.calibration.holdout import Holdout
     from pkmcal.identify.bed import Bed
 
-CalibrationMethod = Literal["bundle"] | AlternativeMethod
-CALIBRATION_METHODS: tuple[str, ...] = ("bundle", *get_args(AlternativeMethod))
+CALIBRATION_METHODS: tuple[str, ...] = get_args(CalibrationMethod)
 
 
 @dataclass(frozen=True, repr=False)

@@ -528,10 +528,10 @@ def _without(case: Case, lost: Mapping[int, str], tried: Mapping[int, Array]) ->
     # an error if no hand-held image, or a single configuration, remains
     if by_hand and lost.keys() >= set(by_hand):
         raise InputError(
-            "the machine is recognised in none of the images by hand",
+            "the machine was localized in none of the hand-held images",
             where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
             found=f"{session.label(by_hand[0])}: {lost[by_hand[0]]}",
-            expected="one place for each where its legs lie on edges of the picture far oftener"
+            expected="one place for each where its legs lie on image edges far oftener"
             " than elsewhere",
             next_step="Check that these images show this machine's legs, large and sharp, that"
             " each bears the name of its configuration, and that the nominal model is this"
@@ -546,7 +546,7 @@ def _without(case: Case, lost: Mapping[int, str], tried: Mapping[int, Array]) ->
     if len(rows) < 2:
         names = [session.configurations[k] for k in sorted(rows)]
         raise InputError(
-            "the images that are recognised show one configuration only",
+            "the localized images show one configuration only",
             where=f"session.yaml, stations.{session.stations[(by_hand or [*lost])[0]].entry}",
             found=f"{listed(names)}; {remainder.rejected[0].finding.text}"
             if remainder.rejected

@@ -748,7 +748,7 @@ def _error_of_part(
         )
     if hypothesis.code == "board.size":
         return InputError(
-            "the board has another size than its file says",
+            "the board has another size than its file states",
             where=session.document["board"]["file"],
             found=f"a board {facts['size']:.4f} times as large, by how far the platform moved",
             expected="the size as measured with a ruler over many squares",

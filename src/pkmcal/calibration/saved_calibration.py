@@ -180,7 +180,7 @@ class SavedCalibration(CalibrationSummary):
                 "where this station stood is not known together with the machine",
                 where=str(self.path),
                 found=name,
-                expected=listed(self.placed, 8) or "a calibration that tells it",
+                expected=listed(self.placed, 8) or "a calibration with the stations' covariance",
                 next_step="An image by hand is no place that a camera is left in"
                 if hand
                 else "Calibrate once more with this pkmcal, or name a station of the calibration",

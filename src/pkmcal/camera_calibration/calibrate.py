@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.detect import detect_boards
 from pkmcal.boards.fit import (
@@ -351,7 +351,7 @@ def check_determined(
         return
     tilt = tilts(fit.T_camera_board, views.points)
     raise ResultError(
-        "the images do not tell the focal length, because the board looks much the same in"
+        "the images do not determine the focal length, because the board looks much the same in"
         " all of them",
         found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
         f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
@@ -407,18 +407,21 @@ def tilts(T_camera_board: Array, points: Array) -> Array:
     return np.rad2deg(np.arctan2(across, np.abs(dot(normal, middle))))
 
 
-def coverage(
-    pixels: Array,
-    image_size: tuple[int, int],
-    options: CalibrationCheckOptions = CALIBRATION_CHECK_OPTIONS,
-) -> Array:
-    """Number of corners in each cell of the image, (rows, columns)."""
+def cell_numbers(pixels: Array, image_size: tuple[int, int], cells: tuple[int, int]) -> Integers:
+    """Number (n,) of the cell of each of the pixels (n, 2), row by row.
+
+    cells : columns and rows. Pixels outside the image count to the nearest cell.
+    """
+    at = np.floor((pixels + 0.5) / image_size * cells).astype(int)
+    column, row = np.clip(at, 0, np.array(cells) - 1).T
+    return row * cells[0] + column
+
+
+def coverage(pixels: Array, image_size: tuple[int, int], cells: tuple[int, int]) -> Integers:
+    """Number of corners in each cell of the image, (rows, columns). cells : columns and rows."""
     flat = pixels[np.isfinite(pixels).all(axis=-1)]
-    edges = [
-        np.linspace(-0.5, size - 0.5, n + 1)
-        for size, n in zip(image_size, options.cells, strict=True)
-    ]
-    return np.histogram2d(flat[:, 1], flat[:, 0], bins=(edges[1], edges[0]))[0]
+    counts = np.bincount(cell_numbers(flat, image_size, cells), minlength=cells[0] * cells[1])
+    return counts.reshape(cells[::-1])
 
 
 def calibration_findings(
@@ -441,7 +444,7 @@ def calibration_findings(
     most = float(tilts(c.T_camera_board, c.board.points).max())
     if most < options.facing_tilt:
         yield doubtful("lens.little_tilt", degrees=most)
-    covered = float(np.mean(coverage(c.pixels, c.camera.image_size, options=options) > 0))
+    covered = float(np.mean(coverage(c.pixels, c.camera.image_size, options.cells) > 0))
     if covered < options.least_covered:
         yield doubtful("lens.little_covered", percent=100 * covered)
     finite = np.isfinite(c.residuals).all(axis=-1)

@@ -27,6 +27,7 @@ from pkmcal.observe.overlays import (
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import image_key
 from pkmcal.outcome.blocks.images import Image, Images, Overlay
+from pkmcal.outcome.blocks.plot import leg_colour
 from pkmcal.outcome.blocks.text import Paragraph
 
 DRAWN_PIXEL_BINARY_DIGITS = 4
@@ -35,11 +36,11 @@ CAPTION_BAR_HEIGHT = 26
 """Height (px) of the caption above each image."""
 PANE_GAP = 6
 """Distance (px) between the two images."""
-LEG_COLOURS = (
-    0xFFB52E, 0x6AD0FF, 0x28DCA8, 0xFF9FD8, 0x86AAFF, 0xFF7C3A, 0xF4E04D, 0xD5DBE0,
-)  # fmt: skip
-"""Colours (RGB) of legs on images, those of ``viewer/src/overlay.css``; machines with more legs
-repeat them."""
+RGB = {
+    "leg-1": 0xFFB52E, "leg-2": 0x6AD0FF, "leg-3": 0x28DCA8, "leg-4": 0xFF9FD8,
+    "leg-5": 0x86AAFF, "leg-6": 0xFF7C3A, "leg-7": 0xF4E04D, "leg-8": 0xD5DBE0,
+}  # fmt: skip
+"""Colours of legs on images, those of ``viewer/src/overlay.css``."""
 NOMINAL_OVER_IMAGES_TEXT = (
     "Lines: the nominal model's legs in their colours; circles: its joints. By the pose found they"
     " lie on the legs to a few pixels, as far as the nominal model is right; where they do not, or"
@@ -97,7 +98,7 @@ def _image(inspection: Inspection, s: int, k: int, jpeg: str) -> Image:
 
 def poses_of(station: StationInspection) -> tuple[tuple[str, Array], ...]:
     """Poses T_camera_base for overlays with their captions; the given pose comes first."""
-    after = "pose found" if station.recognised else "best pose found, not recognised"
+    after = "pose found" if station.recognised else "best candidate pose, not localized"
     by_hand = () if station.by_hand is None else (("pose by hand", station.by_hand),)
     return *by_hand, (after, station.T_camera_base)
 
@@ -193,5 +194,5 @@ def _draw(pane: Any, edges: tuple[EdgeCurve, ...], spots: tuple[Spot, ...]) -> N
 
 def _colour(leg: int) -> tuple[int, int, int]:
     """Colour of a leg on images, BGR."""
-    n = LEG_COLOURS[(leg - 1) % len(LEG_COLOURS)]
+    n = RGB[leg_colour(leg)]
     return n & 255, n >> 8 & 255, n >> 16

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
+from pkmcal.commands.options import argument, as_json, command, option, out
 
 EXAMPLES = """\
 pkmcal board
@@ -17,20 +15,18 @@ pkmcal board board.yaml -o board.pdf
 """
 
 
-def board(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="board.yaml, or a session with one.")
-    ] = Path("board.yaml"),
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="PDF", help="[board.pdf beside FILE]")
-    ] = None,
-    paper: Annotated[
-        str | None,
-        typer.Option(metavar="PAPER", help="a4, letter, a3 … [the smallest]"),
-    ] = None,
-    as_json: console.Json = False,
-) -> int:
-    """Write a board as a PDF page to print in true size."""
+@command(
+    EXAMPLES,
+    argument(
+        "file", "FILE", "board.yaml, or a session with one. [default: board.yaml]", Path,
+        default=Path("board.yaml"),
+    ),
+    option("--paper", "SIZE", "Paper size: a4, letter, a3... [default: the smallest that fits]"),
+    out("board.pdf beside FILE", "PDF file.", "PDF"),
+    as_json(),
+)  # fmt: skip
+def board(file: Path, paper: str | None, out: Path | None, as_json: bool) -> int:
+    """Write a calibration board as a PDF page to print in true size."""
     import pkmcal
 
     with console.progress(as_json) as progress:

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-from pkmcal.ranges import default
+from pkmcal.commands.options import (
+    OUTPUT_GROUP,
+    as_json,
+    choice,
+    command,
+    flag,
+    force,
+    number,
+    option,
+    out,
+    seed,
+    session,
+)
+from pkmcal.ranges import CalibrationMethod
 
 EXAMPLES = """\
 pkmcal calibrate my-machine
@@ -18,46 +29,24 @@ pkmcal calibrate my-machine --refine-camera --seed 1 --json
 """
 
 
+@command(
+    EXAMPLES,
+    session(),
+    choice("method", CalibrationMethod, "bundle, the joint estimate, or a method of the papers."),
+    option("--model", "NAME", "Model named in the mechanism file, such as design."),
+    flag("--refine-camera", "Estimate the cameras' intrinsics as well."),
+    number("calibrate", "holdout", "N", "Configurations left out and predicted."),
+    seed("calibrate"),
+    out("SESSION/calibration"),
+    force(),
+    flag("-q --quiet", "Print nothing if the result is usable.", group=OUTPUT_GROUP),
+    as_json(),
+)
 def calibrate(
-    session: console.SessionFolder,
-    out: Annotated[Path | None, console.folder("SESSION/calibration unless given.")] = None,
-    method: Annotated[
-        Literal["bundle", "four-step", "linear", "inverse-kinematic"],
-        typer.Option(
-            metavar="NAME",
-            help="bundle, or the papers' own: four-step, linear, inverse-kinematic.",
-        ),
-    ] = "bundle",
-    model: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="A model that the mechanism file names, such as design."),
-    ] = None,
-    seed: console.Seed = 0,
-    refine_camera: Annotated[
-        bool,
-        typer.Option("--refine-camera", help="Estimate the cameras' intrinsics as well."),
-    ] = False,
-    holdout: Annotated[
-        int,
-        console.number_option("calibrate", "holdout", "N", "Leave N poses out, and predict them."),
-    ] = default("calibrate", "holdout"),
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force",
-            help="Replace an earlier result; otherwise it is kept, dated.",
-            rich_help_panel=console.OUTPUT_GROUP,
-        ),
-    ] = False,
-    as_json: console.Json = False,
-    quiet: Annotated[
-        bool,
-        typer.Option(
-            "--quiet", "-q", help="Say nothing if it is well.", rich_help_panel=console.OUTPUT_GROUP
-        ),
-    ] = False,
-) -> int:
-    """Calibrate the machine; write model, numbers and report."""
+    session: Path, model: str | None, out: Path | None, force: bool, quiet: bool, as_json: bool,
+    **options: Any,
+) -> int:  # fmt: skip
+    """Calibrate a session's machine; write the model and a report."""
     import pkmcal
 
     with console.progress(quiet or as_json) as progress:
@@ -67,8 +56,5 @@ def calibrate(
         folder = console.output_folder(
             out, loaded.folder / "calibration", CalibrationResult, force=force
         )
-        result = pkmcal.calibrate(
-            loaded, method=method, seed=seed, refine_camera=refine_camera, holdout=holdout,
-            progress=progress.work,
-        )  # fmt: skip
+        result = pkmcal.calibrate(loaded, progress=progress.work, **options)
         return finish(result, folder, progress, force=force, as_json=as_json, quiet=quiet)

@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-
-CAMERA_FOLDER = Path("camera")
-
-
-class CameraFileForm(StrEnum):
-    """Formats of other programs' camera files."""
-
-    OPENCV = "opencv"
-    ROS = "ros"
-    KALIBR = "kalibr"
-
+from pkmcal.commands.options import argument, as_json, choice, choices, command, option, out
+from pkmcal.ranges import CameraFileFormat, CameraModelChoice
 
 EXAMPLES = """\
 pkmcal camera my-machine
@@ -29,40 +17,28 @@ pkmcal camera mirror --model unified --to opencv
 """
 
 
-def camera(
-    images: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SESSION|IMAGES...",
-            help="A session whose stations observe a board, or images, or their folder.",
-        ),
-    ],
-    board: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="The board's file; board.yaml beside them unless given."),
-    ] = None,
-    model: Annotated[
-        Literal["auto", "pinhole", "fisheye", "unified"],
-        typer.Option(metavar="NAME", help="auto, pinhole, fisheye, or unified (mirrors)."),
-    ] = "auto",
-    out: Annotated[Path, console.folder("Where the results go.")] = CAMERA_FOLDER,
-    to: Annotated[
-        list[CameraFileForm] | None,
-        typer.Option(metavar="NAME", help="Write it for opencv, ros or kalibr as well."),
-    ] = None,
-    as_json: console.Json = False,
-) -> int:
+@command(
+    EXAMPLES,
+    argument(
+        "images", "SESSION|IMAGES...", "Session whose stations observe a board; or images of one,"
+        " or their folder.", Path, nargs=-1, required=True,
+    ),
+    option(
+        "--board", "FILE", "Board file. [default: the session's, or board.yaml beside the images]",
+        Path,
+    ),
+    choice("model", CameraModelChoice, "Camera model; unified is for mirrors."),
+    choices("to", CameraFileFormat, "Camera file of another program to write as well; repeatable."),
+    out("camera"),
+    as_json(),
+)  # fmt: skip
+def camera(images: tuple[Path, ...], out: Path | None, as_json: bool, **options: Any) -> int:
     """Calibrate a camera from images of a board."""
     import pkmcal
 
     with console.progress(as_json) as progress:
         from pkmcal.api.camera import CameraResult
 
-        folder = console.output_folder(
-            None if out == CAMERA_FOLDER else out, CAMERA_FOLDER, CameraResult
-        )
-        result = pkmcal.camera(
-            images, board=board, model=model, to=[form.value for form in to or ()],
-            progress=progress.work,
-        )  # fmt: skip
+        folder = console.output_folder(out, Path("camera"), CameraResult)
+        result = pkmcal.camera(images, progress=progress.work, **options)
         return finish(result, folder, progress, as_json=as_json)

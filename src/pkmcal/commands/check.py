@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import answer, finish
+from pkmcal.commands.options import OUTPUT_GROUP, as_json, command, flag, option, seed, session
 
 OVERLAYS_DESCRIPTION = "the nominal model over each image"
 
@@ -19,25 +18,22 @@ pkmcal check my-machine --pictures drawn --repeat
 """
 
 
+@command(
+    EXAMPLES,
+    session(),
+    flag("--repeat", "Estimate the accuracy from repeated images as well."),
+    seed("check"),
+    option("-o --out", "DIR", "Folder for a page with the images.", Path, group=OUTPUT_GROUP),
+    option(
+        "--pictures", "DIR", "Folder for the images with the nominal model overlaid, as PNG.", Path,
+        group=OUTPUT_GROUP,
+    ),
+    as_json(),
+)  # fmt: skip
 def check(
-    session: console.SessionFolder,
-    out: Annotated[Path | None, console.folder("Write a page with images there.")] = None,
-    pictures: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Write the nominal model over each image, as PNG.",
-            rich_help_panel=console.OUTPUT_GROUP,
-        ),
-    ] = None,
-    repeat: Annotated[
-        bool,
-        typer.Option("--repeat", help="Measure the accuracy by repeated images as well."),
-    ] = False,
-    seed: console.Seed = 0,
-    as_json: console.Json = False,
+    session: Path, out: Path | None, pictures: Path | None, as_json: bool, **options: Any
 ) -> int:
-    """Find what is wrong with a session before any work is spent."""
+    """Check a session for faults before it is calibrated."""
     import pkmcal
     from pkmcal.errors import InputError
 
@@ -56,7 +52,7 @@ def check(
                     found=str(pictures),
                     next_step=f"Name another folder, such as {out}-pictures",
                 )
-        result = pkmcal.check(session, repeat=repeat, seed=seed, progress=progress.work)
+        result = pkmcal.check(session, progress=progress.work, **options)
         more: dict[str, str] = {}
         if pictures is not None:
             progress.report("Drawing", console.WORK_SHARE)

@@ -1,6 +1,4 @@
-"""Options shared by commands, and output to the terminal: results to stdout, progress and errors to
-stderr.
-"""
+"""Output to the terminal: results to stdout, progress and errors to stderr."""
 
 from __future__ import annotations
 
@@ -10,104 +8,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import InputError, legible
 from pkmcal.outcome.progress import Progress, no_progress, part, whole
-from pkmcal.ranges import RANGES, check_number
 from pkmcal.terminal import err, print_points
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from pkmcal.api.result import FolderResult
-
-OUTPUT_GROUP = "Output"
-"""Heading of the options of outputs in the help."""
-Json = Annotated[
-    bool,
-    typer.Option(
-        "--json",
-        help="Print one JSON object and nothing else.",
-        rich_help_panel=OUTPUT_GROUP,
-    ),
-]
-
-
-def number_option(
-    command: str, name: str, metavar: str, described: str, *flags: str, group: str | None = None
-) -> Any:
-    """Numeric option that is validated by its range in :data:`pkmcal.ranges.RANGES`; the help shows
-    the range. Lengths and angles may have a unit, such as ``0.1 deg``, as in files.
-
-    described : help text. flags : names of the option; ``--name`` by default. group : heading in
-    the help.
-    """
-    long = flags[-1] if flags else f"--{name.replace('_', '-')}"
-    allowed = RANGES[command][name]
-
-    def check(value: Any) -> Any:
-        check_number(command, name, value, long)
-        return value
-
-    def number(text: Any) -> float:
-        return quantity(str(text), allowed.unit, long)
-
-    return typer.Option(
-        *(flags or (long,)),
-        metavar=metavar,
-        callback=check,
-        parser=number if allowed.unit else None,
-        help=f"{described} [{allowed}]",
-        rich_help_panel=group,
-    )
-
-
-def quantity(text: str, unit: str, where: str) -> float:
-    """Number of an option, with or without a unit; InputError for another text.
-
-    unit : that of a number without one, m, rad, "m or rad" or deg. where : the option.
-    """
-    with suppress(ValueError):
-        return float(text)  # such as every default: units are loaded for others alone
-    from pkmcal.files.quantities import read_quantity
-
-    try:
-        return read_quantity(text, unit)
-    except ValueError:
-        kinds = {"m": "a length", "rad": "an angle", "deg": "an angle"}
-        examples = {"m": "0.001 or 1 mm", "rad": "0.01 or 0.5 deg", "deg": "3 or 3 deg"}
-        raise InputError(
-            "this number cannot be used",
-            where=where,
-            found=text,
-            expected=f"{kinds.get(unit, 'a length or an angle')}, such as"
-            f" {examples.get(unit, '3e-6 or 3 um')}",
-        ) from None
-
-
-def _seed(value: int) -> int:
-    check_number("calibrate", "seed", value, "--seed")
-    return value
-
-
-Seed = Annotated[
-    int, typer.Option("--seed", metavar="N", callback=_seed, help="Seed for all random numbers.")
-]
-
-SessionFolder = Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")]
-CalibrationFolder = Annotated[
-    Path, typer.Argument(metavar="CALIBRATION", help="The folder that calibrate wrote.")
-]
-CamerasOf = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="The session, for its cameras, where it is not found."),
-]
 
 SMALLEST_PICTURE_SIDE, LARGEST_PICTURE_SIDE = 64, 8192
 """Limits of an image's width and height in px: below, legs are too narrow to have edges; above,
@@ -119,11 +32,6 @@ WORK_SHARE = 0.95
 """Share of a command's progress before its files are written."""
 SMALLEST_SHARE_FOR_ESTIMATE, SHORTEST_TIME_FOR_ESTIMATE = 0.05, 2.0
 """Share and seconds from which on the remaining time is estimated."""
-
-
-def folder(given: str) -> Any:
-    """Option of the output folder. given : help text."""
-    return typer.Option("-o", "--out", metavar="DIR", help=given, rich_help_panel=OUTPUT_GROUP)
 
 
 def parsed_size(text: str) -> tuple[int, int]:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.finish import answer
+from pkmcal.commands.options import as_json, command, flag, out
 from pkmcal.errors import InputError
 from pkmcal.outcome.progress import part
 
@@ -27,15 +25,15 @@ pkmcal demo -o my-demo --json
 """
 
 
-def demo(
-    out: Annotated[Path, console.folder("Output folder.")] = DEMO_FOLDER,
-    no_open: Annotated[
-        bool, typer.Option("--no-open", help="Do not open the report in a browser.")
-    ] = False,
-    fast: Annotated[bool, typer.Option("--fast", help="Fewer and smaller images.")] = False,
-    as_json: console.Json = False,
-) -> int:
-    """Simulate, calibrate, compare with the truth, open the report."""
+@command(
+    EXAMPLES,
+    flag("--fast", "Use fewer and smaller images."),
+    flag("--no-open", "Do not open the report in a browser."),
+    out("pkmcal-demo"),
+    as_json(),
+)
+def demo(fast: bool, no_open: bool, out: Path | None, as_json: bool) -> int:
+    """Simulate a session, calibrate it, and compare with the truth."""
     from dataclasses import asdict, replace
     from datetime import datetime
 
@@ -43,15 +41,16 @@ def demo(
 
     with console.progress(as_json) as progress:
         from pkmcal.calibration.results import CALIBRATION_REPORT_FILE
-        from pkmcal.files import write_text
+        from pkmcal.files import default_output, write_text
         from pkmcal.judge.against_truth import compare_with_truth
         from pkmcal.placement.default_camera import camera_of_size, default_camera
         from pkmcal.report.truth import truth_sentence, truth_table, with_truth
         from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
         from pkmcal.web.report_page import report_page
 
-        session, folder = out / DEMO_SESSION_NAME, out / DEMO_CALIBRATION_NAME
-        _make_room(out)
+        place = out or default_output(DEMO_FOLDER)
+        session, folder = place / DEMO_SESSION_NAME, place / DEMO_CALIBRATION_NAME
+        _make_room(place)
         simulated = pkmcal.simulate(
             session,
             DEMO_MECHANISM,
@@ -95,9 +94,9 @@ def demo(
 
 def _make_room(out: Path) -> None:
     """Remove an earlier demonstration; raise InputError if the folder holds anything else."""
-    from pkmcal.files import default_output, entries, remove_folder
+    from pkmcal.files import entries, remove_folder
 
-    standing = entries(default_output(out) if out == DEMO_FOLDER else out)
+    standing = entries(out)
     if not standing:
         return
     ours = {DEMO_SESSION_NAME, DEMO_CALIBRATION_NAME}

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
+from pkmcal.commands.options import argument, as_json, command, force, out
 
 if TYPE_CHECKING:
     from pkmcal.api.diff import DiffResult
@@ -21,28 +20,16 @@ pkmcal diff a/mechanism.yaml b/mechanism.yaml -o diff --json
 """
 
 
-def diff(
-    a: Annotated[
-        str,
-        typer.Argument(
-            metavar="A", help="A calibration's folder, a mechanism file, or a built-in machine."
-        ),
-    ],
-    b: Annotated[str, typer.Argument(metavar="B", help="Another of the same machine.")],
-    out: Annotated[
-        Path | None, console.folder("diff beside the calibration B unless given.")
-    ] = None,
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force",
-            help="Replace an earlier one; otherwise it is kept, dated.",
-            rich_help_panel=console.OUTPUT_GROUP,
-        ),
-    ] = False,
-    as_json: console.Json = False,
-) -> int:
-    """Difference of two calibrations or nominal models at the tool."""
+@command(
+    EXAMPLES,
+    argument("a", "A", "Folder of a calibration, mechanism file, or name of a built-in machine."),
+    argument("b", "B", "Another of the same machine."),
+    out("diff beside the calibration B"),
+    force(),
+    as_json(),
+)
+def diff(a: str, b: str, out: Path | None, force: bool, as_json: bool) -> int:
+    """Compare two calibrations or nominal models, at the tool."""
     import pkmcal
 
     with console.progress(as_json) as progress:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
+from pkmcal.commands.options import argument, as_json, cameras_session, command, flag, option, out
 
 EXAMPLES = """\
 pkmcal export out --to c
@@ -18,35 +17,29 @@ pkmcal export h4 --to ros --json
 """
 
 
-def export(
-    calibration: Annotated[
-        str,
-        typer.Argument(
-            metavar="CALIBRATION",
-            help="The folder that calibrate wrote; or a mechanism file, or a built-in machine.",
-        ),
-    ],
-    to: Annotated[
-        str,
-        typer.Option(
-            metavar="FORMAT",
-            help="c, json, klipper, linuxcnc, mujoco, reprap, ros, sdf, urdf or yaml.",
-        ),
-    ],
-    out: Annotated[Path | None, console.folder("export-FORMAT unless given.")] = None,
-    session: console.CamerasOf = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Export a calibration that was refused.")
-    ] = False,
-    as_json: console.Json = False,
-) -> int:
-    """Write the machine for a controller, a firmware or a simulator."""
+@command(
+    EXAMPLES,
+    argument(
+        "calibration", "CALIBRATION|MACHINE", "Folder that calibrate wrote; or mechanism file, or"
+        " name of a built-in machine.",
+    ),
+    option(
+        "--to", "FORMAT", "c, json, klipper, linuxcnc, mujoco, reprap, ros, sdf, urdf or yaml.",
+        required=True,
+    ),
+    cameras_session(),
+    flag("--force", "Export a calibration that should not be used."),
+    out("export-FORMAT beside the calibration"),
+    as_json(),
+)  # fmt: skip
+def export(calibration: str, to: str, out: Path | None, as_json: bool, **options: Any) -> int:
+    """Write a machine for a controller, a firmware or a simulator."""
     import pkmcal
 
     with console.progress(as_json) as progress:
         from pkmcal.files import default_output
 
-        result = pkmcal.export(calibration, to, session=session, force=force)
+        result = pkmcal.export(calibration, to, **options)
         folder = out or default_output(_default_folder(calibration, to))
         return finish(result, folder, progress, as_json=as_json)
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
+from pkmcal.commands.options import argument, as_json, command, flag, number, option
 
 EXAMPLES = """\
 pkmcal new my-machine
@@ -19,47 +18,33 @@ pkmcal new my-printer --printer printer.cfg
 """
 
 
-def new(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new or empty folder.")],
-    machine: Annotated[
-        str | None,
-        typer.Option(metavar="MACHINE", help="A built-in machine, or a nominal model's file."),
-    ] = None,
-    board: Annotated[bool, typer.Option("--board", help="A board on it is seen.")] = False,
-    legs: Annotated[
-        bool, typer.Option("--legs", help="The legs are seen; the usual where they can be.")
-    ] = False,
-    places: Annotated[
-        int | None,
-        console.number_option("new", "places", "N", "Places that the camera stands in; 1."),
-    ] = None,
-    printer: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="A delta printer's printer.cfg, or config.g with M665: its nominal model"
-            " and heights.",
-        ),
-    ] = None,
-    probed: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="What the printer said while it probed its bed."),
-    ] = None,
-    as_json: console.Json = False,
-) -> int:
-    """Write a commented session to fill in."""
+@command(
+    EXAMPLES,
+    argument("folder", "DIR", "New or empty folder.", Path),
+    option(
+        "--machine", "MACHINE", "Name of a built-in machine, or mechanism file."
+        " [default: a dialogue, or gough-stewart]",
+    ),
+    flag("--legs", "The cameras observe the legs. [default where legs can be observed]"),
+    flag("--board", "The cameras observe a board."),
+    number("new", "places", "N", "Number of stations.", usual="1"),
+    option(
+        "--printer", "FILE", "Delta printer's printer.cfg, or config.g with M665: source of the"
+        " nominal model and the probed heights.", Path,
+    ),
+    option("--probed", "FILE", "Terminal output of the printer's bed probing.", Path),
+    as_json(),
+)  # fmt: skip
+def new(folder: Path, as_json: bool, **options: Any) -> int:
+    """Write a commented session folder to fill in."""
     import pkmcal
     from pkmcal.api.new import NewResult
 
     NewResult.check_folder(folder)
-    plain = not (machine or board or legs or places or printer or probed)
-    if plain and not as_json and on_terminal():
-        machine, board, legs, places = _dialogue()
+    if not any(options.values()) and not as_json and on_terminal():
+        options = _dialogue()
     with console.progress(as_json) as progress:
-        result = pkmcal.new(
-            machine, board=board, legs=legs, places=places, printer=printer, probed=probed
-        )
-        return finish(result, folder, progress, as_json=as_json)
+        return finish(pkmcal.new(**options), folder, progress, as_json=as_json)
 
 
 def on_terminal() -> bool:
@@ -67,8 +52,8 @@ def on_terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
-def _dialogue() -> tuple[str, bool, bool, int]:
-    """Machine, whether a board and the legs are observed, and number of stations, by a dialogue."""
+def _dialogue() -> dict[str, Any]:
+    """Options by a dialogue: machine, whether a board and the legs are observed, and stations."""
     from rich.prompt import IntPrompt, Prompt
 
     from pkmcal.mechanisms import catalogue, load_mechanism
@@ -83,14 +68,19 @@ def _dialogue() -> tuple[str, bool, bool, int]:
     what = ""
     if any(leg.tubes for leg in nominal.document.legs):
         what = Prompt.ask(
-            "What does the camera see of it",
+            "What does the camera observe",
             choices=["legs", "board", "both"], default="legs",
         )  # fmt: skip
     elif nominal.redundancy > 0:
-        terminal.out().print("Its readings alone tell its geometry: no camera is needed.")
-        return machine, False, False, 1
+        terminal.out().print("Its readings alone determine its geometry: no camera is needed.")
+        return {"machine": machine}
     else:
-        terminal.out().print("Its nominal model has no visible cylinders, so a board is seen.")
+        terminal.out().print("Its nominal model has no visible cylinders: a board is observed.")
     usual = 1 if what in ("", "board") else 2
-    places = IntPrompt.ask("In how many places does the camera stand", default=usual)
-    return machine, what in ("board", "both"), what in ("legs", "both"), min(max(places, 1), 20)
+    places = IntPrompt.ask("Number of stations (fixed places of the camera)", default=usual)
+    return {
+        "machine": machine,
+        "board": what in ("board", "both"),
+        "legs": what in ("legs", "both"),
+        "places": min(max(places, 1), 20),
+    }

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
+from pkmcal.commands.options import (
+    argument,
+    as_json,
+    command,
+    flag,
+    number,
+    option,
+    out,
+    seed,
+)
 from pkmcal.errors import InputError
 from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE
-from pkmcal.ranges import default
 
 EXAMPLES = """\
 pkmcal plan my-machine
@@ -20,139 +27,74 @@ pkmcal plan delta --tracker "20 um" --joint-noise "0.01 mm"
 """
 
 
+FOR_A_SESSION, FOR_A_MACHINE = "For a SESSION", "For a MACHINE"
+
+
+@command(
+    EXAMPLES,
+    argument(
+        "subject", "SESSION|MACHINE", "Folder of a session; or name of a built-in machine, or"
+        " mechanism file.",
+    ),
+    number(
+        "plan", "configurations", "N", "Configurations for each station.",
+        flags="-n --configurations", into="count",
+    ),
+    number("plan", "places", "N", "Choose N stations as well."),
+    flag(
+        "--together/--apart", "All stations observe each configuration, or each its own."
+        " [default: together with several cameras or a tracker]", default=None,
+    ),
+    number("plan", "edge_noise", "PX", "Sigma of an edge without images, px."),
+    number("plan", "corner_noise", "PX", "Sigma of a board's corner without images, px."),
+    seed("plan"),
+    number("plan", "best_of", "N", "Choose N of the session's stations.", group=FOR_A_SESSION),
+    option(
+        "--after", "CALIBRATION", "Calibration to continue from. [default: the session's]", Path,
+        group=FOR_A_SESSION,
+    ),
+    flag("--from-drawing", "Ignore the session's calibration.", group=FOR_A_SESSION),
+    flag(
+        "--same-place", "The cameras have not moved since the calibration.", group=FOR_A_SESSION
+    ),
+    option("--camera", "FILE", "Camera file.", Path, group=FOR_A_MACHINE),
+    option(
+        "--size", "WxH", "Image size without a camera file, px. [default: {}x{}]".format(
+            *PLANNED_IMAGE_SIZE
+        ), group=FOR_A_MACHINE,
+    ),
+    flag("--board", "Observe a board on the platform.", group=FOR_A_MACHINE),
+    option(
+        "--tracker", "M[,RAD]", "Observe by a tracker or probe with this sigma, such as 20 um or"
+        " 20 um,0.005 deg.", group=FOR_A_MACHINE,
+    ),
+    number(
+        "plan", "joint_noise", "M", "Sigma of a joint reading, m or rad.", group=FOR_A_MACHINE
+    ),
+    out("SESSION/plan, or plan"),
+    as_json(),
+)  # fmt: skip
 def plan(
-    subject: Annotated[
-        str,
-        typer.Argument(
-            metavar="SESSION|MACHINE", help="A session, or a built-in machine or its file."
-        ),
-    ],
-    out: Annotated[Path | None, console.folder("SESSION/plan, or plan, unless given.")] = None,
-    configurations: Annotated[
-        int,
-        console.number_option(
-            "plan",
-            "configurations",
-            "N",
-            "Configurations from each place.",
-            "-n",
-            "--configurations",
-        ),
-    ] = default("plan", "configurations"),
-    index: Annotated[
-        Literal["tool", "D", "E", "O1"],
-        typer.Option(help="Criterion to minimize: the tool's variance, or D, E, O1."),
-    ] = "tool",
-    places: Annotated[
-        int | None,
-        console.number_option("plan", "places", "N", "Choose N places of the camera as well."),
-    ] = None,
-    best_of: Annotated[
-        int | None,
-        console.number_option(
-            "plan", "best_of", "N", "Choose N of the session's stations.", group="For a SESSION"
-        ),
-    ] = None,
-    after: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="CALIBRATION",
-            help="Calibration to continue from.",
-            rich_help_panel="For a SESSION",
-        ),
-    ] = None,
-    from_drawing: Annotated[
-        bool,
-        typer.Option(
-            "--from-drawing",
-            help="Ignore the calibration in the session.",
-            rich_help_panel="For a SESSION",
-        ),
-    ] = False,
-    same_place: Annotated[
-        bool,
-        typer.Option(
-            "--same-place",
-            help="The cameras stand as they stood in the calibration.",
-            rich_help_panel="For a SESSION",
-        ),
-    ] = False,
-    together: Annotated[
-        bool | None,
-        typer.Option(
-            "--together/--apart", help="All stations measure each configuration, or each its own."
-        ),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Camera file.", rich_help_panel="For a MACHINE"),
-    ] = None,
-    size: Annotated[
-        str,
-        typer.Option(
-            metavar="WxH",
-            help="Image size without a camera file.",
-            rich_help_panel="For a MACHINE",
-        ),
-    ] = "{}x{}".format(*PLANNED_IMAGE_SIZE),
-    board: Annotated[
-        bool,
-        typer.Option(
-            "--board",
-            help="Observe a board on the platform.",
-            rich_help_panel="For a MACHINE",
-        ),
-    ] = False,
-    tracker: Annotated[
-        str | None,
-        typer.Option(
-            metavar="M[,RAD]",
-            help="Noise of a tracker or probe used instead.",
-            rich_help_panel="For a MACHINE",
-        ),
-    ] = None,
-    edge_noise: Annotated[
-        float,
-        console.number_option(
-            "plan", "edge_noise", "PX", "Noise of an edge, if no image determines it."
-        ),
-    ] = default("plan", "edge_noise"),
-    corner_noise: Annotated[
-        float,
-        console.number_option(
-            "plan", "corner_noise", "PX", "Noise of a board's corner, if no image determines it."
-        ),
-    ] = default("plan", "corner_noise"),
-    joint_noise: Annotated[
-        float,
-        console.number_option(
-            "plan",
-            "joint_noise",
-            "M",
-            "Noise of a reading, m or rad.",
-            group="For a MACHINE",
-        ),
-    ] = default("plan", "joint_noise"),
-    seed: console.Seed = 0,
-    as_json: console.Json = False,
-) -> int:
-    """The next configurations worth measuring."""
+    subject: str, camera: Path | None, size: str | None, tracker: str | None, out: Path | None,
+    as_json: bool, **options: Any,
+) -> int:  # fmt: skip
+    """Choose the configurations that determine a machine best."""
     import pkmcal
 
     with console.progress(as_json) as progress:
         from pkmcal.api.plan import PlanResult
         from pkmcal.session.load import session_folder
 
-        session = session_folder(subject)
-        folder = console.output_folder(out, (session or Path()) / "plan", PlanResult)
-        assumed = None if session is not None else console.parsed_size(size)
+        folder = console.output_folder(
+            out, (session_folder(subject) or Path()) / "plan", PlanResult
+        )
         result = pkmcal.plan(
-            subject, count=configurations, index=index, places=places, best_of=best_of,
-            after=after, from_drawing=from_drawing, same_place=same_place, together=together,
-            camera=camera or assumed, board=board,
-            tracker=None if tracker is None else _tracker(tracker), edge_noise=edge_noise,
-            corner_noise=corner_noise, joint_noise=joint_noise, seed=seed, progress=progress.work,
-        )  # fmt: skip
+            subject,
+            camera=camera or (None if size is None else console.parsed_size(size)),
+            tracker=None if tracker is None else _tracker(tracker),
+            progress=progress.work,
+            **options,
+        )
         return finish(result, folder, progress, as_json=as_json)
 
 

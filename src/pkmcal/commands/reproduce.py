@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Any, get_args
 
-import typer
+import click
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-from pkmcal.ranges import default
-
-REPRODUCTION_FOLDER = Path("reproduction")
-
-
-class Paper(StrEnum):
-    """Papers that can be reproduced."""
-
-    A = "a"
-    B = "b"
-    C = "c"
-
+from pkmcal.commands.options import argument, as_json, command, flag, number, out, seed
+from pkmcal.ranges import Paper
 
 EXAMPLES = """\
 pkmcal reproduce
@@ -30,34 +19,25 @@ pkmcal reproduce b c -o papers --json
 """
 
 
-def reproduce(
-    papers: Annotated[
-        list[Paper] | None,
-        typer.Argument(metavar="[a|b|c]...", help="Which papers; all unless given."),
-    ] = None,
-    runs: Annotated[
-        int, console.number_option("reproduce", "runs", "N", "Simulated runs.")
-    ] = default("reproduce", "runs"),
-    seed: console.Seed = 0,
-    long: Annotated[
-        bool, typer.Option("--long", help="Accuracy by number of poses too; a minute.")
-    ] = False,
-    images: Annotated[
-        bool, typer.Option("--photographs", help="Measure Table 1 on rendered images.")
-    ] = False,
-    out: Annotated[Path, console.folder("Where the tables go.")] = REPRODUCTION_FOLDER,
-    as_json: console.Json = False,
-) -> int:
-    """Compute the papers' tables and figures again."""
+@command(
+    EXAMPLES,
+    argument(
+        "papers", "[a|b|c]...", "Papers. [default: all]", click.Choice(get_args(Paper)), nargs=-1
+    ),
+    number("reproduce", "runs", "N", "Simulated runs."),
+    seed("reproduce"),
+    flag("--long", "Add the accuracy by number of configurations; takes a minute."),
+    flag("--photographs images", "Measure paper A's Table 1 on rendered images."),
+    out("reproduction", "Folder for the tables."),
+    as_json(),
+)  # fmt: skip
+def reproduce(papers: tuple[str, ...], out: Path | None, as_json: bool, **options: Any) -> int:
+    """Recompute the tables and figures of papers A, B and C."""
     import pkmcal
 
     with console.progress(as_json) as progress:
-        from pkmcal.api.reproduce import ReproductionResult
+        from pkmcal.api.reproduce import PAPERS, ReproductionResult
 
-        given = None if out == REPRODUCTION_FOLDER else out
-        folder = console.output_folder(given, REPRODUCTION_FOLDER, ReproductionResult)
-        wanted = [paper.value for paper in papers or Paper]
-        result = pkmcal.reproduce(
-            wanted, runs=runs, seed=seed, long=long, images=images, progress=progress.work
-        )
+        folder = console.output_folder(out, Path("reproduction"), ReproductionResult)
+        result = pkmcal.reproduce(papers or PAPERS, progress=progress.work, **options)
         return finish(result, folder, progress, as_json=as_json)

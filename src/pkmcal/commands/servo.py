@@ -4,14 +4,24 @@ machine.
 
 from __future__ import annotations
 
+from math import radians
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-from pkmcal.ranges import default
+from pkmcal.commands.options import (
+    argument,
+    as_json,
+    cameras_session,
+    choice,
+    command,
+    number,
+    option,
+    out,
+    seed,
+)
+from pkmcal.ranges import ServoLaw
 
 EXAMPLES = """\
 pkmcal servo gough-stewart
@@ -20,107 +30,52 @@ pkmcal servo out --gain 2 --rate 50 --hand-rotation "1 deg"
 """
 
 
-def servo(
-    machine: Annotated[
-        str,
-        typer.Argument(
-            metavar="CALIBRATION|MACHINE",
-            help="The folder that calibrate wrote; or a mechanism file, or a built-in machine.",
-        ),
-    ],
-    session: console.CamerasOf = None,
-    station: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="The camera that controls; the first.", rich_help_panel="Camera"
-        ),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Another camera file than the station's.", rich_help_panel="Camera"
-        ),
-    ] = None,
-    law: Annotated[
-        str,
-        typer.Option(
-            metavar="LAW", help="edges or directions of the legs.", rich_help_panel="Loop"
-        ),
-    ] = "edges",
-    legs: Annotated[
-        str | None,
-        typer.Option(
-            metavar="1,2,3", help="Legs that the camera sees; all.", rich_help_panel="Camera"
-        ),
-    ] = None,
-    runs: Annotated[
-        int, console.number_option("servo", "runs", "N", "Number of motions, for every estimate.")
-    ] = default("servo", "runs"),
-    gain: Annotated[
-        float,
-        console.number_option(
-            "servo", "gain", "G", "Part of the error that is corrected in a second.", group="Loop"
-        ),
-    ] = default("servo", "gain"),
-    rate: Annotated[
-        float, console.number_option("servo", "rate", "HZ", "Images a second.", group="Loop")
-    ] = default("servo", "rate"),
-    delay: Annotated[
-        int,
-        console.number_option(
-            "servo", "delay", "N", "Images from exposure to motion.", group="Loop"
-        ),
-    ] = default("servo", "delay"),
-    noise: Annotated[
-        float,
-        console.number_option(
-            "servo", "noise", "PX", "Noise of an edge, shift and tilt.", group="Loop"
-        ),
-    ] = default("servo", "noise"),
-    joint_noise: Annotated[
-        float,
-        console.number_option(
-            "servo", "joint_noise", "M", "Noise of a reading, m or rad.", group="Loop"
-        ),
-    ] = default("servo", "joint_noise"),
-    speed: Annotated[
-        float | None,
-        console.number_option("servo", "speed", "V", "Fastest drive, m/s or rad/s.", group="Loop"),
-    ] = None,
-    duration: Annotated[
-        float | None,
-        console.number_option("servo", "duration", "S", "Seconds of a run; 10 / gain."),
-    ] = None,
-    hand_position: Annotated[
-        float,
-        console.number_option(
-            "servo", "hand_position", "M", "Error of the hand-placed camera, m.", group="Camera"
-        ),
-    ] = default("servo", "hand_position"),
-    hand_rotation: Annotated[
-        float,
-        console.number_option(
-            "servo",
-            "hand_rotation",
-            "DEG",
-            "Error of the hand-placed camera's direction, degrees.",
-            group="Camera",
-        ),
-    ] = default("servo", "hand_rotation"),
-    start: Annotated[
-        str | None,
-        typer.Option(metavar="POSE", help="Start of every run: x,y,z,rx,ry,rz (m, rad)."),
-    ] = None,
-    goal: Annotated[
-        str | None, typer.Option(metavar="POSE", help="Goal of every run, in the same form.")
-    ] = None,
-    out: Annotated[Path | None, console.folder("servo unless given.")] = None,
-    seed: console.Seed = 0,
-    as_json: console.Json = False,
-) -> int:
-    """Simulate control by the legs in the image."""
-    from math import radians
+CAMERA, LOOP = "Camera", "Loop"
 
+
+@command(
+    EXAMPLES,
+    argument(
+        "machine", "CALIBRATION|MACHINE", "Folder that calibrate wrote; or mechanism file, or name"
+        " of a built-in machine.",
+    ),
+    cameras_session(),
+    number("servo", "runs", "N", "Motions for each estimate of the geometry."),
+    number("servo", "duration", "S", "Duration of a run, s.", usual="10 / gain"),
+    option("--start", "POSE", "Start of every run, x,y,z,rx,ry,rz in m and rad or with units."
+        " [default: random]"),
+    option("--goal", "POSE", "Goal of every run, likewise."),
+    seed("servo"),
+    option(
+        "--station", "NAME", "Station whose camera controls. [default: the first]", group=CAMERA
+    ),
+    option("--camera", "FILE", "Camera file. [default: the station's]", Path, group=CAMERA),
+    option("--legs", "1,2,3", "Legs that the camera observes. [default: all]", group=CAMERA),
+    number(
+        "servo", "hand_position", "M", "Position error of the hand-placed camera, m.", group=CAMERA
+    ),
+    number(
+        "servo", "hand_rotation", "DEG", "Orientation error of the hand-placed camera, degrees.",
+        group=CAMERA,
+    ),
+    choice("law", ServoLaw, "Control by the legs' edges or directions.", group=LOOP),
+    number("servo", "gain", "G", "Share of the error corrected in a second, 1/s.", group=LOOP),
+    number("servo", "rate", "HZ", "Images per second.", group=LOOP),
+    number("servo", "delay", "N", "Delay from exposure to motion, in images.", group=LOOP),
+    number("servo", "noise", "PX", "Sigma of an edge's shift and tilt, px.", group=LOOP),
+    number("servo", "joint_noise", "M", "Sigma of a joint reading, m or rad.", group=LOOP),
+    number(
+        "servo", "speed", "V", "Largest speed of a drive, m/s or rad/s.", usual="unlimited",
+        group=LOOP,
+    ),
+    out("servo"),
+    as_json(),
+)  # fmt: skip
+def servo(
+    machine: str, legs: str | None, hand_rotation: float, start: str | None, goal: str | None,
+    out: Path | None, as_json: bool, **options: Any,
+) -> int:  # fmt: skip
+    """Simulate visual servoing by a machine's legs."""
     import pkmcal
 
     with console.progress(as_json) as progress:
@@ -129,12 +84,12 @@ def servo(
 
         folder = console.output_folder(out, Path("servo"), ServoResult)
         result = pkmcal.servo(
-            machine, session=session, station=station, camera=camera, law=law,
-            legs=None if legs is None else legs_of_text(legs), runs=runs, gain=gain, rate=rate,
-            delay=delay, noise=noise, joint_noise=joint_noise, speed=speed, duration=duration,
-            hand_position=hand_position, hand_rotation=radians(hand_rotation),
+            machine,
+            legs=None if legs is None else legs_of_text(legs),
+            hand_rotation=radians(hand_rotation),
             start=None if start is None else pose_of_text(start, "--start"),
-            goal=None if goal is None else pose_of_text(goal, "--goal"), seed=seed,
+            goal=None if goal is None else pose_of_text(goal, "--goal"),
             progress=progress.work,
-        )  # fmt: skip
+            **options,
+        )
         return finish(result, folder, progress, as_json=as_json)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from pkmcal import terminal
 from pkmcal.commands import console
+from pkmcal.commands.options import OUTPUT_GROUP, argument, as_json, command, flag, number, option
 from pkmcal.commands.serve import serve
 
 EXAMPLES = """\
@@ -18,33 +16,19 @@ pkmcal show out -o machine.html
 """
 
 
-def show(
-    machine: Annotated[
-        str,
-        typer.Argument(
-            metavar="MACHINE",
-            help="A built-in machine, a mechanism file, a session or a calibration.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="HTML",
-            help="Write a page instead of serving one.",
-            rich_help_panel=console.OUTPUT_GROUP,
-        ),
-    ] = None,
-    port: Annotated[
-        int, console.number_option("show", "port", "N", "A free one unless given.")
-    ] = 0,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Print the address, and open nothing.")
-    ] = False,
-    as_json: console.Json = False,
-) -> int:
-    """Show a machine in space, with sliders for its readings."""
+@command(
+    EXAMPLES,
+    argument(
+        "machine", "MACHINE", "Name of a built-in machine, mechanism file, or folder of a session"
+        " or calibration.",
+    ),
+    number("show", "port", "N", "Port to listen on.", usual="a free one"),
+    flag("--no-browser", "Print the address without opening a browser."),
+    option("-o --out", "HTML", "Write a page instead of serving one.", Path, group=OUTPUT_GROUP),
+    as_json(),
+)  # fmt: skip
+def show(machine: str, port: int, no_browser: bool, out: Path | None, as_json: bool) -> int:
+    """Show a machine in 3-D, with a slider for each joint reading."""
     from pkmcal.api.show import show as run
     from pkmcal.errors import GeometryError, InputError
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import answer
-from pkmcal.ranges import default
+from pkmcal.commands.options import argument, as_json, choice, command, flag, number, option, seed
+from pkmcal.ranges import Light, Style
 
 EXAMPLES = """\
 pkmcal simulate session
@@ -18,106 +17,46 @@ pkmcal simulate session --plan plan --joint-noise "3 um" --noise 2
 """
 
 
+IMAGES, BOARD = "Images", "Board"
+
+
+@command(
+    EXAMPLES,
+    argument("folder", "DIR", "New or empty folder.", Path),
+    option(
+        "--mechanism", "MACHINE", "Name of a built-in machine, or mechanism file."
+        " [default: gough-stewart]", default="gough-stewart",
+    ),
+    number("simulate", "stations", "N", "Number of stations."),
+    number("simulate", "configurations", "N", "Configurations for each station."),
+    flag("--shared", "All stations observe the same configurations."),
+    number("simulate", "repeats", "N", "Images of each configuration."),
+    flag("--handheld", "Hand-held camera: each image has its own pose."),
+    number(
+        "simulate", "tolerance", "X", "Standard deviation of the true geometry, in prior sigmas."
+    ),
+    number("simulate", "joint_noise", "M", "Sigma of a joint reading, m or rad."),
+    option("--plan", "PLAN", "Folder of a plan: its machine, stations and configurations.", Path),
+    seed("simulate"),
+    option("--camera", "FILE", "Camera file, instead of --size.", Path, group=IMAGES),
+    option("--size", "WxH", "Image size, px. [default: 800x600]", group=IMAGES),
+    number("simulate", "noise", "GREY", "Sigma of a pixel, grey levels.", group=IMAGES),
+    number("simulate", "blur", "PX", "Sigma of the lens's blur, px.", group=IMAGES),
+    choice("finish", Style, "Surface of the legs; metal is polished.", group=IMAGES),
+    choice("light", Light, "Light: soft from all sides, or hard.", group=IMAGES),
+    flag("--as-built", "Add motors, collars and cables to the legs.", group=IMAGES),
+    flag("--board", "Add a board on the base that all stations observe.", group=BOARD),
+    flag("--on-platform", "Add the board on the platform instead.", group=BOARD),
+    as_json(),
+)  # fmt: skip
 def simulate(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new or empty folder.")],
-    mechanism: Annotated[
-        str, typer.Option(metavar="NAME|FILE", help="A built-in machine, or a mechanism file.")
-    ] = "gough-stewart",
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="A camera file, instead of --size.", rich_help_panel="Images"
-        ),
-    ] = None,
-    size: Annotated[
-        str, typer.Option(metavar="WxH", help="Pixels of an image.", rich_help_panel="Images")
-    ] = "800x600",
-    stations: Annotated[
-        int, console.number_option("simulate", "stations", "N", "Places of the camera.")
-    ] = default("simulate", "stations"),
-    configurations: Annotated[
-        int,
-        console.number_option("simulate", "configurations", "N", "Images from each place."),
-    ] = default("simulate", "configurations"),
-    shared: Annotated[
-        bool, typer.Option("--shared", help="The same configurations from all places.")
-    ] = False,
-    repeats: Annotated[
-        int, console.number_option("simulate", "repeats", "N", "Images of each configuration.")
-    ] = default("simulate", "repeats"),
-    tolerance: Annotated[
-        float,
-        console.number_option(
-            "simulate", "tolerance", "X", "True values' deviation, in tolerances."
-        ),
-    ] = default("simulate", "tolerance"),
-    joint_noise: Annotated[
-        float,
-        console.number_option("simulate", "joint_noise", "M", "Noise of a reading, m or rad."),
-    ] = default("simulate", "joint_noise"),
-    noise: Annotated[
-        float,
-        console.number_option(
-            "simulate", "noise", "GREY", "Noise of a pixel, grey levels.", group="Images"
-        ),
-    ] = default("simulate", "noise"),
-    blur: Annotated[
-        float,
-        console.number_option(
-            "simulate", "blur", "PX", "Blur of the lens, pixels.", group="Images"
-        ),
-    ] = default("simulate", "blur"),
-    board: Annotated[
-        bool,
-        typer.Option(
-            "--board",
-            help="A board on the base, which joins the stations.",
-            rich_help_panel="Board",
-        ),
-    ] = False,
-    on_platform: Annotated[
-        bool,
-        typer.Option(
-            "--on-platform", help="The board on the platform instead.", rich_help_panel="Board"
-        ),
-    ] = False,
-    finish: Annotated[
-        Literal["mixed", "matte", "dark", "metal"],
-        typer.Option(help="Surface of the legs; metal is polished.", rich_help_panel="Images"),
-    ] = "mixed",
-    light: Annotated[
-        Literal["usual", "soft", "hard"],
-        typer.Option(help="From all sides, or hard.", rich_help_panel="Images"),
-    ] = "usual",
-    as_built: Annotated[
-        bool,
-        typer.Option(
-            "--as-built", help="Motors, rings and cables on the legs.", rich_help_panel="Images"
-        ),
-    ] = False,
-    handheld: Annotated[
-        bool,
-        typer.Option(
-            "--handheld", help="Each image from its own place, --repeats of a configuration."
-        ),
-    ] = False,
-    plan: Annotated[
-        Path | None,
-        typer.Option(metavar="PLAN", help="What pkmcal plan asked for, with its machine."),
-    ] = None,
-    seed: console.Seed = 0,
-    as_json: console.Json = False,
-) -> int:
+    folder: Path, mechanism: str, camera: Path | None, size: str | None, as_json: bool,
+    **options: Any,
+) -> int:  # fmt: skip
     """Simulate a session with images and known truth."""
     import pkmcal
 
-    eye = camera or console.parsed_size(size)
+    eye = camera or (None if size is None else console.parsed_size(size))
     with console.progress(as_json) as progress:
-        result = pkmcal.simulate(
-            folder, mechanism, camera=eye, board=board, on_platform=on_platform, noise=noise,
-            blur=blur, plan=plan, seed=seed, progress=progress.report, stations=stations,
-            configurations=configurations, shared=shared, repeats=repeats, tolerance=tolerance,
-            joint_noise=joint_noise, finish=finish, light=light, as_built=as_built,
-            handheld=handheld,
-        )  # fmt: skip
+        result = pkmcal.simulate(folder, mechanism, camera=eye, progress=progress.report, **options)
     return answer(result, folder, as_json=as_json)

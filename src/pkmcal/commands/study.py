@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from pkmcal import terminal
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-from pkmcal.ranges import default
+from pkmcal.commands.options import argument, as_json, command, number, option, out, seed
 from pkmcal.studies.varied import DESIGN_NAMES_VARIED, PAPER_NAMES_VARIED
 
 STUDY_FOLDER = Path("study")
@@ -22,9 +20,9 @@ pkmcal study my-machine --vary stations=1,2,3 --runs 200 -o study
 """
 
 FURTHER_HELP = """\
-Names of --vary, of a machine or a session:
+Names of --vary, for a machine or a session:
 {}
-Names of --vary, of a:
+Names of --vary, for the machine of paper A:
 {}
 """.format(
     *(
@@ -37,50 +35,39 @@ Names of --vary, of a:
 )
 
 
+@command(
+    EXAMPLES,
+    argument(
+        "subject", "SUBJECT", "Session's folder, mechanism file, name of a built-in machine, or a"
+        " for the machine of paper A, section 4.3.",
+    ),
+    option(
+        "--vary", "NAME=V1,V2", "Values to combine with all others; one value sets it. Names are"
+        " listed below. [repeatable]", multiple=True,
+    ),
+    number("study", "runs", "N", "Simulations for each combination."),
+    seed("study"),
+    option("--scheduler", "ADDRESS", "Dask scheduler of a trusted cluster, such as tcp://host:8786."),
+    out("study", "Folder for the results and the finished batches."),
+    as_json(),
+    more=FURTHER_HELP,
+)  # fmt: skip
 def study(
-    subject: Annotated[
-        str,
-        typer.Argument(
-            metavar="SUBJECT",
-            help="A session's folder, a mechanism file, a built-in machine, or a: [A] 4.3.",
-        ),
-    ],
-    vary: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=V1,V2", help="Values to try, every combination; one value sets it."
-        ),
-    ] = None,
-    runs: Annotated[
-        int,
-        console.number_option("study", "runs", "N", "Simulations of each combination."),
-    ] = default("study", "runs"),
-    seed: console.Seed = 0,
-    out: Annotated[Path, console.folder("Folder for results and finished batches.")] = STUDY_FOLDER,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Scheduler of a trusted Dask cluster to use."),
-    ] = None,
-    as_json: console.Json = False,
+    subject: str, vary: tuple[str, ...], out: Path | None, as_json: bool, **options: Any
 ) -> int:
-    """Estimate by simulation how accurate calibrations would be."""
+    """Predict the accuracy of calibrations by repeated simulation."""
     import pkmcal
 
     try:
         with console.progress(as_json) as progress:
             from pkmcal.api.study import StudyResult
 
-            given = None if out == STUDY_FOLDER else out
-            folder = console.output_folder(given, STUDY_FOLDER, StudyResult)
-            result = pkmcal.study(
-                subject, vary or (), runs=runs, seed=seed, out=folder, scheduler=scheduler,
-                progress=progress.work,
-            )  # fmt: skip
+            folder = console.output_folder(out, STUDY_FOLDER, StudyResult)
+            result = pkmcal.study(subject, vary, out=folder, progress=progress.work, **options)
             return finish(result, folder, progress, as_json=as_json)
     except KeyboardInterrupt:
         if not as_json:
-            terminal.print_points(
-                terminal.err(),
-                [("", f"What is finished lies in {out}; the same command goes on from there.")],
-            )
+            place = out or STUDY_FOLDER
+            done = f"Finished batches are in {place}; run the same command to continue."
+            terminal.print_points(terminal.err(), [("", done)])
         raise

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-from pkmcal.ranges import default
+from pkmcal.commands.options import as_json, calibration, command, number, out, seed, session
 
 EXAMPLES = """\
 pkmcal validate out new-images
@@ -18,21 +16,19 @@ pkmcal validate out new-images -o validation --json
 """
 
 
+@command(
+    EXAMPLES,
+    calibration(),
+    session("Session with images that the calibration did not use."),
+    number("validate", "regions", "N", "Leave out N regions of the workspace in turn as well."),
+    seed("validate"),
+    out("SESSION/validation"),
+    as_json(),
+)
 def validate(
-    calibration: console.CalibrationFolder,
-    session: Annotated[
-        Path,
-        typer.Argument(metavar="SESSION", help="A session with images that it never saw."),
-    ],
-    out: Annotated[Path | None, console.folder("SESSION/validation unless given.")] = None,
-    regions: Annotated[
-        int,
-        console.number_option("validate", "regions", "N", "Leave out N regions in turn as well."),
-    ] = default("validate", "regions"),
-    seed: console.Seed = 0,
-    as_json: console.Json = False,
+    calibration: Path, session: Path, out: Path | None, as_json: bool, **options: Any
 ) -> int:
-    """Errors on data that the calibration did not see."""
+    """Measure a calibration's errors on data that it did not use."""
     import pkmcal
 
     with console.progress(as_json) as progress:
@@ -40,7 +36,5 @@ def validate(
 
         loaded = pkmcal.load_session(session)
         folder = console.output_folder(out, loaded.folder / "validation", ValidationResult)
-        result = pkmcal.validate(
-            calibration, loaded, regions=regions, seed=seed, progress=progress.work
-        )
+        result = pkmcal.validate(calibration, loaded, progress=progress.work, **options)
         return finish(result, folder, progress, as_json=as_json)

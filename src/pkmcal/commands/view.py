@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from pkmcal.commands import console
+from pkmcal.commands.options import as_json, command, flag, number, option, session
 from pkmcal.commands.serve import serve
 
 EXAMPLES = """\
@@ -17,21 +14,21 @@ pkmcal view my-machine --no-browser --port 8000
 """
 
 
+@command(
+    EXAMPLES,
+    session(),
+    option(
+        "--calibration", "DIR", "Calibration to overlay. [default: SESSION/calibration, if any]",
+        Path,
+    ),
+    number("view", "port", "N", "Port to listen on.", usual="a free one"),
+    flag("--no-browser", "Print the address without opening a browser."),
+    as_json(),
+)  # fmt: skip
 def view(
-    session: console.SessionFolder,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="SESSION/calibration, where it is, unless given."),
-    ] = None,
-    port: Annotated[
-        int, console.number_option("view", "port", "N", "A free one unless given.")
-    ] = 0,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Print the address, and open nothing.")
-    ] = False,
-    as_json: console.Json = False,
+    session: Path, calibration: Path | None, port: int, no_browser: bool, as_json: bool
 ) -> int:
-    """Show images with the machine laid over; move it there."""
+    """Show images with the machine overlaid, and edit station poses."""
     from pkmcal.errors import InputError
     from pkmcal.session.load import load_session
     from pkmcal.view.content import Viewed

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
+from typing import Any
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import finish
-from pkmcal.ranges import default
+from pkmcal.commands.options import (
+    as_json,
+    calibration,
+    command,
+    number,
+    option,
+    out,
+    seed,
+    session,
+)
 
 EXAMPLES = """\
 pkmcal watch out today
@@ -18,29 +25,21 @@ pkmcal watch out today --alpha 0.001 -o watch
 """
 
 
-def watch(
-    calibration: console.CalibrationFolder,
-    session: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SESSION", help="Five new images from one place, with their readings."
-        ),
-    ],
-    out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
-    alpha: Annotated[
-        float, console.number_option("watch", "alpha", "P", "Share of false alarms.")
-    ] = default("watch", "alpha"),
-    same_place: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="STATION",
-            help="A station whose camera was not touched since the calibration; repeat for more.",
-        ),
-    ] = None,
-    seed: console.Seed = 0,
-    as_json: console.Json = False,
-) -> int:
-    """Is the machine still as calibrated? Tests each leg."""
+@command(
+    EXAMPLES,
+    calibration(),
+    session("Session with new images and readings; five images from one station suffice."),
+    number("watch", "alpha", "P", "False-alarm probability."),
+    option(
+        "--same-place", "STATION", "Station whose camera has not moved since the calibration."
+        " [repeatable]", multiple=True,
+    ),
+    seed("watch"),
+    out("SESSION/watch"),
+    as_json(),
+)  # fmt: skip
+def watch(calibration: Path, session: Path, out: Path | None, as_json: bool, **options: Any) -> int:
+    """Test whether a machine has changed since its calibration."""
     import pkmcal
 
     with console.progress(as_json) as progress:
@@ -48,8 +47,5 @@ def watch(
 
         loaded = pkmcal.load_session(session)
         folder = console.output_folder(out, loaded.folder / "watch", WatchResult)
-        result = pkmcal.watch(
-            calibration, loaded, alpha=alpha, same_place=same_place or (), seed=seed,
-            progress=progress.work,
-        )  # fmt: skip
+        result = pkmcal.watch(calibration, loaded, progress=progress.work, **options)
         return finish(result, folder, progress, as_json=as_json)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pkmcal.control.analysis import Subset
 from pkmcal.control.study import Study, Trials
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note, wrong
@@ -27,12 +26,12 @@ UNMENTIONED_GOAL_NOISE = 0.02
 
 def judgement(study: Study) -> Verdict:
     """Verdict on a study: headline and findings."""
-    own, good = study.own, study.trials("identified")
+    own, good = study.visibility, study.trials("identified")
     reasons = (*_blind(study), *_failures(good))
     share = good.reached / len(good.runs.end)
     usable = not own.blind and share >= ENOUGH_REACHED_SHARE
     law = study.plan.loop.law
-    legs = chosen_legs(own, study)
+    legs = observed_legs(study)
     headline = (
         f"Control by the {law} of {legs} brings the platform to its goal in {good.reached} of"
         f" {len(good.runs.end)} runs with the identified geometry."
@@ -44,22 +43,22 @@ def judgement(study: Study) -> Verdict:
             else f"{good.reached} of {len(good.runs.end)} runs reach the goal."
         )
         headline = f"Control by the {law} of {legs} should not be used: {why}"
-    warnings = (*_fading(study), *_others(study), *_hidden(study), *_by_hand(study), *_noise(study))
+    warnings = (*_fading(study), *_hidden(study), *_by_hand(study), *_noise(study))
     if usable:
         reasons = tuple(replace(one, level=Level.DOUBTFUL) for one in reasons)
     return Verdict(usable, headline, (*reasons, *warnings, *_advice(study)))
 
 
-def chosen_legs(choice: Subset, study: Study) -> str:
-    """Legs of a subset as text: ``all legs``, ``legs 1, 3 and 5``."""
-    return named(choice.legs, study.scene.machine.n_legs)
+def observed_legs(study: Study) -> str:
+    """Observed legs as text: ``all legs``, ``legs 1, 3 and 5``."""
+    return named(study.eye.true.legs.tolist(), study.scene.machine.n_legs)
 
 
 def _blind(study: Study) -> tuple[Finding, ...]:
     """Finding on motions that are unobservable."""
-    if not study.own.blind:
+    if not study.visibility.blind:
         return ()
-    law, legs = study.plan.loop.law, chosen_legs(study.own, study)
+    law, legs = study.plan.loop.law, observed_legs(study)
     return (wrong("servo.blind", legs, law=law, legs=legs),)
 
 
@@ -74,29 +73,11 @@ def _failures(outcome: Trials) -> tuple[Finding, ...]:
 
 
 def _fading(study: Study) -> tuple[Finding, ...]:
-    own = study.own
+    own = study.visibility
     if own.blind or not own.fading:
         return ()
-    legs = chosen_legs(own, study)
+    legs = observed_legs(study)
     return (doubtful("servo.fading", legs, legs=legs, percent=100 * own.worst / own.usual),)
-
-
-def _others(study: Study) -> Iterator[Finding]:
-    """Findings on other equilibria."""
-    equilibria, legs = study.equilibria, chosen_legs(study.own, study)
-    for same_edges, part in ((True, equilibria.same_image), (False, equilibria.cancelled)):
-        rows = equilibria.same_edges == same_edges
-        if rows.any():
-            yield doubtful(
-                "servo.other_equilibrium",
-                legs,
-                legs=legs,
-                share=part,
-                why="alike" if same_edges else "cancelled",
-                distance=float(equilibria.distance[rows].min()),
-                readings=float(equilibria.readings[rows].min()),
-                units=study.scene.machine.joint_units[:1],
-            )
 
 
 def _hidden(study: Study) -> tuple[Finding, ...]:
@@ -140,22 +121,7 @@ def _noise(study: Study) -> tuple[Finding, ...]:
     return (doubtful("servo.noise", rms=held, law=study.plan.loop.law),)
 
 
-def _advice(study: Study) -> Iterator[Finding]:
-    """Findings on better choices of legs, if the seen legs have a problem."""
-    own = study.own
-    if not (
-        own.blind or own.fading or study.equilibria.same_image + study.equilibria.cancelled > 0
-    ):
-        return
-    more = [c for c in study.choices if len(c.legs) == len(own.legs) + 1]
-    more = [c for c in more if set(own.legs) < set(c.legs) and c.worst > 2 * own.worst]
-    same = [c for c in study.choices if len(c.legs) == len(own.legs) and c.worst > 2 * own.worst]
-    if more:
-        best = max(more, key=lambda c: c.worst)
-        extra = chosen_legs(Subset(tuple(set(best.legs) - set(own.legs)), 0, 0), study)
-        yield note("servo.more_legs", extra, legs=extra, before=own.worst, after=best.worst)
-    if same:
-        legs = chosen_legs(same[0], study)
-        yield note("servo.other_legs", legs, legs=legs, number=len(own.legs), worst=same[0].worst)
-    if own.blind and not more and study.plan.loop.law == "directions":
-        yield note("servo.by_edges")
+def _advice(study: Study) -> tuple[Finding, ...]:
+    """Finding on the other law, if the directions do not determine every motion."""
+    blind = study.visibility.blind and study.plan.loop.law == "directions"
+    return (note("servo.by_edges"),) if blind else ()

@@ -91,8 +91,8 @@ class End(Enum):
     OUTSIDE_WORKSPACE = (
         "left_workspace",
         "a drive came to the end of its range, or a leg could not follow",
-        "lead the platform through a pose in between, or improve the geometry that the control"
-        " believes",
+        "lead the platform through a pose in between, or improve the geometry of the controller's"
+        " model",
     )
     SINGULAR = (
         "singular",

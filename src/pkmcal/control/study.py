@@ -1,7 +1,7 @@
 """Study of visual servoing with different estimates of the geometry, [B] Fig. 10.
 
-Each estimate controls many runs of the simulated loop; visibility, the choice of legs and other
-equilibria are analysed beside them. The estimates: E1, the nominal model fitted to the identified
+Each estimate controls many runs of the simulated loop, and the visibility of the platform's motion
+is analysed. The estimates: E1, the nominal model fitted to the identified
 base centres ([B] eq. 15). E2, the identified geometry. E3, the nominal model with a hand-measured
 camera pose. The true geometry is the reference.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
-from pkmcal.control.analysis import Equilibria, Subset, equilibria, matrix_at, subsets
+from pkmcal.control.analysis import Visibility, matrix_at
 from pkmcal.control.image import Eye
 from pkmcal.control.machine_view import MachineView, machine_view
 from pkmcal.control.simulation import (
@@ -50,10 +50,6 @@ VISIBILITY_POSES = 60
 """Number of poses in the workspace at which visibility is computed."""
 WRITTEN_POSE_ROUNDING = 1e-6
 """Error, in metres, of a pose written with six decimals."""
-MOST_LEGS = 8
-"""Largest number of legs for which all subsets are compared."""
-EQUILIBRIA_GOALS, EQUILIBRIA_STARTS = 5, 40
-"""Number of goals for which other equilibria are searched, and of starts for each."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +219,7 @@ class Study:
 
     outcomes : true, identified, cad, hand. image, held : noise at the goals, of one image and in
     the loop. hidden : (s,) share of starts and goals at which a leg stands behind another.
-    choices : subsets of all legs with tubes, see :func:`pkmcal.control.analysis.subsets`.
+    visibility : of the platform's motion by the observed legs.
     """
 
     scene: Plant
@@ -233,14 +229,7 @@ class Study:
     image: Stillness
     held: Stillness
     hidden: Array
-    choices: tuple[Subset, ...]
-    equilibria: Equilibria
-
-    @property
-    def own(self) -> Subset:
-        """Subset of the seen legs."""
-        wanted = set(self.eye.true.legs.tolist())
-        return next(choice for choice in self.choices if set(choice.legs) == wanted)
+    visibility: Visibility
 
     def trials(self, name: str) -> Trials:
         """Trials of an estimate by its name."""
@@ -248,7 +237,7 @@ class Study:
 
 
 def study_servoing(scene: Plant, plan: Plan, progress: Progress = no_progress) -> Study:
-    """Simulate the loop with every estimate, and analyse visibility and equilibria.
+    """Simulate the loop with every estimate, and analyse the visibility.
 
     Raises InputError if the loop would be unstable with perfect knowledge, if a start or goal is
     unreachable, and if the camera does not see the legs.
@@ -278,15 +267,10 @@ def study_servoing(scene: Plant, plan: Plan, progress: Progress = no_progress) -
         runs = simulate_servo_runs(eye, belief.view, starts, goals, plan.loop, rng, own)
         ideal = outcomes[0].runs if outcomes else runs
         outcomes.append(outcome(eye.true.machine, belief, runs, ideal))
-    progress("Searching for other equilibria", 0.87)
     # noise at the goals
     ends, joints = np.concatenate([starts, goals]), np.nan_to_num(scene.machine.inverse(goals))
     rng, loop = np.random.default_rng(seeds[4]), plan.loop
     image = one_image(eye, eye.true, loop.law, goals, joints, loop.noise, rng)
-    # choices among all legs with tubes; among the seen legs if there are too many
-    view = machine_view(scene.machine, scene.T_camera_base)
-    if len(view.legs) > MOST_LEGS and scene.legs is not None:
-        view = scene.view()
     return Study(
         scene=scene,
         plan=plan,
@@ -295,10 +279,7 @@ def study_servoing(scene: Plant, plan: Plan, progress: Progress = no_progress) -
         image=image,
         held=image.held(loop.gain / loop.rate, loop.delay),
         hidden=eye.hidden(ends, np.nan_to_num(scene.machine.inverse(ends))).mean(axis=0),
-        choices=subsets(matrix_at(view, loop.law, workspace), view.legs),
-        equilibria=equilibria(
-            eye.true, loop.law, goals[:EQUILIBRIA_GOALS], workspace[:EQUILIBRIA_STARTS]
-        ),
+        visibility=Visibility.of(matrix_at(eye.true, loop.law, workspace)),
     )
 
 

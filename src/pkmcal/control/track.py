@@ -451,7 +451,7 @@ def check_image(image: Integers, camera: Camera) -> None:
         raise InputError(
             what="the image has another size than its camera",
             found=f"{size[0]}x{size[1]} pixels",
-            expected=f"{camera.image_size[0]}x{camera.image_size[1]}, as the camera file says",
+            expected=f"{camera.image_size[0]}x{camera.image_size[1]}, as the camera file states",
             next_step="set the camera to that size; scaled images do not fit its calibration",
         )
 

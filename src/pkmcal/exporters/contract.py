@@ -132,8 +132,8 @@ def make_export(source: MachineSource, name: str, *, force: bool = False) -> Exp
             "this calibration was refused, and is not exported: "
             + " ".join((source.headline, *source.reasons)),
             where=source.origin,
-            next_step="Calibrate again; or export it all the same with --force, and its files"
-            " say so",
+            next_step="Calibrate again; or export it with --force; its files then"
+            " state that it was refused",
         )
     files = exporter.files(source)
     differences = tuple(exporter.check(files, source))

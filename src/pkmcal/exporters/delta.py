@@ -536,7 +536,7 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
         for k, row in enumerate(in_mm[:3])
     ]
     factors = [
-        f"Motor {name} goes {factor:.9g} times as far as its reading says."
+        f"Motor {name} goes {factor:.9g} times as far as its reading."
         for name, factor in zip(names, scales_of(fit), strict=True)
         if abs(factor - 1) > UNTOLD_SCALE_DIFFERENCE
     ]

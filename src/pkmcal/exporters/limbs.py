@@ -147,7 +147,7 @@ def _chains(
             leg = int(group.legs[0])
             raise InputError(
                 f"leg {leg + 1} of mechanism {machine.name!r} is carried on its {side} side by no"
-                " joint that an export knows",
+                " joint that can be exported",
                 found=getattr(machine.document.legs[leg], side).joint,
                 expected="a joint that is one of " + ", ".join(names),
                 next_step="Give its carrier a chain, see docs/export.md",

@@ -88,8 +88,8 @@ LinuxCNC then refuses to home a joint that has no absolute encoder.
 """
 HOMING_CONVENTIONS = (
     "Homing by these values is for absolute encoders: LinuxCNC sets joint = encoder + HOME_OFFSET"
-    " where the machine is, and moves nothing. The encoder counts as the comment in the joint's"
-    " section says.",
+    " where the machine is, and moves nothing. The encoder counts as in the comment of the joint's"
+    " section.",
     "With a home switch, in each joint's section: HOME_ABSOLUTE_ENCODER = 0; HOME_OFFSET = the"
     " joint at the switch, by that comment; HOME_SEARCH_VEL and HOME_LATCH_VEL of your own. After"
     " the switch LinuxCNC moves the joint to HOME, with soft limits off, each joint by itself, at"

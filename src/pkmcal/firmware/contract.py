@@ -16,9 +16,23 @@ from typing import ClassVar
 import numpy as np
 
 from pkmcal.arrays import Array, short_repr
+from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Exporter, exporters
+from pkmcal.exporters.contract import Difference, Exporter, exporters, largest
+from pkmcal.exporters.delta import (
+    SWITCH_ROUNDING,
+    Fit,
+    Freedoms,
+    Inverse,
+    firmware_tool_difference,
+    fit_of,
+    readings_elsewhere,
+    redo,
+    switch_values,
+    workspace_radius,
+)
 from pkmcal.files import LARGEST_WRITTEN_FILE, quoted, read_text
+from pkmcal.outcome.finding import Finding
 
 CARRIAGE_STEP = 1 / 80
 """Default carriage travel per step, mm.
@@ -78,17 +92,41 @@ class Printer:
     __repr__ = short_repr
 
 
+@dataclass(frozen=True)
+class WrittenValues:
+    """Values of a written file as the firmware reads them; motor positions in mm or degrees.
+
+    inverse : motor positions (n, 3) at points (n, 3) mm, by the firmware's formulas.
+    homed : (3,) motor positions at the end switches.
+    homed_by : the same for other values (3,) of the end switches.
+    print_radius : mm, None without one.
+    switches : readings of end switches elsewhere and the values that the text gives for them, (3,)
+        each and NaN for a motor without; None for a text with values proportional to readings.
+    """
+
+    inverse: Inverse
+    homed: Array
+    homed_by: Callable[[Array], Array]
+    print_radius: float | None
+    switches: list[tuple[Array, Array]] | None = None
+
+
 class Firmware(Exporter, ABC):
     """Firmware of delta printers. Firmwares are stateless, as all exporters.
 
     program : its name.
+    file : name of the exported file.
     motors : names of the motors.
     carriage_source : where a user reads the heights of the carriages, in two lines.
+    linear, rotary : free parameters of its kinematics.
     """
 
     program: ClassVar[str]
+    file: ClassVar[str]
     motors: ClassVar[tuple[str, str, str]]
     carriage_source: ClassVar[str]
+    linear: ClassVar[Freedoms]
+    rotary: ClassVar[Freedoms]
 
     @abstractmethod
     def reads(self, text: str) -> bool:
@@ -108,6 +146,57 @@ class Firmware(Exporter, ABC):
         Tool positions (n, 3) mm at contact, and the height of the tool's tip above the bed there;
         None for a text without any. Raises InputError for points that cannot be read.
         """
+
+    @abstractmethod
+    def text(self, fit: Fit, source: MachineSource) -> str:
+        """Text of the exported file. Raises InputError for values that the firmware refuses."""
+
+    @abstractmethod
+    def written(self, text: str, fit: Fit) -> WrittenValues:
+        """Values of an exported text."""
+
+    def print_radius(self, source: MachineSource, kind: str) -> str | None:
+        """Print radius of a machine, linear or rotary, mm, as written; None without one."""
+        del kind
+        return workspace_radius(source)
+
+    def fit(self, source: MachineSource) -> Fit:
+        """The firmware's parameters of a source's machine."""
+        return fit_of(source, self.program, self.linear, self.rotary)
+
+    def files(self, source: MachineSource) -> dict[str, str]:
+        """The exported file; pins, speeds and the like remain the printer's own."""
+        return {self.file: self.text(self.fit(source), source)}
+
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
+        """Differences by the firmware's formulas, with values read as the firmware reads them."""
+        fit, text = self.fit(source), files[self.file]
+        values = self.written(text, fit)
+        zero = values.homed - fit.rate * fit.delta.ends[fit.order]
+        # homing with the values that the text gives for switches at other readings
+        switches = values.switches
+        if switches is None:
+            switches = [(q, switch_values(text, q)) for q in readings_elsewhere(fit)]
+        off = [
+            np.where(np.isnan(q), 0.0, values.homed_by(value) - (fit.rate * q + fit.zero))
+            for q, value in switches
+        ]
+        radius = self.print_radius(source, fit.kind)
+        same = values.print_radius == (None if radius is None else float(radius))
+        return [
+            firmware_tool_difference(text, fit, values.inverse, zero),
+            Difference(
+                f"motors at end switches elsewhere, {len(off)} readings",
+                largest(off) if off else np.inf,
+                SWITCH_ROUNDING,
+                "mm or degrees",
+            ),
+            Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
+        ]
+
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
+        """Agreement of settings and machine, and the steps after installing them."""
+        return (self.fit(source).following, *redo(source))
 
 
 def firmwares() -> list[Firmware]:

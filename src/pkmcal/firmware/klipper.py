@@ -35,7 +35,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference, commented, largest
+from pkmcal.exporters.contract import commented
 from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     SWITCH_ROUNDING,
@@ -45,13 +45,8 @@ from pkmcal.exporters.delta import (
     end_switches,
     firmware_angle,
     firmware_length,
-    firmware_tool_difference,
-    fit_of,
     proportional_switches,
     readings_elsewhere,
-    redo,
-    switch_values,
-    workspace_radius,
 )
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
@@ -61,13 +56,11 @@ from pkmcal.firmware.contract import (
     Firmware,
     Printer,
     Touches,
+    WrittenValues,
     means_by_position,
 )
 from pkmcal.outcome.finding import Finding, note
 
-FILE = "pkmcal_printer.cfg"
-KLIPPER_LINEAR_FREEDOMS = Freedoms((210.0, 330.0, 90.0))
-KLIPPER_ROTARY_FREEDOMS = Freedoms((30.0, 150.0, 270.0), heights=False)
 KLIPPER_STEPPERS = "abc"
 NO_KLIPPER_PRINT_RADIUS = (
     "There is no print_radius: keep the printer's own. Klipper takes delta_radius where none"
@@ -98,6 +91,9 @@ class Klipper(Firmware):
     name: ClassVar = "klipper"
     title: ClassVar = "Klipper: values for printer.cfg"
     program: ClassVar = "Klipper"
+    file: ClassVar = "pkmcal_printer.cfg"
+    linear: ClassVar = Freedoms((210.0, 330.0, 90.0))
+    rotary: ClassVar = Freedoms((30.0, 150.0, 270.0), heights=False)
     motors: ClassVar = ("stepper_a", "stepper_b", "stepper_c")
     carriage_source: ClassVar = "what Klipper's\nGET_POSITION prints behind stepper:"
 
@@ -135,7 +131,7 @@ class Klipper(Firmware):
         }
         by_tower["angle"] = [
             _number(entries, label, f"stepper_{s}", "angle", default)
-            for s, default in zip(KLIPPER_STEPPERS, KLIPPER_LINEAR_FREEDOMS.nominal, strict=True)
+            for s, default in zip(KLIPPER_STEPPERS, self.linear.nominal, strict=True)
         ]
         # the export's formulas read a ConfigParser; values are text there
         config = ConfigParser()
@@ -178,18 +174,17 @@ class Klipper(Firmware):
             return means_by_position(np.array(values, dtype=float)) - [dx, dy, 0.0], 0.0
         return None
 
-    def files(self, source: MachineSource) -> dict[str, str]:
-        """Configuration file; pins, speeds and the like remain the printer's own."""
-        fit = self._fit(source)
+    def text(self, fit: Fit, source: MachineSource) -> str:
+        """Sections of printer.cfg under a header of comments."""
         word = "Multiply its rotation_distance" if fit.kind == "linear" else "Divide its gear_ratio"
         lines = about(source, fit, KLIPPER_STEPPERS, f"{word} by that.")
         lines.append("Put these values into the sections of the printer's own configuration.")
         lines.append(note("export.klipper_saved").text)
         lines.append(end_switches(fit))
+        radius = self.print_radius(source, fit.kind)
         if fit.kind == "linear":
             names = [f"stepper_{s}.position_endstop" for s in KLIPPER_STEPPERS]
             lines += proportional_switches(fit, names, _tower_endstops(fit))
-            radius = workspace_radius(source)
             if radius is None:
                 lines.append(NO_KLIPPER_PRINT_RADIUS)
             sections = _linear(fit, radius)
@@ -200,46 +195,29 @@ class Klipper(Firmware):
             f"\n[{name}]\n" + "".join(f"{key}: {value}\n" for key, value in values.items())
             for name, values in sections.items()
         )
-        return {FILE: commented(lines, "#") + body}
+        return commented(lines, "#") + body
 
-    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Differences by Klipper's formulas, with the values read as Klipper reads them."""
-        fit = self._fit(source)
-        text = files[FILE]
+    def print_radius(self, source: MachineSource, kind: str) -> str | None:
+        """Print radius, which Klipper has for linear deltas alone."""
+        return super().print_radius(source, kind) if kind == "linear" else None
+
+    def written(self, text: str, fit: Fit) -> WrittenValues:
+        """Values as Klipper reads them."""
         config = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
         config.read_string(text)
-        move = klipper_carriage_heights if fit.kind == "linear" else klipper_arm_angles
-        zero = homed(config) - fit.rate * fit.delta.ends[fit.order]
-        # switches at other readings: homing with the value that the text gives for them
-        elsewhere = [
-            np.where(
-                np.isnan(readings),
-                0.0,
-                _homed_by(config, values) - (fit.rate * readings + fit.zero),
-            )
-            for readings, values in _endstops_elsewhere(text, fit)
-        ]
-        radius = workspace_radius(source) if fit.kind == "linear" else None
-        own = config.getfloat("printer", "print_radius", fallback=None)
-        same = own == (None if radius is None else float(radius))
-        return [
-            firmware_tool_difference(text, fit, lambda points: move(config, points), zero),
-            Difference(
-                f"motors at end switches elsewhere, {len(elsewhere)} readings",
-                largest(elsewhere) if elsewhere else np.inf,
-                SWITCH_ROUNDING,
-                "mm or degrees",
-            ),
-            Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
-        ]
+        linear = fit.kind == "linear"
+        return WrittenValues(
+            partial(klipper_carriage_heights if linear else klipper_arm_angles, config),
+            homed(config),
+            partial(_homed_by, config),
+            config.getfloat("printer", "print_radius", fallback=None),
+            None if linear else _arm_switches(text),
+        )
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """Agreement of settings and machine, and the steps after installing them."""
-        return (self._fit(source).following, note("export.klipper_saved"), *redo(source))
-
-    def _fit(self, source: MachineSource) -> Fit:
-        """Klipper's parameters of a source's machine."""
-        return fit_of(source, self.program, KLIPPER_LINEAR_FREEDOMS, KLIPPER_ROTARY_FREEDOMS)
+        """As for any firmware, and how SAVE_CONFIG's lines are kept."""
+        following, *others = super().notes(source)
+        return (following, note("export.klipper_saved"), *others)
 
 
 # Klipper's formulas
@@ -507,13 +485,8 @@ def _arm_endstop_lines(fit: Fit, sections: dict[str, dict[str, str]]) -> list[st
     return lines
 
 
-def _endstops_elsewhere(text: str, fit: Fit) -> list[tuple[Array, Array]]:
-    """Readings of switches elsewhere and their values by the text, (3,) each.
-
-    For tables one motor at a time, NaN for the others.
-    """
-    if fit.kind == "linear":
-        return [(q, switch_values(text, q)) for q in readings_elsewhere(fit)]
+def _arm_switches(text: str) -> list[tuple[Array, Array]]:
+    """Readings and values of :func:`_arm_endstop_lines`, (3,) each, NaN for the other motors."""
     out: list[tuple[Array, Array]] = []
     for k, name in enumerate(KLIPPER_STEPPERS):
         pairs = text.partition(f"stepper_{name}.position_endstop = ")[2].partition("\n")[0]

@@ -24,31 +24,28 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference, commented, largest
+from pkmcal.exporters.contract import commented
 from pkmcal.exporters.delta import (
     DEGREES_A_RADIAN,
     MM_A_METRE,
-    SWITCH_ROUNDING,
     Fit,
     Freedoms,
     about,
     end_switches,
     firmware_angle,
     firmware_length,
-    firmware_tool_difference,
-    fit_of,
     proportional_switches,
-    readings_elsewhere,
-    redo,
-    switch_values,
-    workspace_radius,
 )
 from pkmcal.files import quoted
-from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, NUMBER, Firmware, Printer
-from pkmcal.outcome.finding import Finding
+from pkmcal.firmware.contract import (
+    LARGEST_PRINTER_VALUE,
+    NUMBER,
+    Firmware,
+    Printer,
+    WrittenValues,
+)
 from pkmcal.wording import listed
 
-FILE = "pkmcal_delta.g"
 REPRAP_TOWER_ANGLES = (-150.0, -30.0, 90.0)
 STEEPEST_ARM_ANGLE = 90.0
 NO_REPRAP_PRINT_RADIUS = (
@@ -70,6 +67,9 @@ class RepRap(Firmware):
     name: ClassVar = "reprap"
     title: ClassVar = "RepRapFirmware: lines for config.g"
     program: ClassVar = "RepRapFirmware"
+    file: ClassVar = "pkmcal_delta.g"
+    linear: ClassVar = Freedoms(REPRAP_TOWER_ANGLES)
+    rotary: ClassVar = linear
     motors: ClassVar = ("X", "Y", "Z")
     carriage_source: ClassVar = "what M114\nprints behind Count, divided by M92"
 
@@ -124,60 +124,34 @@ class RepRap(Firmware):
             return _sequence_points(text, label, values[-1][0]), 0.0
         return None
 
-    def files(self, source: MachineSource) -> dict[str, str]:
-        """One file of G-code."""
-        fit = self._fit(source)
+    def text(self, fit: Fit, source: MachineSource) -> str:
+        """Commands under a header of comments."""
         unit = "mm" if fit.kind == "linear" else "degree"
         correcting = f"Divide its steps per {unit} (M92) by that."
         lines = about(source, fit, "XYZ", correcting)
         names = [f"M666 {letter}" for letter in "XYZ"]
         lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
-        radius = workspace_radius(source)
+        radius = self.print_radius(source, fit.kind)
         if radius is None:
             lines.append(NO_REPRAP_PRINT_RADIUS)
         commands = (_linear if fit.kind == "linear" else _rotary)(fit, radius)
-        return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
+        return commented(lines, ";") + "\n".join(commands) + "\n"
 
-    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
-        """Differences by the firmware's formulas, with values read as the firmware reads them."""
-        fit = self._fit(source)
-        text = files[FILE]
+    def written(self, text: str, fit: Fit) -> WrittenValues:
+        """Values as RepRapFirmware reads them."""
         words = read_words(text)
-        ends = fit.rate * fit.delta.ends[fit.order]
         linear = fit.kind == "linear"
-        homed = (homed_carriages if linear else homed_arms)(words)
+        homed = homed_carriages if linear else homed_arms
         move = reprap_carriage_heights if linear else reprap_arm_angles
-        # switches at other readings: homing with the value that the text gives for them
-        elsewhere = [
-            (homed_carriages if linear else homed_arms)(
-                {**words, **{f"666{c}": np.array([v]) for c, v in zip("XYZ", values, strict=True)}}
-            )
-            - (fit.rate * readings + fit.zero)
-            for readings in readings_elsewhere(fit)
-            for values in [switch_values(text, readings)]
-        ]
-        radius = workspace_radius(source)
-        read_radius = [*words.get("665B", words.get("669B", []))]
-        same = read_radius == ([] if radius is None else [float(radius)])
-        return [
-            firmware_tool_difference(text, fit, lambda points: move(words, points), homed - ends),
-            Difference(
-                "motors at end switches elsewhere",
-                largest(elsewhere),
-                SWITCH_ROUNDING,
-                "mm or degrees",
-            ),
-            Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
-        ]
 
-    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
-        """Agreement of settings and machine, and the steps after installing them."""
-        return (self._fit(source).following, *redo(source))
+        def homed_by(values: Array) -> Array:
+            adjusted = {f"666{c}": np.array([v]) for c, v in zip("XYZ", values, strict=True)}
+            return homed({**words, **adjusted})
 
-    def _fit(self, source: MachineSource) -> Fit:
-        """RepRapFirmware's parameters of a source's machine."""
-        towers = Freedoms(REPRAP_TOWER_ANGLES)
-        return fit_of(source, self.program, towers, towers)
+        radius = words.get("665B", words.get("669B"))
+        return WrittenValues(
+            partial(move, words), homed(words), homed_by, None if radius is None else radius[0]
+        )
 
 
 # The firmware's words and formulas

@@ -27,7 +27,7 @@ CARRIAGE_MARGIN_BELOW = 5.0
 The bed may hang lower than the firmware's values place it.
 """
 PRINTER_NOMINAL_TEXT = """\
-# {name}, a linear delta, by the values in {label}. A firmware knows only the difference
+# {name}, a linear delta, by the values in {label}. A firmware has only the difference
 # of the towers' radius and the tool's, so the rods' lower ends stand in the platform's origin, the
 # nozzle. Readings are the carriages' heights by these values, their range ends at the end switches.
 name: {name}
@@ -77,7 +77,7 @@ joints:
 
 """
 FIRMWARE_FIXED_TEXT = """\
-# What the firmware can hold: towers upright, motors that go as far as it says.
+# What the firmware can hold: towers upright, motors that move as far as it commands.
 fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
 """
 PLATFORM_FIXED_TEXT = """\
@@ -90,7 +90,7 @@ pkmcal: 1
 mechanism: mechanism.yaml
 
 joints:
-  file: joints.csv            # the carriages when the bed was felt
+  file: joints.csv            # the carriages when the bed was probed
   noise: {noise} mm             # {steps}
 
 stations:
@@ -184,7 +184,7 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
     """
     if touches is None:
         raise InputError(
-            "no point of the bed is known",
+            "there is no probed point of the bed",
             where=printer.label,
             expected="a section [delta_calibrate] with height0 and height0_pos, which Klipper's"
             " DELTA_CALIBRATE and SAVE_CONFIG write",
@@ -198,27 +198,22 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
             found=count(len(touches.heights), "point"),
             expected=f"{FEWEST_BED_POINTS} or more, spread to the edge of the bed",
         )
-    motors = printer.firmware.motors
-    above = touches.carriages.max(axis=0) - printer.homed
-    if above.max() > 0:
-        motor = int(np.argmax(above))
-        raise InputError(
-            "a carriage would have been above its end switch when the bed was felt",
-            where=touches.origin,
-            found=f"{motors[motor]} {above[motor]:.1f} mm above it",
-            expected=f"points that belong to the values in {printer.label}",
-        )
     # the upper end of a rod is above the bed when the lower one touches it; a bed may hang lower
     # than the origin, but by less than a rod
-    below = -(touches.carriages / printer.rod).min(axis=0) - 1
-    if below.max() > 0:
-        motor = int(np.argmax(below))
-        raise InputError(
-            "a carriage would have been far below the bed when the bed was felt",
-            where=touches.origin,
-            found=f"{motors[motor]} {-touches.carriages[:, motor].min():.4g} mm below it",
-            expected=f"points that belong to the values in {printer.label}",
-        )
+    lowest = touches.carriages.min(axis=0)
+    above, below = touches.carriages.max(axis=0) - printer.homed, -lowest - printer.rod
+    for beyond, where, distance in (
+        (above, "above its end switch", above),
+        (below, "far below the bed", -lowest),
+    ):
+        if beyond.max() > 0:
+            motor = int(np.argmax(beyond))
+            raise InputError(
+                f"a carriage would have been {where} when the bed was probed",
+                where=touches.origin,
+                found=f"{printer.firmware.motors[motor]} {distance[motor]:.4g} mm {where}",
+                expected=f"points that belong to the values in {printer.label}",
+            )
     return touches
 
 

@@ -383,7 +383,7 @@ def _whole_leg(s: Situation, leg: int) -> Iterator[NamedChanges]:
     one = "of the values of {legs}, {combinations}{mostly}"
     yield NamedChanges((leg,), s.one_hot(own), one)
     if "tubes" in s.fields[leg] and s.imaged:
-        one = "the tubes' radii of {legs} and the distance to the camera cannot be told apart"
+        one = "the tubes' radii of {legs} and the distance to the camera cannot be separated"
         every = s.one_hot(s.rows(leg, ""))
         yield NamedChanges((leg,), every, one + "{better}", advice="caliper")
 
@@ -434,7 +434,7 @@ def _sizes(s: Situation) -> Iterator[NamedChanges]:
     all_sizes = sizes(s)
     numbers = [*range(1, min(MOST_SIZES, len(all_sizes)) + 1)]
     numbers += [len(all_sizes)] if len(all_sizes) > MOST_SIZES else []
-    apart = "cannot be told apart" + (" by heights" if s.heights else "") + "{better}"
+    apart = "cannot be separated" + (" by heights" if s.heights else "") + "{better}"
     single: list[NamedChanges] = []
     for group in (group for n in numbers for group in combinations(all_sizes, n)):
         columns = np.stack([g.columns for g in group], axis=2)  # (P, L, sizes)
@@ -658,7 +658,7 @@ def _spread(s: Situation, legs: tuple[int, ...]) -> NamedChanges:
         rows = s.rows(j, "tubes")
         out[rows, 0] = values[rows]
     who = "the legs" if len(legs) == len(s.legs) else named(legs)
-    text = f"how far apart {who} stand and how thick their tubes are cannot be told apart{{better}}"
+    text = f"how far apart {who} stand and how thick their tubes are cannot be separated{{better}}"
     return NamedChanges(legs, out, text, advice="more or caliper")
 
 

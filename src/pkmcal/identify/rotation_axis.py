@@ -85,7 +85,7 @@ class RotationAxis:
         one = self.hypothesis == "one axis"
         if self.tenable:
             retained = "turn about one axis" if one else "do not turn"
-            return f"The boards {retained}, as far as their noise tells: {facts}."
+            return f"The boards {retained}, within their noise: {facts}."
         broken = "do not turn about one axis alone" if one else "turn, and the machine should not"
         return f"The boards {broken}: {facts}. The model leaves something out."
 

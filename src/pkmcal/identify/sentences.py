@@ -204,8 +204,8 @@ def advice_on(
         "caliper": f"{caliper} and give a small tolerance.radius",
         "more or caliper": f"{more}; or measure the tubes with a caliper",
         "turn": f"{take} configurations that turn these joints further, to both sides",
-        "size": "Let a board be seen with the legs (observe: [legs, board]), whose squares tell the"
-        " size, or check the readings over a long way against a measure",
+        "size": "Observe a board with the legs (observe: [legs, board]), whose squares determine"
+        " the size, or check the readings over a long way against a measure",
         "drawing": "Legs look the same however these axes lie: leave them to the nominal model",
     }[open_motion.motion.advice]
     decide = f"{held} if the nominal model is sure of that"

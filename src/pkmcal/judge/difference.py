@@ -275,30 +275,30 @@ def _assumptions(
 ) -> tuple[str, ...]:
     """Assumptions of the change's standard deviations, in sentences."""
     out = [
-        "The change leads from A to B, told in A's frames, B laid over it where the two differ"
+        "The change leads from A to B in A's frames, with B aligned to A where the two differ"
         " least: by least squares over all free numbers, each in its tolerance."
     ]
     nominal = [side for side in (a, b) if side.saved is None]
     if len(nominal) == 2:
-        return (*out, "Nominal models are taken at their word, so any difference is one.")
+        return (*out, "Nominal models have no standard deviations, so any difference counts.")
     if nominal:
         return (
             *out,
-            f"The nominal model {nominal[0].name} is taken at its word; the standard deviations"
+            f"The nominal model {nominal[0].name} has no standard deviations; those stated"
             " are the calibration's.",
             UNMODELLED_CHANGES_TEXT,
         )
     out.append(
-        "Both calibrations lean on the same nominal model: where that alone decides, they agree,"
-        " and its error is common to both."
+        "Both calibrations have the same nominal model as a prior: where it alone decides, they"
+        " agree, and its error is common to both."
         if same_nominal
-        else "The calibrations lean on different nominal models, whose errors are taken to be"
+        else "The calibrations use different nominal models as priors, whose errors are taken to be"
         " independent."
     )
     out.append(
         f"{count(shared, 'configuration')} were seen by both, {share:.0%} of what the one that has"
-        " fewer saw; their noise is taken to be common to both, and each configuration to tell as"
-        " much as any other."
+        " fewer saw; their noise is taken to be common to both, and all configurations to"
+        " be equally informative."
         if shared
         else "They share no configuration, so the noise of one is independent of the other's."
     )

@@ -220,8 +220,10 @@ def too_little(machine: Machine, measurements: Measurements) -> PkmcalError:
             " different configurations and compare the results with pkmcal diff",
         )
     return ResultError(
-        "too little was seen to predict readings: some poses follow from their own readings alone",
-        expected="legs, a board or whole poses in several more configurations; heights tell none",
+        "there are too few measurements to predict readings: some poses follow from their own"
+        " readings alone",
+        expected="legs, a board or whole poses in several more configurations; heights determine"
+        " no pose",
         next_step="Take images of more configurations from each station",
     )
 

@@ -268,12 +268,12 @@ def watch_verdict(judged: ChangeTests, around: ComparedSession) -> Verdict:
     if blind:
         return Verdict(
             False,
-            "These data are too few to tell whether the machine is still as calibrated.",
+            "These data are too few to decide whether the machine is still as calibrated.",
             (*_blindness_findings(blind), *warnings, note("watch.more_configurations")),
         )
     new = int(np.sum(around.observed & ~around.calibrated))
     headline = (
-        f"Still as calibrated, as far as {count(new, 'new configuration')} can tell:"
+        f"Still as calibrated, as far as {count(new, 'new configuration')} can show:"
         f" {_detectable_clause(judged)}."
     )
     silent = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
@@ -323,7 +323,7 @@ def signed(value: float, sigma: float, unit: str) -> str:
     """``+0.31 mm (±0.04)``."""
     scale, name = DISPLAY_UNITS[unit]
     if not np.isfinite(sigma):
-        return "an amount that these data do not tell"
+        return "an amount that these data do not determine"
     places = decimals(sigma * scale)
     size = with_unit(number(value * scale, places, signed=True), name)
     return f"{size} (±{number(sigma * scale, places)})"
@@ -384,7 +384,7 @@ def _change_verdict(
     if lens:
         headline = (
             "The images do not fit the calibration, and a camera explains that better than"
-            " the machine: whether the machine is as calibrated cannot be told."
+            " the machine: these data do not decide whether the machine is as calibrated."
         )
     else:
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."

@@ -1,1 +1,1 @@
-"""Images to measurements. The only package besides cameras/ that uses cv2."""
+"""Edges and background features from images, and localization of stations."""

@@ -158,14 +158,13 @@ def mistake(
     at = ", nor in those of " + listed(others) if others else ""
     few = len(worst.view.configuration) < ENOUGH_IMAGES_ALONE
     return InputError(
-        f"the machine is not recognised in the images of {worst.name}{at}",
+        f"the machine was not localized in the images of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
         found=_little(worst),
-        expected="one place where its legs lie on edges of the picture far oftener than any"
-        " machine's would",
+        expected="one place where its legs lie on image edges far more often than by chance",
         next_step=(
-            f"Take more images from there, {USUAL_IMAGES} are usual: of so few it"
-            " cannot be said whether anything is mixed up. If there are more, check"
+            f"Take more images from there, {USUAL_IMAGES} are usual: with so few"
+            " no exchange of images or readings can be detected. If there are more, check"
             if few
             else "Check"
         )
@@ -538,14 +537,14 @@ def _mirrored(station: SuspectStation) -> InputError:
         return InputError(
             f"this image of {station.name} is mirrored",
             where=station.files[0],
-            found="the machine is recognised with left and right exchanged",
+            found="the machine is localized with left and right exchanged",
             next_step="Flip this image, or take it again without mirroring",
             code="image.mirrored",
         )
     return InputError(
         f"the images of {station.name} are mirrored",
         where=f"session.yaml, stations.{station.name}",
-        found="the machine is recognised with left and right exchanged",
+        found="the machine is localized with left and right exchanged",
         next_step="Switch mirroring off in the camera or in the program that saved them, or flip"
         " the images and the camera's calibration alike",
         code="image.mirrored",

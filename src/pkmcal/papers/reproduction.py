@@ -145,16 +145,16 @@ class Reproduction:
 
 
 def reproduce_paper(paper: str, options: Options) -> Outcome:
-    """Reproduce the figures of a paper. paper : its letter in lower case.
-
-    With fewer than the default number of runs, a missed expectation comes with a note on that
-    number.
-    """
+    """Reproduce the figures of a paper. paper : its letter in lower case."""
     module = import_module(f"pkmcal.papers.paper_{paper}")
-    outcome: Outcome = module.reproduce(options).outcome()
-    if outcome.verdict.usable or options.runs >= Options.runs:
+    return with_few_runs(module.reproduce(options).outcome(), options.runs)
+
+
+def with_few_runs(outcome: Outcome, runs: int) -> Outcome:
+    """Outcome with a note if an expectation is missed with fewer runs than by default."""
+    if outcome.verdict.usable or runs >= Options.runs:
         return outcome
-    few = note("study.few_runs", runs=options.runs, usual=Options.runs)
+    few = note("study.few_runs", runs=runs, usual=Options.runs)
     verdict = replace(outcome.verdict, findings=(*outcome.verdict.findings, few))
     return replace(outcome, verdict=verdict)
 

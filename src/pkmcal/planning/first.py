@@ -149,7 +149,7 @@ def first_edges(
 
     def measurements(edges: EdgeSet) -> Measurements:
         if len(edges) < FEWEST_FIRST_EDGES:
-            raise ResultError("too few edges to tell what others will give", found=len(edges))
+            raise ResultError("too few edges to predict the accuracy of others", found=len(edges))
         return Measurements(
             edges, session.joints, session.joint_noise, len(images), numbers, shaded=True
         )

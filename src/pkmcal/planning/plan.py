@@ -29,7 +29,7 @@ from pkmcal.planning.candidates import (
     neighbours,
 )
 from pkmcal.planning.defaults import CONFIGURATIONS_A_CAPTURE
-from pkmcal.planning.exchange import PLAN_INDICES, ShareProgress, exchanged, greedy
+from pkmcal.planning.exchange import ShareProgress, exchanged, greedy, tool_variance, tool_weight
 from pkmcal.planning.information import CandidateRows, Candidates, information_of
 from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
 from pkmcal.planning.route import length, motor_distances, shortest_path
@@ -99,8 +99,7 @@ class MeasurementPlan:
     subject : subject of the plan, with the chosen stations if these were free. stations : (n,)
     tuples of names of the stations that measure each configuration. names, joints (n, m),
     T_base_platform (n, 4, 4) : the configurations; those of ``rank`` up to k are the best k at each
-    station. index : name of the minimized index. value : its value; at_random : its mean for
-    configurations that are drawn uniformly over the joints' ranges. now, promised, by_chance :
+    station. now, promised, by_chance :
     accuracy before the plan, with it, and with random configurations. curve : accuracy with fewer
     and with more configurations. region : the workspace, work : its poses. blocked : (n,) True if
     the machine cannot take the straight path to a configuration, or its legs touch on it. travel :
@@ -114,9 +113,6 @@ class MeasurementPlan:
     joints: Array
     T_base_platform: Array
     rank: Integers
-    index: str
-    value: float
-    at_random: float
     now: Accuracy
     promised: Accuracy
     by_chance: Accuracy
@@ -146,7 +142,6 @@ def plan_measurements(
     subject: Subject,
     *,
     count: int = CONFIGURATIONS_A_CAPTURE,
-    index: str = "tool",
     region: Region | None = None,
     together: bool | None = None,
     free_stations: int | None = None,
@@ -157,17 +152,17 @@ def plan_measurements(
 ) -> MeasurementPlan:
     """Plan measurements for a subject.
 
-    count : configurations at each station; in total, if all stations measure together. index : one
-    of :data:`~pkmcal.planning.exchange.PLAN_INDICES`. region : workspace in which the tool's
-    accuracy counts; by default all reachable poses. together : whether all stations measure every
-    configuration; by default if they have cameras of their own or there is a tracker.
-    free_stations : number of stations to choose on a sphere around the machine. best_of : number of
-    the rig's stations to choose. seed : of all random numbers. progress : callback with the share
-    done. options : of the search. Raises InputError for what cannot be planned.
+    count : configurations at each station; in total, if all stations measure together. region :
+    workspace in which the tool's accuracy counts; by default all reachable poses. together :
+    whether all stations measure every configuration; by default if they have cameras of their own
+    or there is a tracker. free_stations : number of stations to choose on a sphere around the
+    machine. best_of : number of the rig's stations to choose. seed : of all random numbers.
+    progress : callback with the share done. options : of the search. Raises InputError for what
+    cannot be planned.
     """
     progress = progress or (lambda _share: None)
     rig, rng = subject.rig, np.random.default_rng(seed)
-    _check(rig, count, index, free_stations, best_of)
+    _check(rig, count, free_stations, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, options.work_poses, seed)
     # Candidate configurations, by which stations are chosen first, if they are free.
@@ -177,7 +172,7 @@ def plan_measurements(
     tried: tuple[TriedStation, ...] = ()
     if free_stations or best_of:
         rig, prior, tried = _with_stations(
-            subject, work, candidates, count, index, free_stations, best_of, options
+            subject, work, candidates, count, free_stations, best_of, options
         )
         subject = replace(subject, rig=rig, prior=prior)
     progress(0.3)
@@ -188,21 +183,15 @@ def plan_measurements(
     stations = range(len(rig.names))
     groups = (tuple(stations),) if together else tuple((s,) for s in stations)
     # The best configurations for these stations.
-    selection = _Selection(rig, subject.prior, groups, count, index, work, options)
+    selection = _Selection(rig, subject.prior, groups, count, work, options)
     pool = selection.pool(Candidates.of_all(groups, *candidates))
     chosen = selection.chosen(pool, rng, lambda share: progress(0.3 + 0.6 * share))
     progress(0.9)
     return _routed_plan(subject, selection, chosen, pool, region, together, tried, rng)
 
 
-def _check(
-    rig: Rig, count: int, index: str, free_stations: int | None, best_of: int | None
-) -> None:
+def _check(rig: Rig, count: int, free_stations: int | None, best_of: int | None) -> None:
     rig.machine.check_free("fixed")
-    if index not in PLAN_INDICES:
-        raise InputError(
-            "there is no such index", where="--index", found=index, expected=", ".join(PLAN_INDICES)
-        )
     check_number("plan", "configurations", count, "--configurations")
     check_number("plan", "places", free_stations, "--places")
     check_number("plan", "best_of", best_of, "--best-of")
@@ -243,7 +232,6 @@ class _Selection:
     prior: CalibrationPrior | None
     groups: tuple[tuple[int, ...], ...]
     count: int
-    index: str
     work: Array
     options: PlanOptions
 
@@ -254,20 +242,19 @@ class _Selection:
 
     def chosen(self, pool: _Pool, rng: np.random.Generator, progress: ShareProgress) -> Candidates:
         """Best candidates of a pool, improved locally."""
-        index = PLAN_INDICES[self.index](pool.info)
         # Global choice among the candidates.
-        first = greedy(pool.info, self.count, index, lambda x: progress(0.4 * x)).chosen
-        best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
+        first = greedy(pool.info, self.count, lambda x: progress(0.4 * x)).chosen
+        best = pool.candidates.only(np.sort(exchanged(pool.info, first)))
         # Local improvement, until a round gains too little.
         size = np.inf
         rounds = self.options.rounds
         for k in range(rounds):
             progress(0.5 + 0.5 * k / rounds)
             pool, start = self._with_neighbours(best, rng)
-            chosen = np.sort(exchanged(pool.info, start, index))
+            chosen = np.sort(exchanged(pool.info, start))
             best = pool.candidates.only(chosen)
             covariance = pool.info.covariance(pool.info.of(chosen))
-            before, size = size, index.size(float(index.value(covariance)), len(covariance))
+            before, size = size, float(tool_variance(tool_weight(pool.info), covariance)) ** 0.5
             if size > (1 - NEGLIGIBLE) * before:
                 break
         return best
@@ -313,14 +300,14 @@ def _routed_plan(
     machine, count, groups = subject.rig.machine, selection.count, selection.groups
     # edges with drawn rather than mean information, as real images have
     own = selection.pool(chosen, np.random.default_rng(PLAN_SEED)).info
-    index, every = PLAN_INDICES[selection.index](own), np.arange(len(chosen.group))
+    every = np.arange(len(chosen.group))
     # Accuracy by number of configurations, in the greedy order, and beyond the plan.
-    nested = greedy(own, count, index)
+    nested = greedy(own, count)
     curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
     covariance = own.covariance(own.of(every))
     promised = _accuracy(own, covariance, count)
     more = [_accuracy(own, own.covariance(own.of(every, t)), t * count) for t in CAPTURE_MULTIPLES]
-    by_chance, at_random = _random_accuracy(selection, pool, rng)
+    by_chance = _random_accuracy(selection, pool, rng)
     rank = np.empty(len(every), dtype=int)
     rank[nested.chosen] = every // len(groups) + 1
     order, blocked, travel = _route(machine, chosen, rng, selection.options)
@@ -331,9 +318,6 @@ def _routed_plan(
         joints=chosen.joints[order],
         T_base_platform=chosen.T_base_platform[order],
         rank=rank[order],
-        index=selection.index,
-        value=float(index.value(covariance)),
-        at_random=at_random,
         now=_accuracy(own, own.covariance(own.information), 0),
         promised=promised,
         by_chance=by_chance,
@@ -361,23 +345,18 @@ def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _random_accuracy(
-    selection: _Selection, pool: _Pool, rng: np.random.Generator
-) -> tuple[Accuracy, float]:
-    """Accuracy and index with configurations drawn uniformly over the joints' ranges, mean of
-    several draws.
-    """
-    index, n_groups = PLAN_INDICES[selection.index](pool.info), len(selection.groups)
+def _random_accuracy(selection: _Selection, pool: _Pool, rng: np.random.Generator) -> Accuracy:
+    """Accuracy with configurations drawn uniformly over the joints' ranges, mean of some draws."""
+    n_groups = len(selection.groups)
     n = len(pool.info.group) // n_groups
     evenly = np.arange(n // 2, n)  # the first half is at the ends of the ranges
     count = min(selection.count, len(evenly))
-    figures: list[tuple[float, float, float]] = []
+    figures: list[tuple[float, float]] = []
     for _ in range(selection.options.random_plans):
         rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
         covariance = pool.info.covariance(pool.info.of(np.concatenate(rows)))
-        figures.append((*pool.info.tool(covariance), float(index.value(covariance))))
-    position, orientation, value = np.mean(figures, axis=0).tolist()
-    return Accuracy(selection.count, position, orientation), value
+        figures.append(pool.info.tool(covariance))
+    return Accuracy(selection.count, *np.mean(figures, axis=0).tolist())
 
 
 # ------------------------------------------------------------------ the way between them
@@ -452,7 +431,6 @@ def _with_stations(
     work: Array,
     candidates: Configurations,
     count: int,
-    index: str,
     free_stations: int | None,
     best_of: int | None,
     options: PlanOptions,
@@ -497,9 +475,8 @@ def _with_stations(
     same = np.zeros(len(rows), dtype=int)
     number = np.arange(len(rows), dtype=float)[:, None]
     whole = CandidateRows(rows, same, number, start, np.eye(len(start)), first.work)
-    rule = PLAN_INDICES[index](whole)
     wanted = free_stations or best_of or 1
-    best = np.sort(exchanged(whole, greedy(whole, wanted, rule).chosen, rule))
+    best = np.sort(exchanged(whole, greedy(whole, wanted).chosen))
     tried = tuple(
         TriedStation(place, float(alone[k]), bool(k in best)) for k, place in enumerate(poses)
     )

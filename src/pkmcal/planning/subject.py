@@ -437,7 +437,7 @@ def _edge_noise(
             first = first_edges(session, images.images, rows, T_camera_base[legs], poses)
         except (PkmcalError, np.linalg.LinAlgError):
             # `check` and `calibrate` report what is wrong with these images; the plan uses defaults
-            why = "the images that there are do not determine it; pkmcal check says why"
+            why = "the images that there are do not determine it; pkmcal check gives the reason"
         else:
             count = sum(len(row) for row in rows)
             words = f"The accuracy of edges is measured in {count} of the images that there are."

@@ -12,6 +12,7 @@ from pkmcal.arrays import enlargement
 from pkmcal.camera_calibration.calibrate import (
     CALIBRATION_CHECK_OPTIONS,
     CameraCalibration,
+    cell_numbers,
     coverage,
     tilts,
 )
@@ -47,7 +48,7 @@ CAMERA_SIGMA_TEXT = (
     "The standard deviations are those with which the intrinsics would scatter if other"
     " images of this kind were taken. They hold the noise of the corners and the views'"
     " disagreement beyond it. They do not contain what all images share: a board whose"
-    " squares are not as long as its file says leaves the intrinsics alone and scales every"
+    " squares are not as long as its file states leaves the intrinsics alone and scales every"
     " distance; a focus that moves afterwards makes it another camera."
 )
 
@@ -158,7 +159,8 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     """Main numbers."""
     share = float(np.max(c.sigma[:2] / c.camera.parameters[:2])) * 100
     tilt = tilts(c.T_camera_board, c.board.points)
-    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
+    cells = CALIBRATION_CHECK_OPTIONS.cells
+    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size, cells) > 0))
     finite = int(np.isfinite(c.residuals).all(axis=-1).sum())
     return (
         Figure(
@@ -196,9 +198,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
         Figure(
             "How much of the image was tested?",
             ((f"{covered:.0f}", "%"),),
-            "of {}×{} cells hold corners; elsewhere the lens is extrapolated".format(
-                *CALIBRATION_CHECK_OPTIONS.cells
-            ),
+            "of {}×{} cells hold corners; elsewhere the lens is extrapolated".format(*cells),
         ),
     )
 
@@ -272,15 +272,10 @@ def _field_block(c: CameraCalibration) -> Images:
     The means have an enlargement of their own, as they are smaller than single residuals.
     """
     width, height = c.camera.image_size
-    columns, rows = FIELD_CELLS
     # from the expected to the detected corner, as in the field of a calibration
     pixels, off = c.pixels[c.inliers], -c.residuals[c.inliers]
-    dx, dy = width / columns, height / rows
-    # cell of each corner, and number of corners in each cell
-    column = np.clip(((pixels[:, 0] + 0.5) / dx).astype(int), 0, columns - 1)
-    row = np.clip(((pixels[:, 1] + 0.5) / dy).astype(int), 0, rows - 1)
-    flat = row * columns + column
-    counts = np.bincount(flat, minlength=rows * columns)
+    flat = cell_numbers(pixels, c.camera.image_size, FIELD_CELLS)
+    counts = np.bincount(flat)
     # mean residual of cells with three or more corners, at the corners' mean
     arrows: list[Arrow] = []
     for k in np.flatnonzero(counts >= 3).tolist():

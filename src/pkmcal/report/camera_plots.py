@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.camera_calibration.calibrate import CameraCalibration
+from pkmcal.camera_calibration.calibrate import CameraCalibration, coverage
 from pkmcal.outcome.blocks.base import configuration_key
 from pkmcal.outcome.blocks.plot import (
     BarsMark,
@@ -40,11 +40,8 @@ def field_plots(c: CameraCalibration) -> tuple[Panels, ...]:
 def coverage_plot(c: CameraCalibration) -> Plot:
     """Number of corners in each cell of the image."""
     width, height = c.camera.image_size
-    columns, rows = COVERAGE_CELLS
-    pixels = c.pixels[c.inliers]
-    column = np.clip(((pixels[:, 0] + 0.5) / width * columns).astype(int), 0, columns - 1)
-    row = np.clip(((pixels[:, 1] + 0.5) / height * rows).astype(int), 0, rows - 1)
-    counts = np.bincount(row * columns + column, minlength=rows * columns).reshape(rows, columns)
+    counts = coverage(c.pixels[c.inliers], c.camera.image_size, COVERAGE_CELLS)
+    rows, columns = counts.shape
     most = max(int(counts.max()), 1)
     x, y = (-0.5, width - 0.5), (-0.5, height - 0.5)
     return Plot(

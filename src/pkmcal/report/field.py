@@ -24,9 +24,9 @@ from pkmcal.observe.overlays import measured_curves, offsets_across_curves, own_
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
+from pkmcal.outcome.blocks.base import image_key
 from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners
-from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.wording import brief, number
@@ -233,13 +233,13 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
 
 def fields(session: Session, value: Offsets) -> tuple[ImageField, ...]:
     """Field of each station with enough data; hand-held images of one camera share a field."""
-    links, entries = Links.of(session), [one.entry or one.name for one in session.stations]
+    entries = [one.entry or one.name for one in session.stations]
     out: list[ImageField] = []
     for entry in dict.fromkeys(entries):
         of_entry = [s for s, name in enumerate(entries) if name == entry]
         mine = np.isin(value.station, of_entry)
         camera = session.stations[of_entry[0]].camera
-        cells = _cells(value.select(mine), camera.image_size, links)
+        cells = _cells(value.select(mine), camera.image_size, session)
         if cells:
             intrinsics = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
             middle = intrinsics["center.x"], intrinsics["center.y"]
@@ -248,7 +248,7 @@ def fields(session: Session, value: Offsets) -> tuple[ImageField, ...]:
     return tuple(out)
 
 
-def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[blocks.Arrow]:
+def _cells(result: Offsets, size: tuple[int, int], session: Session) -> list[blocks.Arrow]:
     """Mean shifts, px, of the image's cells with enough data."""
     from scipy.special import fdtrc
 
@@ -301,8 +301,9 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[blocks.
             f" {number(-down, 3, signed=True)} px upwards, of"
             f" {len(np.unique(some.thing[here]))} edges and corners"
         )
-        size_of = np.abs(value[number_of == c])
-        key = links.to_largest(some.station[here], some.configuration[here], size_of)
+        largest = here[np.argmax(np.nan_to_num(np.abs(value[number_of == c]), nan=-np.inf))]
+        station = session.stations[some.station[largest]]
+        key = image_key(station.name, session.configurations[some.configuration[largest]])
         out.append(
             blocks.Arrow(
                 at=(round(x, 1), round(y, 1)),

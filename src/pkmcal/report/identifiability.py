@@ -92,14 +92,14 @@ def directions_headline(findings: Findings) -> str:
     possible = ranks.n_parameters - ranks.n_frames
     frames = f"{ranks.n_parameters} free values less {ranks.n_frames} that only place the frames"
     lost = possible - ranks.rank
-    start = f"The data fix {ranks.rank} of {possible} directions ({frames})."
+    start = f"The data determine {ranks.rank} of {possible} directions ({frames})."
     if lost == 0 and not ranks.weak:
-        return f"{start} Each is known better from the data than from the nominal model."
+        return f"{start} Each is determined better by the data than by the nominal model."
     parts: list[str] = []
     if lost:
-        parts.append(f"{count(lost, 'direction')} no amount of such data would fix")
+        parts.append(f"{count(lost, 'direction')} no amount of such data would determine")
     if ranks.weak:
-        parts.append(f"{count(len(ranks.weak), 'direction')} the nominal model knows better")
+        parts.append(f"{count(len(ranks.weak), 'direction')} determined better by the prior")
     return f"{start} {capital(joined(parts))}."
 
 
@@ -114,9 +114,9 @@ def spectrum(findings: Findings) -> Plot | None:
         words = (
             "the data do not determine it"
             if k >= rank
-            else f"the nominal model knows it {brief(1 / ratio)} times better"
+            else f"the nominal model determines it {brief(1 / ratio)} times better"
             if ratio < 1
-            else f"the data know it {brief(ratio)} times better than the nominal model"
+            else f"the data determine it {brief(ratio)} times better than the nominal model"
         )
         bars.append(
             Point(

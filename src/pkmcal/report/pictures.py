@@ -36,7 +36,6 @@ from pkmcal.outcome.blocks import images as blocks
 from pkmcal.outcome.blocks.base import image_key
 from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.links import Place
 from pkmcal.report.strips import edge_lines, strips_of_image
 from pkmcal.session.image_files import Image
 from pkmcal.session.load import RejectedStation, Session, Station
@@ -48,6 +47,9 @@ if TYPE_CHECKING:
 
 CORNER_ARROW_LENGTH = 0.03
 """Length of a large corner residual as drawn, in image widths."""
+
+Place = tuple[int, int]
+"""Image by the indices of its station and configuration."""
 
 
 @dataclass(frozen=True)

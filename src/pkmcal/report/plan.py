@@ -24,12 +24,6 @@ PLAN_TABLE_FILE, PLAN_STATIONS_FILE = "plan.csv", "stations.yaml"
 PLAN_FORMAT = 1
 PLAN_READING_DECIMALS = 6
 """Decimals of a reading in metres or radians."""
-INDEX_NAMES = {
-    "tool": "the variance of the tool's position over the workspace",
-    "D": "the determinant of the machine's covariance (D)",
-    "E": "the largest eigenvalue of the machine's covariance (E)",
-    "O1": "the noise amplification index O1",
-}
 PLAN_METHOD_TEXT = (
     "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
     " corners, poses and readings, with the platform's pose of that configuration eliminated."
@@ -122,7 +116,7 @@ def _purpose(plan: MeasurementPlan) -> str:
     if len({name for names in plan.stations for name in names}) > 1:
         where = " seen by all stations" if plan.together else " from each place"
     each = count(plan.promised.count, "configuration") + where
-    return f"{each}, chosen for {INDEX_NAMES[plan.index]}; workspace: {plan.region}."
+    return f"{each}, chosen for the least variance of the tool; workspace: {plan.region}."
 
 
 def _worth_note(plan: MeasurementPlan) -> Finding:
@@ -262,7 +256,6 @@ def plan_document(plan: MeasurementPlan) -> dict[str, Any]:
         {
             "pkmcal_plan": PLAN_FORMAT,
             "machine": rig.machine.name,
-            "index": {"name": plan.index, "value": plan.value, "by_chance": plan.at_random},
             "workspace": {
                 "x": plan.region.x, "y": plan.region.y, "z": plan.region.z,
                 "turn": plan.region.turn,

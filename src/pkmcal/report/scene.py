@@ -85,13 +85,13 @@ def section(
     return Part("geometry", "The machine in space", blocks=(block,), menu="Geometry")
 
 
-def _caption(shown: int, used: int) -> str:
+def _caption(drawn: int, used: int) -> str:
     """Sentences below the stage."""
-    fewer = f" of {used}, evenly chosen" if shown < used else ""
+    fewer = f" of {used}, evenly chosen" if drawn < used else ""
     return (
         "True to scale, except for the change of the joint centres from the nominal model (blue)"
-        f" and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged as the sliders say."
-        f" The slider takes the machine through {count(shown, 'pose')}{fewer}; a click on a pose's"
+        f" and their {ELLIPSOID_SIGMAS:g}σ ellipsoids, which are enlarged by the sliders."
+        f" The slider takes the machine through {count(drawn, 'pose')}{fewer}; a click on a pose's"
         " point leads to its images, and the space bar changes between nominal model and result."
     )
 
@@ -107,7 +107,7 @@ def tool_arrows(tool_map: ToolMap) -> SpaceArrows:
         points=line(after.T_base_platform[finite, :3, 3], 4),
         vectors=tuple(small_vector(v) for v in after.off[finite, 3:]),
         tips=tuple(f"Nominal model's position {brief(x)} mm off" for x in off.tolist()),
-        shown=False,
+        visible=False,
     )
 
 

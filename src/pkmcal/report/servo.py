@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, rms
-from pkmcal.control.sentences import chosen_legs, judgement
+from pkmcal.control.sentences import judgement
 from pkmcal.control.study import Study, Trials
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.blocks.plot import panels
@@ -20,16 +20,14 @@ from pkmcal.report.servo_plots import (
     shares,
     tail_plot,
 )
-from pkmcal.wording import brief, number
+from pkmcal.wording import brief
 
-MOST_CHOICES = 2
-"""Listed sets of legs of each size."""
 SERVO_METHOD_TEXT = (
     "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
     " what is seen and what was seen when the goal was taught: of the edges' normals, or of the"
     " legs' directions. The drives' rates are −gain · D N⁺ e, with the interaction matrix N and the"
-    " inverse Jacobian D by the measured directions, the readings, and the base centres that the"
-    " controller believes. The goal is taught by the true machine without noise, so a wrong"
+    " inverse Jacobian D by the measured directions, the readings, and the base centres of"
+    " the controller's model. The goal is taught by the true machine without noise, so a wrong"
     " geometry changes the way and not the end.",
     "The true machine follows its drives by forward kinematics. A run ends early where a drive"
     " leaves its range, the platform comes near a singular pose, or a leg leaves the image. A leg"
@@ -59,7 +57,6 @@ def outcome_of(study: Study) -> Outcome:
                 tables=(outcome_table(study), *([ends] if ends else [])),
             ),
             Part("run", "One run", blocks=(run_stage(study, run), image_plot(study, run))),
-            Part("legs", "Legs", tables=(choices_table(study),)),
             Part("how", "How it was computed", SERVO_METHOD_TEXT, tables=(settings_table(study),)),
         ),
         findings=study.scene.findings,
@@ -103,21 +100,7 @@ def servo_document(s: Study, verdict: Verdict) -> dict[str, Any]:
             "one_image_turn": rms(s.image.turn),
         },
         "hidden": dict(zip([str(j + 1) for j in s.eye.true.legs], s.hidden, strict=True)),
-        "visibility": {
-            "legs": [
-                {"legs": [j + 1 for j in c.legs], "worst": c.worst, "usual": c.usual}
-                for c in s.choices
-            ],
-        },
-        "equilibria": {
-            "reached": s.equilibria.reached,
-            "alike": s.equilibria.same_image,
-            "cancelled": s.equilibria.cancelled,
-            "outside": s.equilibria.out,
-            "distance": s.equilibria.distance,
-            "looks_alike": s.equilibria.same_edges,
-            "T_base_platform": s.equilibria.T_base_platform,
-        },
+        "visibility": {"worst": s.visibility.worst, "usual": s.visibility.usual},
         "curves": {
             "time": s.outcomes[0].runs.time,
             **{o.estimate.name: np.median(shares(o, o.runs.error), axis=0) for o in s.outcomes},
@@ -220,32 +203,6 @@ def ends_table(study: Study) -> Table | None:
     ]
     columns = ("How the others ended", *(o.estimate.title for o in study.outcomes))
     return Table("Runs that did not reach their goal", columns, tuple(rows), brief=False)
-
-
-def choices_table(s: Study) -> Table:
-    """Table of the sets of legs that have to be observed."""
-    useful = [c for c in s.choices if not c.blind]
-    sizes = sorted({len(c.legs) for c in useful})
-    listed = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
-    if s.own not in listed:
-        listed = [s.own, *listed]
-    rows = [
-        Row(
-            chosen_legs(c, s) + (", as seen" if c == s.own else ""),
-            (number(c.worst, 5), number(c.usual, 5), "no" if c.blind else "hardly, at some poses"
-             if c.fading else "yes"),
-        )
-        for c in listed
-    ]  # fmt: skip
-    return Table(
-        f"Which legs must be seen, by their {s.plan.loop.law}",
-        ("Legs", "Visibility, worst pose", "usual", "Every motion seen"),
-        tuple(rows),
-        "Visibility: the smallest singular value of the interaction matrix as a part of its"
-        " largest, at poses all over the workspace; the two best choices of each number. Fewer legs"
-        " do not show every motion.",
-        brief=False,
-    )
 
 
 def settings_table(study: Study) -> Table:

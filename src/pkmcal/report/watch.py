@@ -369,8 +369,8 @@ def _by_configuration(w: Watch) -> Plot | None:
     return Plot(
         name="run",
         title="Residuals in the order of the configurations, the machine held as calibrated",
-        caption="A level that stays says that something changed; single points, that an image or"
-        " its readings are wrong.",
+        caption="A lasting change of level means that something changed; single points mean that an"
+        " image or its readings are wrong.",
         alt=f"Residuals of {count(len(points), 'configuration')}",
         x=category_axis(names, "configurations"),
         y=linear_axis(

@@ -49,7 +49,7 @@ def camera_by_exif(images: list[tuple[Path, str]], where: str) -> Camera:
                 "the image does not state the focal length it was taken with",
                 where=label,
                 found="no EXIF FocalLengthIn35mmFilm",
-                expected=f"a JPEG file as the camera wrote it, for {where} says camera: exif",
+                expected=f"a JPEG file as the camera wrote it, because {where} has camera: exif",
                 next_step="Calibrate the camera with pkmcal camera, and name its file",
             )
         sizes.append((width, height))

@@ -137,7 +137,7 @@ def _pattern_parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
         parts.append(("", field))
     if ("", "configuration") not in parts:
         raise InputError(
-            "the pattern does not say where the configuration's name stands",
+            "the pattern has no place for the configuration's name",
             where=where,
             found=quoted(pattern),
             expected="a pattern with {configuration}, such as images/front/{configuration}.png",
@@ -215,8 +215,8 @@ def _unknown_configuration(
     next_step = "Add its readings to the table, or move the image away"
     if name.lstrip("0") in short:
         next_step = (
-            f"The table has {short[name.lstrip('0')]} where the image says {name}: "
-            "write the names alike; spreadsheets drop leading zeros"
+            f"The table has {short[name.lstrip('0')]} where the image has {name}: "
+            "use equal names; spreadsheets drop leading zeros"
         )
     return InputError(
         f"{files[0]} is of a configuration without joint readings{more}",

@@ -142,7 +142,7 @@ def read_poses(
     rows = configuration_rows(table, names)
     if len(rows) < kind.fewest_rows:
         raise InputError(
-            f"too few {kind.label} to say where the tracker stands",
+            f"too few {kind.label} to determine the tracker's pose",
             where=label,
             found=f"{len(rows)} rows",
             expected=f"{kind.fewest_rows} at least",
@@ -150,11 +150,11 @@ def read_poses(
     T = kind.T_tracker_target(table)
     if level and not kind.levels:
         raise InputError(
-            "only of heights can be said that the bed is level",
+            "level applies to heights only",
             where=label,
             found=f"columns {', '.join(table.columns)}",
             expected="configuration and z",
-            next_step="Leave level out: how such a tracker stands is found out",
+            next_step="Leave level out: the orientation of such a tracker is estimated",
         )
     return PoseTable(name, label, kind.code, rows, T, position, rotation, level)
 

@@ -17,6 +17,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR_MOTIONS
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.drives import Drives, drives_of, reaches, side_bars
+from pkmcal.ranges import Light
 from pkmcal.simulation.render import Scene, ScenePart
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulation.surfaces import (
@@ -24,7 +25,6 @@ from pkmcal.simulation.surfaces import (
     Clouds,
     Finish,
     Lamp,
-    Light,
     Lighting,
     Material,
     Slats,

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import final
 
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.ranges import Style
 from pkmcal.simulation.shapes import Cylinder, Shape, inner
 
-Style = Literal["mixed", "matte", "dark", "metal"]
-Light = Literal["usual", "soft", "hard"]
 NOISE_SIZE = 256
 BRUSH_ACROSS, BRUSH_ALONG = 0.13, 0.75
 """Roughness of turned steel across and along the axis, in Ward's model."""

@@ -30,13 +30,12 @@ from pkmcal.placement.stations import (
     rough_pose,
     rough_poses,
 )
-from pkmcal.ranges import default
+from pkmcal.ranges import Light, Style, default
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import same_pose
 from pkmcal.session.schema import BoardBody
 from pkmcal.simulation.board import place_board
 from pkmcal.simulation.render import Sensor
-from pkmcal.simulation.surfaces import Light, Style
 
 TRUTH_FILE = "truth.json"
 RANDOM_STREAMS = (

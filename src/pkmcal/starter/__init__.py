@@ -59,7 +59,7 @@ MOVED_STATION_TEXT = """\
     observe: {observe}
 """
 READINGS_ALONE_TEXT = """\
-# No stations: this machine has more readings than freedoms, and they alone tell its geometry.
+# No stations: this machine has more readings than freedoms, and they alone determine its geometry.
 # Spread the configurations over all that it reaches.
 """
 EXAMPLE_UNIT_FACTORS = {"[deg]": np.rad2deg(1.0), "[mm]": 1e3}

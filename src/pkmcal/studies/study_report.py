@@ -65,8 +65,8 @@ STUDY_METHOD_TEXT = (
     "The tool's error is that of the platform's pose at readings spread over the workspace,"
     " between the calibrated and the true machine, frames laid over each other. What a camera"
     " sees is decided by the nominal model. Not simulated are wrong edges, other things in the"
-    " picture, bending, play and errors of the lens: these cost accuracy, and no simulation"
-    " knows how much.",
+    " picture, bending, play and errors of the lens: these reduce the accuracy by an"
+    " amount that no simulation gives.",
 )
 PAPER_STUDY_METHOD_TEXT = (
     "Each run draws a hexapod, measures the axes of its legs with the noise of [A] Table 1, and"
@@ -120,7 +120,7 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     covered = [c.covered.value for c in study.found] + [c.covered_tool.value for c in study.found]
     if any(cell.honest is None for cell in study.found):
         where = " of some combinations" if len(study.found) > 1 else ""
-        return f"Too few calibrations{where} can be used to tell how good they are."
+        return f"Too few calibrations{where} can be used to estimate their accuracy."
     low, high = 100 * min(covered), 100 * max(covered)
     share = f"{low:.1f} %" if round(high - low, 1) == 0 else f"{low:.1f} to {high:.1f} %"
     if bad:

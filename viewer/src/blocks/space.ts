@@ -242,7 +242,7 @@ function switches(block: Space, model: SpaceModel): HTMLElement {
   };
   return h("fieldset", { class: "layers" },
     h("legend", { class: "hidden" }, "Shown"),
-    ...model.items.map((item) => box(item.name, item.colour, item.shown, item.show)),
+    ...model.items.map((item) => box(item.name, item.colour, item.visible, item.show)),
     ...(block.machine.cameras.length ? [layer("cameras", "Cameras", true)] : []),
     ...(block.machine.axes.length ? [layer("axes", "Joint axes", false)] : []),
     layer("frames", "Frames", true));

@@ -25,7 +25,7 @@ const ELLIPSOID = new SphereGeometry(1, 32, 24);
 interface Item {
   name: string;
   colour: string;
-  shown: boolean;
+  visible: boolean;
   show: (visible: boolean) => void;
 }
 
@@ -98,13 +98,13 @@ export class SpaceModel {
       mesh.frustumCulled = false;
       stage.pickable.push(mesh);
       this.clouds.push({ mesh, content });
-      this.add(content.name, content.colour, content.shown, mesh);
+      this.add(content.name, content.colour, content.visible, mesh);
     }
     this.mark(null);
 
     for (const content of block.arrows) {
       const lines = new Lines(lineMaterial(palette, content.colour, { width: 1.5 }));
-      this.add(content.name, content.colour, content.shown, lines.object);
+      this.add(content.name, content.colour, content.visible, lines.object);
       this.arrows.push({ lines, content });
     }
     for (const path of block.paths) {
@@ -179,15 +179,15 @@ export class SpaceModel {
     }
   }
 
-  private add(name: string, colour: string, shown: boolean, object: Group | Mesh): void {
+  private add(name: string, colour: string, visible: boolean, object: Group | Mesh): void {
     const parent = new Group(); // lines hide themselves where they are empty
     parent.add(object);
-    parent.visible = shown;
+    parent.visible = visible;
     this.stage.scene.add(parent);
     const item: Item = {
-      name, colour, shown,
+      name, colour, visible,
       show: (visible) => {
-        item.shown = parent.visible = visible;
+        item.visible = parent.visible = visible;
         this.stage.draw();
       },
     };

@@ -13,8 +13,3 @@ What every calibration uses stands one level up: [A]'s conditions and joints of 
 ``estimates`` returns their estimates with standard deviations. A form that follows a paper where
 the paper is in error is named *printed*; :doc:`formulation` gives the reasons.
 """
-
-from typing import Literal
-
-AlternativeMethod = Literal["four-step", "linear", "inverse-kinematic"]
-"""Methods for which ``estimates`` returns estimates."""

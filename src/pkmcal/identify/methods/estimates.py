@@ -20,7 +20,6 @@ from pkmcal.identify.covariance import data_share, prior_in_gauge
 from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.gauge import default_gauge, in_gauge
 from pkmcal.identify.hand_eye import start_from_poses
-from pkmcal.identify.methods import AlternativeMethod
 from pkmcal.identify.methods.four_step import four_step
 from pkmcal.identify.methods.four_step_base import with_boards
 from pkmcal.identify.methods.inverse_kinematic import inverse_kinematic
@@ -30,6 +29,7 @@ from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
+from pkmcal.ranges import AlternativeMethod
 from pkmcal.solver.kernels import NO_WEIGHT_DISTANCE
 
 Repeated = Literal["four-step", "inverse-kinematic"]

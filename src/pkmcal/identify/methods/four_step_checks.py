@@ -202,7 +202,7 @@ def lengths_are_fixed(
     part = np.abs(vectors[:, free]).max(axis=1)
     names = np.flatnonzero(legs.closing)[part > 0.3 * part.max()]
     raise ResultError(
-        what=f"the images do not tell the lengths of {named(names)}",
+        what=f"the images do not determine the lengths of {named(names)}",
         found="distances between platform joints that do not depend on a combination of them",
         expected="legs that change their directions against each other, seen at once, [A] 3.4",
         next_step=f"add configurations that tilt and turn the platform more, or {USE_JOINT_METHOD}",

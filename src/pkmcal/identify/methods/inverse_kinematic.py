@@ -267,7 +267,7 @@ def inverse_kinematic(machine: Machine, measurements: Measurements, start: State
     if poses.rows.min() < 6:
         raise InputError(
             what="the inverse-kinematic method needs whole poses",
-            found="points or heights, which tell no rotation",
+            found="points or heights, which determine no rotation",
             next_step="measure rotations as well, or use the method bundle",
         )
     problem, state = pose_problem(

@@ -72,11 +72,11 @@ class Slider(BaseCarrier):
         return (
             NamedMotion(
                 lean,
-                one="how the guide of {legs} leans cannot be told from where it stands{better}",
-                several="how the guides of {legs} lean cannot be told from where they stand"
+                one="the tilt of the guide of {legs} cannot be separated from its position{better}",
+                several="the tilts of the guides of {legs} cannot be separated from their positions"
                 "{better}",
-                together="how the guides of {legs} lean to each other cannot be told from where"
-                " they stand{better} {ways}{mostly}",
+                together="the tilts of the guides of {legs} to each other cannot be separated from"
+                " their positions{better} {ways}{mostly}",
             ),
         )
 

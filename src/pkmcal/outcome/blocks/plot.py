@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from itertools import product
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -42,12 +42,15 @@ PLOT_DIGITS = 6
 """Significant digits of values in a plot."""
 
 
+LEG_COLOURS: tuple[Colour, ...] = tuple(
+    colour for colour in get_args(Colour) if colour.startswith("leg-")
+)
+"""Colours of the legs; machines with more legs repeat them."""
+
+
 def leg_colour(leg: int | None) -> Colour:
     """Colour of a leg, from 1; quiet for no leg."""
-    colours: tuple[Colour, ...] = (
-        "leg-1", "leg-2", "leg-3", "leg-4", "leg-5", "leg-6", "leg-7", "leg-8",
-    )  # fmt: skip
-    return colours[(leg - 1) % len(colours)] if leg else "quiet"
+    return LEG_COLOURS[(leg - 1) % len(LEG_COLOURS)] if leg else "quiet"
 
 
 # ------------------------------------------------------------------ axes

@@ -46,7 +46,7 @@ class SpacePoints(Schema):
     colour : custom property of the style sheet.
     keys, tips : of each point.
     sizes : relative to others; empty for all alike.
-    shown : whether they are drawn from the start.
+    visible : whether they are drawn from the start.
     """
 
     name: Text
@@ -55,7 +55,7 @@ class SpacePoints(Schema):
     keys: tuple[Key, ...]
     tips: tuple[Text, ...]
     sizes: tuple[float, ...] = ()
-    shown: bool = True
+    visible: bool = True
 
 
 class SpaceArrows(Schema):
@@ -66,7 +66,7 @@ class SpaceArrows(Schema):
     points: Line
     vectors: Line
     tips: tuple[Text, ...]
-    shown: bool = True
+    visible: bool = True
 
 
 class SpacePath(Schema):
