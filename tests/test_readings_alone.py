@@ -28,7 +28,7 @@ from pkmcal.mechanisms import (
 )
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.report.calibration import outcome_of, save
-from pkmcal.session.load import load_session
+from pkmcal.session.load import load_session, load_session_to_plan
 from pkmcal.simulation.truth import true_machine
 from pkmcal.web.report_page import report_document
 
@@ -262,7 +262,7 @@ def test_what_needs_a_camera_states_so(belts):
     with pytest.raises(ResultError, match="readings are not predicted from themselves"):
         outcome_of(calibrate_session(folder, holdout=5))
     with pytest.raises(InputError, match="no station to plan for"):
-        load_session(folder, measured=False)
+        load_session_to_plan(folder)
 
 
 def test_the_page_holds_no_section_of_cameras(belts):

@@ -330,6 +330,13 @@ def test_a_session_and_a_calibration_have_their_cameras(demo):
     assert calibrated.sigma is not None
 
 
+def test_a_session_is_shown_before_anything_was_measured(tmp_path):
+    pkmcal.new("gough-stewart").save(tmp_path / "mine")
+    document = pkmcal.show(tmp_path / "mine").document
+    assert document["machine"]["name"] == "gough-stewart"
+    assert len(document["machine"]["legs"]) == 6
+
+
 def test_a_view_in_python(tmp_path):
     view = pkmcal.show("3-rpr")
     assert view.document["machine"]["name"] == "3-rpr"

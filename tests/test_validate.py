@@ -181,6 +181,25 @@ def test_own_readings_have_no_part_where_a_board_needs_the_others(h4):
     del nominal
 
 
+def test_a_pose_that_follows_from_its_own_readings_is_left_out(hexapod, new):
+    """An image in which hardly an edge was measured predicts nothing, and spoils no other one."""
+    estimate = hexapod[2]
+    stations, data = new
+    edges = data.edges
+    first = np.flatnonzero(edges.configuration == 4)[:1]
+    poor = edges.select(np.sort(np.concatenate([np.flatnonzero(edges.configuration != 4), first])))
+    start = start_state(estimate.machine, data, stations)
+    whole, without = (
+        predict(estimate.machine, one, start) for one in (data, replace(data, edges=poor))
+    )
+    assert whole.observed.all()
+    assert np.flatnonzero(~without.observed).tolist() == [4]
+    others = np.delete(np.arange(len(data.joints)), 4)
+    change = without.errors.residuals[others] - whole.errors.residuals[others]
+    assert np.abs(change).max() < 0.1 * np.abs(whole.errors.residuals[others]).max()
+    assert np.isnan(without.errors.residuals[4]).all()
+
+
 def test_a_board_in_one_configuration_decides_nothing(h4):
     _, _, estimate, case, _ = h4
     one = select(case.measurements, np.arange(71) == 0)

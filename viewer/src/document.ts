@@ -339,13 +339,14 @@ export interface DataTable {
  *
  * form : text; number, to the right, ``a ± b`` with the second part small; leg, a chip with the
  *     leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
- *     darker the larger it is among those of all such columns.
+ *     darker the larger it is among those of all such columns; chance, a probability in words,
+ *     whose number is its tooltip.
  * hint : explanation of the heading.
  * by_size : sorted by the size of the values, whatever their sign, as changes are.
  */
 export interface Column {
   name: string;
-  form: "text" | "number" | "leg" | "share" | "shade";
+  form: "text" | "number" | "leg" | "share" | "shade" | "chance";
   hint: string;
   by_size: boolean;
 }
@@ -683,9 +684,9 @@ export interface Images {
  * key : of the image, so that a selection elsewhere finds it.
  * width, height : of the camera's image, px.
  * quarter_turns : clockwise, that turn it upright, as EXIF says.
- * jpeg : base64, of at most these pixels; empty if the file cannot be read.
+ * webp : base64, of at most these pixels; empty if the file cannot be read.
  * overlays : of which a viewer shows one at a time.
- * strip_jpeg : the strips one below the other, base64; empty without any.
+ * strip_webp : the strips one below the other, base64; empty without any.
  */
 export interface Image {
   title: string;
@@ -695,9 +696,9 @@ export interface Image {
   width: number;
   height: number;
   quarter_turns: number;
-  jpeg: string;
+  webp: string;
   overlays: Overlay[];
-  strip_jpeg: string;
+  strip_webp: string;
   strips: Strip[];
 }
 /**
@@ -789,8 +790,8 @@ export interface Arrow {
 /**
  * Image along an edge, sampled in native pixels across the predicted edge and along it.
  *
- * title : name of the edge, its residual and standard deviation.
- * row : first row of the strip in the image's ``strip_jpeg``.
+ * title : name of the edge, offset of the fitted line from the prediction, its standard deviation.
+ * row : first row of the strip in the image's ``strip_webp``.
  * length, across : columns along the edge, from A to B, and rows across it, outward first; the
  *     prediction is in the middle row.
  * offset : offset of the fitted line from the prediction, px outward, at evenly spaced positions

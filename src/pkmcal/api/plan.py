@@ -25,7 +25,7 @@ from pkmcal.planning.plan import MeasurementPlan, plan_measurements
 from pkmcal.planning.subject import Subject, as_it_stands, of_machine
 from pkmcal.ranges import default
 from pkmcal.report.plan import PLAN_STATIONS_FILE, PLAN_TABLE_FILE, outcome_of
-from pkmcal.session.load import Session, load_session, session_folder
+from pkmcal.session.load import Session, load_session_to_plan, session_folder
 from pkmcal.simulation import board_for
 
 
@@ -139,9 +139,7 @@ def plan(
                 "a machine", {"--camera": camera, "--board": board, "--tracker": tracker}
             )
             session = (
-                subject
-                if isinstance(subject, Session)
-                else load_session(folder or "", measured=False)
+                subject if isinstance(subject, Session) else load_session_to_plan(folder or "")
             )
             region = session.workspace
             report("Reading the measurements", 0.02)

@@ -146,7 +146,7 @@ def _of_session(folder: Path) -> MachineView:
     from pkmcal.geometry.rigid import inverse
     from pkmcal.session.load import load_session
 
-    session = load_session(folder)
+    session = load_session(folder, measured=False)
     cameras = {
         station.name: (station.camera, inverse(station.T_camera_base))
         for station in session.stations

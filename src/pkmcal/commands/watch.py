@@ -21,7 +21,7 @@ from pkmcal.commands.options import (
 EXAMPLES = """\
 pkmcal watch out today
 pkmcal watch out today --same-place front
-pkmcal watch out today --alpha 0.001 -o watch
+pkmcal watch out today -o watch      (again with later sessions: a run chart)
 """
 
 
@@ -35,7 +35,7 @@ pkmcal watch out today --alpha 0.001 -o watch
         " [repeatable]", multiple=True,
     ),
     seed("watch"),
-    out("SESSION/watch"),
+    out("SESSION/watch", "Folder for the results; an earlier test there starts the run chart."),
     as_json(),
 )  # fmt: skip
 def watch(calibration: Path, session: Path, out: Path | None, as_json: bool, **options: Any) -> int:

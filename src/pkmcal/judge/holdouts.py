@@ -12,6 +12,7 @@ from pkmcal.calibration.holdout import Neighbours, by_region, select
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.judge.comparison import NominalComparison, compare_with_nominal
+from pkmcal.judge.fixed_machine import too_little
 from pkmcal.judge.prediction import predict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -66,11 +67,15 @@ def judged_without(
 ) -> HoldOut:
     """Comparison of an estimate on the configurations of a region that it did not use, and on those
     that it used.
+
+    Raises ResultError if the poses of one of the two follow from their own readings alone.
     """
     measurements = estimate.stated_edge_noise(measurements)
     prediction = predict(estimate.machine, measurements, estimate.state)
     out = region.rows[prediction.observed[region.rows]]
     used = np.setdiff1d(np.flatnonzero(prediction.observed), out)
+    if not (len(out) and len(used)):
+        raise too_little(estimate.machine, measurements)
     both = (
         compare_with_nominal(nominal, estimate.covariance, measurements, prediction, None, rows)
         for rows in (out, used)

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.calibration.holdout import select
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.gauge import pose_generators
@@ -84,8 +85,11 @@ class Prediction:
 def predict(machine: Machine, measurements: Measurements, start: State) -> Prediction:
     """Predict readings and tool points of the measured configurations.
 
+    Configurations whose pose follows from little but their own readings, such as those of an image
+    in which hardly an edge was measured, count as not observed.
+
     start : stations, mounts and poses in frames near those of the machine. Raises ResultError if
-    they are not found, or if a pose depends on nothing but the configuration's own readings.
+    they are not found, or if no configuration's pose is observed.
     """
     if not measurements.n_stations:
         raise ResultError(
@@ -109,8 +113,13 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     redundancy = np.eye(m) - along - beside @ beside.mT  # L
     # below this redundancy hardly anything but the readings determined the pose: the uncertainty
     # by the observations was ten times SOFT_READING_NOISE
-    if float(np.linalg.eigvalsh(redundancy).min(initial=1.0)) < NEGLIGIBLE:
+    determined = np.linalg.eigvalsh(redundancy).min(axis=-1) >= NEGLIGIBLE
+    if not determined.any():
         raise too_little(machine, measurements)
+    if not determined.all():
+        keep = held.observed.copy()
+        keep[held.observed] = determined
+        return predict(machine, select(measurements, keep), start)
     alone = np.linalg.inv(redundancy)
     units = _reading_per_sigma(held)[..., None] * alone
 

@@ -272,8 +272,8 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     model :
         One of the models that the mechanism file names.
     measured :
-        Whether images, or poses, of at least two configurations are required. A plan is made
-        before any exist.
+        Whether images, or poses, of at least two configurations are required. A session is
+        shown and planned for before any exist.
 
     Raises
     ------
@@ -285,14 +285,6 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     folder, document = _session_document(Path(folder))
     schema = validated_document(document, session_schema())
     machine, source = _machine(folder, document, schema.mechanism, model)
-    if not measured and not schema.stations:
-        raise InputError(
-            "there is no station to plan for",
-            where=document.where("stations"),
-            expected="one entry a camera, or a tracker, in one place",
-            next_step="Where readings alone are calibrated from, spread the poses over all that the"
-            " machine reaches",
-        )
     # Joint readings.
     table, findings = _readings(folder, document, schema, machine, measured)
     # Board, camera stations and trackers.
@@ -332,6 +324,23 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         workspace=_workspace(document, schema),
         links=links,
     )
+
+
+def load_session_to_plan(folder: Path | str) -> Session:
+    """Read and check a session of which images or poses may not exist yet.
+
+    Raises InputError as :func:`load_session` does, and for a session without a station.
+    """
+    session = load_session(folder, measured=False)
+    if not session.station_names:
+        raise InputError(
+            "there is no station to plan for",
+            where="session.yaml, stations",
+            expected="one entry a camera, or a tracker, in one place",
+            next_step="Where readings alone are calibrated from, spread the poses over all that the"
+            " machine reaches",
+        )
+    return session
 
 
 def _readings(

@@ -26,7 +26,7 @@ from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.outcome.finding import Finding, note
 from pkmcal.placement.configurations import check_drawable
 from pkmcal.placement.default_camera import camera_of_size
-from pkmcal.session.load import Session, load_session, session_folder
+from pkmcal.session.load import Session, load_session_to_plan, session_folder
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
 from pkmcal.studies.tasks import StudySetting
@@ -100,7 +100,7 @@ def subject_of(origin: str) -> StudySubject:
     """
     folder = session_folder(origin)
     if folder is not None:
-        session = load_session(folder, measured=False)
+        session = load_session_to_plan(folder)
         check_drawable(session.machine)
         return _of_session(session)
     if origin not in catalogue() and Path(origin).suffix not in (".yaml", ".yml"):
