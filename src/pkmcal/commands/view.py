@@ -1,4 +1,4 @@
-"""``pkmcal view``: local page of a session's images with the machine overlaid."""
+"""``pkmcal view``: local page of a session, a result or a folder of both."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from pkmcal.commands.serve import serve
 
 EXAMPLES = """\
 pkmcal view my-machine
-pkmcal view my-machine --calibration out
-pkmcal view my-machine --no-browser --port 8000
+pkmcal view my-machine/calibration
+pkmcal view my-machine --calibration out --no-browser --port 8000
 """
 
 
 def view(
-    session: console.SessionFolder,
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PATH",
+            help="A session, a result that a command wrote, or a folder with some of these.",
+        ),
+    ],
     calibration: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="SESSION/calibration, where it is, unless given."),
+        typer.Option(
+            metavar="DIR",
+            help="Calibration of the session; SESSION/calibration, where it is, unless given.",
+        ),
     ] = None,
     port: Annotated[
         int, console.number_option("view", "port", "N", "A free one unless given.")
@@ -31,26 +40,8 @@ def view(
     ] = False,
     as_json: console.Json = False,
 ) -> int:
-    """Show images with the machine laid over; move it there."""
-    from pkmcal.errors import InputError
-    from pkmcal.session.load import load_session
-    from pkmcal.view.content import Viewed
-    from pkmcal.view.server import application
+    """Show a session's images with the machine laid over, or results; move the machine there."""
+    from pkmcal.api.view import view as run
 
-    loaded = load_session(session)
-    if not loaded.stations:
-        raise InputError(
-            "there are no images to be shown",
-            where=f"{loaded.folder / 'session.yaml'}, stations",
-            expected="a station with a camera",
-        )
-    beside = loaded.folder / "calibration"
-    viewed = Viewed(
-        loaded, calibration or (beside if (beside / "calibration.json").is_file() else None)
-    )
-    if calibration is not None:
-        _ = viewed.saved  # raises for an unusable file before the page is served
-    return serve(
-        lambda token, port: application(viewed, token, port), port,
-        no_browser=no_browser, as_json=as_json,
-    )  # fmt: skip
+    opened = run(source, calibration=calibration)
+    return serve(opened.application, port, no_browser=no_browser, as_json=as_json)

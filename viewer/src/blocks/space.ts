@@ -18,7 +18,7 @@ const SLOWEST = 600;
 const BESIDE = 1.2; // largest angle between the eye and a camera, rad
 const HEIGHT = 0.4; // of the eye above the horizon, as a slope
 
-export function space(block: Space, context: Context): HTMLElement {
+export function space(block: Space, context: Pick<Context, "selection">): HTMLElement {
   const figure = h("figure", { class: "space-block" });
   if (block.title) figure.append(h("h3", {}, block.title));
   let stage: Stage;
@@ -201,7 +201,7 @@ function enlarger(name: string, start: number, most: number, onchange: (factor: 
 
 /** Selection shared with the page: legs, and configurations by their points and the slider. */
 function select(
-  block: Space, { selection }: Context, stage: Stage, model: SpaceModel, go: (pose: number) => void,
+  block: Space, { selection }: Pick<Context, "selection">, stage: Stage, model: SpaceModel, go: (pose: number) => void,
 ): void {
   const { legs } = block.machine;
   const legKey = (leg: number): Key => `leg:${legs[leg].number}`;
