@@ -344,10 +344,11 @@ export class Inspector {
       this.view.y -= (share * (now.y - last.y)) / this.view.scale;
       this.draw();
     });
-    new ResizeObserver(() => {
+    // a frame later: what is drawn may change the size of the bar, and with it that of the window
+    new ResizeObserver(() => requestAnimationFrame(() => {
       this.view.scale = Math.max(this.view.scale, this.smallest());
       this.draw();
-    }).observe(host);
+    })).observe(host);
   }
 
   private endDrag(cancelled: boolean): void {

@@ -177,7 +177,10 @@ def folder_source(folder: Path) -> Source:
         if n >= len(places):
             raise InputError("there is no such entry", where="the page", found=n)
         path = places[n]
-        return session_source(path) if path.is_dir() else page_source(path)
+        try:
+            return session_source(path) if path.is_dir() else page_source(path)
+        except PkmcalError as error:
+            raise InputError("this cannot be opened", where=str(path), found=str(error)) from error
 
     def routes() -> list[BaseRoute]:
         from starlette.routing import Mount

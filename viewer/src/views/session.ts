@@ -115,7 +115,10 @@ class SessionView {
     this.machines.hidden = !content.calibration;
     this.views = choice("View", [["image", "Image"], ["space", "In space"]], "image", (name) => this.showSpace(name === "space"));
     this.views.hidden = !content.calibration;
-    this.kinds = choice("What a drag does", KINDS, "aim", (name) => { this.kind = name; });
+    this.kinds = choice("What a drag does", KINDS, "aim", (name) => {
+      this.kind = name;
+      this.showState();
+    });
     for (const one of [this.fitButton, this.saveButton]) one.classList.add("main");
     const middle = (): Pixel => [(this.image.width - 1) / 2, (this.image.height - 1) / 2];
     const tools = h("div", { class: "bar session-tools" }, this.kinds,
@@ -283,6 +286,7 @@ class SessionView {
   private showState(): void {
     const { fixed, station, pose } = this;
     for (const element of this.editing) element.hidden = fixed || !this.stage.hidden;
+    this.inspector.element.classList.toggle("session-editing", !fixed && this.kind !== "pan");
     this.undoButton.disabled = fixed || !pose.undoable;
     this.fitButton.disabled = this.searchButton.disabled = fixed || !station.legs;
     this.saveButton.disabled = fixed || station.handheld || !pose.changed;
