@@ -248,10 +248,10 @@ def test_a_result_opens_its_page(both, monkeypatch):
 # ------------------------------------------------------------------ defaults
 
 
-RENAMED = {("plan", "configurations"): "count"}
+RENAMED = {("plan", "configurations"): "count", ("show", "machine"): "source"}
 """Options whose argument has another name."""
-FOR_OUTPUT = {"out", "as_json", "quiet", "model", "pictures", "folder"}
-"""Options of outputs, or of loaded files."""
+FOR_OUTPUT = {"out", "as_json", "quiet", "model", "pictures", "folder", "port", "no_browser"}
+"""Options of outputs, of pages that are served, or of loaded files."""
 OTHERWISE = {
     ("plan", "size"): ("camera", PLANNED_IMAGE_SIZE),
     ("simulate", "size"): ("camera", default_camera().image_size),
@@ -262,7 +262,7 @@ OTHERWISE = {
 """Options that a person types otherwise: the argument that they become, and their default."""
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", [*VERBS, "show", "view"])
 def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
     command = inspect.signature(getattr(import_module(f"pkmcal.commands.{verb}"), verb)).parameters
     function = inspect.signature(getattr(pkmcal, verb)).parameters

@@ -17,7 +17,7 @@ const settled = async () => {
   for (let quiet = 0; quiet < 4;) { await wait(100); quiet = pending ? 0 : quiet + 1; }
 };
 const out = document.documentElement.dataset;
-document.addEventListener("load", (event) => {
+document.documentElement.addEventListener("load", (event) => {
   if (event.target.matches?.(".inspected image")) out.image ??= Math.round(performance.now());
 }, true);
 const finish = () => {

@@ -83,6 +83,7 @@ export class Inspector {
       "div",
       { class: "inspector", tabindex: -1 },
       this.host,
+      this.where,
       this.tip,
       this.strip,
       h(
@@ -97,7 +98,6 @@ export class Inspector {
         this.layers,
         this.strips,
         h("label", { class: "inspector-gamma" }, "Dark parts", this.gamma),
-        this.where,
       ),
     );
     this.listen();

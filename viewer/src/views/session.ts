@@ -231,7 +231,10 @@ class SessionView {
     if (answer && epoch === this.epoch) {
       this.showMeasured(answer);
       this.list.set(s, k, answer.mark);
-    } else if (epoch === this.epoch) this.list.set(s, k, "wrong");
+    } else if (epoch === this.epoch) {
+      this.list.set(s, k, "wrong");
+      this.showFit("wrong", ["Not measured."]);
+    }
     void this.markOthers();
   }
 
@@ -300,21 +303,24 @@ class SessionView {
   private showMeasured(answer: EdgesAnswer): void {
     this.measured = answer.layers;
     this.drawLayers();
-    this.fit.className = `session-fit ${answer.mark ?? ""}`;
-    this.fit.replaceChildren(...answer.texts.map((text, n) =>
-      h("p", {}, ...(n === 0 && answer.mark ? [sign(answer.mark), " "] : []), text)));
+    this.showFit(answer.mark, answer.texts);
     answer.legs.forEach(({ measured, predicted }, j) => {
       this.counts[j].textContent = predicted ? `${measured} of ${predicted}` : "–";
     });
     this.reasons.replaceChildren(...answer.reasons.map((text) => h("li", {}, text)));
   }
 
+  private showFit(mark: ImageMark, texts: readonly string[]): void {
+    this.fit.className = `session-fit ${mark ?? ""}`;
+    this.fit.replaceChildren(...texts.map((text, n) =>
+      h("p", {}, ...(n === 0 && mark ? [sign(mark), " "] : []), text)));
+  }
+
   /** Remove what was measured for another pose. */
   private clearMeasured(): void {
     this.measured = [];
     this.drawLayers();
-    this.fit.className = "session-fit";
-    this.fit.replaceChildren(h("p", { class: "small" }, "Not measured at this pose yet."));
+    this.showFit(null, ["Not measured at this pose yet."]);
     for (const cell of this.counts) cell.textContent = "–";
     this.reasons.replaceChildren();
   }

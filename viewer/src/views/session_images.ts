@@ -20,7 +20,10 @@ export class ImageList {
     this.buttons = stations.map((station, s) => station.images.map((image, k) => {
       const { width, height } = uprightSize(image);
       const address = image.url.replace("image", "thumbnail");
-      const picture = h("img", { src: address, alt: "", loading: "lazy", width, height });
+      const picture = h("img", {
+        src: address, alt: "", loading: "lazy", fetchpriority: "low", width, height,
+        onerror: () => picture.removeAttribute("src"), // its mark and its image say why
+      });
       return h("button", { type: "button", title: image.title, onclick: () => choose(s, k) },
         picture, h("span", { class: "session-name" }, h("span", { class: "session-mark" }), image.caption));
     }));
