@@ -40,7 +40,7 @@ def view(
     ] = False,
     as_json: console.Json = False,
 ) -> int:
-    """Show a session's images with the machine laid over, or results; move the machine there."""
+    """Show images with the machine laid over, or a command's results."""
     from pkmcal.api.view import view as run
 
     opened = run(source, calibration=calibration)

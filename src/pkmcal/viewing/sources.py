@@ -116,13 +116,13 @@ def session_source(folder: Path, calibration: Path | None = None) -> Source:
             where=f"{session.folder / SESSION_FILE_NAME}, stations",
             expected="a station with a camera",
         )
-    own = session.folder / CALIBRATION_FOLDER
-    if calibration is None and (own / CALIBRATION_DOCUMENT_FILE).is_file():
-        content = SessionContent(session, own)
+    if calibration is None:
+        own = session.folder / CALIBRATION_FOLDER
+        has_own = (own / CALIBRATION_DOCUMENT_FILE).is_file()
+        content = SessionContent(session, own if has_own else None)
     else:
         content = SessionContent(session, calibration)
-        if calibration is not None:
-            _ = content.saved  # raises for an unusable file before the page is served
+        _ = content.saved  # raises for an unusable file before the page is served
     report = None if content.calibration is None else content.calibration / CALIBRATION_REPORT_FILE
     has_report = report is not None and is_page(report)
 
