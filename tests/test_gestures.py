@@ -9,7 +9,14 @@ from pkmcal.cameras import camera_models
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb, pose_difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.view.gestures import PINNED_JOINT_SIGMA, aimed, farther, pinned, rolled, turned_as_ball
+from pkmcal.viewing.gestures import (
+    PINNED_JOINT_SIGMA,
+    aimed,
+    farther,
+    pinned,
+    rolled,
+    turned_as_ball,
+)
 
 CAMERAS = {
     "pinhole": [705.0, 706.0, 402.3, 297.8, -0.11, 0.09, 0.0004, -0.0003, 0.0],

@@ -4,17 +4,16 @@ import base64
 import hashlib
 import json
 import re
-import shutil
 import subprocess
 from dataclasses import replace
 from datetime import datetime
-from html.parser import HTMLParser
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from browsers import CHROMIUM, PageParts
 from page_documents import page_blocks, page_document, page_section, page_text
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.tool import centres_and_tool, tool_error
@@ -33,9 +32,6 @@ from pkmcal.web.tables import leading_number
 from test_report_case import Case, calibration, case_document, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
 
 
 @pytest.fixture(scope="module")
@@ -57,27 +53,6 @@ def page(case) -> str:
     return report_html(
         case.session, case.observation, case.estimate, verdict, timings={"observe": 1.5}
     )
-
-
-class PageParts(HTMLParser):
-    """Tags, attributes and text of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self._texts: list[str] = []
-        self.feed(text)
-        self.text = "".join(self._texts)
-
-    def updatepos(self, i, j):
-        """Line numbers are not needed; counting lines in megabytes takes longer than all else."""
-        return j
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_data(self, data):
-        self._texts.append(data)
 
 
 # ------------------------------------------------------------------ the document

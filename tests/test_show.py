@@ -20,6 +20,7 @@ import pytest
 from pydantic import ValidationError
 
 import pkmcal
+from browsers import DARK, FRAME, NO_GL, SOFTWARE, PageParts, browse
 from conftest import run
 from pkmcal.api.show import show
 from pkmcal.errors import InputError
@@ -35,9 +36,8 @@ from pkmcal.web.machine_page import (
 )
 from pkmcal.web.motion import Postures, moved
 from pkmcal.web.page import standalone_page
-from test_report_page import CHROMIUM, HOSTILE, PageParts
-from test_view import PORT, TOKEN, Answer
-from test_view import Page as ViewPage
+from served_pages import PORT, TOKEN, Answer, ServedPage
+from test_report_page import HOSTILE
 
 ROUNDING = 2e-6
 """m, of points written to a micrometre."""
@@ -173,9 +173,10 @@ def test_readings_of_a_redundant_machine_follow():
     present = {name: home[name] for name in ("readings", "T_base_platform")}
     body = {"index": 0, "value": home["readings"][0] + 0.1, **present}
     request = PoseRequest.model_validate_json(json.dumps(body))
-    after = configuration_at(machine, request)["configuration"]
-    assert after["readings"][0] == pytest.approx(home["readings"][0] + 0.1)
-    moved = np.subtract(after["T_base_platform"], home["T_base_platform"])[:3, 3]
+    after = configuration_at(machine, request).configuration
+    assert after is not None
+    assert after.readings[0] == pytest.approx(home["readings"][0] + 0.1)
+    moved = np.subtract(after.T_base_platform, home["T_base_platform"])[:3, 3]
     # the least motion is along the belt
     belt = np.array([1.5, 1.1, 0.0])
     np.testing.assert_allclose(
@@ -232,7 +233,7 @@ def test_hostile_names_stay_text():
     assert "\\u202e\\x1b" in title
 
 
-class Page(ViewPage):
+class Page(ServedPage):
     """The page of a machine as it is served."""
 
     def __init__(self, name):
@@ -408,12 +409,6 @@ addEventListener("load", async () => {
   parent.postMessage({ ...out }, "*");
 });
 """
-FRAME = """<!doctype html><html lang="en"><title>Frame</title>
-<iframe src="page.html" width="WIDTH" height="860"></iframe>
-<script>addEventListener("message", (event) => {
-  Object.assign(document.documentElement.dataset, event.data);
-});</script></html>"""
-"""Browsers have no window as narrow as a phone."""
 
 
 def acting(page: str, script: str) -> str:
@@ -421,28 +416,6 @@ def acting(page: str, script: str) -> str:
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     page = page.replace("script-src ", f"script-src 'sha256-{digest}' ", 1)
     return page.replace('<div id="viewer">', f'<script>{script}</script><div id="viewer">', 1)
-
-
-def browse(address: str, folder, width: int, *options: str) -> dict[str, str]:
-    """Data that the script left on the root element."""
-    if CHROMIUM is None:
-        pytest.skip("NO CHROMIUM: the machine's page was not opened in a browser")
-    done = subprocess.run(
-        [CHROMIUM, "--headless", "--no-sandbox", "--no-first-run", "--enable-logging=stderr",
-         "--disable-background-networking", f"--user-data-dir={folder / 'profile'}", "--v=0",
-         f"--window-size={width},900", "--virtual-time-budget=60000", "--dump-dom", *options,
-         address],
-        capture_output=True, text=True, timeout=240, check=True,
-    )  # fmt: skip
-    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", done.stderr), done.stderr
-    root = PageParts(done.stdout).tags[0][1]
-    assert root.get("data-done") == "yes", root
-    return {name.removeprefix("data-"): value or "" for name, value in root.items()}
-
-
-SOFTWARE = ("--disable-gpu", "--enable-unsafe-swiftshader")
-NO_GL = ("--disable-gpu", "--disable-3d-apis")
-DARK = "--blink-settings=preferredColorScheme=0"
 
 
 def fine(root: dict[str, str]) -> None:

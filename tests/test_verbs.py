@@ -252,7 +252,7 @@ OTHERWISE = {"model": "session", "size": "camera", "folder": "folder"}
 """Options whose value becomes a part of an argument with another name."""
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", [*VERBS, "show", "view"])
 def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
     command = command_named(verb)
     options = {one.name: one for one in command.params}

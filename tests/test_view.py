@@ -1,9 +1,9 @@
-"""The page of images: access, responses, written files, and a browser on it."""
+"""The pages of `view`: access, responses, written files, results and folders, and browsers."""
 
 from __future__ import annotations
 
-import asyncio
 import json
+import os
 import re
 import shutil
 import signal
@@ -12,75 +12,44 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
+import pkmcal
+from browsers import DARK, FRAME, SOFTWARE, PageParts, browse
 from conftest import run
+from fuzz.run import listing
+from page_documents import page_document
 from pkmcal.cameras.files import camera_text
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb, pose, pose_difference, rotation
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
-from pkmcal.view import server
-from pkmcal.view.content import Viewed
-from pkmcal.view.pose_file import PoseFile
+from pkmcal.viewing.content import SessionContent
+from pkmcal.viewing.pose_file import PoseFile
+from pkmcal.viewing.server import session_document, session_routes
+from pkmcal.viewing.sources import MOST_ENTRIES
 from pkmcal.web import serving
+from pkmcal.web.bundle_files import SCRIPT_FILE, bundle_file
+from pkmcal.web.page import DOCUMENT_START, PAGE_MARK
 from rendered import BOARD_SESSION, by_command
-from test_report_page import CHROMIUM, PageParts
-
-PORT, TOKEN = 4711, "the-token"
-
-
-@dataclass(frozen=True)
-class Answer:
-    status: int
-    headers: dict[str, str]
-    content: bytes
-
-    @property
-    def text(self):
-        return self.content.decode()
-
-    def json(self):
-        return json.loads(self.content)
+from served_pages import PORT, TOKEN, ServedPage
+from test_report_page import HOSTILE
 
 
-class Page:
-    """A page that is served, and its questions, as the server passes them on."""
+class Page(ServedPage):
+    """A session's page, and its questions."""
 
     def __init__(self, folder, calibration=None):
-        self.subject = Viewed(load_session(folder), calibration)
-        self.app = server.application(self.subject, TOKEN, PORT)
-
-    def request(self, path, content=None, kind="http", **headers):
-        text = {"host": f"127.0.0.1:{PORT}", **headers}
-        scope = {
-            "type": kind, "method": "GET" if content is None else "POST", "path": path,
-            "raw_path": path.encode(), "query_string": b"", "root_path": "", "scheme": "http",
-            "headers": [(k.encode(), v.encode()) for k, v in text.items()],
-            "http_version": "1.1", "client": None, "server": ("127.0.0.1", PORT),
-            "extensions": {"websocket.http.response": {}},
-        }  # fmt: skip
-        sent = []
-
-        async def receive():
-            return {"type": "http.request", "body": content or b""}
-
-        async def send(message):
-            sent.append(message)
-
-        asyncio.run(self.app(scope, receive, send))
-        start = sent[0]
-        headers = {k.decode(): v.decode() for k, v in start["headers"]}
-        return Answer(start["status"], headers, b"".join(m.get("body", b"") for m in sent[1:]))
-
-    def get(self, path="", token=TOKEN, **headers):
-        return self.request(f"/{token}/{path}", **headers)
+        self.subject = SessionContent(load_session(folder), calibration)
+        routes = session_routes(self.subject, session_document(self.subject))
+        self.app = serving.application(routes, TOKEN, PORT)
 
     def post(self, what, content=None, **body):
         text = json.dumps({"station": 0, "image": 0, **body}).encode()
@@ -116,7 +85,9 @@ def test_the_page_opens_with_its_token(page):
     assert page.get(origin=f"http://127.0.0.1:{PORT}").status == 200
 
 
-@pytest.mark.parametrize("path", ["", "view.js", "image/0/0", "nowhere"])
+@pytest.mark.parametrize(
+    "path", ["", "viewer.js", "image/0/0", "thumbnail/0/0", "stage", "nowhere"]
+)
 @pytest.mark.parametrize("token", ["", "the-toke", "the-tokens", "é"])
 def test_without_the_token_nothing_is_reported(page, path, token):
     answer = page.get(path, token)
@@ -151,9 +122,8 @@ def test_the_page_asks_for_nothing_outside(page):
     for tag, attributes in PageParts(text).tags:
         assert tag not in ("iframe", "object", "embed", "base")
         for name in ("src", "href"):
-            assert attributes.get(name) in (None, "data:,", "view.js", "view.css")
+            assert attributes.get(name) in (None, "data:,", "viewer.js", "viewer.css")
     assert not re.search(r"\bon[a-z]+=|<style|style=", text)  # which the policy would block
-    assert not re.search(r"https?:|@import|url\(", page.get("view.css").text)
 
 
 # ------------------------------------------------------------------ what is shown
@@ -168,7 +138,7 @@ def test_all_images_are_named(page, demo):
 def test_an_image_is_sent(page):
     image = cv2.imdecode(np.frombuffer(page.get("image/1/2").content, np.uint8), 0)
     assert image.shape[::-1] == page.subject.station(1).camera.image_size
-    assert np.abs(image.astype(int) - page.subject.image(1, 2)).mean() < 3
+    assert np.abs(image.astype(int) - page.subject.image(1, 2)).mean() < 1
 
 
 def test_nothing_is_decoded_before_it_is_looked_at(demo):
@@ -179,11 +149,23 @@ def test_nothing_is_decoded_before_it_is_looked_at(demo):
     assert opened.subject.image.cache_info().misses == 1
 
 
-def test_a_large_image_is_sent_at_the_screens_size(page):
-    for widest in (100, 10_000):
-        jpeg = np.frombuffer(page.subject.jpeg(0, 0, widest), np.uint8)
-        width = page.subject.station(0).camera.image_size[0]
-        assert cv2.imdecode(jpeg, 0).shape[1] == min(widest, width)
+def test_a_thumbnail_is_small_and_upright(page, session):
+    size = page.subject.station(0).camera.image_size
+    image = cv2.imdecode(np.frombuffer(page.get("thumbnail/0/0").content, np.uint8), 0)
+    assert image.shape[1] < size[0] / 2
+    path = load_session(session).stations[0].images[0].path
+    with Image.open(path) as picture:
+        exif = picture.getexif()
+        exif[0x0112] = 6  # to be turned clockwise
+        picture.save(path, exif=exif)
+    turned = Page(session)
+    (first, *_), *_ = (s["images"] for s in page_document(turned.get().text)["stations"])
+    assert first["quarter_turns"] == 1
+    small = cv2.imdecode(np.frombuffer(turned.get("thumbnail/0/0").content, np.uint8), 0)
+    assert small.shape[0] > small.shape[1]
+    corner = image[: image.shape[0] // 3, : image.shape[1] // 3].mean()
+    other = small[: small.shape[0] // 3, -(small.shape[1] // 3) :].mean()
+    assert other == pytest.approx(corner, abs=8)
 
 
 def test_faults_are_reported_in_words(page, session):
@@ -204,12 +186,12 @@ def test_faults_are_reported_in_words(page, session):
         answer = page.post("overlay", **body)
         assert answer.status == 422
         assert words in answer.json()["message"]
-    assert "not valid JSON" in page.post("fit", b"{").json()["message"]
-    assert "no JSON object" in page.post("fit", b"[]").json()["message"]
+    assert "not valid JSON" in page.post("localize", b"{").json()["message"]
+    assert "no JSON object" in page.post("localize", b"[]").json()["message"]
 
 
 def test_a_defect_is_reported_as_one(page, monkeypatch):
-    monkeypatch.setattr(Viewed, "jpeg", lambda *_: 1 / 0)
+    monkeypatch.setattr(SessionContent, "jpeg", lambda *_: 1 / 0)
     answer = page.get("image/0/0")
     assert answer.status == 500
     assert "a defect of pkmcal" in answer.json()["message"]
@@ -219,13 +201,12 @@ def test_the_overlay_is_where_the_machine_is(page, truth):
     """At the true pose, the joints are at their pixels."""
     T = truth.T_camera_base[0]
     answer = page.ask("overlay", pose=T.tolist())
-    pane = page.subject.drawn(0, 0)
+    pane = page.subject.nominal(0, 0)
     for joint in answer["joints"]:
         point = pane.points[("base", "platform").index(joint["end"]), joint["leg"] - 1]
-        np.testing.assert_allclose(
-            [joint["x"], joint["y"]], pane.camera.project(apply(T, point)), atol=0.051
-        )
-    assert {leg["leg"] for leg in answer["legs"]} == {1, 2, 3, 4, 5, 6}
+        np.testing.assert_allclose(joint["at"], pane.camera.project(apply(T, point)), atol=0.051)
+    (machine,) = (layer for layer in answer["layers"] if layer["name"] == "machine")
+    assert {shape["key"] for shape in machine["shapes"]} == {f"leg:{n}" for n in range(1, 7)}
     assert len(answer["joints"]) == 12
 
 
@@ -234,15 +215,20 @@ def test_a_joint_comes_to_where_it_is_pulled(page):
     first = {"image": 0, "end": "platform", "leg": 2, "pixel": [300, 200]}
     answer = page.ask("overlay", pins=[first])
     shifted = next(j for j in answer["joints"] if (j["end"], j["leg"]) == ("platform", 2))
-    assert (shifted["x"], shifted["y"]) == (300, 200)
+    assert shifted["at"] == [300, 200]
     base = page.ask("overlay", image=1, pose=answer["pose"])["joints"]
     other = next(j for j in base if (j["end"], j["leg"]) == ("base", 5))
-    second = {"image": 1, "end": "base", "leg": 5, "pixel": [other["x"] + 20, other["y"] - 9]}
+    second = {
+        "image": 1,
+        "end": "base",
+        "leg": 5,
+        "pixel": [other["at"][0] + 20, other["at"][1] - 9],
+    }
     answer = page.ask("overlay", pose=answer["pose"], pins=[first, second])
     for image, pin in ((0, first), (1, second)):
         joints = page.ask("overlay", image=image, pose=answer["pose"])["joints"]
         at = next(j for j in joints if (j["end"], j["leg"]) == (pin["end"], pin["leg"]))
-        np.testing.assert_allclose([at["x"], at["y"]], pin["pixel"], atol=0.051)
+        np.testing.assert_allclose(at["at"], pin["pixel"], atol=0.051)
 
 
 @pytest.mark.parametrize("kind", ["aim", "turn", "roll", "distance"])
@@ -277,10 +263,15 @@ def test_no_pose_is_too_odd(page):
                 {"pins": [pin, {**pin, "leg": 4, "pixel": start}]},
             ):
                 assert np.isfinite(page.ask("overlay", pose=T, **more)["pose"]).all()
-            assert page.ask("found", pose=T)["told"]
+            assert page.ask("edges", pose=T)["texts"]
 
 
 # ------------------------------------------------------------------ what is found
+
+
+def shapes(answer, name):
+    """Shapes of a layer."""
+    return next(layer["shapes"] for layer in answer["layers"] if layer["name"] == name)
 
 
 def off(value, true):
@@ -297,23 +288,35 @@ def test_the_machine_snaps_to_its_place(page, truth):
     true = truth.T_camera_base[0]
     rough = perturb(true, np.array([0.03, -0.04, 0.05, 0.03, -0.02, 0.05]))
     assert off(rough, true)[1] > 50
-    value = page.ask("fit", pose=rough.tolist())
-    assert value["recognised"]
-    assert value["said"].startswith("Recognised in 4 images")
-    angle, distance = off(value["pose"], true)
+    value = page.ask("localize", pose=rough.tolist())
+    assert value["localized"]
+    assert value["text"].startswith("Localized in 4 images")
+    angle, distance = off(value["overlay"]["pose"], true)
     assert angle < 1.0
     assert distance < 15
-    visible = page.ask("found", pose=value["pose"])
-    assert visible["told"][0].startswith("It fits: ")
-    assert len(visible["edges"]) > 2 * len(visible["missed"])
-    assert page.ask("found", pose=rough.tolist())["told"][0].startswith("It does not fit: ")
+    visible = page.ask("edges", pose=value["overlay"]["pose"])
+    assert visible["mark"] == "good"
+    assert len(shapes(visible, "edges")) > 2 * len(shapes(visible, "rejected"))
+    counts = [(one["measured"], one["predicted"]) for one in visible["legs"]]
+    measured, predicted = map(sum, zip(*counts, strict=True))
+    assert measured == len(shapes(visible, "edges"))
+    assert predicted == measured + len(shapes(visible, "rejected"))
+    assert page.ask("edges", pose=rough.tolist())["mark"] == "wrong"
+
+
+def test_every_edge_that_is_not_measured_has_its_reason(page):
+    visible = page.ask("edges")
+    tips = [shape["tip"].split(": ", 1)[1] for shape in shapes(visible, "rejected")]
+    assert tips
+    assert all(any(reason in text for text in visible["reasons"]) for reason in tips)
+    assert len({*tips}) == len(visible["reasons"])
 
 
 def test_the_machine_is_found_from_nowhere(page, truth):
     away = pose(np.eye(3), np.array([0.0, 0.0, 3.0]))
-    value = page.ask("fit", pose=away.tolist(), anywhere=True)
-    assert value["recognised"]
-    assert off(value["pose"], truth.T_camera_base[0])[0] < 1.0
+    value = page.ask("localize", pose=away.tolist(), anywhere=True)
+    assert value["localized"]
+    assert off(value["overlay"]["pose"], truth.T_camera_base[0])[0] < 1.0
 
 
 def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
@@ -325,19 +328,19 @@ def test_a_machine_that_is_not_there_stays_where_it_was_put(session):
         cv2.imwrite(str(photo.path), cv2.resize(noise, image.shape[::-1]).clip(0, 255).astype("u1"))
     opened = Page(session)
     before = opened.ask("overlay")["pose"]
-    value = opened.ask("fit")
-    assert not value["recognised"]
-    assert value["said"].startswith("Not ")
-    assert value["pose"] == before
+    value = opened.ask("localize")
+    assert not value["localized"]
+    assert value["text"].startswith("Not ")
+    assert value["overlay"]["pose"] == before
 
 
 def test_what_a_calibration_found_is_shown_with_its_judgement(page, demo):
-    visible = page.ask("found", shown="calibration")
-    assert visible["median"] < 0.5
+    visible = page.ask("edges", machine="calibration")
+    assert (visible["median"] < 0.5, visible["mark"]) == (True, "good")
     saved = page.subject.saved.document
     rows = {tuple(r[2:5]): r for r in saved["residuals"]["edges"] if r[:2] == [1, 1]}
     assert rows
-    values = [edge["tip"] for edge in visible["edges"] if "residual" in edge["tip"]]
+    values = [edge["tip"] for edge in shapes(visible, "edges") if "residual" in edge["tip"]]
     assert len(values) > 0.8 * len(rows)
     _, _, leg, tube, side, weight, *_ = next(iter(rows.values()))
     tip = next(
@@ -352,10 +355,10 @@ def test_reasons_of_what_was_left_out_are_reported(page, monkeypatch):
     group = {"reason": "a cable hangs there", "cases": [[name, configuration, 3, 1, 2]]}
     document = {**saved.document, "rejected": [group]}
     monkeypatch.setitem(page.subject.__dict__, "saved", replace(saved, document=document))
-    visible = page.ask("found", shown="calibration")
+    visible = page.ask("edges", machine="calibration")
     rows = [
         e["tip"]
-        for e in (*visible["edges"], *visible["missed"])
+        for e in (*shapes(visible, "edges"), *shapes(visible, "rejected"))
         if "a cable hangs there" in e["tip"]
     ]
     assert len(rows) == 1
@@ -367,19 +370,20 @@ def test_a_boards_corners_are_shown(tmp_path):
     text = (folder / "session.yaml").read_text().replace("fixed_to: base", "fixed_to: platform")
     (folder / "session.yaml").write_text(re.sub(r"observe: .*", "observe: board", text))
     opened = Page(folder)
-    visible = opened.ask("found")
-    assert len(visible["corners"]) > 5
-    assert visible["told"] == [f"The board: {len(visible['corners'])} corners found."]
-    assert "no legs to be recognised" in opened.post("fit").json()["message"]
+    visible = opened.ask("edges")
+    assert len(shapes(visible, "corners")) > 5
+    assert visible["mark"] == "good"
+    assert f"{len(shapes(visible, 'corners'))} corners" in visible["texts"][0]
+    assert "no legs to be localized by" in opened.post("localize").json()["message"]
 
 
 def test_a_calibration_of_another_session_is_refused(page, demo, session):
     table = (session / "joints.csv").read_text().splitlines()
     (session / "joints.csv").write_text("\n".join([table[0], *table[2:], table[1]]) + "\n")
-    answer = Page(session, demo.calibration).post("overlay", shown="calibration")
+    answer = Page(session, demo.calibration).post("overlay", machine="calibration")
     assert answer.status == 422
     assert "the calibration of another session" in answer.json()["message"]
-    message = Page(session).post("overlay", shown="calibration").json()["message"]
+    message = Page(session).post("overlay", machine="calibration").json()["message"]
     assert "there is no calibration of this session" in message
 
 
@@ -387,9 +391,9 @@ def test_a_station_that_was_left_out_is_reported(page, monkeypatch):
     saved = page.subject.saved
     others = replace(saved, stations=saved.stations[1:])
     monkeypatch.setitem(page.subject.__dict__, "saved", others)
-    message = page.post("overlay", shown="calibration").json()["message"]
+    message = page.post("overlay", machine="calibration").json()["message"]
     assert "the calibration has no station station1" in message
-    assert page.ask("overlay", station=1, shown="calibration")["pose"]
+    assert page.ask("overlay", station=1, machine="calibration")["pose"]
 
 
 def test_cameras_are_those_that_the_calibration_left(demo, session, tmp_path):
@@ -421,7 +425,7 @@ def test_the_pose_is_written_and_nothing_else(session, truth):
     file.write_text(text + "# the end\n")
     opened = Page(session)
     true = truth.T_camera_base[0]
-    words = opened.ask("save", pose=true.tolist())["said"]
+    words = opened.ask("save", pose=true.tolist())["text"]
     assert words == "The pose of station1 is in session.yaml; nothing else in it changed."
     number = re.compile(r"(?<=[\[ ,])-?\d+\.\d+(?=[\],])")
     before, after = text + "# the end\n", file.read_text()
@@ -512,106 +516,291 @@ def test_what_cannot_be_shown_is_reported_before(demo, session, tmp_path):
     assert (done.code, "there are no images to be shown" in done.err) == (2, True)
 
 
+# ------------------------------------------------------------------ the stage
+
+
+def test_the_stage_has_the_calibrated_machine_and_its_cameras(page, demo):
+    block, saved = page.get("stage").json(), page.subject.saved
+    assert [one["label"] for one in block["poses"]] == [*saved.configurations]
+    for one, T in zip(block["poses"], saved.T_base_platform, strict=True):
+        np.testing.assert_allclose(one["configuration"]["T_base_platform"], T, atol=1e-6)
+    for camera, station in zip(block["machine"]["cameras"], saved.stations, strict=True):
+        np.testing.assert_allclose(camera["position"], station.T_base_camera[:3, 3], atol=1e-6)
+    answer = Page(demo.session).get("stage")
+    assert answer.status == 422
+    assert "there is no calibration of this session" in answer.json()["message"]
+
+
+# ------------------------------------------------------------------ results and folders
+
+
+class Opened(Page):
+    """The page of whatever a path holds."""
+
+    def __init__(self, path, calibration=None):
+        self.app = pkmcal.view(path, calibration=calibration).application(TOKEN, PORT)
+
+    def document(self, path=""):
+        return page_document(self.get(path).text)
+
+
+@pytest.fixture(scope="module")
+def results(demo, tmp_path_factory):
+    """A folder with a session, its calibration, a difference, a machine's page, a page that is
+    older, another file of HTML, and a broken session.
+    """
+    folder = tmp_path_factory.mktemp("results") / "all"
+    shutil.copytree(demo.session, folder / "bench")
+    shutil.copytree(demo.calibration, folder / "bench" / "calibration")
+    pkmcal.diff(demo.calibration, demo.session / "mechanism.yaml").save(folder / "diff")
+    pkmcal.show("3-rpr").save(folder / "machine.html")
+    text = (folder / "diff" / "diff.html").read_text(encoding="utf-8")
+    (folder / "older.html").write_text(text.replace('"version": 1', '"version": 0'))
+    (folder / "mine.html").write_text("<p>mine</p>")
+    (folder / "broken").mkdir()
+    (folder / "broken" / "session.yaml").write_text("pkmcal: [")
+    (folder / ".hidden").mkdir()
+    shutil.copy(folder / "machine.html", folder / ".hidden")
+    (folder / "link").symlink_to(demo.folder, target_is_directory=True)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["", "report.html", "calibration.json"])
+def test_a_calibration_opens_as_its_report(demo, name):
+    stored = page_document((demo.calibration / "report.html").read_text(encoding="utf-8"))
+    opened = Opened(demo.calibration / name)
+    assert opened.document() == stored
+    assert opened.get("viewer.js").status == 200
+    assert opened.get(token="other").status == 403
+
+
+def test_other_results_open_as_their_pages(results):
+    for path in (results / "diff", results / "diff" / "diff.json", results / "diff" / "diff.html"):
+        assert Opened(path).document()["title"] == Opened(results / "diff").document()["title"]
+    assert Opened(results / "machine.html").document()["kind"] == "machine"
+
+
+def test_a_folder_lists_sessions_and_results(results):
+    document = Opened(results).document()
+    rows = {one["name"]: one for one in document["entries"]}
+    assert list(rows) == [
+        "machine.html", "older.html", "bench", "bench/calibration/report.html", "broken",
+        "diff/diff.html",
+    ]  # fmt: skip
+    report = Opened(results / "bench" / "calibration").document()
+    row = rows["bench/calibration/report.html"]
+    assert (row["mark"], row["title"]) == ("good", report["title"])
+    assert row["date"] == report["origin"][0]
+    magnitudes = {one["role"]: one["text"] for one in report["verdict"]["comparison"]["magnitudes"]}
+    assert (row["before"], row["after"]) == (magnitudes["nominal"], magnitudes["calibrated"])
+    # a page that this version cannot show is listed with the reason
+    assert (rows["older.html"]["href"], rows["older.html"]["mark"]) == ("", "wrong")
+    assert rows["diff/diff.html"]["before"] == rows["machine.html"]["date"] == ""
+
+
+def test_each_entry_of_a_folder_opens(results):
+    opened = Opened(results)
+    kinds = {}
+    for one in opened.document()["entries"]:
+        if one["href"]:
+            kinds[one["name"]] = opened.document(one["href"])["kind"]
+            assert opened.get(f"{one['href']}viewer.css").status == 200
+    assert kinds == {
+        "machine.html": "machine", "bench": "session", "bench/calibration/report.html": "report",
+        "broken": "folder", "diff/diff.html": "report",
+    }  # fmt: skip
+    names = [one["name"] for one in opened.document()["entries"]]
+    bench, broken = names.index("bench"), names.index("broken")
+    assert opened.get(f"{bench}/image/0/0").headers["content-type"] == "image/jpeg"
+    assert opened.document(f"{bench}/report/")["kind"] == "report"
+    # one that cannot be opened is a page with the reason, also in its place of the list
+    assert "broken" in opened.document(f"{broken}/")["note"]
+    assert opened.document("99/")["note"]
+    assert opened.get("0/nowhere").status == 404
+
+
+def test_a_session_leads_to_its_calibration_and_report(results, demo):
+    document = Opened(results / "bench").document()
+    assert document["calibration"] == str(results / "bench" / "calibration")
+    assert document["report"] == "report/"
+    assert Opened(demo.session).document()["calibration"] == ""
+    named = Opened(demo.session, demo.calibration).document()
+    assert named["calibration"] == str(demo.calibration)
+    assert Opened(results / "bench" / "session.yaml").document() == document
+
+
+def test_only_the_first_sessions_of_many_are_listed(tmp_path):
+    for n in range(MOST_ENTRIES + 1):
+        (tmp_path / f"{n:03d}").mkdir()
+        (tmp_path / f"{n:03d}" / "session.yaml").touch()
+    document = Opened(tmp_path).document()
+    assert len(document["entries"]) == MOST_ENTRIES
+    assert str(MOST_ENTRIES) in document["note"]
+
+
+def test_reading_results_writes_nothing(results):
+    before = listing(results)
+    opened = Opened(results)
+    for one in opened.document()["entries"]:
+        opened.get(one["href"] or "0/")
+    opened.get("2/image/0/0")
+    assert listing(results) == before
+
+
+def test_what_holds_nothing_to_view_is_reported(results, demo, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bare").mkdir()
+    shutil.copy(demo.calibration / "calibration.json", tmp_path / "bare")
+    os.mkfifo(tmp_path / "empty" / "pipe.html")
+    (tmp_path / "cut.html").write_text(PAGE_MARK + DOCUMENT_START + "{")
+    (tmp_path / "binary.html").write_bytes(PAGE_MARK.encode() + b"\xff")
+    for path in (
+        tmp_path / "empty", tmp_path / "bare", tmp_path / "nowhere", tmp_path / "cut.html",
+        tmp_path / "binary.html", tmp_path / "empty" / "pipe.html", results / "mine.html",
+        results / "older.html", results / "bench" / "joints.csv",
+    ):  # fmt: skip
+        with pytest.raises(InputError) as caught:
+            pkmcal.view(path)
+        assert str(path.name) in str(caught.value)
+    with pytest.raises(InputError, match="for a session alone"):
+        pkmcal.view(demo.calibration, calibration=demo.calibration)
+
+
+def test_a_hostile_page_stays_text(demo, tmp_path):
+    """Of a stored page only the document is served, and of that only texts."""
+    text = (demo.calibration / "report.html").read_text(encoding="utf-8")
+    title = json.dumps(HOSTILE).replace("<", "\\u003c")
+    text = text.replace('"title": "Calibration of gough-stewart"', f'"title": {title}', 1)
+    (tmp_path / "report.html").write_text(text.replace("<body>", f"<body>{HOSTILE}"))
+    served = Opened(tmp_path).get().text
+    assert page_document(served)["title"] == HOSTILE
+    tags = PageParts(served).tags
+    assert [tag for tag, _ in tags].count("script") == 2
+    assert not [1 for tag, attributes in tags if tag == "img" or "onerror" in attributes]
+
+
+def test_a_result_in_a_notebook_shows_itself(demo):
+    view = pkmcal.view(demo.calibration)
+    frame = view._repr_html_()
+    assert frame is not None
+    assert frame.startswith('<iframe srcdoc="&lt;!doctype html&gt;')
+    assert pkmcal.view(demo.session)._repr_html_() is None
+    assert view.document["kind"] == "report"
+
+
 # ------------------------------------------------------------------ in a browser
 
-ACT = """
-const faults = [];
-addEventListener("error", (event) => { if (event.message) faults.push(event.message); });
-addEventListener("unhandledrejection", (event) => faults.push(String(event.reason)));
-document.addEventListener("securitypolicyviolation", (event) => {
-  faults.push(`blocked ${event.blockedURI}`);
-});
-SVGElement.prototype.setPointerCapture = () => {};  // knows no pointer of a script
-const wait = (ms) => new Promise((done) => setTimeout(done, ms));
-const settled = async () => {
-  do { await wait(50); } while (asking || finding || $("told").textContent === "…");
-};
-const key = (name, more = {}) => {
-  dispatchEvent(new KeyboardEvent("keydown", { key: name, cancelable: true, ...more }));
-};
-const joint = (end, leg) => document.querySelector(`.hit[data-end=${end}][data-leg="${leg}"]`);
-const at = (mark) => [+mark.getAttribute("cx"), +mark.getAttribute("cy")];
-async function pulled(target, from, to) {
-  const send = (type, [x, y]) => {
-    const point = new DOMPoint(x, y).matrixTransform($("shot").getScreenCTM());
-    const where = { clientX: point.x, clientY: point.y, button: 0, pointerId: 1 };
-    const there = target.isConnected ? target : $("shot");
-    there.dispatchEvent(new PointerEvent(type, { bubbles: true, cancelable: true, ...where }));
-  };
-  send("pointerdown", from);
-  for (let k = 1; k <= 8; k += 1) send("pointermove", from.map((v, i) => v + (to[i] - v) * k / 8));
-  send("pointerup", to);
-  await settled();
-}
-(async () => {
-  const out = document.documentElement.dataset;
-  await settled();
-  key("ArrowRight");
-  await settled();
-  out.walked = $("where").textContent;
-  key("ArrowLeft"); key("ArrowDown"); key("ArrowUp");
-  await settled();
-  out.back = $("where").textContent;
-  const before = at(joint("platform", 2)), to = before.map((v) => v + 25);
-  await pulled(joint("platform", 2), before, to);
-  out.pulled = JSON.stringify([to, at(joint("platform", 2))]);
-  key("z", { ctrlKey: true });
-  await settled();
-  out.undone = JSON.stringify([before, at(joint("platform", 2))]);
-  for (const [end, leg, place] of PLACES) await pulled(joint(end, leg), at(joint(end, leg)), place);
-  out.said = $("said").textContent;
-  out.told = $("told").textContent;
-  await save();
-  out.saved = $("said").textContent;
-  document.querySelector("[data-shown=calibration]").click();
-  await settled();
-  out.calibrated = $("told").textContent;
-  out.overhang = document.documentElement.scrollWidth - document.documentElement.clientWidth;
-  out.faults = faults.join("; ");
-  out.done = "yes";
-})();
-"""
+
+SCRIPTS = Path(__file__).parent / "browser_scripts"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="NO CHROMIUM: the page was not opened in a browser")
-@pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
-def test_the_page_works_in_a_browser(session, demo, truth, tmp_path, monkeypatch, width):
-    """A user walks, pulls, undoes, pins two joints, and the machine snaps to its pose."""
-    template, before = server._template, (session / "session.yaml").read_text()
+def act(name):
+    """A script of ``browser_scripts``, behind what all of them use."""
+    return "".join((SCRIPTS / f"{one}.js").read_text() for one in ("common", name))
+
+
+def served_with(app, script, width):
+    """The application with a script before its bundle, and a page with it in a frame, which it
+    allows; browsers have no window as narrow as a phone.
+    """
+    from starlette.datastructures import MutableHeaders
+    from starlette.responses import HTMLResponse, Response
+
+    frame = FRAME.replace("page.html", "./").replace("WIDTH", str(width))
+
+    async def both(scope, receive, send):
+        async def framed(message):
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                policy = headers["content-security-policy"]
+                headers["content-security-policy"] = policy.replace(
+                    "frame-ancestors 'none'", "frame-ancestors 'self'"
+                )
+            await send(message)
+
+        if scope["path"] == f"/{TOKEN}/frame":
+            await HTMLResponse(frame)(scope, receive, send)
+        elif scope["path"].endswith(SCRIPT_FILE):
+            content = script + bundle_file(SCRIPT_FILE)
+            await Response(content, media_type="text/javascript")(scope, receive, send)
+        else:
+            await app(scope, receive, framed)
+
+    return both
+
+
+def browsed(view, script, width, folder, *options):
+    """Data that the script left on the root element of the page in a frame."""
     with serving.listening_socket(0) as socket_:
         port = socket_.getsockname()[1]
-        subject = Viewed(load_session(session), demo.calibration)
-        pane = subject.drawn(0, 0)
-        visible = pane.camera.project(apply(truth.T_camera_base[0], pane.points)).round(1).tolist()
-        places = [["platform", 2, visible[1][1]], ["base", 5, visible[0][4]]]
-        more = {"view.js": f"const PLACES = {json.dumps(places)};{ACT}"}
-        monkeypatch.setattr(server, "_template", lambda name: template(name) + more.get(name, ""))
-        app = server.application(subject, TOKEN, port)
+        app = served_with(view.application(TOKEN, port), script, width)
         # a thread of its own has no signals to be ended by: it ends with the tests
         threading.Thread(
             target=serving.serve_until_interrupted, args=(app, socket_), daemon=True
         ).start()
-        done = subprocess.run(
-            [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
-             "--disable-background-networking", f"--user-data-dir={tmp_path / 'profile'}",
-             "--enable-logging=stderr", "--v=0", f"--window-size={width},900",
-             "--virtual-time-budget=60000", "--dump-dom", f"http://127.0.0.1:{port}/{TOKEN}/"],
-            capture_output=True, text=True, timeout=240, check=True,
-        )  # fmt: skip
-    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", done.stderr), done.stderr
-    root = PageParts(done.stdout).tags[0][1]
-    assert root.get("data-done") == "yes", root
-    assert root["data-faults"] == ""
-    assert root["data-overhang"] == "0"
-    station, names = "station1", subject.session.configurations
-    assert root["data-walked"] == f"{station} / {names[1]}"
-    assert root["data-back"] == f"{station} / {names[0]}"
-    for name in ("pulled", "undone"):
-        wanted, there = json.loads(root[f"data-{name}"])
+        return browse(f"http://127.0.0.1:{port}/{TOKEN}/frame", folder, 1500, *options)
+
+
+def pairs(root, *names):
+    """Two pixels of each name."""
+    return [np.array(json.loads(root[name])) for name in names]
+
+
+@pytest.mark.parametrize("width", [1440, pytest.param(390, marks=pytest.mark.slow)])
+def test_a_session_is_worked_on_in_a_browser(session, demo, truth, tmp_path, width):
+    """A user walks, zooms, drags, undoes, places two joints, and saves the localized pose."""
+    before = (session / "session.yaml").read_text()
+    loaded = load_session(session)
+    pane = SessionContent(loaded, demo.calibration).nominal(0, 0)
+    pixels = pane.camera.project(apply(truth.T_camera_base[0], pane.points)).round(1).tolist()
+    places = [["platform", 2, pixels[1][1]], ["base", 5, pixels[0][4]]]
+    script = f"const PLACES = {json.dumps(places)};{act('session')}"
+    options = (*SOFTWARE, DARK) if width == 390 else SOFTWARE
+    root = browsed(
+        pkmcal.view(session, calibration=demo.calibration), script, width, tmp_path, *options
+    )
+    assert (root["faults"], root["overhang"]) == ("", "0")
+    station, images = loaded.stations[0], sum(len(one.images) for one in loaded.stations)
+    names = [loaded.configurations[one.configuration] for one in station.images]
+    assert root["next"] == f"{station.name} / {names[1]}"
+    assert root["back"] == f"{station.name} / {names[0]}"
+    # the image has all its pixels; every image is in the list, with its mark
+    assert root["size"] == "{}x{}".format(*station.camera.image_size)
+    assert int(root["thumbnails"]) == images
+    marks = json.loads(root["marks"])
+    assert len(marks) == images
+    assert "wrong" in marks
+    number = re.compile(r"-?\d+(?:\.\d+)?")
+    whole, zoomed = (
+        [float(x) for x in number.findall(text.replace("\u2212", "-"))]
+        for text in json.loads(root["zoomed"])
+    )
+    np.testing.assert_allclose(zoomed[:2], whole[:2], atol=0.11)  # of a tenth each
+    assert zoomed[2] > 5 * whole[2]
+    for wanted, there in pairs(root, "unmoved", "pulled", "undone", "pinched", "panned"):
         np.testing.assert_allclose(there, wanted, atol=0.2)  # of a tenth, and of the screen's grid
-    assert root["data-said"].startswith("Recognised in")
-    assert root["data-told"].startswith("It fits")
-    assert root["data-saved"].startswith(f"The pose of {station} is in session.yaml")
-    assert "px from the calibrated machine" in root["data-calibrated"]
+    ((old, new),) = pairs(root, "farther")
+    assert np.abs(new - old).max() > 1
+    assert int(root["measured"]) > 0
+    assert (root["ghosts"], root["during"].strip(), root["filled"]) == ("0", "session-fit", "1")
+    assert root["changed"] == "true"
+    # then all images of the station fit
+    assert root["status"] == root["saved"] == "session-status good"
+    assert root["fitted"] == root["calibrated"] == "session-fit good"
+    marks = json.loads(root["remarks"])[: len(station.images)]
+    assert "wrong" not in marks
+    assert root["stage"] == "true"
     assert (session / "session.yaml").read_text() != before
-    load_session(session)
+    angle, _ = off(load_session(session).stations[0].T_camera_base, truth.T_camera_base[0])
+    assert angle < 1.0
+
+
+@pytest.mark.parametrize("width", [1440, pytest.param(390, marks=pytest.mark.slow)])
+def test_a_folder_leads_to_a_report_in_a_browser(results, tmp_path, width):
+    root = browsed(pkmcal.view(results), act("folder"), width, tmp_path, *SOFTWARE)
+    assert (root["faults"], root["overhang"], root["wide"]) == ("", "0", "0")
+    row = json.loads(root["row"])
+    assert row[0] == "bench/calibration/report.html"
+    assert row[1] == root["title"]
+    assert "\u2192" in row[4]
+    assert root["images"] == "true"

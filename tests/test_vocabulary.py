@@ -62,7 +62,7 @@ ALLOWED = {
     "tells": "a key of the document of `check`",
     "known": "an argument of `pkmcal.compare`",
     "asked": "an argument of `pkmcal.simulate`",
-    "shown": "a key of the requests of the page of `view`",
+    "shown": "a key of the viewer's documents",
     "left": "the opposite of right",
     "drawing": "a column of the public table of parameters, and keys of documents",
     "by_drawing": "a key of calibration.json",
@@ -72,7 +72,7 @@ ALLOWED = {
     "photographs": "a key of the documents of `check`",
     "rejected_photographs": "a key of calibration.json",
     "DRAWING_COLOUR": "a colour of the pages' style sheet",
-    "ask": "a message to the page of `view` in its test",
+    "ask": "a message to a page in its test",
 }
 """Names that are part of a file, of the command line or of Python's public interface."""
 

@@ -43,8 +43,6 @@ from pkmcal.report.plan import outcome_of
 from pkmcal.session.load import Session
 from pkmcal.simulation import load_truth, simulate_session, true_machine
 from pkmcal.simulation.demo import DEMO_MECHANISM, DEMO_SEED, DEMO_SETTINGS
-from pkmcal.view.content import Viewed
-from pkmcal.view.server import application
 from pkmcal.web.report_page import report_page
 from pkmcal.web.serving import (
     LOOPBACK_ADDRESS,
@@ -293,7 +291,7 @@ def served(session: Session) -> str:
     """The address at which a session is to be viewed, until this program ends."""
     socket_, token = listening_socket(0), new_token()
     port = socket_.getsockname()[1]
-    app = application(Viewed(session, None), token, port)
+    app = pkmcal.view(session.folder).application(token, port)
     Thread(target=serve_until_interrupted, args=(app, socket_), daemon=True).start()
     return f"http://{LOOPBACK_ADDRESS}:{port}/{token}/"
 

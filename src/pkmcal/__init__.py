@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from pkmcal.api.simulate import simulate
     from pkmcal.api.study import study
     from pkmcal.api.validate import validate
+    from pkmcal.api.view import view
     from pkmcal.api.watch import watch
     from pkmcal.cameras import load_camera
     from pkmcal.judge.machine_errors import compare
@@ -63,6 +64,7 @@ __all__ = [
     "simulate",
     "study",
     "validate",
+    "view",
     "watch",
 ]
 
@@ -87,6 +89,7 @@ _HOMES = {
     "simulate": "pkmcal.api.simulate",
     "study": "pkmcal.api.study",
     "validate": "pkmcal.api.validate",
+    "view": "pkmcal.api.view",
     "watch": "pkmcal.api.watch",
 }
 """Modules of the public names."""

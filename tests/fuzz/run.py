@@ -143,20 +143,22 @@ def _read_camera(path: Path) -> None:
 def _look_at(folder: Path) -> None:
     """Requests of the page of `pkmcal view` for every station, without serving it."""
     from pkmcal.session.load import load_session
-    from pkmcal.view.content import Viewed
-    from pkmcal.view.edge_search import edge_search
-    from pkmcal.view.overlay import overlay_after_gesture
-    from pkmcal.view.requests import ViewRequest
-    from pkmcal.view.server import view_page_html
+    from pkmcal.viewing.content import SessionContent
+    from pkmcal.viewing.edge_search import edge_search
+    from pkmcal.viewing.overlay import overlay_after_gesture
+    from pkmcal.viewing.server import session_document
+    from pkmcal.web.page import served_page
+    from pkmcal.web.session_document import ViewRequest
 
-    viewed = Viewed(load_session(folder), None)
-    view_page_html(viewed)
-    for k, station in enumerate(viewed.session.stations):
+    content = SessionContent(load_session(folder), None)
+    served_page(session_document(content))
+    for k, station in enumerate(content.session.stations):
         if station.images:
-            viewed.jpeg(k, 0)
+            content.jpeg(k, 0)
+            content.thumbnail(k, 0)
             edges = ViewRequest(station=k, image=0)
-            overlay_after_gesture(viewed, edges)
-            edge_search(viewed, edges)
+            overlay_after_gesture(content, edges)
+            edge_search(content, edges)
 
 
 def listing(place: Path) -> dict[str, tuple[int, ...]]:

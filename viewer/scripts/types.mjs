@@ -24,7 +24,14 @@ const strip = (node) => {
   }
 };
 strip(schema);
-const text = await compile(schema, "ViewerDocument", {
+// an object with every type, so that those of a served page's messages are generated too
+const { $defs, oneOf } = schema;
+const every = { ...$defs, ViewerDocument: { oneOf } };
+const properties = Object.fromEntries(
+  Object.keys(every).map((name) => [name, { $ref: `#/$defs/${name}` }]),
+);
+const root = { type: "object", properties, required: Object.keys(every), $defs: every };
+const text = await compile(root, "EveryType", {
   additionalProperties: false,
   bannerComment: "// Generated from src/pkmcal/web/schema.json by `npm run types`; do not edit.",
 });

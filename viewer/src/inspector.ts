@@ -6,7 +6,7 @@
 import "./inspector.css";
 import type { Image, Layer } from "./document";
 import { h, number, svg } from "./dom";
-import { cameraPixel, imageSvg, scaleMarks, uprightSize } from "./overlay";
+import { cameraPixel, imageSvg, replaceLayers, scaleMarks, uprightSize } from "./overlay";
 import type { Key } from "./selection";
 import { stripPanel } from "./strips";
 
@@ -17,8 +17,19 @@ const KEY_PAN = 0.15; // of the window
 
 const CLICK_DISTANCE = 4; // screen pixels that a pointer may move between down and up
 
+export type Pixel = [number, number];
+/** What a drag does in place of moving the image; pixels are the camera's. */
+export interface DragTool {
+  /** Whether the drag that begins here is the tool's; scale: screen pixels for one of the image. */
+  start: (at: Pixel, scale: number, event: PointerEvent) => boolean;
+  move: (at: Pixel, event: PointerEvent) => void;
+  /** cancelled: by a second finger, or by the browser. */
+  end: (cancelled: boolean) => void;
+}
+
 /** Titles and keys of the layers. */
 const LAYERS: Record<Layer["name"], { title: string; key: string }> = {
+  machine: { title: "Machine", key: "m" },
   edges: { title: "Edges", key: "e" },
   rejected: { title: "Not used", key: "u" },
   joints: { title: "Joints", key: "j" },
@@ -45,6 +56,7 @@ export class Inspector {
   private chosen = -1;
   private curve: SVGElement[] = [];
   private readonly off = new Set<LayerName>();
+  private dragging = false; // by the tool
   private readonly pointers = new Map<number, { x: number; y: number }>();
   private size = { x: 0, y: 0, width: 1, height: 1 };
   /** Image pixel at the window's middle, and screen pixels for one of the image. */
@@ -53,8 +65,13 @@ export class Inspector {
   /**
    * step : shows the image before (-1) or the next one (1).
    * follow : shows the image of a key, to which an arrow leads.
+   * tool : of drags with the main button.
    */
-  constructor(private readonly step: (by: number) => void, private readonly follow: (key: Key) => void) {
+  constructor(
+    private readonly step: (by: number) => void,
+    private readonly follow: (key: Key) => void,
+    private readonly tool: DragTool | null = null,
+  ) {
     this.gamma = h("input", {
       type: "range", min: 0.2, max: 1.8, step: 0.05, value: 1, "aria-label": "Brightness of the dark parts",
       oninput: () => this.brighten(),
@@ -66,6 +83,7 @@ export class Inspector {
       "div",
       { class: "inspector", tabindex: -1 },
       this.host,
+      this.where,
       this.tip,
       this.strip,
       h(
@@ -80,7 +98,6 @@ export class Inspector {
         this.layers,
         this.strips,
         h("label", { class: "inspector-gamma" }, "Dark parts", this.gamma),
-        this.where,
       ),
     );
     this.listen();
@@ -93,6 +110,15 @@ export class Inspector {
     this.chooseStrip(-1);
     this.replaceOverlay(Math.min(this.overlay, Math.max(image.overlays.length - 1, 0)));
     this.fit();
+  }
+
+  /** Replace the shapes over the image; zoom, layers and brightness stay. */
+  setOverlays(overlays: Image["overlays"]): void {
+    if (!this.image || !this.picture) return;
+    this.image = { ...this.image, overlays };
+    replaceLayers(this.picture, this.image, this.overlay);
+    scaleMarks(this.picture, 1 / this.view.scale);
+    this.addLayers(overlays[this.overlay]?.layers ?? []);
   }
 
   /** Draw the image with one of its overlays. */
@@ -113,6 +139,7 @@ export class Inspector {
           this.draw();
         },
       }, title))));
+    this.layers.replaceChildren();
     this.addLayers(image.overlays[overlay]?.layers ?? []);
     this.brighten();
     this.markStrip();
@@ -122,7 +149,7 @@ export class Inspector {
   /** Take the focus that a button had which is gone, so that keys keep their meaning. */
   private keepFocus(): void {
     const focused = document.activeElement as HTMLElement | null;
-    if (!focused || focused === document.body || focused.hidden) this.element.focus();
+    if (!focused || focused === document.body || focused.hidden) this.element.focus({ preventScroll: true });
   }
 
   /** Show the strip of an edge below the image, none for an index without one. */
@@ -226,9 +253,11 @@ export class Inspector {
     else image?.setAttribute("filter", "url(#inspector-tones)");
   }
 
+  /** Buttons of layers that have none yet. */
   private addLayers(layers: Layer[]): void {
-    this.layers.replaceChildren(
-      ...layers.filter((layer) => layer.shapes.length).map(({ name }) =>
+    const own = [...this.layers.children].map((button) => (button as HTMLElement).dataset.layer);
+    this.layers.append(
+      ...layers.filter((layer) => layer.shapes.length && !own.includes(layer.name)).map(({ name }) =>
         h("button", {
           type: "button", "data-layer": name, title: `Key ${LAYERS[name].key}`, onclick: () => this.toggle(name),
         }, LAYERS[name].title)),
@@ -275,12 +304,14 @@ export class Inspector {
       down = { x: event.clientX, y: event.clientY };
       pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
       host.setPointerCapture(event.pointerId);
+      if (this.dragging) this.endDrag(true); // a second finger: both zoom
+      else if (pointers.size === 1 && event.button === 0 && this.tool) {
+        this.dragging = this.tool.start(this.pixelAt(event), this.view.scale, event);
+      }
     });
-    const up = (event: PointerEvent): void => {
-      pointers.delete(event.pointerId);
-    };
     host.addEventListener("pointerup", (event) => {
-      up(event);
+      pointers.delete(event.pointerId);
+      if (this.dragging) return this.endDrag(false);
       if (Math.hypot(event.clientX - down.x, event.clientY - down.y) > CLICK_DISTANCE) return;
       const { strip, key } = this.shapeAt(event)?.dataset ?? {};
       if (strip !== undefined) this.chooseStrip(Number(strip));
@@ -289,11 +320,15 @@ export class Inspector {
     host.addEventListener("pointerleave", () => {
       this.tip.hidden = true;
     });
-    host.addEventListener("pointercancel", up);
+    host.addEventListener("pointercancel", (event) => {
+      pointers.delete(event.pointerId);
+      if (this.dragging) this.endDrag(true);
+    });
     host.addEventListener("pointermove", (event) => {
       this.locate(event);
       const last = pointers.get(event.pointerId);
       if (!last) return;
+      if (this.dragging) return this.tool?.move(this.pixelAt(event), event);
       const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
       const now = { x: event.clientX, y: event.clientY };
       pointers.set(event.pointerId, now);
@@ -309,18 +344,30 @@ export class Inspector {
       this.view.y -= (share * (now.y - last.y)) / this.view.scale;
       this.draw();
     });
-    new ResizeObserver(() => {
+    // a frame later: what is drawn may change the size of the bar, and with it that of the window
+    new ResizeObserver(() => requestAnimationFrame(() => {
       this.view.scale = Math.max(this.view.scale, this.smallest());
       this.draw();
-    }).observe(host);
+    })).observe(host);
   }
 
-  /** Coordinates of the pixel under the pointer; pixel centres are at integers. */
-  private locate(event: PointerEvent): void {
+  private endDrag(cancelled: boolean): void {
+    this.dragging = false;
+    this.tool?.end(cancelled);
+  }
+
+  /** Camera's pixel under the pointer; pixel centres are at integers. */
+  private pixelAt(event: PointerEvent): Pixel {
     const box = this.host.getBoundingClientRect();
     const x = this.view.x + (event.clientX - box.left - box.width / 2) / this.view.scale;
     const y = this.view.y + (event.clientY - box.top - box.height / 2) / this.view.scale;
-    const [u, v] = this.image ? cameraPixel(this.image, x, y) : [x, y];
+    return this.image ? cameraPixel(this.image, x, y) : [x, y];
+  }
+
+  /** Coordinates and explanation of what is under the pointer. */
+  private locate(event: PointerEvent): void {
+    const box = this.host.getBoundingClientRect();
+    const [u, v] = this.pixelAt(event);
     const scale = number(this.view.scale, this.view.scale < 10 ? 1 : 0);
     this.where.textContent = `x ${number(u, 1)}, y ${number(v, 1)} px · ${scale}×`;
     const text = this.pointers.size ? "" : this.shapeAt(event)?.dataset.tip;

@@ -3,8 +3,10 @@
 import "./style.css";
 import type { ViewerDocument } from "./document";
 import { h } from "./dom";
+import { folderView } from "./views/folder";
 import { machineView } from "./views/machine";
 import { reportView } from "./views/report";
+import { sessionView } from "./views/session";
 
 const VERSION = 1;
 
@@ -18,8 +20,12 @@ function start(): void {
     host.append(h("p", { class: "note" }, "This page was written by another version of pkmcal."));
     return;
   }
-  if (content.kind === "machine") machineView(host, content);
-  else reportView(host, content);
+  switch (content.kind) {
+    case "machine": return machineView(host, content);
+    case "report": return reportView(host, content);
+    case "session": return sessionView(host, content);
+    case "folder": return folderView(host, content);
+  }
 }
 
 start();

@@ -35,17 +35,24 @@ export function cameraPixel(image: Image, x: number, y: number): [number, number
 export function imageSvg(image: Image, overlay = 0): SVGSVGElement {
   const { width, height } = uprightSize(image);
   const frame = { x: -0.5, y: -0.5, width: image.width, height: image.height };
-  const background = image.webp
-    ? svg("image", { ...frame, preserveAspectRatio: "none", href: toBlobUrl(image.webp) })
+  const href = image.url || (image.webp && toBlobUrl(image.webp));
+  const background = href
+    ? svg("image", { ...frame, preserveAspectRatio: "none", href })
     : svg("rect", { ...frame, class: "absent" });
-  const layers = image.overlays[overlay]?.layers ?? [];
   const picture = svg("svg", {
     class: "shot", role: "img", viewBox: `-0.5 -0.5 ${width} ${height}`,
     "aria-label": [image.title, image.caption].filter(Boolean).join(": "),
   }, svg("g", { transform: `matrix(${uprightMatrix(image).join(" ")})` },
-    background, ...layers.map((layer) => layerGroup(layer, image))));
+    background, svg("g", { class: "overlay" })));
+  replaceLayers(picture, image, overlay);
   scaleMarks(picture, width / 660);
   return picture;
+}
+
+/** Draw an overlay in place of the one before; its marks need `scaleMarks`. */
+export function replaceLayers(picture: SVGSVGElement, image: Image, overlay: number): void {
+  const layers = image.overlays[overlay]?.layers ?? [];
+  picture.querySelector(".overlay")?.replaceChildren(...layers.map((layer) => layerGroup(layer, image)));
 }
 
 /** Give rings, crosses and arrowheads their size: image pixels for one of their units. */
@@ -56,7 +63,7 @@ export function scaleMarks(picture: SVGSVGElement, unit: number): void {
 }
 
 function layerGroup(layer: Layer, image: Image): SVGElement {
-  const halo = layer.name === "edges" ? [svg("path", { class: "halo", d: layer.shapes.map(pathData).join("") })] : [];
+  const halo = layer.name === "edges" || layer.name === "machine" ? [svg("path", { class: "halo", d: layer.shapes.map(pathData).join("") })] : [];
   return svg("g", { class: `layer ${layer.name}`, "data-layer": layer.name },
     ...halo, ...layer.shapes.map((shape) => shapeGroup(shape, layer, image)));
 }
@@ -81,7 +88,8 @@ function shapeGroup(shape: Shape, layer: Layer, image: Image): SVGElement {
     }
     case "ring": {
       const r = layer.name === "corners" ? 3 : 6;
-      const ring = mark(shape.at, upright, svg("circle", { class: "halo", r }), svg("circle", { class: "line", r }));
+      const ring = mark(shape.at, upright, svg("circle", { class: "halo", r }),
+        svg("circle", { class: shape.filled ? "line filled" : "line", r }));
       if (shape.label) {
         const label = svg("text", { x: 8.4, y: 14.4 });
         label.textContent = shape.label;

@@ -18,9 +18,6 @@ from pkmcal.mechanisms import Machine
 if TYPE_CHECKING:
     from pkmcal.web.document import MachineDocument
 
-PAGE_MARK = b'<meta name="generator" content="pkmcal viewer">'
-"""Element of the pages that are written here, and of no other page."""
-
 
 @dataclass(frozen=True)
 class MachineView:
@@ -67,16 +64,17 @@ class MachineView:
 
     def save(self, path: Path | str) -> None:
         """Write the page. Raises InputError where another program's file has this name."""
+        from pkmcal.files import write_text
+        from pkmcal.web.page import PAGE_MARK
+
         path = Path(path)
         regular = path.is_file() and not path.is_symlink()
-        if os.path.lexists(path) and not (regular and PAGE_MARK in path.read_bytes()):
+        if os.path.lexists(path) and not (regular and PAGE_MARK.encode() in path.read_bytes()):
             raise InputError(
                 "this is not a page of the viewer, and stays as it is",
                 where=str(path),
                 next_step="Name another file with -o",
             )
-        from pkmcal.files import write_text
-
         write_text(path, self.html)
 
     def served(self) -> MachineDocument:

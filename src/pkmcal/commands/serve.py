@@ -21,18 +21,9 @@ def serve(
     application : from the page's token and port. port : 0 for a free one.
     Raises InputError if the port is taken.
     """
-    from pkmcal.web.serving import (
-        LOOPBACK_ADDRESS,
-        listening_socket,
-        new_token,
-        serve_until_interrupted,
-    )
+    from pkmcal.web import serving
 
-    token = new_token()
-    with listening_socket(port) as socket_:
-        port = socket_.getsockname()[1]
-        address = f"http://{LOOPBACK_ADDRESS}:{port}/{token}/"
-        app = application(token, port)
+    def announce(address: str) -> None:
         if as_json:
             console.print_json({"url": address})
         else:
@@ -44,5 +35,6 @@ def serve(
             import webbrowser
 
             webbrowser.open(address)
-        serve_until_interrupted(app, socket_)
+
+    serving.serve(application, port, announce)
     return 0

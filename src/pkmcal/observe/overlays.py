@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -81,14 +82,13 @@ class Spot:
     """Joint centre in pixels, of the calibrated and of the nominal model.
 
     leg : from 1.
-    end : base or platform.
     calibrated : pixel by the model of the overlay.
     nominal : pixel by the nominal model, None without comparison.
     labelled : whether the leg's number stands here.
     """
 
     leg: int
-    end: str
+    end: Literal["base", "platform"]
     calibrated: tuple[float, float]
     nominal: tuple[float, float] | None
     labelled: bool
@@ -263,7 +263,8 @@ def _spots(pixel: Array, visible: Booleans, width: int) -> tuple[Spot, ...]:
         for end in at:
             x, y = pixel[end, j]
             place = round(float(x), 1), round(float(y), 1)
-            spots.append(Spot(j + 1, ("base", "platform")[end], place, None, end == best))
+            name: Literal["base", "platform"] = "platform" if end else "base"
+            spots.append(Spot(j + 1, name, place, None, end == best))
         if best is not None:
             labels.append(pixel[best, j])
     return tuple(spots)

@@ -12,6 +12,7 @@ import json
 from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
+from pydantic.json_schema import models_json_schema
 
 from pkmcal.files import Schema
 from pkmcal.outcome.blocks import Block
@@ -20,6 +21,7 @@ from pkmcal.outcome.blocks.log_bar import LogBar
 from pkmcal.outcome.blocks.machine import Configuration, Machine
 from pkmcal.outcome.blocks.text import Fact
 from pkmcal.outcome.finding import Mark
+from pkmcal.web import session_document as session
 
 
 class Sweep(Schema):
@@ -131,13 +133,72 @@ class ReportDocument(Head):
     sections: tuple[Section, ...]
 
 
-ViewerDocument = Annotated[MachineDocument | ReportDocument, Field(discriminator="kind")]
+class SessionDocument(Head):
+    """Page of a session, which requests images, overlays and the stage from the program.
+
+    legs : number of legs.
+    calibration : its folder; empty for none. report : address of its report, relative to the page;
+        empty for none.
+    """
+
+    kind: Literal["session"] = "session"
+    legs: int
+    calibration: Text
+    report: str
+    stations: tuple[session.SessionStation, ...]
+
+
+class FolderEntry(Schema):
+    """Session or result in a folder.
+
+    name : path in the folder. href : of its page, relative to the list's; empty if it cannot be
+        opened.
+    title : of its page. date : of the result; empty where it has none.
+    mark, text : verdict, or why it cannot be opened.
+    before, after : tool errors by the nominal model and after the calibration; empty without them.
+    """
+
+    name: Text
+    href: str
+    title: Text
+    date: Text
+    mark: Mark | None
+    text: Text
+    before: Text
+    after: Text
+
+
+class FolderDocument(Head):
+    """Page of a folder with sessions and results.
+
+    note : on what is not listed.
+    """
+
+    kind: Literal["folder"] = "folder"
+    entries: tuple[FolderEntry, ...]
+    note: Text
+
+
+PageDocument = MachineDocument | ReportDocument
+"""Document of a page in one file."""
+AnyDocument = PageDocument | SessionDocument | FolderDocument
+ViewerDocument = Annotated[AnyDocument, Field(discriminator="kind")]
+_MESSAGES = (
+    session.ViewRequest,
+    session.OverlayAnswer,
+    session.EdgesAnswer,
+    session.LocalizationAnswer,
+    session.SavedAnswer,
+)
+"""Requests of a session's page and the answers to them, whose types the viewer has too."""
 
 
 def schema_text() -> str:
-    """JSON schema of ``ViewerDocument``, the content of ``schema.json``."""
-    schema = TypeAdapter[MachineDocument | ReportDocument](ViewerDocument).json_schema(
-        mode="serialization"
+    """JSON schema of ``ViewerDocument``, with those of the pages' messages: ``schema.json``."""
+    (_, definitions) = models_json_schema(
+        [(one, "serialization") for one in _MESSAGES], ref_template="#/$defs/{model}"
     )
+    schema = TypeAdapter[AnyDocument](ViewerDocument).json_schema(mode="serialization")
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return json.dumps({**dialect, **schema}, indent=2) + "\n"
+    own = {**schema["$defs"], **definitions["$defs"]}
+    return json.dumps({**dialect, **schema, "$defs": own}, indent=2) + "\n"

@@ -18,7 +18,7 @@ REFUSED_REQUEST_TEXT = (
     "This page opens with the whole address that pkmcal printed, token included.\n"
 )
 RESPONSE_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; img-src 'self' data:; style-src 'self';"
+    "Content-Security-Policy": "default-src 'none'; img-src 'self' data: blob:; style-src 'self';"
     " script-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none';"
     " frame-ancestors 'none'",
     "Cache-Control": "no-store",

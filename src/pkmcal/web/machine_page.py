@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -15,13 +14,12 @@ from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome.blocks.base import Pose
+from pkmcal.outcome.blocks.machine import Configuration
 from pkmcal.outcome.blocks.machine import Machine as MachineShape
 from pkmcal.web import document as shapes
 from pkmcal.web import serving
-from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.guard import Guard
 from pkmcal.web.motion import Postures, home_posture, moved, sweeps
-from pkmcal.web.page import served_page
 from pkmcal.web.stage import configurations, leg_rows, machine_shape, slider_ranges
 from pkmcal.wording import count
 
@@ -118,8 +116,14 @@ class PoseRequest(Schema):
     T_base_platform: Pose
 
 
-def configuration_at(machine: Machine, request: PoseRequest) -> dict[str, Any]:
-    """Response to a request: the configuration, or null where the way to it has no pose.
+class PoseAnswer(Schema):
+    """Configuration after the change; null where the way to it has no pose."""
+
+    configuration: Configuration | None
+
+
+def configuration_at(machine: Machine, request: PoseRequest) -> PoseAnswer:
+    """Response to a request.
 
     Raises InputError for readings or a pose that do not belong to the machine.
     """
@@ -144,33 +148,20 @@ def configuration_at(machine: Machine, request: PoseRequest) -> dict[str, Any]:
         )
     after = moved(machine, posture, request.index, request.value, high - low)
     if not after.closed.all():
-        return {"configuration": None}
+        return PoseAnswer(configuration=None)
     (shape,) = configurations(machine, after)
-    return {"configuration": shape.model_dump(mode="json")}
+    return PoseAnswer(configuration=shape)
 
 
 def application(machine: Machine, document: shapes.MachineDocument, token: str, port: int) -> Guard:
     """ASGI application: the page at /TOKEN/, its bundle, and the poses that it asks for."""
-    from starlette.requests import Request
-    from starlette.responses import HTMLResponse, Response
     from starlette.routing import Route
 
-    async def page(_request: Request) -> Response:
-        return HTMLResponse(served_page(document))
-
-    async def script(_request: Request) -> Response:
-        return Response(bundle_file(SCRIPT_FILE), media_type="text/javascript")
-
-    async def style(_request: Request) -> Response:
-        return Response(bundle_file(STYLE_FILE), media_type="text/css")
-
-    def pose(request: PoseRequest) -> dict[str, Any]:
+    def pose(request: PoseRequest) -> PoseAnswer:
         return configuration_at(machine, request)
 
     routes = [
-        Route("/", page),
-        Route(f"/{SCRIPT_FILE}", script),
-        Route(f"/{STYLE_FILE}", style),
+        *serving.page_routes(document),
         Route("/pose", serving.json_endpoint(PoseRequest, pose), methods=["POST"]),
     ]
     return serving.application(routes, token, port)

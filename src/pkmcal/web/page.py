@@ -13,13 +13,16 @@ from html import escape
 from typing import Any
 
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
-from pkmcal.web.document import MachineDocument, ReportDocument
+from pkmcal.web.document import AnyDocument, PageDocument
 
+PAGE_MARK = '<meta name="generator" content="pkmcal viewer">'
+"""Element of the pages that are written here, and of no other page."""
+DOCUMENT_START, DOCUMENT_END = '<script type="application/json" id="document">', "</script>"
 FRAME_HEIGHT = 700
 """Height of a page in a notebook, px."""
 
 
-def standalone_page(document: MachineDocument | ReportDocument) -> str:
+def standalone_page(document: PageDocument) -> str:
     """Page in one file that opens without a network."""
     script, style = bundle_file(SCRIPT_FILE), bundle_file(STYLE_FILE)
     policy = (
@@ -34,7 +37,7 @@ def standalone_page(document: MachineDocument | ReportDocument) -> str:
     )
 
 
-def served_page(document: MachineDocument | ReportDocument) -> str:
+def served_page(document: AnyDocument) -> str:
     """Page beside which a server has the bundle; the server's headers hold its policy."""
     return _shell(
         document,
@@ -56,14 +59,14 @@ def _hash_source(text: str) -> str:
     return f"'sha256-{b64encode(sha256(text.encode('utf-8')).digest()).decode('ascii')}'"
 
 
-def _shell(document: MachineDocument | ReportDocument, head: str, end: str) -> str:
+def _shell(document: AnyDocument, head: str, end: str) -> str:
     return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
-<meta name="generator" content="pkmcal viewer">
+{PAGE_MARK}
 <title>{escape(document.title)}</title>
 <link rel="icon" href="data:,">
 {head}
@@ -71,14 +74,14 @@ def _shell(document: MachineDocument | ReportDocument, head: str, end: str) -> s
 <body>
 <div id="viewer"><noscript><p>{escape(document.title)}: this page is drawn by a script, and scripts
 are switched off in this browser.</p></noscript></div>
-<script type="application/json" id="document">{embedded_json(document)}</script>
+{DOCUMENT_START}{embedded_json(document)}{DOCUMENT_END}
 {end}
 </body>
 </html>
 """
 
 
-def embedded_json(document: MachineDocument | ReportDocument) -> str:
+def embedded_json(document: AnyDocument) -> str:
     """Document inside a script element; see :func:`script_json`."""
     return script_json(document.model_dump(mode="json"))
 

@@ -10,13 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import Document, Schema, json_value, next_step_after, validated_document
+from pkmcal.files import Document, Schema, next_step_after, validated_document
+from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.guard import Guard
+from pkmcal.web.page import served_page
 
 if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.responses import Response
     from starlette.routing import BaseRoute
+
+    from pkmcal.web.document import AnyDocument
 
 TOKEN_BYTES = 24
 LOOPBACK_ADDRESS = "127.0.0.1"
@@ -62,8 +66,29 @@ def application(routes: Sequence[BaseRoute], token: str, port: int) -> Guard:
     return Guard(Starlette(routes=[Mount(f"/{token}", routes=routes)]), token, port)
 
 
+def page_routes(document: AnyDocument) -> list[BaseRoute]:
+    """Routes of a page: the document in its shell, and the viewer's bundle."""
+    from starlette.responses import HTMLResponse, Response
+    from starlette.routing import Route
+
+    async def page(_request: Request) -> Response:
+        return HTMLResponse(served_page(document))
+
+    async def script(_request: Request) -> Response:
+        return Response(bundle_file(SCRIPT_FILE), media_type="text/javascript")
+
+    async def style(_request: Request) -> Response:
+        return Response(bundle_file(STYLE_FILE), media_type="text/css")
+
+    return [
+        Route("/", page),
+        Route(f"/{SCRIPT_FILE}", script),
+        Route(f"/{STYLE_FILE}", style),
+    ]
+
+
 def json_endpoint(
-    schema: type[SomeRequest], respond: Callable[[SomeRequest], dict[str, Any]]
+    schema: type[SomeRequest], respond: Callable[[SomeRequest], Schema]
 ) -> Callable[[Request], Any]:
     """Endpoint of requests by POST, each a JSON document that is validated as files are, because
     a page may be older than the program.
@@ -88,8 +113,8 @@ def checked_request(body: bytes, schema: type[SomeRequest]) -> SomeRequest:
     return validated_document(Document(Path("the page"), "the page", data, {}), schema)
 
 
-async def response_of(work: Callable[[], Any]) -> Response:
-    """Response with the result of the work, or with its error as JSON; never a traceback."""
+async def response_of(work: Callable[[], Response | Schema]) -> Response:
+    """Response of the work, or with its result or its error as JSON; never a traceback."""
     from starlette.concurrency import run_in_threadpool
     from starlette.responses import JSONResponse, Response
 
@@ -111,7 +136,25 @@ async def response_of(work: Callable[[], Any]) -> Response:
             next_step="Report it",
         )
         return JSONResponse(message.as_dict(), 500)
-    return done if isinstance(done, Response) else JSONResponse(json_value(done))
+    if isinstance(done, Schema):
+        return Response(done.model_dump_json(), media_type="application/json")
+    return done
+
+
+def serve(
+    application: Callable[[str, int], Guard], port: int, announce: Callable[[str], object]
+) -> None:
+    """Serve a page until the program is interrupted.
+
+    application : from the page's token and port. port : 0 for a free one. announce : called with
+    the address. Raises InputError if the port is taken.
+    """
+    token = new_token()
+    with listening_socket(port) as socket_:
+        port = socket_.getsockname()[1]
+        app = application(token, port)
+        announce(f"http://{LOOPBACK_ADDRESS}:{port}/{token}/")
+        serve_until_interrupted(app, socket_)
 
 
 def serve_until_interrupted(app: Guard, socket_: socket.socket) -> None:

@@ -15,7 +15,7 @@ from pkmcal.files import Schema
 from pkmcal.outcome.blocks.base import Key, Text
 
 Pixel = tuple[float, float]
-LayerName = Literal["edges", "rejected", "joints", "nominal", "corners", "residuals"]
+LayerName = Literal["machine", "edges", "rejected", "joints", "nominal", "corners", "residuals"]
 
 
 class Polyline(Schema):
@@ -36,7 +36,11 @@ class Polyline(Schema):
 
 
 class Ring(Schema):
-    """Circle of a fixed size around a pixel; label : text beside it, such as a leg's number."""
+    """Circle of a fixed size around a pixel.
+
+    label : text beside it, such as a leg's number.
+    filled : the joint was placed here by hand.
+    """
 
     shape: Literal["ring"] = "ring"
     at: Pixel
@@ -44,6 +48,7 @@ class Ring(Schema):
     tip: Text = ""
     dashed: bool = False
     label: Text = ""
+    filled: bool = False
 
 
 class Cross(Schema):
@@ -123,6 +128,7 @@ class Image(Schema):
     width, height : of the camera's image, px.
     quarter_turns : clockwise, that turn it upright, as EXIF says.
     webp : base64, of at most these pixels; empty if the file cannot be read.
+    url : of the image beside a page that is served, in place of ``webp``.
     overlays : of which a viewer shows one at a time.
     strip_webp : the strips one below the other, base64; empty without any.
     """
@@ -135,6 +141,7 @@ class Image(Schema):
     height: int
     quarter_turns: int = 0
     webp: str = ""
+    url: str = Field(default="", pattern=r"^(image/\d+/\d+)?$")
     overlays: tuple[Overlay, ...] = ()
     strip_webp: str = ""
     strips: tuple[Strip, ...] = ()

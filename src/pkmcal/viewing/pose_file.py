@@ -9,7 +9,7 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import resolved, with_numbers, write_bytes
 from pkmcal.session.load import SESSION_FILE_NAME, Station
-from pkmcal.view.overlay import place_of
+from pkmcal.viewing.overlay import place_of
 
 
 class PoseFile:

@@ -1,4 +1,4 @@
-"""Contents of the page: a session image by image, and its calibration if there is one.
+"""Contents of a session's page: its images, and its calibration if there is one.
 
 An image is decoded, and anything computed from it, only when it is displayed.
 """
@@ -19,7 +19,7 @@ from pkmcal.cameras.response import Response
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.images import decode
+from pkmcal.observe.images import decode, upright_turns
 from pkmcal.session.image_files import Image, label_of
 from pkmcal.session.load import Session, Station
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 DECODED_IMAGES_CACHED = 16
 """Decoded images in the cache, for going back and forth between a few of them."""
-WIDEST_VIEWED_PICTURE = 1600
-"""Width of a displayed image, px; a screen has no more room for it beside two columns."""
-VIEWED_JPEG_QUALITY = 88
+IMAGE_JPEG_QUALITY = 95
+"""Quality of images that are inspected to single pixels."""
+THUMBNAIL_WIDTH, THUMBNAIL_JPEG_QUALITY = 180, 75
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Pane:
         return np.stack([ends.a, ends.b])
 
 
-class Viewed:
+class SessionContent:
     """Session and, if there is one, its calibration.
 
     calibration : folder that `pkmcal calibrate` wrote, None for none.
@@ -71,6 +71,7 @@ class Viewed:
         self.image = lru_cache(DECODED_IMAGES_CACHED)(self._image)
         self.corners = lru_cache(DECODED_IMAGES_CACHED)(self._corners)
         self.start = cache(self._start)
+        self.thumbnail = cache(self._thumbnail)
         self.views: dict[int, StationView] = {}
 
     def station(self, s: int) -> Station:
@@ -91,13 +92,21 @@ class Viewed:
         path = self.image_entry(s, k).path
         return decode(path, self.station(s).camera.image_size, label_of(self.session.folder, path))
 
-    def jpeg(self, s: int, k: int, widest: int = WIDEST_VIEWED_PICTURE) -> bytes:
-        """Image as JPEG in the size of the screen, at most ``widest`` pixels across."""
+    def jpeg(self, s: int, k: int) -> bytes:
+        """Image as JPEG with all its pixels."""
+        from pkmcal.observe.jpegs import coded
+
+        return coded(self.image(s, k), IMAGE_JPEG_QUALITY)
+
+    def _thumbnail(self, s: int, k: int) -> bytes:
+        """Small JPEG of an image, upright."""
         from pkmcal.observe.jpegs import coded, narrowed
 
-        return coded(narrowed(self.image(s, k), widest), VIEWED_JPEG_QUALITY)
+        turns = upright_turns(self.image_entry(s, k).path, self.station(s).camera.image_size)
+        upright = np.ascontiguousarray(np.rot90(self.image(s, k), -turns))
+        return coded(narrowed(upright, THUMBNAIL_WIDTH), THUMBNAIL_JPEG_QUALITY)
 
-    def drawn(self, s: int, k: int) -> Pane:
+    def nominal(self, s: int, k: int) -> Pane:
         """Nominal machine in front of a station's camera.
 
         The camera is at the station's pose, or at a default pose without one.
@@ -141,15 +150,19 @@ class Viewed:
         saved, row, station = self.saved, self.image_entry(s, k).configuration, self.station(s)
         number = self.number(s)
         T_camera_base = inverse(saved.stations[number].T_base_camera)
+        response = saved.document["stations"][number].get("response") or station.response
+        pose, joints = saved.T_base_platform[row], saved.joints[row]
+        camera = self.calibrated_camera(s)
+        return Pane(saved.machine, camera, joints, pose, T_camera_base, response)
+
+    def calibrated_camera(self, s: int) -> Camera:
+        """Camera of a station with the intrinsics and the focal scale of the calibration."""
+        saved, station = self.saved, self.station(s)
         refined = saved.path.parent / written_camera(station.camera_file)
         camera = load_camera(refined) if refined.is_file() else station.camera
         # breathing: the station's own focal length differs from the camera file's
-        excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
-        camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
-        pose = saved.T_base_platform[row]
-        response = saved.document["stations"][number].get("response") or station.response
-        joints = saved.joints[row]
-        return Pane(saved.machine, camera, joints, pose, T_camera_base, response)
+        excess = saved.document["stations"][self.number(s)].get("focal_scale", 1.0) - 1.0
+        return replace(camera, parameters=camera.parameters + excess * camera.focal_part)
 
     @cached_property
     def saved(self) -> SavedCalibration:

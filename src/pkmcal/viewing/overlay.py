@@ -6,7 +6,6 @@ Here and in the neighbouring modules, imports that the first image does not need
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -16,73 +15,78 @@ from pkmcal.geometry.rigid import apply
 from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
     EdgeCurve,
+    edge_layer,
+    joint_layers,
     machine_laid_over,
     polyline,
     straightened,
 )
-from pkmcal.view.content import Pane, Viewed
-from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned_as_ball
-from pkmcal.view.requests import ViewRequest, requested_pose
+from pkmcal.outcome.blocks.base import Pose
+from pkmcal.outcome.blocks.machine import Property
+from pkmcal.viewing.content import Pane, SessionContent
+from pkmcal.viewing.gestures import aimed, farther, pinned, rolled, turned_as_ball
+from pkmcal.web.session_document import JointPixel, OverlayAnswer, ViewRequest
+from pkmcal.web.stage import pose_row
+from pkmcal.wording import number
 
 STATION_POSE_DECIMALS = 4
 """Decimals of a written position in m; nobody places a camera to a tenth of a millimetre."""
 
 
-def pane_of(viewed: Viewed, request: ViewRequest) -> Pane:
+def pane_of(content: SessionContent, request: ViewRequest) -> Pane:
     """Machine of a request, in front of the camera at the pose of the files."""
-    pane_at = viewed.calibrated if request.shown == "calibration" else viewed.drawn
+    pane_at = content.calibrated if request.machine == "calibration" else content.nominal
     return pane_at(request.station, request.image)
 
 
-def overlay_after_gesture(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
-    """Pose after the request's gesture, and the overlay in pixels."""
-    pane = placed_by_hand(viewed, request)
+def overlay_after_gesture(content: SessionContent, request: ViewRequest) -> OverlayAnswer:
+    """Pose after the request's gesture, and the machine in pixels."""
+    pane = placed_by_hand(content, request)
     edges, spots = machine_laid_over(
         pane.machine, pane.camera, pane.T_camera_base, pane.joints, pane.T_base_platform
     )
-    lines = [*edges, *_bare_limbs(pane)]
-    # one SVG path for each leg
-    legs = sorted({edge.leg for edge in lines})
-    paths = [
-        {
-            "leg": leg,
-            "quiet": not pane.machine.document.legs[leg - 1].tubes,
-            "d": "".join(path_data(edge) for edge in lines if edge.leg == leg),
-        }
-        for leg in legs
-    ]
-    joints = [
-        {
-            "leg": s.leg,
-            "end": s.end,
-            "x": s.calibrated[0],
-            "y": s.calibrated[1],
-            "number": s.labelled,
-        }
-        for s in spots
-    ]
-    return {
-        "pose": pane.T_camera_base,
-        "place": place_of(pane.T_camera_base),
-        "legs": paths,
-        "joints": joints,
-    }
+    place = place_of(pane.T_camera_base)
+    return OverlayAnswer(
+        pose=pose_rows(pane.T_camera_base),
+        place=tuple(
+            Property(label=name, value=", ".join(number(x, STATION_POSE_DECIMALS) for x in part))
+            for name, part in place.items()
+        ),
+        layers=(edge_layer("machine", [*edges, *_bare_limbs(pane)]), *joint_layers(spots)),
+        joints=tuple(JointPixel(leg=s.leg, end=s.end, at=s.calibrated) for s in spots),
+    )
 
 
-def path_data(edge: EdgeCurve) -> str:
-    """Edge as data of an SVG path."""
-    return "M" + "L".join(f"{x:.2f},{y:.2f}" for x, y in edge.points)
+def pose_rows(T: Array) -> Pose:
+    """Pose (4, 4) as rows of a document."""
+    first, second, third, last = map(pose_row, T)
+    return first, second, third, last
 
 
-def placed_by_hand(viewed: Viewed, request: ViewRequest) -> Pane:
+def requested_pose(request: ViewRequest) -> Array | None:
+    """T_camera_base (4, 4) of a request, None without one.
+
+    Raises InputError for a matrix that is not a rigid motion.
+    """
+    if request.pose is None:
+        return None
+    pose = np.array(request.pose, dtype=float)
+    rot = pose[:3, :3]
+    rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
+    if not rigid or not np.array_equal(pose[3], [0, 0, 0, 1]):
+        raise InputError("the pose is no rotation and translation", where="the page, pose")
+    return pose
+
+
+def placed_by_hand(content: SessionContent, request: ViewRequest) -> Pane:
     """Machine of a request, in front of the camera at the pose after pins and gesture."""
-    pane, T_camera_base = pane_of(viewed, request), requested_pose(request)
+    pane, T_camera_base = pane_of(content, request), requested_pose(request)
     if T_camera_base is None:
         T_camera_base = pane.T_camera_base
     camera, points = pane.camera, pane.points.reshape(-1, 3)
     # pins first, then the gesture
     if request.pins:
-        pins = np.stack([_joint(viewed, request, k) for k in range(len(request.pins))])
+        pins = np.stack([_joint(content, request, k) for k in range(len(request.pins))])
         pixels = np.array([pin.pixel for pin in request.pins], dtype=float)
         T_camera_base = pinned(camera, T_camera_base, points, pins, pixels)
     if request.gesture is not None:
@@ -109,14 +113,14 @@ def place_of(T_camera_base: Array) -> dict[str, list[float]]:
     return StationPose.of(T_camera_base).rounded(STATION_POSE_DECIMALS)
 
 
-def _joint(viewed: Viewed, request: ViewRequest, k: int) -> Array:
+def _joint(content: SessionContent, request: ViewRequest, k: int) -> Array:
     """Centre (3,) of a pinned joint, base frame, m, in the configuration of the pin's image.
 
     Raises InputError for a leg that the machine lacks.
     """
     pin = request.pins[k]
     other = request.model_copy(update={"image": pin.image})
-    points = pane_of(viewed, other).points[0 if pin.end == "base" else 1]
+    points = pane_of(content, other).points[0 if pin.end == "base" else 1]
     if pin.leg > len(points):
         raise InputError("there is no such leg", where=f"the page, pins[{k + 1}]", found=pin.leg)
     return points[pin.leg - 1]

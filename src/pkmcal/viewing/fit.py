@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
@@ -13,9 +11,9 @@ from pkmcal.observe.image_localization import localize_image
 from pkmcal.observe.pose_likelihood import StationView
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.station_localization import LOCALIZATION_OPTIONS, find_station
-from pkmcal.view.content import Viewed
-from pkmcal.view.overlay import overlay_after_gesture, placed_by_hand
-from pkmcal.view.requests import ViewRequest
+from pkmcal.viewing.content import SessionContent
+from pkmcal.viewing.overlay import overlay_after_gesture, placed_by_hand, pose_rows
+from pkmcal.web.session_document import LocalizationAnswer, ViewRequest
 from pkmcal.wording import brief, count
 
 FIT_IMAGES = 16
@@ -29,36 +27,33 @@ LEAST_CHANCE_DISPLAYED = 1e-9
 """Probability below which no digits are displayed."""
 
 
-def localized_overlay(viewed: Viewed, request: ViewRequest) -> dict[str, Any]:
+def localized_overlay(content: SessionContent, request: ViewRequest) -> LocalizationAnswer:
     """Localized pose with its overlay, and in words how certain the pose is.
 
     The search starts at the request's pose, or everywhere. Without success the pose remains
     unchanged. Raises InputError for a station without legs to be localized by.
     """
-    station = viewed.station(request.station)
-    if "legs" not in station.observe or not len(tubes_of(viewed.session.machine)):
+    station = content.station(request.station)
+    if "legs" not in station.observe or not len(tubes_of(content.session.machine)):
         raise InputError(
-            "there are no legs to be recognised at this station",
+            "there are no legs to be localized by at this station",
             where=f"session.yaml, stations.{station.entry}",
             found="observe: board" if "legs" not in station.observe else "legs without tubes",
             next_step="Its place is found from the board when you calibrate",
         )
     # several images verify each other; a single one is searched globally
-    start = placed_by_hand(viewed, request).T_camera_base
-    view = _search_view(viewed, request.station)
+    start = placed_by_hand(content, request).T_camera_base
+    view = _search_view(content, request.station)
     many = len(view.configuration) >= FEWEST_FITTED_TOGETHER
     if many:
         localized, sure, text = _from_images(view, None if request.anywhere else start)
     else:
-        localized, sure, text = _from_one_image(view, viewed.image(request.station, request.image))
+        localized, sure, text = _from_one_image(view, content.image(request.station, request.image))
     pose = localized if sure else start
     # overlay at the localized pose, without the gesture and pins that led to the start
-    plain = {"pose": tuple(map(tuple, pose.tolist())), "gesture": None, "pins": ()}
-    return {
-        **overlay_after_gesture(viewed, request.model_copy(update=plain)),
-        "recognised": sure,
-        "said": text,
-    }
+    plain = {"pose": pose_rows(pose), "gesture": None, "pins": ()}
+    overlay = overlay_after_gesture(content, request.model_copy(update=plain))
+    return LocalizationAnswer(localized=sure, text=text, overlay=overlay)
 
 
 def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
@@ -71,7 +66,7 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
             if pose.by_chance > LEAST_CHANCE_DISPLAYED
             else f"less than {LEAST_CHANCE_DISPLAYED:.0e}"
         )
-        text = f"Recognised in {shots}: as good a fit by chance has probability {chance}."
+        text = f"Localized in {shots}: as good a fit by chance has probability {chance}."
     elif pose.second >= LOCALIZATION_OPTIONS.rival:
         text = (
             f"Not sure: from another place the machine fits {shots} nearly as well. Bring it to"
@@ -79,7 +74,7 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
         )
     else:
         text = (
-            f"Not recognised in {shots} about this pose. Bring two or three joints to their places"
+            f"Not localized in {shots} about this pose. Bring two or three joints to their places"
             " and try again, or check whether nominal model, readings and images"
             " belong together."
         )
@@ -96,20 +91,20 @@ def _from_one_image(view: StationView, image: Integers) -> tuple[Array, bool, st
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
 
 
-def _search_view(viewed: Viewed, s: int) -> StationView:
+def _search_view(content: SessionContent, s: int) -> StationView:
     """Data of a station for the search, cached because the user fits repeatedly."""
-    views: dict[int, StationView] = viewed.views
+    views: dict[int, StationView] = content.views
     if s not in views:
-        session, station = viewed.session, viewed.station(s)
+        session, station = content.session, content.station(s)
         rows = np.array([photo.configuration for photo in station.images])
         few = np.unique(np.linspace(0, len(rows) - 1, min(FIT_IMAGES, len(rows))).astype(int))
-        tables = distance_tables([viewed.image(s, int(k)) for k in few])
+        tables = distance_tables([content.image(s, int(k)) for k in few])
         views[s] = StationView(
             session.machine,
             station.camera,
             rows[few],
             session.joints,
-            viewed.poses,
+            content.poses,
             tables,
         )
     return views[s]

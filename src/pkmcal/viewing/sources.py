@@ -1,0 +1,290 @@
+"""What `pkmcal view` opens: a session, a result or a folder of both, each a document with the
+routes of its page.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE
+from pkmcal.errors import InputError, PkmcalError
+from pkmcal.files import resolved
+from pkmcal.outcome.finding import Level, Mark
+from pkmcal.session.load import SESSION_FILE_NAME, load_session
+from pkmcal.viewing.content import SessionContent
+from pkmcal.viewing.server import session_document, session_routes
+from pkmcal.viewing.stored_pages import is_page, pages_in, stored_document
+from pkmcal.web.document import (
+    AnyDocument,
+    FolderDocument,
+    FolderEntry,
+    MachineDocument,
+    PageDocument,
+    Verdict,
+)
+from pkmcal.web.serving import page_routes
+
+if TYPE_CHECKING:
+    from starlette.routing import BaseRoute
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+CALIBRATION_FOLDER = "calibration"
+"""Folder of a session in which `pkmcal calibrate` writes by default."""
+DEEPEST_RESULT = 4
+"""Depth of subfolders that are searched."""
+MOST_ENTRIES = 200
+"""Sessions and results in a list."""
+TONE_MARKS: dict[str, Mark | None] = {
+    "good": "good",
+    "partial": Level.DOUBTFUL,
+    "bad": Level.WRONG,
+    "neutral": None,
+}
+
+
+@dataclass(frozen=True)
+class Source:
+    """Document of a page, and the routes below its address."""
+
+    document: AnyDocument
+    routes: Callable[[], list[BaseRoute]]
+
+    @classmethod
+    def of_document(cls, document: AnyDocument) -> Source:
+        """Page that requests nothing but its own files."""
+        return cls(document, lambda: page_routes(document))
+
+
+def source_of(path: Path, calibration: Path | None = None) -> Source:
+    """Session, result or folder of both, by what a path holds.
+
+    path : a session's folder or its session.yaml; a result's folder, its page, or its JSON
+        document; a folder in which, up to ``DEEPEST_RESULT`` levels deep, sessions and results are.
+    calibration : of the session, instead of its own.
+    Raises InputError for anything else.
+    """
+    folder = path.parent if path.name == SESSION_FILE_NAME else path
+    if (folder / SESSION_FILE_NAME).exists():
+        return session_source(folder, calibration)
+    if calibration is not None:
+        raise InputError(
+            "a calibration can be named for a session alone",
+            where="--calibration",
+            found=f"{path}, which has no {SESSION_FILE_NAME}",
+            next_step="Leave --calibration out, or name the session",
+        )
+    if not path.is_dir():
+        return page_source(_page_beside(path))
+    pages = pages_in(path)
+    if len(pages) == 1:
+        return page_source(pages[0])
+    if not pages and (path / CALIBRATION_DOCUMENT_FILE).is_file():
+        return page_source(path / CALIBRATION_REPORT_FILE)
+    return folder_source(path)
+
+
+def _page_beside(path: Path) -> Path:
+    """Page of a result by one of its files; Raises InputError where there is none."""
+    if path.suffix == ".json":
+        if path.name == CALIBRATION_DOCUMENT_FILE:
+            return path.with_name(CALIBRATION_REPORT_FILE)
+        return path.with_suffix(".html")
+    if path.suffix == ".html":
+        return path
+    raise InputError(
+        "there is nothing to view here" if path.exists() else "this does not exist",
+        where=str(path),
+        expected="a session, a result that a command wrote, or a folder with some of these",
+    )
+
+
+# ------------------------------------------------------------------ session and result
+
+
+def session_source(folder: Path, calibration: Path | None = None) -> Source:
+    """Session with a calibration, by default the one in its own folder."""
+    session = load_session(folder)
+    if not session.stations:
+        raise InputError(
+            "there are no images to be shown",
+            where=f"{session.folder / SESSION_FILE_NAME}, stations",
+            expected="a station with a camera",
+        )
+    if calibration is None:
+        own = session.folder / CALIBRATION_FOLDER
+        has_own = (own / CALIBRATION_DOCUMENT_FILE).is_file()
+        content = SessionContent(session, own if has_own else None)
+    else:
+        content = SessionContent(session, calibration)
+        _ = content.saved  # raises for an unusable file before the page is served
+    report = None if content.calibration is None else content.calibration / CALIBRATION_REPORT_FILE
+    has_report = report is not None and is_page(report)
+
+    def routes() -> list[BaseRoute]:
+        from starlette.routing import Mount
+
+        own_routes = session_routes(content, document)
+        if report is None or not has_report:
+            return own_routes
+        return [*own_routes, Mount("/report", app=OnDemand(lambda _: page_source(report)))]
+
+    document = session_document(content, "report/" if has_report else "")
+    return Source(document, routes)
+
+
+def page_source(path: Path) -> Source:
+    """Page that a command wrote. Raises InputError where there is none."""
+    if not path.exists():
+        raise InputError(
+            "the page of this result is missing",
+            where=str(path),
+            expected="the page that its command wrote there",
+            next_step="Run the command again",
+        )
+    return Source.of_document(stored_document(path))
+
+
+# ------------------------------------------------------------------ folder
+
+
+def folder_source(folder: Path) -> Source:
+    """List of the sessions and results in a folder. Raises InputError for a folder without any."""
+    places = list(islice(_places(folder, DEEPEST_RESULT), MOST_ENTRIES + 1))
+    if not places:
+        raise InputError(
+            "there is no session and no result in this folder",
+            where=str(folder),
+            expected=f"{SESSION_FILE_NAME}, or a page that a command of pkmcal wrote",
+        )
+    note = ""
+    if len(places) > MOST_ENTRIES:
+        places = places[:MOST_ENTRIES]
+        note = f"The first {MOST_ENTRIES} are listed; name a folder in it for others."
+    document = FolderDocument(
+        program=f"pkmcal {version('pkmcal')}",
+        title=resolved(folder).name,
+        entries=tuple(_entry(n, path, folder) for n, path in enumerate(places)),
+        note=note,
+    )
+
+    def open_place(n: int) -> Source:
+        if n >= len(places):
+            raise InputError("there is no such entry", where="the page", found=n)
+        path = places[n]
+        try:
+            return session_source(path) if path.is_dir() else page_source(path)
+        except PkmcalError as error:
+            raise InputError("this cannot be opened", where=str(path), found=str(error)) from error
+
+    def routes() -> list[BaseRoute]:
+        from starlette.routing import Mount
+
+        return [*page_routes(document), Mount("/{n:int}", app=OnDemand(open_place))]
+
+    return Source(document, routes)
+
+
+def _places(folder: Path, depth: int) -> Iterator[Path]:
+    """Folders of sessions and pages of results, below a folder; links to folders are not
+    followed.
+    """
+    if (folder / SESSION_FILE_NAME).is_file():
+        yield folder
+    yield from pages_in(folder)
+    if not depth:
+        return
+    try:
+        with os.scandir(folder) as every:
+            own = sorted(one.path for one in every if one.is_dir(follow_symlinks=False))
+    except OSError:  # a folder that cannot be read has nothing that can be opened
+        return
+    for path in map(Path, own):
+        if not path.name.startswith("."):
+            yield from _places(path, depth - 1)
+
+
+def _entry(n: int, path: Path, folder: Path) -> FolderEntry:
+    """Row of a session or a page."""
+    name = str(path.relative_to(folder))
+    plain = FolderEntry(
+        name=name if name != "." else resolved(folder).name, href=f"{n}/", title="Session",
+        date="", mark=None, text="Images with the machine laid over", before="", after="",
+    )  # fmt: skip
+    if path.is_dir():
+        return plain
+    try:
+        document = stored_document(path)
+    except InputError as error:
+        update = {"href": "", "title": "", "mark": Level.WRONG, "text": error.what}
+        return plain.model_copy(update=update)
+    return plain.model_copy(update=_summary(document))
+
+
+def _summary(document: PageDocument) -> dict[str, object]:
+    """Fields of a row from its document."""
+    if isinstance(document, MachineDocument):
+        return {"title": document.title, "text": document.subtitle}
+    before, after = _tool_errors(document.verdict)
+    # a date precedes the program in the origin
+    date = document.origin[0] if document.origin[:1] != (document.program,) else ""
+    return {
+        "title": document.title,
+        "date": date,
+        "mark": TONE_MARKS[document.verdict.tone],
+        "text": f"{document.verdict.stamp}: {document.verdict.headline}",
+        "before": before,
+        "after": after,
+    }
+
+
+def _tool_errors(verdict: Verdict) -> tuple[str, str]:
+    """Tool error by the nominal model and after the calibration; empty texts without both."""
+    bar = verdict.comparison
+    texts = {one.role: one.text for one in bar.magnitudes} if bar is not None else {}
+    if "nominal" in texts and "calibrated" in texts:
+        return texts["nominal"], texts["calibrated"]
+    return "", ""
+
+
+class OnDemand:
+    """ASGI application of pages that are opened when they are first requested.
+
+    open_source : source by the number in the path, 0 without one. An error becomes a page.
+    """
+
+    def __init__(self, open_source: Callable[[int], Source]) -> None:
+        self._open = open_source
+        self._routers: dict[int, ASGIApp] = {}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI entry point."""
+        from starlette.concurrency import run_in_threadpool
+        from starlette.routing import Router
+
+        n = scope["path_params"].get("n", 0)
+        router = self._routers.get(n)
+        if router is None:
+            try:
+                source = await run_in_threadpool(self._open, n)
+                router = self._routers[n] = Router(routes=source.routes())
+            except PkmcalError as error:  # not stored: the file may be corrected meanwhile
+                router = Router(routes=_fault_source(error).routes())
+        await router(scope, receive, send)
+
+
+def _fault_source(error: PkmcalError) -> Source:
+    """Page of an entry that cannot be opened, with the reason."""
+    return Source.of_document(
+        FolderDocument(
+            program=f"pkmcal {version('pkmcal')}",
+            title="This cannot be opened",
+            entries=(),
+            note=str(error),
+        )
+    )

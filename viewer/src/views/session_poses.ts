@@ -1,0 +1,45 @@
+/** Pose of a station as its page has it, with the steps that can be undone. */
+
+import type { Pin, ViewRequest } from "../document";
+
+export type Pose = NonNullable<ViewRequest["pose"]>;
+interface Step {
+  pose: Pose | null;
+  pins: Pin[];
+  changed: boolean;
+}
+
+export class StationPose {
+  /** T_camera_base; null for the files' own. */
+  pose: Pose | null = null;
+  /** Joints placed at pixels. */
+  pins: Pin[] = [];
+  /** Whether session.yaml has another pose. */
+  changed = false;
+  private readonly before: Step[] = [];
+
+  constructor(public posed: boolean) {}
+
+  get undoable(): boolean {
+    return this.before.length > 0;
+  }
+
+  /** Begin a change. */
+  begin(): void {
+    const { pose, pins, changed } = this;
+    this.before.push({ pose, pins, changed });
+    this.changed = true;
+  }
+
+  /** Return to the state before the last change; false without one. */
+  undo(): boolean {
+    const last = this.before.pop();
+    if (last) Object.assign(this, last);
+    return last !== undefined;
+  }
+
+  saved(): void {
+    this.changed = false;
+    this.posed = true;
+  }
+}
