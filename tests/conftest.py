@@ -58,14 +58,15 @@ def run(*words) -> Run:
 
 
 LONG = (
-    "test_study", "test_board_session", "test_fuzz", "test_cli", "test_camera_calibration",
-    "test_calibrate_board", "test_validate", "test_boards", "test_pose_sessions",
-    "test_silhouettes", "test_watch_command", "test_handheld", "test_study_workers", "test_servo",
-    "test_observe_search", "test_heights", "test_plan", "test_model_violations", "test_export_c",
-    "test_bundle", "test_view", "test_hostile", "test_diagnose", "test_export_mujoco",
-    "test_export_trees", "test_simulate", "test_calibration", "test_reproduce_b", "test_paper_c",
-    "test_python", "test_response", "test_profiles", "test_h4", "test_discrepancy", "test_writing",
-    "test_kinematics", "test_repeats", "test_cli_camera", "test_paper_a", "test_site",
+    "test_cli", "test_study_executors", "test_fuzz", "test_board_session",
+    "test_camera_calibration", "test_silhouettes", "test_boards", "test_validate",
+    "test_calibrate_board", "test_pose_sessions", "test_docs", "test_handheld", "test_show",
+    "test_observe_search", "test_verbs", "test_watch_command", "test_servo", "test_repeats",
+    "test_site", "test_export_c", "test_study", "test_plan", "test_bundle", "test_heights",
+    "test_model_violations", "test_reproduce_b", "test_writing", "test_export_trees",
+    "test_simulate", "test_hostile", "test_paper_c", "test_response", "test_python",
+    "test_readings_alone", "test_paper_a", "test_watch", "test_edge_noise", "test_discrepancy",
+    "test_view", "test_profiles",
 )  # fmt: skip
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from conftest import run
 from document_keys import assert_keys
 from pkmcal.cameras import load_camera
+from rendered import once
 from test_boards import board_of, camera_of, render
 from test_camera_calibration import poses_for
 
@@ -16,15 +19,17 @@ BOARD = "type: charuco\nsquares: [8, 6]\nsquare: 0.03\nmarker: 0.022\ndictionary
 TRUTH = camera_of("pinhole", 620.0, 622.0, 318.0, 242.0, -0.12, 0.05, 0.0, 0.0, 0.0)
 
 
-@pytest.fixture(scope="module")
-def boards(tmp_path_factory):
-    """A folder with board.yaml and eight images of it."""
-    folder = tmp_path_factory.mktemp("boards")
-    board = board_of(folder, BOARD)
-    (folder / "board.yaml").write_text(BOARD)
-    for k, pose in enumerate(poses_for(TRUTH, 8, seed=2)):
-        cv2.imwrite(str(folder / f"p{k}.png"), render(TRUTH, pose, board, seed=k))
-    return folder
+@pytest.fixture(scope="session")
+def boards(common):
+    """A folder with board.yaml and eight images of it; tests must not write into it."""
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        board = board_of(folder, BOARD)
+        for k, pose in enumerate(poses_for(TRUTH, 8, seed=2)):
+            cv2.imwrite(str(folder / f"p{k}.png"), render(TRUTH, pose, board, seed=k))
+
+    return once(common / "boards", make)
 
 
 def test_a_camera_is_calibrated(boards, tmp_path):

@@ -250,7 +250,7 @@ def test_a_turned_image_is_reported(folder):
 # a simulated session, and what is estimated from it
 
 
-SETTINGS = Settings(configurations=3, repeats=1, handheld=True, tolerance=0.0)
+SETTINGS = Settings(configurations=3, repeats=1, handheld=True, tolerance=0.0, finish="matte")
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.arrays import Array, Booleans, Integers, short_repr, with_zero
 from pkmcal.geometry.rigid import inverse, perturb
 from pkmcal.identify.gauge import (
     mount_generators,
@@ -605,8 +605,7 @@ class Problem:
         if not bent.any():
             return trial
         c = self.closure(state)
-        change = shared[:, self.unknowns.machine] @ self.free.T
-        change = np.pad(change, ((0, 0), (0, 1)))[:, c.index][:, None]
+        change = with_zero(shared[:, self.unknowns.machine] @ self.free.T)[:, c.index][:, None]
         wanted = c.rows.value + np.sum(c.by_theta * change, axis=-1)
         wanted = wanted + (by_own(layout, c.rows) @ own[..., None])[..., 0]
         for _ in range(CLOSING_NEWTON_STEPS):

@@ -5,6 +5,7 @@ advice.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -268,14 +269,12 @@ def _fixing(around: Situation, names: tuple[str, ...]) -> str:
         axis = ".axis." in name and len(names) > 1
         entries[whole if every or axis else name] = None
     texts: dict[str, None] = {}
+    legs = dict.fromkeys(n.partition("]")[0] for n in table.names)
+    # names and all groups of them: legs[1].base.center.x, legs[1].base.center, legs[1].base ...
+    groups = {n[: dot.start()] for n in table.names for dot in re.finditer(r"\.|$", n)}
     for entry in entries:
         rest = entry.partition("]")[2]
-        legs = dict.fromkeys(n.partition("]")[0] for n in table.names)
-        having = [
-            f"{leg}]{rest}"
-            for leg in legs
-            if any(n == f"{leg}]{rest}" or n.startswith(f"{leg}]{rest}.") for n in table.names)
-        ]
+        having = [f"{leg}]{rest}" for leg in legs if f"{leg}]{rest}" in groups]
         same = len(having) > 1 and all(other in entries for other in having)
         texts[f"{EVERY_LEG}{rest}" if same else entry] = None
     line = ", ".join(json.dumps(entry) for entry in texts)

@@ -270,7 +270,9 @@ def _open(around: Situation, null: Array, information: Array | None) -> _Open:
     space = _open_with_tubes(around.machine, null, information)
     if around.imaged or not len(space.rows):
         return space
-    return _without(space, _within(all_radii(around).columns, space, 1 - NEGLIGIBLE))
+    return _without(
+        space, _within(_cosines(all_radii(around).columns, space), space, 1 - NEGLIGIBLE)
+    )
 
 
 def _shifts(space: _Open, effect: Array) -> Array:
@@ -317,25 +319,27 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
     options = around.options
     done = np.zeros((0, space.rows.shape[1]))
     all_motions, whole = list(candidates(around)), space
-    for motion, inside in [
-        *((m, share) for share in options.inside for m in all_motions[:-1]),
-        (all_motions[-1], 0.0),
-    ]:
+    last = len(all_motions) - 1
+    cosines: dict[int, tuple[Array, Array]] = {}  # in the present space, by the motion's number
+    for k, inside in [*((k, share) for share in options.inside for k in range(last)), (last, 0.0)]:
         if len(done) == len(whole.rows):
             break
-        names = _within(motion.columns, space, inside)
+        motion = all_motions[k]
+        if k not in cosines:
+            cosines[k] = _cosines(motion.columns, space)
+        names = _within(cosines[k], space, inside)
         # the part that no earlier motion explains
         new = _directions(names - (names @ done.T) @ done, options)
         if len(new) == 0:
             continue
-        if motion is all_motions[-1]:
+        if k == last:
             names = new
         done = _orthonormal(np.concatenate([done, new]))
         numbers = _coefficients(motion, space, names, options)
         own = numbers @ motion.columns.T / space.unit
         parts.append(OpenMotion(motion, motion.legs, names, numbers, own, len(new)))
         if motion.convention:
-            space = _without(space, new)
+            space, cosines = _without(space, new), {}
     return parts
 
 
@@ -359,10 +363,9 @@ def _directions(rows: Array, options: UnidentifiedOptions) -> Array:
     return vt[s > options.new_sine]
 
 
-def _within(changes: Array, space: _Open, inside: float) -> Array:
-    """Orthonormal directions (k, P) of the open space that changes (P, m) can make.
-
-    inside : least squared cosine between such a direction and the changes.
+def _cosines(changes: Array, space: _Open) -> tuple[Array, Array]:
+    """Principal directions (n, n), as columns in the open space's basis, and their cosines (n,)
+    with the space of changes (P, m).
     """
     columns = (changes / space.unit[:, None]).T
     size = np.linalg.norm(columns, axis=1)
@@ -370,8 +373,19 @@ def _within(changes: Array, space: _Open, inside: float) -> Array:
     # pure frame changes are removed, with their rounding
     basis = _orthonormal(columns - (columns @ space.frames) @ space.frames.T, 1e-4)
     u, s, _ = np.linalg.svd(space.rows @ basis.T)
-    s = np.pad(s, (0, len(space.rows) - len(s)))[: len(space.rows)]
-    return u[:, s**2 > inside].T @ space.rows
+    cosine = np.zeros(len(u))
+    cosine[: len(s)] = s
+    return u, cosine
+
+
+def _within(cosines: tuple[Array, Array], space: _Open, inside: float) -> Array:
+    """Orthonormal directions (k, P) of the open space that changes can make.
+
+    cosines : of the changes, by :func:`_cosines`.
+    inside : least squared cosine between such a direction and the changes.
+    """
+    directions, cosine = cosines
+    return directions[:, cosine**2 > inside].T @ space.rows
 
 
 def _coefficients(

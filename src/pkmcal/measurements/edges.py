@@ -17,7 +17,7 @@ from typing import ClassVar, NamedTuple, TypeVar, final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.arrays import Array, Booleans, Integers, short_repr, with_zero
 from pkmcal.geometry.cylinders import SIDE_SIGNS, LineSilhouettes, edge_planes
 from pkmcal.geometry.rigid import skew
 from pkmcal.measurements.contract import ImageKind
@@ -414,7 +414,7 @@ class EdgeRows:
         rows = self.cosine[0] * along_m - self.sine * along_w
         for cosine, (_, along_m, along_w) in zip(self.cosine[1:], others, strict=True):
             rows += cosine * along_m - self.sine * along_w
-        numbers = np.pad(columns, ((0, 0), (0, 1)))  # the last is none's
+        numbers = with_zero(columns)  # the last is none's
         for by, column in zip(data.by_columns, of_views.T, strict=True):
             rows += by * numbers[:, column, None]
         return np.where(data.counts, rows, 0.0)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.arrays import Array, Booleans, Integers, short_repr, with_zero
 from pkmcal.geometry.rigid import dot, perturb, pose_difference, skew
 from pkmcal.measurements.rows import among
 
@@ -165,7 +165,7 @@ def pose_rows(
         return weigh @ out
 
     eye, by_columns = np.eye(3), weigh @ data.columns
-    numbers = np.pad(columns, ((0, 0), (0, 1)))[:, blocks.column]  # the last is none's
+    numbers = with_zero(columns)[:, blocks.column]  # the last is none's
     value = (weigh @ error[..., None] + by_columns @ numbers[..., None])[..., 0]
     return PoseRows(
         value,
