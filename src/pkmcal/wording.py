@@ -131,8 +131,7 @@ class Chance(str):
     value : the probability.
     """
 
-    __slots__ = ("value",)
-    value: float
+    value: float = math.nan
 
     def __new__(cls, probability: float) -> Chance:
         """Text of a probability."""
