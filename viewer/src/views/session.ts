@@ -22,6 +22,7 @@ import { h } from "../dom";
 import { type DragTool, Inspector, type Pixel } from "../inspector";
 import { legClass, sign } from "../marks";
 import { Selection, connect } from "../selection";
+import { button, choice, press } from "./buttons";
 import { ImageList, type ImageMark } from "./session_images";
 import { type Pose, StationPose } from "./session_poses";
 
@@ -571,31 +572,6 @@ class SessionView {
         .then(fault, () => fault(null));
     }, true);
   }
-}
-
-function button(text: string, act: () => void, title = ""): HTMLButtonElement {
-  return h("button", { type: "button", onclick: act, ...(title ? { title } : {}) }, text);
-}
-
-/** Group of buttons of which one is pressed. */
-function choice<T extends string>(
-  label: string, items: [T, string, string?][], first: T, onchoose: (name: T) => void,
-): HTMLElement {
-  const group = h("span", { class: "choice", role: "group", "aria-label": label });
-  group.append(...items.map(([name, text, title]) => {
-    const one = button(text, () => {
-      press(group, name);
-      onchoose(name);
-    }, title);
-    one.dataset.name = name;
-    return one;
-  }));
-  press(group, first);
-  return group;
-}
-
-function press(group: HTMLElement, name: string): void {
-  for (const one of group.querySelectorAll("button")) one.setAttribute("aria-pressed", String(one.dataset.name === name));
 }
 
 function legend(): HTMLElement {
