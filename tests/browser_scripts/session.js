@@ -103,6 +103,13 @@ addEventListener("load", async () => {
   await settled();
   await wait(500);
   out.stage = $(".session-stage canvas")?.width > 100;
+  key("ArrowRight");
+  await settled();
   press("Image");
+  await settled();
+  const image = $(".inspected image"), window_ = $(".inspected").getBoundingClientRect();
+  out.window = JSON.stringify([window_.width, window_.height]);
+  out.whole = Math.min(window_.width / image.width.baseVal.value, window_.height / image.height.baseVal.value);
+  out.scale = $(".inspector-where").textContent.replace("×", "");
   finish();
 });

@@ -389,7 +389,8 @@ class SessionView {
     this.stage.hidden = !visible;
     this.inspector.element.hidden = visible;
     this.showState();
-    if (visible && this.stageState === "absent") void this.drawStage();
+    if (!visible) this.inspector.fit();
+    else if (this.stageState === "absent") void this.drawStage();
   }
 
   private async drawStage(): Promise<void> {
@@ -479,7 +480,7 @@ class SessionView {
   private async endDrag(cancelled: boolean): Promise<void> {
     const { drag } = this;
     this.drag = null;
-    if (!drag?.moved) return;
+    if (!drag?.moved) return this.markOthers(); // which the drag interrupted
     await this.overlaying;
     if (cancelled) this.undo();
     // two joints determine the place well enough for the machine to be localized there
