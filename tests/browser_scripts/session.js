@@ -34,7 +34,10 @@ addEventListener("load", async () => {
     full.onload = () => done(`${full.naturalWidth}x${full.naturalHeight}`);
     full.src = $(".inspected image").getAttribute("href");
   });
-  out.thumbnails = all(".session-images img").length;
+  const list = all(".session-images img");
+  list.forEach((one) => one.scrollIntoView());
+  await settled();
+  out.thumbnails = list.filter((one) => one.naturalWidth > 50).length;
   out.marks = JSON.stringify(marks());
   out.fit = $(".session-fit").className;
   key("ArrowRight");

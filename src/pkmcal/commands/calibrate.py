@@ -62,10 +62,11 @@ def calibrate(
 
     with console.progress(quiet or as_json) as progress:
         from pkmcal.api.calibrate import CalibrationResult
+        from pkmcal.calibration.file_names import CALIBRATION_FOLDER
 
         loaded = pkmcal.load_session(session, model)
         folder = console.output_folder(
-            out, loaded.folder / "calibration", CalibrationResult, force=force
+            out, loaded.folder / CALIBRATION_FOLDER, CalibrationResult, force=force
         )
         result = pkmcal.calibrate(
             loaded, method=method, seed=seed, refine_camera=refine_camera, holdout=holdout,

@@ -42,7 +42,7 @@ def demo(
     import pkmcal
 
     with console.progress(as_json) as progress:
-        from pkmcal.calibration.results import CALIBRATION_REPORT_FILE
+        from pkmcal.calibration.file_names import CALIBRATION_REPORT_FILE
         from pkmcal.files import write_text
         from pkmcal.judge.against_truth import compare_with_truth
         from pkmcal.placement.default_camera import camera_of_size, default_camera

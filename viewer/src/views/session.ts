@@ -565,8 +565,10 @@ class SessionView {
     addEventListener("beforeunload", (event) => {
       if (this.poses.some((pose) => pose.changed)) event.preventDefault();
     });
-    // an image that does not come has its reason in words
+    // the first image precedes the thumbnails; one that does not come has its reason in words
+    this.inspector.element.addEventListener("load", () => this.list.load(), { capture: true, once: true });
     this.inspector.element.addEventListener("error", () => {
+      this.list.load();
       const fault = (answer: { message?: string } | null): void =>
         this.notify(answer?.message ?? "The image does not come.", "bad");
       fetch(this.image.url).then((response) => response.json() as Promise<{ message?: string }>)
