@@ -790,6 +790,9 @@ def test_a_session_is_worked_on_in_a_browser(session, demo, truth, tmp_path, wid
     marks = json.loads(root["remarks"])[: len(station.images)]
     assert "wrong" not in marks
     assert root["stage"] == "true"
+    # the image fills the window again
+    assert float(root["scale"]) == pytest.approx(float(root["whole"]), abs=0.06)
+    assert min(json.loads(root["window"])) > 250
     assert (session / "session.yaml").read_text() != before
     angle, _ = off(load_session(session).stations[0].T_camera_base, truth.T_camera_base[0])
     assert angle < 1.0

@@ -13,8 +13,8 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
 from pkmcal.arrays import Array, Booleans, short_repr
+from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE
 from pkmcal.calibration.results import (
-    CALIBRATION_DOCUMENT_FILE,
     CALIBRATION_FORMAT,
     EDGE_COLUMNS,
     EDGE_RESIDUALS,

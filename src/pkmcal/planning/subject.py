@@ -15,6 +15,7 @@ from pkmcal.arrays import Array, numbered, short_repr
 from pkmcal.boards.board import Board, load_board
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE, CALIBRATION_FOLDER
 from pkmcal.calibration.localization import (
     boards_of,
     localize_stations,
@@ -22,7 +23,6 @@ from pkmcal.calibration.localization import (
     read_images,
 )
 from pkmcal.calibration.machine_identity import read_same_machine
-from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE
 from pkmcal.calibration.saved_calibration import CalibrationPrior, SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
@@ -57,8 +57,6 @@ PLAN_IMAGES_A_STATION = 12
 together. A plan is made once, and few edges determine the shading badly.
 """
 BOARD_MOUNT_NAME = "board"
-LAST_CALIBRATION_FOLDER = "calibration"
-"""Output folder of `calibrate` inside a session."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +101,9 @@ def as_it_stands(
     if (
         after is None
         and not from_nominal
-        and (session.folder / LAST_CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
+        and (session.folder / CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
     ):
-        after = load(session.folder / LAST_CALIBRATION_FOLDER)
+        after = load(session.folder / CALIBRATION_FOLDER)
         if not after.verdict.usable:  # a default must not be an unusable calibration
             after = None
     if after is not None:

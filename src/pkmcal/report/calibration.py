@@ -13,8 +13,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.archive import keep_earlier
+from pkmcal.calibration.file_names import CALIBRATION_REPORT_FILE
 from pkmcal.calibration.results import (
-    CALIBRATION_REPORT_FILE,
     calibration_document,
     check_output,
     rejected_photographs,
