@@ -121,8 +121,13 @@ def print_table(console: Console, table: Table) -> None:
     if table.title:
         console.print(legible(table.title), style="bold", markup=False)
     console.print(grid)
-    if table.legend:
-        print_points(console, [("  ", table.legend)], style="dim")
+    explained: dict[str, list[str]] = {}
+    for name, hint in zip(columns, table.hints, strict=False):  # hints of further columns remain
+        if hint:
+            explained.setdefault(hint, []).append(name)
+    hints = " ".join(f"{', '.join(names)}: {hint}" for hint, names in explained.items())
+    for text in filter(None, (hints, table.legend)):
+        print_points(console, [("  ", text)], style="dim")
 
 
 def escaped(text: str) -> str:

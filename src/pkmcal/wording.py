@@ -125,6 +125,32 @@ def how_often(probability: float) -> str:
     return f"once in {1 / probability:.0f} times" if probability < 0.5 else "as a rule"
 
 
+class Chance(str):
+    """Text of a probability: ``34%``, ``1 in 250``, ``< 1 in a million``; a dash for NaN.
+
+    value : the probability.
+    """
+
+    __slots__ = ("value",)
+    value: float
+
+    def __new__(cls, probability: float) -> Chance:
+        """Text of a probability."""
+        if not math.isfinite(probability):
+            text = "–"
+        elif probability >= 0.1:
+            text = f"{probability:.0%}"
+        elif probability >= 1e-6:
+            often = 1 / probability
+            places = max(0, math.floor(math.log10(often)) - 1)  # two significant digits
+            text = f"1 in {round(often, -places):,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+        else:
+            text = f"{'<' if probability > 1e-7 else '≪'} 1 in a million"
+        out = super().__new__(cls, text)
+        out.value = probability
+        return out
+
+
 def percent(share: float) -> str:
     """Share as whole percent, rounded down so that it never claims certainty."""
     return f"{math.floor(100 * min(max(share, 0.0), 1.0))} %"

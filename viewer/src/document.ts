@@ -339,13 +339,14 @@ export interface DataTable {
  *
  * form : text; number, to the right, ``a ± b`` with the second part small; leg, a chip with the
  *     leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
- *     darker the larger it is among those of all such columns.
+ *     darker the larger it is among those of all such columns; chance, a probability in words,
+ *     whose number is its tooltip.
  * hint : explanation of the heading.
  * by_size : sorted by the size of the values, whatever their sign, as changes are.
  */
 export interface Column {
   name: string;
-  form: "text" | "number" | "leg" | "share" | "shade";
+  form: "text" | "number" | "leg" | "share" | "shade" | "chance";
   hint: string;
   by_size: boolean;
 }

@@ -27,17 +27,15 @@ INFORMATION_LOST_SHARE = 1 - 1 / RELEVANT_FACTOR**2
 """Share of the information that is lost with that factor."""
 POOR_LEG = 0.5
 """Information of a leg, relative to the mean of all legs, below which the leg is named."""
-EDGE_SHARES_LEGEND = (
-    "Shares of the edges' information about the machine, by leg and station. Variance: of the"
-    " platform's position, what comes from the leg's edges: where it is large, a better view of"
-    " that leg gains most."
-)
-ONE_LEGEND = (
-    "Seen: of its edges, what nothing hides. Found: of these, measured, agreeing with the others."
-    " Sigma: of an edge, across. Share: of the edges' information about the machine. Variance: of"
-    " the platform's position, what comes from its edges: where it is large, a better view of that"
-    " leg gains most."
-)
+LEG_COLUMNS = {
+    "In view": "Share of the leg's edges that nothing hides.",
+    "Measured": "Share of these that are measured and agree with the others.",
+    "Edge sigma": "Standard deviation of an edge across itself, median.",
+    "Information": "Share of the edges' information about the machine.",
+    "Tool variance": "Share of the variance of the platform's position that comes from the leg's"
+    " edges: where it is large, a better view of that leg gains most.",
+}
+"""Columns of the tables of legs, with their explanations."""
 
 
 def advice(inspection: Inspection, forecast: Forecast | None) -> tuple[Finding, ...]:
@@ -207,21 +205,21 @@ def forecast_part(forecast: Forecast) -> Part:
     total = {j: sum(by[s, j].tells for s in stations) for j in numbers}
     mean = sum(total.values()) / len(total)
     poor = [j for j in numbers if total[j] < POOR_LEG * mean]
-    columns = ("Seen", "Found", "Sigma", "Share", "Variance")
+    hints = ("", *LEG_COLUMNS.values())
     details = Table(
         "By station and leg",
-        ("Station, leg", *columns),
+        ("Station, leg", *LEG_COLUMNS),
         tuple(Row(f"{leg.station}, {leg.leg}", _cells(leg)) for leg in forecast.legs),
-        note=" ".join(ONE_LEGEND),
         brief=False,
         folded=True,
+        hints=hints,
     )
     if len(stations) == 1:
         rows = tuple(
             Row(str(leg.leg), _cells(leg), mark=Level.NOTE if leg.leg in poor else "good")
             for leg in forecast.legs
         )
-        tables = (Table("", ("Leg", *columns), rows, ONE_LEGEND, legend=ONE_LEGEND),)
+        tables = (Table("Legs", ("Leg", *LEG_COLUMNS), rows, brief=bool(poor), hints=hints),)
     else:
         rows = tuple(
             Row(
@@ -240,10 +238,12 @@ def forecast_part(forecast: Forecast) -> Part:
         all_ = Row(
             "all", tuple(_percent(x) for x in (*together, sum(together), variance)), mark="good"
         )
-        head = ("Leg", *stations, "Together", "Variance")
+        share = LEG_COLUMNS["Information"]
+        head = ("Leg", *stations, "All stations", "Tool variance")
         shares = Table(
-            "", head, (*rows, all_), EDGE_SHARES_LEGEND, legend=EDGE_SHARES_LEGEND,
-            shaded=tuple(range(1, 1 + len(stations))),
+            "Information by leg and station", head, (*rows, all_),
+            brief=bool(poor), shaded=tuple(range(1, 1 + len(stations))),
+            hints=("", *(share for _ in head[1:-1]), LEG_COLUMNS["Tool variance"]),
         )  # fmt: skip
         tables = (shares, details)
     return Part(

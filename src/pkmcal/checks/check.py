@@ -492,7 +492,9 @@ def joint_checks(session: Session) -> tuple[JointCheck, ...]:
             int(np.sum(readings > high - NEAR_END * stroke)),
         )
         used = float(np.ptp(readings) / stroke)
-        checks.append(JointCheck(name, float(readings.min()), float(readings.max()), used, ends))
+        unit = session.machine.joint_units[k]
+        extremes = float(readings.min()), float(readings.max())
+        checks.append(JointCheck(name, unit, *extremes, used, ends))
     return tuple(checks)
 
 

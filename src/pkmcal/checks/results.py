@@ -34,13 +34,14 @@ class BoardCheck:
 
 @dataclass(frozen=True)
 class JointCheck:
-    """Readings of one joint, m or rad.
+    """Readings of one joint.
 
-    used : share of its range. ends : numbers of readings near either end of it. NaN and 0 if the
-    mechanism file gives no range.
+    unit : m or rad. used : share of its range. ends : numbers of readings near either end of it.
+    NaN and 0 if the mechanism file gives no range.
     """
 
     name: str
+    unit: str
     low: float
     high: float
     used: float

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,18 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.checks.advice import forecast_figure, forecast_part
+from pkmcal.checks.forecast import NEAR_END
 from pkmcal.checks.results import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
 from pkmcal.files import resolved
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.judge.repeatability import RepeatStudy, part_of
 from pkmcal.levels import MAJORITY
 from pkmcal.measurements.contract import measurement_kinds
-from pkmcal.outcome import Mark, Outcome, Part, Row, Table, Verdict
+from pkmcal.outcome import Figure, Mark, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.finding import Finding, Level, doubtful, note
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import count, listed
+from pkmcal.wording import DISPLAY_UNITS, Chance, count, listed, number, with_unit
 
 OVEREXPOSED_PIXEL_SHARE = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost; a highlight has a tenth."""
@@ -29,16 +31,35 @@ BLUR_STILL_MEASURED = 1.7
 """Blur (px) beyond which edges are measured badly: the model of an edge ends at 1.5."""
 POOR_CORNERS = 0.5
 """Residual of corners (px rms) beyond that of any sharp image of a flat board."""
-STATION_LEGEND = (
-    "By chance: probability of other readings fitting as well (of an image by hand, another place);"
-    " good below 0.001, or 0.01 near a pose or by hand. Moved: from the pose by hand to the one"
-    " found. Legs: found in an image. White, black: of the legs' pixels. Blur: of the sharpest"
-    " edges."
-)
-BOARD_LEGEND = (
-    "Seen: images that show it. Off: corners from their predicted places. Wander: of the board on"
-    " the base between images; a still one stays below 0.1 px."
-)
+STATION_COLUMNS = {
+    "Station": "",
+    "Images": "",
+    "Match by chance": "Probability that wrong readings (of an image by hand: another place) match"
+    " the images as well; good below 1 in 1000, near a rough pose or by hand below 1 in 100.",
+    "Moved": "Distance and turn from the rough pose to the estimated one.",
+    "Legs found": "Mean number in an image.",
+    "Blur": "Standard deviation of the blur of the sharpest edges.",
+    "White": "Share of the legs' pixels that are saturated.",
+    "Black": "Share of the legs' pixels that are black.",
+}
+"""Columns of the table of stations, with their explanations."""
+BOARD_COLUMNS = {
+    "Board at": "",
+    "Images": "Images in which the board was found.",
+    "Corners": "Mean number found in these.",
+    "Residual": "Root mean square distance of the corners from their predicted places.",
+    "Wander": "Motion of a board on the base between images; a still one stays below 0.1 px.",
+    "Distance": "From the camera.",
+}
+JOINT_COLUMNS = {
+    "Joint": "",
+    "Lowest": "",
+    "Highest": "",
+    "Range used": "From the lowest to the highest reading, of the mechanism file's range.",
+    "Near low end": f"Configurations with a reading in the lowest {NEAR_END:.0%} of the range;"
+    " readings near both ends determine the joint's offset best.",
+    "Near high end": f"Configurations with a reading in the highest {NEAR_END:.0%} of the range.",
+}
 KINEMATICS_SENTENCE = (
     "The nominal machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
     " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
@@ -184,11 +205,44 @@ def outcome_of(check: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         verdict=Verdict(code == 0, headlines[2 if refused else code], check.advice),
         stamp=("Ready", "Doubtful", "Not yet")[2 if refused else code],
         level=Level.WRONG if code == 2 else Level.DOUBTFUL,
-        figures=(forecast_figure(check.forecast),) if check.forecast else (),
+        figures=_cards(check),
         parts=(*parts, part_of(study)) if study else parts,
         findings=findings,
         document=check.as_dict(),
     )
+
+
+def _cards(check: SessionCheck) -> tuple[Figure, ...]:
+    """Main numbers; those without data are left out."""
+    out: list[Figure] = []
+    searched = [one for one in check.stations if math.isfinite(one.by_chance)]
+    if searched:
+        good = sum(one.recognised for one in searched)
+        worst = max(searched, key=lambda one: one.by_chance)
+        out.append(
+            Figure(
+                "Where is the machine recognized?",
+                ((f"{good} of {len(searched)}", "stations"),),
+                "wrong readings would match as well with a probability of"
+                f" {Chance(worst.by_chance)} at worst ({worst.name})",
+                mark="good" if good == len(searched) else Level.WRONG,
+            )
+        )
+    used = [joint for joint in check.joints if math.isfinite(joint.used)]
+    if used:
+        least = min(used, key=lambda joint: joint.used)
+        out.append(
+            Figure(
+                "How much of the joints' ranges is used?",
+                ((f"{least.used:.0%}", ""),),
+                f"by {least.name}, the least of {count(len(used), 'joint')}",
+                f"limit {MAJORITY:.0%}",
+                "good" if least.used >= MAJORITY else Level.NOTE,
+            )
+        )
+    if check.forecast:
+        out.append(forecast_figure(check.forecast))
+    return tuple(out)
 
 
 def _stations_table(check: SessionCheck) -> Table:
@@ -203,16 +257,15 @@ def _stations_table(check: SessionCheck) -> Table:
         finite = station.recognised and math.isfinite(station.legs)
         cells = (
             str(station.photographs),
-            _number(station.by_chance, "{:.0e}"),
+            Chance(station.by_chance),
             motion if math.isfinite(station.moved) else "–",
-            f"{station.legs:.1f}/{check.n_legs}" if finite else "–",
+            f"{station.legs:.1f} of {check.n_legs}" if finite else "–",
+            _number(station.blur, "{:.1f} px"),
             _number(station.saturated, "{:.0%}"),
             _number(station.black, "{:.0%}"),
-            _number(station.blur, "{:.1f} px"),
         )
         rows.append(Row(station.name, cells, mark=mark))
-    columns = ("Station", "Photos", "By chance", "Moved", "Legs", "White", "Black", "Blur")
-    return Table("", columns, tuple(rows), STATION_LEGEND, legend=STATION_LEGEND)
+    return _table("Stations", STATION_COLUMNS, tuple(rows), first=6)
 
 
 def _boards_table(check: SessionCheck) -> Table:
@@ -221,7 +274,7 @@ def _boards_table(check: SessionCheck) -> Table:
             station.name,
             (
                 f"{board.found} of {station.photographs}",
-                f"{board.corners:.0f}/{board.corners_of}",
+                f"{board.corners:.0f} of {board.corners_of}",
                 f"{board.rms:.3f} px",
                 _number(board.scatter, "{:.3f} px"),
                 f"{board.distance:.2f} m",
@@ -231,8 +284,7 @@ def _boards_table(check: SessionCheck) -> Table:
         for station in check.stations
         if (board := station.board) is not None
     )
-    columns = ("Board", "Seen", "Corners", "Off", "Wander", "Distance")
-    return Table("", columns, rows, legend=BOARD_LEGEND)
+    return _table("Boards", BOARD_COLUMNS, rows)
 
 
 def _joints_table(joints: tuple[JointCheck, ...]) -> Table:
@@ -240,16 +292,28 @@ def _joints_table(joints: tuple[JointCheck, ...]) -> Table:
         Row(
             joint.name,
             (
-                f"{joint.low:.4f}",
-                f"{joint.high:.4f}",
+                _reading(joint.low, joint.unit),
+                _reading(joint.high, joint.unit),
                 _number(joint.used, "{:.0%}"),
-                f"{joint.ends[0]} + {joint.ends[1]}" if math.isfinite(joint.used) else "–",
+                *(str(n) if math.isfinite(joint.used) else "–" for n in joint.ends),
             ),
             mark=Level.NOTE if joint.used < MAJORITY else "good",
         )
         for joint in joints
     )
-    return Table("", ("Joint", "Lowest", "Highest", "Of its range", "Near the ends"), rows)
+    brief = any(row.mark != "good" for row in rows)
+    return _table("Readings", JOINT_COLUMNS, rows, brief=brief)
+
+
+def _table(title: str, columns: Mapping[str, str], rows: tuple[Row, ...], **layout: Any) -> Table:
+    """Table whose columns have explanations; layout : further fields."""
+    return Table(title, tuple(columns), rows, hints=tuple(columns.values()), **layout)
+
+
+def _reading(value: float, unit: str) -> str:
+    """Reading, m or rad, in its display unit."""
+    scale, name = DISPLAY_UNITS[unit]
+    return with_unit(number(value * scale, 1 if unit == "m" else 2), name)
 
 
 def _number(value: float, form: str) -> str:

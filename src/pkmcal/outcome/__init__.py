@@ -117,6 +117,8 @@ class Table:
         all.
     words : indices of the columns that hold text and are aligned to the left.
     shaded : indices of the columns whose cells are shaded by their numbers on the page.
+    hints : explanation of each column, empty for none: at its heading on the page, and under the
+        table on a terminal and on paper.
     legend : paragraph under the table on a terminal.
     """
 
@@ -129,6 +131,7 @@ class Table:
     first: int | None = None
     words: tuple[int, ...] = ()
     shaded: tuple[int, ...] = ()
+    hints: tuple[str, ...] = ()
     legend: str = ""
 
 

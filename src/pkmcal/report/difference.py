@@ -28,11 +28,11 @@ from pkmcal.report.space import (
     small_vector,
     start_enlargements,
 )
-from pkmcal.report.watch import NO_VALUE_SIGN, chance_text
+from pkmcal.report.watch import NO_VALUE_SIGN
 from pkmcal.report.workspace import middle_and_worst
 from pkmcal.web.motion import Postures, home_posture
 from pkmcal.web.stage import extent_of, leg_rows, line, machine_shape
-from pkmcal.wording import DISPLAY_UNITS, brief, count, decimals, number
+from pkmcal.wording import DISPLAY_UNITS, Chance, brief, count, decimals, number
 
 CHANGES_ON_TERMINAL = 8
 """Changes that a terminal lists."""
@@ -98,7 +98,7 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
         out.append(
             Figure(
                 "How likely by chance alone?",
-                ((chance_text(d.chance), ""),),
+                ((Chance(d.chance), ""),),
                 f"χ² {number(d.change.chi2, 1)} for {count(d.change.dof, 'degree')} of freedom",
             )
         )
@@ -186,7 +186,7 @@ def _row(d: MachineDifference, k: int) -> Row:
     size = sigma if sigma > 0 else abs(change)
     places = decimals(size) if size > 0 else 3
     name = table.in_words(table.names[k])
-    chance = chance_text(float(d.chances[k]))
+    chance = Chance(float(d.chances[k]))
     return Row(
         f"{name}, {unit}" if unit else name,
         (

@@ -24,7 +24,7 @@ from pkmcal.outcome.blocks.plot import (
     rounded,
 )
 from pkmcal.report.charts import NORMAL_90, bar_plot
-from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, listed, named, number
+from pkmcal.wording import DISPLAY_UNITS, Chance, amount, brief, count, listed, named, number
 
 NO_VALUE_SIGN = "–"
 LARGE_RESIDUAL_SIGMAS = 2.0
@@ -114,9 +114,9 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
     out = [
         Figure(
             "How likely by chance alone?",
-            ((chance_text(least), ""),),
+            ((Chance(least), ""),),
             f"of {who}, the least of {count(len(judged.tests), 'test')},"
-            f" their number allowed for; below {judged.alpha:g} counts as a change",
+            f" their number allowed for; below {Chance(judged.alpha)} counts as a change",
         )
     ]
     sizes = [leg for leg in judged.legs if leg.zero and leg.zero.dof]
@@ -147,7 +147,7 @@ def legs_table(w: Watch) -> Table:
             (
                 _statistic(leg.whole),
                 _statistic(leg.zero),
-                chance_text(leg.chance),
+                Chance(leg.chance),
                 _zero(leg),
                 amount(leg.detects_zero, leg.unit)
                 if np.isfinite(leg.detects_zero)
@@ -228,19 +228,10 @@ def _findings_table(w: Watch) -> Table | None:
     )
 
 
-def chance_text(chance: float) -> str:
-    """Probability with one or two digits, never zero."""
-    if not np.isfinite(chance):
-        return NO_VALUE_SIGN
-    if chance < 1e-4:
-        return "< 0.0001"
-    return f"{chance:.2g}" if chance < 0.995 else "1"
-
-
 def _cells(test: Score) -> tuple[str, str, str]:
     """Statistic, degrees of freedom and probability of a test, as text."""
     cells = (
-        (number(test.chi2, 1), chance_text(test.adjusted))
+        (number(test.chi2, 1), Chance(test.adjusted))
         if test.dof
         else (NO_VALUE_SIGN, NO_VALUE_SIGN)
     )

@@ -76,6 +76,7 @@ export function dataTable(block: DataTable, { selection, printSteps }: Context):
     ...tools,
     scrollable(table, block.title || "Table"),
     more,
+    ...explanations(block.columns),
     ...(block.note ? [h("p", { class: "small" }, block.note)] : []),
   ];
   printSteps.push(() => {
@@ -86,6 +87,15 @@ export function dataTable(block: DataTable, { selection, printSteps }: Context):
   });
   if (block.folded) return h("details", {}, h("summary", {}, block.title), ...content);
   return h("div", { class: "data-table" }, ...(block.title ? [h("h3", {}, block.title)] : []), ...content);
+}
+
+/** The columns' explanations, for paper, where nothing can be pointed at. */
+function explanations(columns: Column[]): HTMLElement[] {
+  const named = new Map<string, string[]>();
+  for (const { name, hint } of columns) if (hint) named.set(hint, [...(named.get(hint) ?? []), name]);
+  if (!named.size) return [];
+  const items = [...named].map(([hint, names]) => h("li", {}, h("b", {}, names.join(", ")), `: ${hint}`));
+  return [h("ul", { class: "explanations" }, ...items)];
 }
 
 /** Area that scrolls sideways, and is reached by the keyboard as long as there is anything to scroll. */
@@ -150,7 +160,8 @@ function tableRow(row: TableRow, columns: Column[], most: number): HTMLTableRowE
     const text = row.cells[k] ?? "", children = cellContent(column, text, row.values[k] ?? null);
     const first = k === columns.findIndex((one) => one.form === "text");
     if (!first) {
-      const cell = h("td", { class: column.form }, ...children);
+      const value = column.form === "chance" ? row.values[k] ?? null : null;
+      const cell = h("td", { class: column.form, "data-tip": value !== null && value.toPrecision(2) }, ...children);
       if (column.form === "shade") cell.style.setProperty("--share", String((row.values[k] ?? 0) / most));
       return cell;
     }

@@ -14,13 +14,14 @@ class Column(Schema):
 
     form : text; number, to the right, ``a ± b`` with the second part small; leg, a chip with the
         leg's colour; share, a bar from 0 to 1 beside its text; shade, a number whose cell is the
-        darker the larger it is among those of all such columns.
+        darker the larger it is among those of all such columns; chance, a probability in words,
+        whose number is its tooltip.
     hint : explanation of the heading.
     by_size : sorted by the size of the values, whatever their sign, as changes are.
     """
 
     name: Text
-    form: Literal["text", "number", "leg", "share", "shade"] = "number"
+    form: Literal["text", "number", "leg", "share", "shade", "chance"] = "number"
     hint: Text = ""
     by_size: bool = False
 
