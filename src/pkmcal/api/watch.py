@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 from pkmcal.api.result import FolderResult, page_and_numbers
 from pkmcal.calibration.saved_calibration import SavedCalibration
+from pkmcal.files import write_folder
 from pkmcal.judge.watch import Watch, watch_machine
+from pkmcal.judge.watch_runs import earlier_runs
 from pkmcal.outcome import Outcome
 from pkmcal.outcome.progress import Progress, whole
 from pkmcal.ranges import default
@@ -19,7 +21,10 @@ from pkmcal.session.load import Session
 
 @dataclass(frozen=True, repr=False, eq=False)
 class WatchResult(FolderResult, Watch):
-    """Tests of a calibrated machine, with their files: ``judged``, ``verdict``."""
+    """Tests of a calibrated machine, with their files: ``judged``, ``verdict``.
+
+    Saved over an earlier test, a result continues its run chart.
+    """
 
     own_files = page_and_numbers("watch")
     kind = ("what watch writes", "an earlier test of the machine")
@@ -28,6 +33,23 @@ class WatchResult(FolderResult, Watch):
     def outcome(self) -> Outcome:
         """Verdict, tables and sections of the page."""
         return outcome_of(self)
+
+    @classmethod
+    def check_folder(cls, folder: Path | str, *, force: bool = False) -> list[str]:
+        """Names of an earlier test's files in a folder; see :class:`FolderResult`.
+
+        Raises InputError for an earlier test whose run chart cannot be continued, too.
+        """
+        names = super().check_folder(folder, force=force)
+        earlier_runs(folder)
+        return names
+
+    def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
+        """Write the command's files; the run chart continues that of a test in this folder."""
+        over = self.check_folder(folder, force=force)
+        whole_history = replace(self, earlier=earlier_runs(folder))
+        write_folder(Path(folder), whole_history.contents(), over)
+        return None
 
 
 def watch(

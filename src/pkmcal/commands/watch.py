@@ -14,7 +14,7 @@ from pkmcal.ranges import default
 EXAMPLES = """\
 pkmcal watch out today
 pkmcal watch out today --same-place front
-pkmcal watch out today --alpha 0.001 -o watch
+pkmcal watch out today -o watch      (again with later sessions: a run chart)
 """
 
 
@@ -26,7 +26,10 @@ def watch(
             metavar="SESSION", help="Five new images from one place, with their readings."
         ),
     ],
-    out: Annotated[Path | None, console.folder("SESSION/watch unless given.")] = None,
+    out: Annotated[
+        Path | None,
+        console.folder("SESSION/watch unless given; one with an earlier test adds its run chart."),
+    ] = None,
     alpha: Annotated[
         float, console.number_option("watch", "alpha", "P", "Share of false alarms.")
     ] = default("watch", "alpha"),

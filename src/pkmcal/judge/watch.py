@@ -29,6 +29,7 @@ from pkmcal.judge.changes import CHANGE_ALPHA, ChangeTests, StationTest, detect_
 from pkmcal.judge.fixed_machine import Held, Trust, change_evidence, hold
 from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
+from pkmcal.judge.watch_runs import Run, continued, run_of
 from pkmcal.measurements.rows import Kinds
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.progress import Progress, no_progress, part
@@ -52,7 +53,8 @@ class Watch:
     configuration's residuals with the fixed machine, in standard deviations. calibrated : (K,)
     configurations used by the calibration, which are excluded. observed : (K,) those that are
     tested. noise_scale, pose_scale : factors on the stated noise. same_place : stations with the
-    poses of the calibration. stations_moved : stations that should have them, and do not.
+    poses of the calibration. stations_moved : stations that should have them, and do not. run :
+    this test as an entry of the run chart. earlier : those before it.
     """
 
     calibration: SavedCalibration
@@ -64,9 +66,11 @@ class Watch:
     observed: Booleans
     noise_scale: float
     pose_scale: float
+    run: Run
     same_place: tuple[str, ...] = ()
     stations_moved: tuple[StationTest, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
+    earlier: tuple[Run, ...] = ()
 
     __repr__ = short_repr
 
@@ -93,6 +97,7 @@ class Watch:
                     }
                     for s in self.stations_moved
                 ],
+                "runs": [one.model_dump() for one in continued(self.earlier, self.run)],
                 "timings": self.timings,
             }
         )
@@ -149,16 +154,19 @@ def watch_machine(
             names_of(session),
             stations_moved,
         )
+        verdict = watch_verdict(judged, compared)
+        tested = observed & ~calibrated
         return Watch(
             calibration=saved,
             session=session,
-            verdict=watch_verdict(judged, compared),
+            verdict=verdict,
             judged=judged,
             residuals=held.residuals(),
             calibrated=calibrated,
-            observed=observed & ~calibrated,
+            observed=tested,
             noise_scale=noise,
             pose_scale=data_weights.scale.poses,
+            run=run_of(saved, session, judged, verdict, int(tested.sum())),
             same_place=tuple(session.station_names[k] for k in prior.stations),
             stations_moved=stations_moved,
             timings={**remeasured.timings, "all": time.perf_counter() - began},

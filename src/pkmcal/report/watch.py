@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pkmcal.identify.score import Score
 from pkmcal.judge.changes import DETECTION_POWER, LegTest
 from pkmcal.judge.sentences import cause_words, least_size, signed
 from pkmcal.judge.watch import Watch, names_of
+from pkmcal.judge.watch_runs import Run, continued, share
 from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table
 from pkmcal.outcome.blocks.base import configuration_key, leg_key
 from pkmcal.outcome.blocks.plot import (
     DotsMark,
     LineMark,
+    Mark,
     Plot,
     Point,
     RuleMark,
@@ -20,6 +24,7 @@ from pkmcal.outcome.blocks.plot import (
     leg_colour,
     line_points,
     linear_axis,
+    log_axis,
     panels,
     rounded,
 )
@@ -27,6 +32,15 @@ from pkmcal.report.charts import NORMAL_90, bar_plot
 from pkmcal.wording import DISPLAY_UNITS, Chance, amount, brief, count, listed, named, number
 
 NO_VALUE_SIGN = "–"
+STAMPS = {
+    "as_calibrated": "Still as calibrated",
+    "changed": "Changed",
+    "undecided": "Undecided",
+    "another_machine": "Another machine",
+}
+"""Result of a test in one to three words."""
+LEAST_DRAWN_SHARE = 0.01
+"""Statistic, in thresholds, below which it is drawn there on the logarithmic axis."""
 LARGE_RESIDUAL_SIGMAS = 2.0
 """Standard deviations above which a configuration's residuals are emphasized."""
 WATCH_METHOD_TEXT = (
@@ -43,6 +57,22 @@ WATCH_METHOD_TEXT = (
 )
 
 
+LEG_COLUMNS = {
+    "Leg": "",
+    "χ² / degrees": "Statistic of all numbers of the leg, and its degrees of freedom.",
+    "χ² of zero": "Statistic of the zero of the leg's reading alone.",
+    "By chance": "Probability of as much in a machine that did not change, all tests allowed for.",
+    "Zero off by": "Change of the zero of the reading, if nothing else changed.",
+    "Found from": "Smallest change of the zero with a probability of"
+    f" {DETECTION_POWER:.0%} to be found.",
+    "Base joint from, mm": "Smallest displacement that would be found as often, in the direction"
+    " seen best, and seen worst.",
+    "Platform joint from, mm": "Smallest displacement that would be found as often, in the"
+    " direction seen best, and seen worst.",
+}
+"""Columns of the table of legs, with their explanations."""
+
+
 FIXED_STATION_TEXT = (
     "A camera's place in the calibration is used with its covariance, most of which it shares with"
     " the machine. Whether such a camera was moved is tested as well; a base that moved against its"
@@ -54,6 +84,7 @@ def outcome_of(w: Watch) -> Outcome:
     """Outcome of ``pkmcal watch``."""
     causes, run = _findings_table(w), panels(_by_configuration(w))
     parts = (
+        _history(w),
         Part(
             "legs",
             "Tests",
@@ -69,7 +100,7 @@ def outcome_of(w: Watch) -> Outcome:
         title=f"Watch of {w.calibration.machine.name}",
         kicker=w.session.called,
         verdict=w.verdict,
-        stamp=stamp(w),
+        stamp=STAMPS[w.run.result],
         level=Level.WRONG if w.judged.changed else Level.DOUBTFUL,
         figures=_cards(w),
         parts=tuple(part for part in parts if part),
@@ -96,12 +127,127 @@ def _how(w: Watch) -> Part:
     return Part("how", "How it was computed", text, notes=(left_out,) if prior else ())
 
 
-def stamp(w: Watch) -> str:
-    """Verdict in one to three words."""
-    if w.verdict.usable:
-        return "Still as calibrated"
-    parts = {f.suspect.cause.part for f in w.judged.findings}
-    return "Changed" if w.judged.changed and parts != {"camera"} else "Undecided"
+def _history(w: Watch) -> Part | None:
+    """Section with the run charts over this test and earlier ones; None without one."""
+    every = continued(w.earlier, w.run)
+    runs = [one for one in every if one.calibration == w.run.calibration]
+    if len(runs) < 2:
+        return None
+    others = len(every) - len(runs)
+    note = (
+        f"{count(others, 'earlier test')} against another calibration"
+        f" {'is' if others == 1 else 'are'} not drawn."
+    )
+    rows = tuple(
+        Row(
+            f"{one.when:%Y-%m-%d %H:%M}",
+            (one.session, str(one.configurations), brief(one.share), STAMPS[one.result]),
+            mark="good" if one.result == "as_calibrated" else Level.DOUBTFUL,
+        )
+        for one in reversed(runs)
+    )
+    table = Table(
+        "Tests against this calibration",
+        ("Tested", "Session", "Configurations", "Largest statistic", "Result"),
+        rows,
+        brief=False,
+        words=(1, 4),
+        hints=("", "", "", "Largest statistic of all tests, in thresholds: 1 is a change.", ""),
+    )
+    return Part(
+        "history",
+        "Run chart",
+        blocks=panels(_share_chart(runs), _zero_chart(runs)),
+        tables=(table,),
+        notes=(note,) if others else (),
+    )
+
+
+def _labels(runs: Sequence[Run]) -> list[str]:
+    """Dates of tests, with the time where a day has several."""
+    days = [f"{one.when:%Y-%m-%d}" for one in runs]
+    names = [
+        day if days.count(day) == 1 else f"{one.when:%m-%d %H:%M:%S}"
+        for day, one in zip(days, runs, strict=True)
+    ]
+    return names if len({*names}) == len(names) else [f"{k + 1}" for k in range(len(names))]
+
+
+def _share_chart(runs: Sequence[Run]) -> Plot:
+    """Run chart of the largest statistic, in thresholds."""
+    labels, values = _labels(runs), [max(one.share, LEAST_DRAWN_SHARE) for one in runs]
+    points = tuple(
+        Point(
+            x=label,
+            y=rounded(value),
+            tip=f"{one.when:%Y-%m-%d %H:%M}, {one.session}: {STAMPS[one.result].lower()},"
+            f" {brief(one.share)} thresholds",
+            colour=None if one.result == "as_calibrated" else "bad",
+        )
+        for label, value, one in zip(labels, values, runs, strict=True)
+    )
+    return Plot(
+        name="history",
+        title="Largest statistic of each test",
+        caption="Above the threshold the machine changed, or is another one.",
+        alt=f"Largest statistics of {count(len(runs), 'test')} in thresholds, by date",
+        x=category_axis(labels, "tested"),
+        y=log_axis("in thresholds", (*values, 1.0)),
+        marks=(
+            RuleMark(name="threshold", axis="y", at=1.0, colour="bad"),
+            LineMark(name="", colour="quiet", points=line_points(labels, values)),
+            DotsMark(name="tests", colour="calibrated", points=points),
+        ),
+    )
+
+
+def _zero_chart(runs: Sequence[Run]) -> Plot | None:
+    """Run chart of the zeros of the legs' readings, in their limits; of another machine, whose
+    zeros mean nothing, there are none.
+    """
+    labels = _labels(runs)
+    legs = sorted({zero.legs for one in runs for zero in one.zeros})
+    marks: list[Mark] = [
+        RuleMark(name="limits", axis="y", at=at, colour="bad") for at in (-1.0, 1.0)
+    ]
+    marks[1] = marks[1].model_copy(update={"name": ""})
+    drawn: list[float] = [-1.0, 1.0]
+    for leg in legs:
+        points: list[Point] = []
+        for label, one in zip(labels, runs, strict=True):
+            zero = next((each for each in one.zeros if each.legs == leg), None)
+            if zero is None or one.result == "another_machine":
+                continue
+            name = named(j - 1 for j in leg)
+            text = signed(zero.value, zero.sigma, zero.unit)
+            limit = amount(zero.limit, zero.unit)
+            points.append(
+                Point(
+                    x=label,
+                    y=rounded(zero.value / zero.limit),
+                    tip=f"{name}, {label}: {text}, limit {limit}",
+                    key=leg_key(leg[0]),
+                )
+            )
+        values = [float(point.y) for point in points]
+        drawn += values
+        line = line_points([str(point.x) for point in points], values)
+        colour, key = leg_colour(leg[0]), leg_key(leg[0])
+        marks += [
+            LineMark(name="", colour=colour, points=line, key=key),
+            DotsMark(name=named(j - 1 for j in leg), colour=colour, points=tuple(points), radius=3),
+        ]
+    if len(drawn) == 2:
+        return None
+    return Plot(
+        name="history-zeros",
+        title="The zero of each leg's reading, if nothing else changed",
+        caption="In limits: beyond ±1 the leg's own test fails.",
+        alt=f"Changes of the zeros in {count(len(runs), 'test')}, in their limits, by date",
+        x=category_axis(labels, "tested"),
+        y=linear_axis("in limits", drawn),
+        marks=tuple(marks),
+    )
 
 
 def _cards(w: Watch) -> tuple[Figure, ...]:
@@ -158,20 +304,13 @@ def legs_table(w: Watch) -> Table:
         )
         for leg in w.judged.legs
     ]
-    columns = (
-        "Leg", "χ² / degrees", "of its zero", "chance", "zero off by", "found from",
-        "base joint, mm", "platform joint, mm",
-    )  # fmt: skip
     return Table(
         "Legs",
-        columns,
+        tuple(LEG_COLUMNS),
         tuple(rows),
-        "χ² of all numbers of a leg, and of the zero of its reading alone. Chance: of as much in a"
-        " machine that did not change, all tests allowed for. Zero off by: if nothing else"
-        " changed. Found from: the smallest change of that zero, and of the joints in the direction"
-        f" seen best and worst, that has a {DETECTION_POWER:.0%} probability to be found. A leg"
-        " that changed moves the tests of the others, too.",
+        "A leg that changed moves the tests of the others, too.",
         first=6,
+        hints=tuple(LEG_COLUMNS.values()),
     )
 
 
@@ -281,21 +420,17 @@ def _statistics(w: Watch) -> Plot | None:
 
 def _leg_bar(label: str, leg: int, tests: list[Score], level: float) -> Point:
     """Bar of a leg's tests."""
-    from scipy.special import chdtri
-
-    limits = [float(chdtri(t.dof, level)) for t in tests]
+    shares = [share(test, level) for test in tests]
     texts = [
-        f"χ² {number(t.chi2, 1)} for {count(t.dof, 'degree')} of freedom,"
-        f" threshold {number(limit, 1)}"
-        for t, limit in zip(tests, limits, strict=True)
+        f"χ² {number(t.chi2, 1)} for {count(t.dof, 'degree')} of freedom, {brief(one)} thresholds"
+        for t, one in zip(tests, shares, strict=True)
     ]
-    share = max(t.chi2 / limit for t, limit in zip(tests, limits, strict=True))
     return Point(
         x=label,
-        y=rounded(share),
+        y=rounded(max(shares)),
         tip=f"{label}: {'; '.join(texts)}",
         key=leg_key(leg),
-        colour="quiet" if share < 1 else None,
+        colour="quiet" if max(shares) < 1 else None,
     )
 
 
