@@ -403,7 +403,7 @@ def test_the_page(wide_calibration, tmp_path):
     assert document["verdict"]["tone"] == "good"
     (block,) = page_blocks(document, "images", "images")
     assert len(block["images"]) == 10
-    assert [one["title"] for one in block["images"] if one["jpeg"]] == ["p0.png"]
+    assert [one["title"] for one in block["images"] if one["webp"]] == ["p0.png"]
     # the largest held-out error first
     order = np.argsort(-value.held_out.by_view, kind="stable")
     assert [one["title"] for one in block["images"]] == [value.views[v] for v in order]

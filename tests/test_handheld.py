@@ -354,7 +354,7 @@ def test_a_rejected_image_is_counted_named_and_shown(breathed):
     assert [layer.name for layer in overlay.layers] == ["edges", "joints"]
     assert all(layer.shapes for layer in overlay.layers)
     assert image.caption == f"rejected, for {EDGES_DISAGREE_REASON}"
-    assert len(image.jpeg) > 1000
+    assert len(image.webp) > 1000
 
 
 def test_the_better_of_estimated_intrinsics_and_those_of_the_files(breathed):

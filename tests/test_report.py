@@ -302,13 +302,13 @@ def test_as_many_images_are_shown_as_there_is_room_for(case):
     assert [one.title for one in block.images] == [one.title for one in display.images]
     assert len(block.images) == 7
     assert "7 of 15 images" in part.blocks[0].text
-    large = [len(shot.jpeg) for shot in display.images]
-    few = album_of(case, replace(seven, jpeg_characters=sum(large) * 9 // 10)).images
-    size = [len(shot.jpeg) for shot in few]
+    large = [len(shot.webp) for shot in display.images]
+    few = album_of(case, replace(seven, characters=sum(large) * 9 // 10)).images
+    size = [len(shot.webp) for shot in few]
     assert len(few) == 7
     assert 0 < sum(a < b for a, b in zip(size, large, strict=True)) < 7  # in fewer pixels
     assert sum(size) <= sum(large) * 9 // 10
-    fewer = album_of(case, replace(seven, jpeg_characters=min(size) * 3)).images
+    fewer = album_of(case, replace(seven, characters=min(size) * 3)).images
     assert 0 < len(fewer) < 7
 
 

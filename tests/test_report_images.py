@@ -38,8 +38,8 @@ def case(tmp_path_factory) -> Case:
     return make_case(tmp_path_factory.mktemp("session"))
 
 
-def decoded(jpeg: str) -> np.ndarray:
-    return cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), np.uint8), cv2.IMREAD_GRAYSCALE)
+def decoded(webp: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(webp), np.uint8), cv2.IMREAD_GRAYSCALE)
 
 
 def image_of_edge(curve, outward, size) -> np.ndarray:
@@ -99,12 +99,12 @@ def test_the_fitted_line_lies_on_the_edge_in_the_strip(case):
     curves = pictures.edge_curves(c, mine, 0)
     for k in range(0, len(mine), 3):
         tube = image_of_edge(curves[k], lines.normal[k].mean(axis=0), size)
-        (strip,), jpeg = strips_of_image(c, tube, mine[k : k + 1], lines.select(mine == mine[k]))
-        level = decoded(jpeg)
+        (strip,), webp = strips_of_image(c, tube, mine[k : k + 1], lines.select(mine == mine[k]))
+        level = decoded(webp)
         assert level.shape == (STRIP_ROWS, strip.length)
         at = np.linspace(0, strip.length - 1, len(strip.offset))
         expected = MIDDLE - np.interp(np.arange(strip.length), at, strip.offset)
-        # with the noise of the JPEG
+        # with the noise of the compression
         np.testing.assert_allclose(step_rows(level)[3:-3], expected[3:-3], atol=0.1)
 
 
@@ -167,8 +167,8 @@ def test_the_page_holds_each_image_once_with_strips_of_the_first(page, case):
     assert [len(one["strips"]) > 0 for one in images] == [True] * 12 + [False] * 3
     size = case.session.stations[0].camera.image_size
     for image in images:
-        assert page.count(image["jpeg"]) >= 1
-        assert decoded(image["jpeg"]).shape == size[::-1]
+        assert page.count(image["webp"]) >= 1
+        assert decoded(image["webp"]).shape == size[::-1]
         (overlay,) = image["overlays"]
         layers = {layer["name"]: layer["shapes"] for layer in overlay["layers"]}
         assert len(layers["joints"]) == len(layers["nominal"]) == 12

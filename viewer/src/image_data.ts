@@ -2,12 +2,12 @@
 
 const urls = new Map<string, string>();
 
-export function toBlobUrl(jpeg: string): string {
-  let url = urls.get(jpeg);
+export function toBlobUrl(webp: string): string {
+  let url = urls.get(webp);
   if (!url) {
-    const bytes = Uint8Array.from(atob(jpeg), (sign) => sign.charCodeAt(0));
-    url = URL.createObjectURL(new Blob([bytes], { type: "image/jpeg" }));
-    urls.set(jpeg, url);
+    const bytes = Uint8Array.from(atob(webp), (sign) => sign.charCodeAt(0));
+    url = URL.createObjectURL(new Blob([bytes], { type: "image/webp" }));
+    urls.set(webp, url);
   }
   return url;
 }

@@ -35,8 +35,8 @@ export function cameraPixel(image: Image, x: number, y: number): [number, number
 export function imageSvg(image: Image, overlay = 0): SVGSVGElement {
   const { width, height } = uprightSize(image);
   const frame = { x: -0.5, y: -0.5, width: image.width, height: image.height };
-  const background = image.jpeg
-    ? svg("image", { ...frame, preserveAspectRatio: "none", href: toBlobUrl(image.jpeg) })
+  const background = image.webp
+    ? svg("image", { ...frame, preserveAspectRatio: "none", href: toBlobUrl(image.webp) })
     : svg("rect", { ...frame, class: "absent" });
   const layers = image.overlays[overlay]?.layers ?? [];
   const picture = svg("svg", {

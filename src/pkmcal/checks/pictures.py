@@ -16,7 +16,6 @@ from pkmcal.cameras import Camera
 from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.files import place_below, staged_folder
 from pkmcal.observe.images import upright_turns
-from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
 from pkmcal.observe.overlays import (
     EdgeCurve,
     Spot,
@@ -24,6 +23,7 @@ from pkmcal.observe.overlays import (
     joint_layers,
     machine_laid_over,
 )
+from pkmcal.observe.page_images import PAGE_IMAGE_CHARACTERS, images_within
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.base import image_key
 from pkmcal.outcome.blocks.images import Image, Images, Overlay
@@ -57,8 +57,8 @@ def with_pictures(inspection: Inspection) -> Part:
     ]
     order = list(dict.fromkeys([*first, *others]))
     files = [(inspection.stations[s].images.images, k) for s, k in order]
-    jpegs = jpegs_within(files, PAGE_JPEG_CHARACTERS)
-    images = [_image(inspection, s, k, one) for (s, k), one in zip(order, jpegs, strict=False)]
+    contents = images_within(files, PAGE_IMAGE_CHARACTERS)
+    images = [_image(inspection, s, k, one) for (s, k), one in zip(order, contents, strict=False)]
     text = NOMINAL_OVER_IMAGES_TEXT
     if len(images) < len(order):
         text += f" Here are {len(images)} of {len(order)} images."
@@ -71,7 +71,7 @@ def with_pictures(inspection: Inspection) -> Part:
     )
 
 
-def _image(inspection: Inspection, s: int, k: int, jpeg: str) -> Image:
+def _image(inspection: Inspection, s: int, k: int, webp: str) -> Image:
     """Image k of a station with an overlay for each pose, that of the search first."""
     session, station = inspection.session, inspection.stations[s]
     camera, name = station.images.camera, station.name
@@ -84,13 +84,13 @@ def _image(inspection: Inspection, s: int, k: int, jpeg: str) -> Image:
     path = session.stations[station.images.station].images[k].path
     return Image(
         title=f"{name} / {configuration}",
-        caption="" if jpeg else "the file could not be read",
+        caption="" if webp else "the file could not be read",
         group=name,
         key=image_key(name, configuration),
         width=camera.image_size[0],
         height=camera.image_size[1],
         quarter_turns=upright_turns(path, camera.image_size),
-        jpeg=jpeg,
+        webp=webp,
         overlays=tuple(overlays),
     )
 

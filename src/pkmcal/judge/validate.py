@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
+from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.errors import PkmcalError
@@ -46,7 +47,8 @@ class Validation:
     """Results of a validation.
 
     calibration : as loaded. judged : comparison on configurations that it did not use; None without
-    any, when only regions were held out. calibrated : (K,) configurations that it used. repeated :
+    any, when only regions were held out. remeasured : the new data's measurements, with an estimate
+    of their own. calibrated : (K,) configurations that it used. repeated :
     (K,) new measurements at poses that it used. regions : holdouts within the session. paths :
     straight paths.
     """
@@ -55,6 +57,7 @@ class Validation:
     session: Session
     verdict: Verdict
     judged: NominalComparison | None
+    remeasured: Calibration
     calibrated: Booleans
     repeated: Booleans
     regions: tuple[HoldOut, ...]
@@ -141,6 +144,7 @@ def validate_calibration(
             session=session,
             verdict=replace(verdict, findings=(*verdict.findings, *failed)),
             judged=judged,
+            remeasured=remeasured,
             calibrated=calibrated,
             repeated=repeated,
             regions=held_out,

@@ -17,7 +17,7 @@ from pkmcal.camera_calibration.calibrate import (
 )
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.observe.images import Pictures, upright_turns
-from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
+from pkmcal.observe.page_images import PAGE_IMAGE_CHARACTERS, images_within
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.outcome.blocks import Block
 from pkmcal.outcome.blocks.base import configuration_key
@@ -214,9 +214,9 @@ def _image_blocks(c: CameraCalibration, paths: list[Path]) -> tuple[Block, ...]:
     present = [path for path in files if path]
     pictures = Pictures(present, size, [path.name for path in present])
     each = [(pictures, k) for k in range(len(present))]
-    jpegs = dict(zip(present, jpegs_within(each, PAGE_JPEG_CHARACTERS), strict=False))
+    contents = dict(zip(present, images_within(each, PAGE_IMAGE_CHARACTERS), strict=False))
     images = tuple(
-        _image(c, v, jpegs.get(path, "") if path else "", factor, path)
+        _image(c, v, contents.get(path, "") if path else "", factor, path)
         for v, path in zip(order, files, strict=True)
     )
     text = (
@@ -229,7 +229,7 @@ def _image_blocks(c: CameraCalibration, paths: list[Path]) -> tuple[Block, ...]:
     return Paragraph(text=text, small=True), Images(images=images), *listing
 
 
-def _image(c: CameraCalibration, v: int, jpeg: str, factor: float, path: Path | None) -> Image:
+def _image(c: CameraCalibration, v: int, webp: str, factor: float, path: Path | None) -> Image:
     """One view with its detected corners."""
     finite = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1)).tolist()
     rings, arrows = list[Shape](), list[Shape]()
@@ -248,7 +248,7 @@ def _image(c: CameraCalibration, v: int, jpeg: str, factor: float, path: Path | 
     n_rejected = len(finite) - int(c.inliers[v, finite].sum())
     caption = f"{count(len(finite), 'corner')}" + (f", {n_rejected} rejected" if n_rejected else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
-    caption += "" if jpeg else "; the image cannot be read, or has no room here"
+    caption += "" if webp else "; the image cannot be read, or has no room here"
     width, height = c.camera.image_size
     layers = (
         Layer(name="corners", shapes=tuple(rings)),
@@ -261,7 +261,7 @@ def _image(c: CameraCalibration, v: int, jpeg: str, factor: float, path: Path | 
         width=width,
         height=height,
         quarter_turns=upright_turns(path, c.camera.image_size) if path else 0,
-        jpeg=jpeg,
+        webp=webp,
         overlays=(Overlay(layers=layers),),
     )
 

@@ -19,8 +19,9 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
-from pkmcal.observe.jpegs import base64_jpeg, narrowed
+from pkmcal.observe.jpegs import narrowed
 from pkmcal.observe.overlays import measured_curves, offsets_across_curves, own_edges
+from pkmcal.observe.page_images import base64_webp
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
@@ -147,7 +148,7 @@ def field_image(
         caption=caption,
         width=one.size[0],
         height=one.size[1],
-        jpeg="" if mean is None else base64_jpeg(mean),
+        webp="" if mean is None else base64_webp(mean),
         overlays=(blocks.Overlay(layers=(layer,)),),
     )
 

@@ -14,9 +14,9 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.tool import centres_and_tool
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.observe.images import Pictures, upright_turns
-from pkmcal.observe.jpegs import PAGE_JPEG_CHARACTERS, jpegs_within
 from pkmcal.observe.overlays import (
     EDGE_CURVE_POINTS,
     EdgeCurve,
@@ -30,6 +30,7 @@ from pkmcal.observe.overlays import (
     residual_words,
     straightened,
 )
+from pkmcal.observe.page_images import PAGE_IMAGE_CHARACTERS, images_within
 from pkmcal.observe.predict import LegsInCamera, edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
@@ -37,6 +38,7 @@ from pkmcal.outcome.blocks.base import image_key
 from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.links import Place
+from pkmcal.report.residuals import outward_shift
 from pkmcal.report.strips import edge_lines, strips_of_image
 from pkmcal.session.image_files import Image
 from pkmcal.session.load import RejectedStation, Session, Station
@@ -56,10 +58,10 @@ class AlbumSize:
 
     # images: browsers take a second to lay out as many
     images: int = 400
-    # characters of all JPEGs
-    jpeg_characters: int = PAGE_JPEG_CHARACTERS
-    # first images with strips: those of all would double the page
-    strips: int = 12
+    # characters of all images
+    characters: int = PAGE_IMAGE_CHARACTERS
+    # characters of all strips, of the first images: with those of 45 images a page has 3 MB
+    strip_characters: int = 700_000
 
 
 ALBUM_SIZE = AlbumSize()
@@ -107,9 +109,11 @@ def _order_text(album: Album) -> str:
     """Which images there are, and their order."""
     n, strips = len(album.images), sum(bool(one.strips) for one in album.images)
     some = f"{n} of {album.total} images" if n < album.total else f"All {count(n, 'image')}"
-    text = f"{some}: those without data in use first, then by their residuals, the largest first."
+    text = f"{some}: those without data in use first, then by their residuals, the largest first"
+    held_out = any("held out" in one.caption for one in album.images)
+    text += "; last those that were held out." if held_out else "."
     if strips:
-        which = "every image" if strips == n else f"the first {count(strips, 'image')}"
+        which = "every image" if strips == n else f"{count(strips, 'image')}"
         text += (
             f" In {which}, a click on an edge shows the image along it, with the fitted line and"
             " its standard deviation."
@@ -148,39 +152,78 @@ def album(
 ) -> Album:
     """Images with their overlays, as many as there is room for.
 
-    Images without data in use come first, then those with the largest residuals.
+    Images without data in use come first, then those with the largest residuals, last those that
+    were held out.
 
     shifts : (N,) px of the edges, for tooltips.
     """
     session, level = calibration.session, levels(calibration.observation, calibration.estimate)
-    # the first image of each configuration at each station
-    every = [
-        (s, photo)
-        for s, station in enumerate(session.stations)
-        for photo in {p.configuration: p for p in reversed(station.images)}.values()
-    ]
-    ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
+    every = _first_images(session)
+    held_out = set(calibration.holdout.region.rows.tolist() if calibration.holdout else ())
+
+    def place_of(item: tuple[int, Image]) -> float:
+        s, photo = item
+        last = photo.configuration in held_out
+        return np.inf if last else -level.get((s, photo.configuration), np.inf)
+
+    ordered = sorted(every, key=place_of)
     images = station_images(calibration)
     files = [
         (images[s], session.stations[s].images.index(photo))
         for s, photo in ordered[: largest.images]
     ]
-    # JPEGs until the budget is spent; overlays for the images that have one
-    jpegs = list(jpegs_within(files, largest.jpeg_characters))
-    chosen = ordered[: len(jpegs)]
+    # files until the budget is spent; overlays for the images that have one
+    contents = list(images_within(files, largest.characters))
+    chosen = ordered[: len(contents)]
     overlays = _ImageOverlays(calibration, shifts, centres, chosen)
-    overlays.add_strips(images, chosen[: largest.strips])
-    room = largest.jpeg_characters - sum(map(len, jpegs))
+    overlays.add_strips(images, chosen, largest.strip_characters)
+    room = largest.characters - sum(map(len, contents))
     return Album(
         tuple(
-            overlays.image(s, photo, jpeg, level.get((s, photo.configuration), np.nan))
-            for (s, photo), jpeg in zip(chosen, jpegs, strict=True)
+            overlays.image(s, photo, webp, level.get((s, photo.configuration), np.nan))
+            for (s, photo), webp in zip(chosen, contents, strict=True)
         ),
         tuple(_rejected(session, largest.images, room)),
         len(every),
         overlays.factor,
         overlays.corners,
     )
+
+
+def _first_images(session: Session) -> list[tuple[int, Image]]:
+    """First image of each configuration at each station, with the station's index."""
+    return [
+        (s, photo)
+        for s, station in enumerate(session.stations)
+        for photo in {p.configuration: p for p in reversed(station.images)}.values()
+    ]
+
+
+def images_of_configurations(
+    calibration: Calibration, captions: Mapping[int, str]
+) -> tuple[blocks.Image, ...]:
+    """Images of some configurations with their measured edges, as many as there is room for.
+
+    captions : what the images show, by the configurations' indices in the order of the images.
+    """
+    c, session = calibration, calibration.session
+    images, order = station_images(c), {k: n for n, k in enumerate(captions)}
+    chosen = [item for item in _first_images(session) if item[1].configuration in order]
+    chosen.sort(key=lambda item: order[item[1].configuration])
+    files = [(images[s], session.stations[s].images.index(photo)) for s, photo in chosen]
+    contents = list(images_within(files[: ALBUM_SIZE.images], ALBUM_SIZE.characters))
+    centres, _ = centres_and_tool(session.machine, c.estimate, session.joints)
+    shifts = outward_shift(
+        c.observation.edges, c.estimate, session.joints, session.camera_of_station
+    )
+    level = levels(c.observation, c.estimate)
+    overlays = _ImageOverlays(c, shifts, centres, chosen[: len(contents)])
+    out: list[blocks.Image] = []
+    for (s, photo), webp in zip(chosen, contents, strict=False):
+        k = photo.configuration
+        image = overlays.image(s, photo, webp, level.get((s, k), np.nan))
+        out.append(image.model_copy(update={"caption": f"{captions[k]}; {image.caption}"}))
+    return tuple(out)
 
 
 def station_images(calibration: Calibration) -> dict[int, Sequence[Integers]]:
@@ -197,11 +240,11 @@ def _rejected(session: Session, most: int, room: int) -> Iterator[blocks.Image]:
     """
     lost = [(one, photo) for one in session.rejected for photo in one.station.images]
     files = [(_decoded(one.station), one.station.images.index(photo)) for one, photo in lost[:most]]
-    jpegs = list(jpegs_within(files, room))
-    jpegs += [""] * (len(lost) - len(jpegs))
-    for (one, photo), jpeg in zip(lost, jpegs, strict=True):
+    contents = list(images_within(files, room))
+    contents += [""] * (len(lost) - len(contents))
+    for (one, photo), webp in zip(lost, contents, strict=True):
         image = _block(
-            one.station, photo, session.configurations, f"rejected, for {one.reason}", jpeg
+            one.station, photo, session.configurations, f"rejected, for {one.reason}", webp
         )
         yield image.model_copy(update={"overlays": _tried_overlay(session, one, photo)})
 
@@ -222,7 +265,7 @@ def _tried_overlay(
 
 
 def _block(
-    station: Station, photo: Image, configurations: Sequence[str], caption: str, jpeg: str
+    station: Station, photo: Image, configurations: Sequence[str], caption: str, webp: str
 ) -> blocks.Image:
     """Image without overlays."""
     configuration = configurations[photo.configuration]
@@ -235,7 +278,7 @@ def _block(
         width=width,
         height=height,
         quarter_turns=upright_turns(photo.path, station.camera.image_size),
-        jpeg=jpeg,
+        webp=webp,
     )
 
 
@@ -310,10 +353,13 @@ class _ImageOverlays:
         self,
         images: Mapping[int, Sequence[Integers]],
         chosen: Sequence[tuple[int, Image]],
+        room: int,
     ) -> None:
-        """Strips of the edges in some images."""
+        """Strips of the edges in the first images, as many as ``room`` characters hold."""
         c, coarse = self.calibration, self.calibration.observation.edges.coarse
         for s, photo in chosen:
+            if room <= 0:
+                return
             place = s, photo.configuration
             mine = np.array([n for n in self.edges[place] if not coarse[n]], dtype=int)
             if not len(mine):
@@ -327,11 +373,12 @@ class _ImageOverlays:
                 axis=1
             )
             mine, lines = mine[finite], lines.select(np.asarray(finite))
-            self.strips[place] = strips_of_image(c, image, mine, lines)
+            self.strips[place] = strips, sheet = strips_of_image(c, image, mine, lines)
+            room -= len(sheet) + sum(len(one.model_dump_json()) for one in strips)
             for k, n in enumerate(mine.tolist()):
                 self.edges[place][n] = replace(self.edges[place][n], strip=k)
 
-    def image(self, s: int, photo: Image, jpeg: str, level: float) -> blocks.Image:
+    def image(self, s: int, photo: Image, webp: str, level: float) -> blocks.Image:
         """Image with its overlay."""
         session = self.calibration.session
         k, station = photo.configuration, session.stations[s]
@@ -346,9 +393,9 @@ class _ImageOverlays:
             else "",
             f"{len(missed)} not used" if missed else "",
             f"{count(len(mine), 'corner')}, {brief(rms)} px off" if len(mine) else "",
-            f"residuals {number(level, 2)} σ" if np.isfinite(level) else "nothing in use",
+            self._use(k, level),
             *self.reasons[s, k],
-            "" if jpeg else "the file could not be read",
+            "" if webp else "the file could not be read",
         ]
         caption = "; ".join(text for text in captions if text)
         layers = (
@@ -358,13 +405,20 @@ class _ImageOverlays:
             *joint_layers(self.spots[s, k]),
         )
         strips, sheet = self.strips.get((s, k), ((), ""))
-        return _block(station, photo, session.configurations, caption, jpeg).model_copy(
+        return _block(station, photo, session.configurations, caption, webp).model_copy(
             update={
                 "overlays": (blocks.Overlay(layers=tuple(one for one in layers if one.shapes)),),
                 "strips": strips,
-                "strip_jpeg": sheet,
+                "strip_webp": sheet,
             }
         )
+
+    def _use(self, configuration: int, level: float) -> str:
+        """What is used of an image. level : of its residuals, NaN without any."""
+        if np.isfinite(level):
+            return f"residuals {number(level, 2)} σ"
+        out = self.calibration.holdout
+        return "held out" if out and configuration in out.region.rows else "nothing in use"
 
     def _corner_layers(self, corners: BoardCorners) -> tuple[blocks.Layer, blocks.Layer]:
         """Detected corners, and arrows from there to where they are predicted."""

@@ -1,7 +1,7 @@
 """Rectified strips along measured edges, with the fitted line: how well it lies on the edge.
 
 The image is sampled by bilinear interpolation at native pixels, across the edge that the calibrated
-machine predicts and along it. The strips of an image are one JPEG, one strip below the other.
+machine predicts and along it. The strips of an image are one WebP file, one strip below the other.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.measurements.effects import EDGE_SHIFT
-from pkmcal.observe.jpegs import base64_jpeg
 from pkmcal.observe.overlays import (
     edge_name,
     measured_curves,
     offsets_across_curves,
     own_edges,
 )
+from pkmcal.observe.page_images import base64_webp
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome.blocks.images import Strip
 from pkmcal.wording import brief, number
@@ -31,9 +31,8 @@ STRIP_ROWS = 41
 """Rows of a strip: pixels across the edge."""
 STRIP_CURVE_FRACTIONS = np.linspace(0, 1, 65)
 """Positions at which the curve of an edge is computed, as fractions of its span."""
-STRIP_LINE_POINTS = 9
+STRIP_LINE_POINTS = 5
 """Points of the fitted line; it differs from the predicted edge by an almost straight line."""
-STRIP_JPEG_QUALITY = 85
 STRIP_GREY_PERCENTILES = 1.0, 99.0
 """Percentiles of a strip's grey levels that become black and white."""
 
@@ -115,7 +114,7 @@ def sampled_strip(image: Array | Integers, curve: Array, normal: Array) -> tuple
 def strips_of_image(
     c: Calibration, image: Integers, mine: Integers, lines: EdgeLines
 ) -> tuple[tuple[Strip, ...], str]:
-    """Strips of the edges ``mine`` in an image, and their common JPEG in base64."""
+    """Strips of the edges ``mine`` in an image, and their common WebP file in base64."""
     edges, strips, levels = c.observation.edges, list[Strip](), list[Array]()
     for k, n in enumerate(mine.tolist()):
         level, along = sampled_strip(image, lines.curve[k], lines.normal[k])
@@ -124,8 +123,8 @@ def strips_of_image(
         middle = STRIP_LINE_POINTS // 2
         name = edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n])).capitalize()
         title = (
-            f"{name}: fitted line {number(float(offset[middle]), 3, signed=True)} px outward of the"
-            f" calibrated machine's, ± {brief(float(sigma[middle]))} px"
+            f"{name}: {number(float(offset[middle]), 3, signed=True)} ±"
+            f" {brief(float(sigma[middle]))} px outward"
         )
         strips.append(
             Strip(
@@ -133,8 +132,8 @@ def strips_of_image(
                 row=k * STRIP_ROWS,
                 length=level.shape[1],
                 across=STRIP_ROWS,
-                offset=tuple(np.round(offset, 4).tolist()),
-                sigma=tuple(np.round(sigma, 4).tolist()),
+                offset=tuple(np.round(offset, 3).tolist()),
+                sigma=tuple(np.round(sigma, 3).tolist()),
             )
         )
         dark, light = np.percentile(level, STRIP_GREY_PERCENTILES)
@@ -144,4 +143,4 @@ def strips_of_image(
     sheet = np.zeros((STRIP_ROWS * len(strips), max(one.length for one in strips)), np.uint8)
     for strip, level in zip(strips, levels, strict=True):
         sheet[strip.row : strip.row + STRIP_ROWS, : strip.length] = np.rint(level)
-    return tuple(strips), base64_jpeg(sheet, STRIP_JPEG_QUALITY)
+    return tuple(strips), base64_webp(sheet)

@@ -11,6 +11,7 @@ from pkmcal.judge.sentences import against, better, factor
 from pkmcal.judge.validate import Validation
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table
 from pkmcal.outcome.blocks.base import configuration_key, leg_key
+from pkmcal.outcome.blocks.images import Images
 from pkmcal.outcome.blocks.plot import (
     Box,
     DotsMark,
@@ -20,11 +21,27 @@ from pkmcal.outcome.blocks.plot import (
     panels,
     rounded,
 )
+from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.charts import NORMAL_90, bar_plot, box, row_plot
+from pkmcal.report.pictures import images_of_configurations
 from pkmcal.session.load import Session
 from pkmcal.session.readings import same_pose
 from pkmcal.wording import DISPLAY_UNITS, amount, brief, count, decimals, number
 
+RESIDUAL_COLUMNS = {
+    "Joint": "",
+    "Mean before": "Mean residual by the nominal model.",
+    "rms before": "Root mean square of the residuals by the nominal model.",
+    "Mean after": "Mean residual by the calibrated machine.",
+    "rms after": "Root mean square of the residuals by the calibrated machine.",
+    "Promised": "Root mean square that the calibration's standard deviations and the images'"
+    " noise let one expect.",
+    "Common": "By how much all configurations are off alike.",
+    "Common σ": "Standard deviation of that.",
+}
+"""Columns of the table of readings, with their explanations."""
+FIRST_IMAGES = 4
+"""Images on the page before all are asked for."""
 VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
     " platform are estimated from the images; a configuration's own readings have no part in its"
@@ -51,6 +68,7 @@ def outcome_of(v: Validation) -> Outcome:
     notes = tuple(f"{what}: {', '.join(names)}." for what, names in sentences if names)
     parts = (
         _readings(v.judged, v.session) if v.judged else None,
+        _images(v.judged, v) if v.judged else None,
         Part("paths", "Paths", tables=(paths_table(v.paths),)) if v.paths else None,
         Part("regions", "Regions", tables=(regions_table(v.regions, v.session),))
         if v.regions
@@ -117,16 +135,7 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
     test = judged.promise
     residuals = Table(
         "Readings: measured less predicted",
-        (
-            "Joint",
-            "Nominal model, mean",
-            "rms",
-            "Calibrated, mean",
-            "rms",
-            "promised",
-            "in common",
-            "σ",
-        ),
+        tuple(RESIDUAL_COLUMNS),
         tuple(
             Row(
                 name,
@@ -141,8 +150,9 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
             for k, (name, unit) in enumerate(_joints(session))
         ),
         "Predicted from poses that the images show, without their own readings; weighed by"
-        " how well each was seen. Promised: what the calibration's deviations and the images'"
-        " noise let one expect. In common: what all configurations are off alike.",
+        " how well each was seen.",
+        hints=tuple(RESIDUAL_COLUMNS.values()),
+        first=6,
     )
     tool = Table(
         "Tool point: forward kinematics of the readings against the images",
@@ -161,6 +171,29 @@ def _readings(judged: NominalComparison, session: Session) -> Part:
         blocks=panels(_by_configuration(judged, session), _by_joint(judged, session)),
         tables=(residuals, tool),
     )
+
+
+def _images(judged: NominalComparison, v: Validation) -> Part | None:
+    """Section with the images of the judged configurations, the worst first; None without any."""
+    unit, size = _unit(v.session), np.nan_to_num(judged.after, nan=-np.inf)
+    captions = {
+        int(judged.rows[k]): f"readings {amount(float(judged.after[k]), unit)} off"
+        if unit and np.isfinite(judged.after[k])
+        else "configuration not judged"
+        for k in np.argsort(-size, kind="stable").tolist()
+    }
+    images = images_of_configurations(v.remeasured, captions)
+    if not images:
+        return None
+    n = len(judged.rows)
+    text = (
+        f"Of the {count(n, 'judged configuration')}, the one with the largest residuals first."
+        " Lines: measured edges in their leg's colour, dashed where they were rejected. A click on"
+        " a bar of the chart above leads to its image."
+    )
+    legs = v.session.machine.n_legs if any(one.overlays for one in images) else 0
+    block = Images(images=images, first=FIRST_IMAGES, legs=legs)
+    return Part("photographs", "Images", blocks=(Paragraph(text=text), block))
 
 
 def _worst(judged: NominalComparison, session: Session) -> tuple[str, ...]:
@@ -267,7 +300,14 @@ def held_out_part(item: HoldOut, session: Session) -> Part:
         rows.append(Row(name, ("", cells[0], "", cells[1], cells[2])))
     table = Table(
         "Residuals of configurations in use and held out",
-        ("Joint", "In use, mean", "rms", "Held out, mean", "rms", "by the nominal model, rms"),
+        (
+            "Joint",
+            "Mean in use",
+            "rms in use",
+            "Mean held out",
+            "rms held out",
+            "rms by the nominal model",
+        ),
         tuple(rows),
         "Readings measured less predicted from poses that the images show, weighed by how well"
         " each was seen; their noise is in all columns.",

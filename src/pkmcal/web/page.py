@@ -85,7 +85,7 @@ def embedded_json(document: MachineDocument | ReportDocument) -> str:
 
 def script_json(value: Any) -> str:
     """JSON of a value inside a script element, which no text in it can end."""
-    text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")
     return text

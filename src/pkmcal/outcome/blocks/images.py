@@ -97,8 +97,8 @@ class Overlay(Schema):
 class Strip(Schema):
     """Image along an edge, sampled in native pixels across the predicted edge and along it.
 
-    title : name of the edge, its residual and standard deviation.
-    row : first row of the strip in the image's ``strip_jpeg``.
+    title : name of the edge, offset of the fitted line from the prediction, its standard deviation.
+    row : first row of the strip in the image's ``strip_webp``.
     length, across : columns along the edge, from A to B, and rows across it, outward first; the
         prediction is in the middle row.
     offset : offset of the fitted line from the prediction, px outward, at evenly spaced positions
@@ -122,9 +122,9 @@ class Image(Schema):
     key : of the image, so that a selection elsewhere finds it.
     width, height : of the camera's image, px.
     quarter_turns : clockwise, that turn it upright, as EXIF says.
-    jpeg : base64, of at most these pixels; empty if the file cannot be read.
+    webp : base64, of at most these pixels; empty if the file cannot be read.
     overlays : of which a viewer shows one at a time.
-    strip_jpeg : the strips one below the other, base64; empty without any.
+    strip_webp : the strips one below the other, base64; empty without any.
     """
 
     title: Text
@@ -134,9 +134,9 @@ class Image(Schema):
     width: int
     height: int
     quarter_turns: int = 0
-    jpeg: str = ""
+    webp: str = ""
     overlays: tuple[Overlay, ...] = ()
-    strip_jpeg: str = ""
+    strip_webp: str = ""
     strips: tuple[Strip, ...] = ()
 
 
