@@ -23,7 +23,7 @@ def drawn_field(case: Case, shift_at, noise, n=6000):
     value = np.sum(direction * shift_at(pixel), axis=-1) + noise * rng.normal(size=n)
     zero = np.zeros(n, dtype=int)
     offsets = Offsets(zero, zero, np.arange(n), pixel, direction, value)
-    (one,) = field.fields(case.session, offsets)
+    (one,) = field.fields(case.session, offsets, ())
     return one
 
 
@@ -57,9 +57,40 @@ def test_of_parallel_edges_only_what_is_across_them_is_shown(case):
     zero = np.zeros(n, dtype=int)
     value = 0.3 + 0.01 * rng.normal(size=n)
     offsets = Offsets(zero, zero, np.arange(n), pixel, direction, value)
-    (one,) = field.fields(case.session, offsets)
+    (one,) = field.fields(case.session, offsets, ())
     shift = np.array([cell.displacement for cell in one.cells])
     np.testing.assert_allclose(shift, np.tile([0.3, 0.0], (len(shift), 1)), atol=0.02)
+
+
+def test_arrows_lead_to_images_on_the_page_only(case):
+    names = [f"image:{case.session.stations[0].name}/{name}" for name in ("c0", "c1")]
+    n = 4000
+    rng = np.random.default_rng(4)
+    pixel = rng.uniform(0, 1, (n, 2)) * [319, 239]
+    direction = np.tile([1.0, 0.0], (n, 1))
+    row = np.arange(n) % 2
+    # the residuals of the second configuration are the larger ones
+    offsets = Offsets(np.zeros(n, dtype=int), row, np.arange(n), pixel, direction, 0.1 + 0.2 * row)
+    keys_of = {}
+    for keys in (names, names[:1], []):
+        (one,) = field.fields(case.session, offsets, keys)
+        keys_of[len(keys)] = {cell.key for cell in one.cells}
+    assert keys_of == {2: {names[1]}, 1: {names[0]}, 0: {""}}
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_the_scale_lies_at_the_lower_left_of_the_upright_image(turns):
+    size = (320, 240)
+    arrow = field.scale_arrow(size, 100.0, turns)
+    turn = field.upright_turn(turns)
+    width, height = size[::-1] if turns % 2 else size
+    middle = np.array(size) / 2
+    x, y = turn @ (np.array(arrow.at) - middle) + np.array([width, height]) / 2
+    right, down = turn @ np.array(arrow.displacement)
+    assert 0 < x < 0.1 * width
+    assert 0.9 * height < y < height
+    assert right > 0
+    assert abs(down) < 1e-9
 
 
 def test_edges_are_off_by_what_they_were_shifted(case):

@@ -173,7 +173,14 @@ def report_of(
         residuals.section(
             session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
         ),
-        field.section(session, observation, estimate, album.corners, pictures.station_images(c)),
+        field.section(
+            session,
+            observation,
+            estimate,
+            album.corners,
+            pictures.station_images(c),
+            [one.key for one in album.images],
+        ),
         provenance.left_out(session, observation.rejected, estimate),
         provenance.how(session, estimate, c.timings),
     )

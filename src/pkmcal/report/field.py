@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +19,14 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
+from pkmcal.observe.images import upright_turns
 from pkmcal.observe.jpegs import narrowed
 from pkmcal.observe.overlays import measured_curves, offsets_across_curves, own_edges
 from pkmcal.observe.page_images import base64_webp
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks import images as blocks
+from pkmcal.outcome.blocks.base import Key
 from pkmcal.outcome.blocks.text import Paragraph
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.links import Links
@@ -67,6 +69,7 @@ class ImageField:
     station : index of the first station with the camera's images.
     middle : principal point, px.
     cells : mean shifts, px; insignificant ones are dashed.
+    quarter_turns : clockwise, that turn its images upright.
     """
 
     title: str
@@ -74,6 +77,7 @@ class ImageField:
     size: tuple[int, int]
     middle: tuple[float, float]
     cells: tuple[blocks.Arrow, ...]
+    quarter_turns: int = 0
 
 
 @dataclass(frozen=True)
@@ -105,13 +109,14 @@ def section(
     estimate: Estimate,
     corners: BoardCorners,
     images: Mapping[int, Sequence[Integers]],
+    keys: Iterable[Key],
 ) -> Part | None:
     """Section of the report; None without residuals.
 
-    images : of the stations, by their indices.
+    images : of the stations, by their indices. keys : of the images on the page.
     """
     offsets = field_offsets(session, observation.edges, estimate, corners)
-    result = fields(session, offsets)
+    result = fields(session, offsets, keys)
     if not result:
         return None
     lengths = np.array([np.hypot(*cell.displacement) for one in result for cell in one.cells])
@@ -140,7 +145,8 @@ def field_image(
     factor : enlargement of the arrows.
     """
     cross = blocks.Cross(at=one.middle, tip="Principal point")
-    shapes: tuple[blocks.Shape, ...] = (cross, *one.cells, scale_arrow(one.size, factor))
+    scale = scale_arrow(one.size, factor, one.quarter_turns)
+    shapes: tuple[blocks.Shape, ...] = (cross, *one.cells, scale)
     layer = blocks.Layer(name="residuals", shapes=shapes, enlargement=factor)
     mean = mean_image(images)
     return blocks.Image(
@@ -148,18 +154,30 @@ def field_image(
         caption=caption,
         width=one.size[0],
         height=one.size[1],
+        quarter_turns=one.quarter_turns,
         webp="" if mean is None else base64_webp(mean),
         overlays=(blocks.Overlay(layers=(layer,)),),
     )
 
 
-def scale_arrow(size: tuple[int, int], factor: float) -> blocks.Arrow:
-    """Scale of enlarged arrows, at the lower left: a round length in px."""
-    longest = SCALE_ARROW_LENGTH * size[0] / factor
+def scale_arrow(size: tuple[int, int], factor: float, quarter_turns: int = 0) -> blocks.Arrow:
+    """Scale of enlarged arrows, a round length in px: to the right, at the lower left of the
+    upright image.
+    """
+    width, height = size[::-1] if quarter_turns % 2 else size
+    longest = SCALE_ARROW_LENGTH * width / factor
     power = 10.0 ** math.floor(math.log10(longest))
     length = max(m * power for m in (1, 2, 5) if m * power <= longest)
-    at = 0.04 * size[0], size[1] - 0.05 * size[0]
-    return blocks.Arrow(at=at, displacement=(length, 0.0), label=f"{length:g} px")
+    turn = upright_turn(quarter_turns)
+    from_middle = np.array([0.04 * width, height - 0.05 * width]) - np.array([width, height]) / 2
+    x, y = (from_middle @ turn + np.array(size) / 2).tolist()
+    right, down = (np.array([length, 0.0]) @ turn).tolist()
+    return blocks.Arrow(at=(x, y), displacement=(right, down), label=f"{length:g} px")
+
+
+def upright_turn(quarter_turns: int) -> Array:
+    """Rotation (2, 2) of directions (right, down) in the camera's image to the upright one."""
+    return np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), quarter_turns % 4)
 
 
 def mean_image(images: Sequence[Integers]) -> Integers | None:
@@ -232,25 +250,35 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
     )
 
 
-def fields(session: Session, value: Offsets) -> tuple[ImageField, ...]:
-    """Field of each station with enough data; hand-held images of one camera share a field."""
-    links, entries = Links.of(session), [one.entry or one.name for one in session.stations]
+def fields(session: Session, value: Offsets, keys: Iterable[Key]) -> tuple[ImageField, ...]:
+    """Field of each station with enough data; hand-held images of one camera share a field.
+
+    keys : of the images on the page, to which arrows lead.
+    """
+    links, entries = Links.of(session, keys), [one.entry or one.name for one in session.stations]
     out: list[ImageField] = []
     for entry in dict.fromkeys(entries):
         of_entry = [s for s, name in enumerate(entries) if name == entry]
         mine = np.isin(value.station, of_entry)
-        camera = session.stations[of_entry[0]].camera
-        cells = _cells(value.select(mine), camera.image_size, links)
+        station = session.stations[of_entry[0]]
+        camera, files = station.camera, station.images
+        turns = upright_turns(files[0].path, camera.image_size) if files else 0
+        cells = _cells(value.select(mine), camera.image_size, links, turns)
         if cells:
             intrinsics = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
             middle = intrinsics["center.x"], intrinsics["center.y"]
             size = camera.image_size
-            out.append(ImageField(entry, of_entry[0], size, middle, tuple(cells)))
+            out.append(ImageField(entry, of_entry[0], size, middle, tuple(cells), turns))
     return tuple(out)
 
 
-def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[blocks.Arrow]:
-    """Mean shifts, px, of the image's cells with enough data."""
+def _cells(
+    result: Offsets, size: tuple[int, int], links: Links, quarter_turns: int
+) -> list[blocks.Arrow]:
+    """Mean shifts, px, of the image's cells with enough data.
+
+    quarter_turns : to the upright image, in which tooltips name directions.
+    """
     from scipy.special import fdtrc
 
     side = size[0] / FIELD_CELLS_ACROSS
@@ -297,9 +325,10 @@ def _cells(result: Offsets, size: tuple[int, int], links: Links) -> list[blocks.
     for c in np.flatnonzero(n >= FEWEST_IN_A_CELL).tolist():
         here = first[number_of == c]
         (x, y), (right, down) = places[c].tolist(), shift[c].tolist()
+        upright = (upright_turn(quarter_turns) @ shift[c]).tolist()
         tip = (
-            f"{number(right, 3, signed=True)} px to the right,"
-            f" {number(-down, 3, signed=True)} px upwards, of"
+            f"{number(upright[0], 3, signed=True)} px to the right,"
+            f" {number(-upright[1], 3, signed=True)} px upwards, of"
             f" {len(np.unique(some.thing[here]))} edges and corners"
         )
         size_of = np.abs(value[number_of == c])
