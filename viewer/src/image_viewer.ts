@@ -3,12 +3,13 @@
 import type { Image } from "./document";
 import { h } from "./dom";
 import { Inspector } from "./inspector";
-import type { Key, Selection } from "./selection";
+import { type Key, matches, type Selection } from "./selection";
 
-/** Images of one block: `open` shows the one that belongs to a key, and is false without one. */
+/** Images of one block; `open` shows one of them. */
 interface ImageBlock {
   element: HTMLElement;
-  open: (key: Key) => boolean;
+  images: Image[];
+  open: (image: Image) => void;
 }
 
 export class ImageViewer {
@@ -46,9 +47,17 @@ export class ImageViewer {
     this.blocks.push(block);
   }
 
+  /** Image with exactly this key, of the first block that has one. */
+  find(key: Key): Image | undefined {
+    return this.blocks.flatMap((block) => block.images).find((image) => image.key === key);
+  }
+
   /** Open the image that belongs to a key, of the first block that has one. */
   openKey(key: Key, blocks = this.blocks): void {
-    blocks.some((block) => block.open(key));
+    for (const block of blocks) {
+      const image = block.images.find((one) => matches(one.key, key));
+      if (image) return block.open(image);
+    }
   }
 
   /** Open an image, one of those to walk through. */

@@ -49,7 +49,7 @@ def outcome_of(d: MachineDifference) -> Outcome:
             blocks=(_joints(d),),
             tables=(_legs(d),),
         ),
-        Part("parameters", "All numbers", tables=_parameters(d)),
+        Part("parameters", "Parameters", tables=_parameters(d)),
         Part("how", "How they were compared", d.assumed),
     )
     refused = any(side.saved and not side.saved.verdict.usable for side in (d.a, d.b))

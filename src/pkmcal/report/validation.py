@@ -40,7 +40,7 @@ RESIDUAL_COLUMNS = {
     "Common σ": "Standard deviation of that.",
 }
 """Columns of the table of readings, with their explanations."""
-FIRST_IMAGES = 4
+FIRST_IMAGES = 6
 """Images on the page before all are asked for."""
 VALIDATION_METHOD_TEXT = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"

@@ -164,13 +164,12 @@ def _history(w: Watch) -> Part | None:
 
 
 def _labels(runs: Sequence[Run]) -> list[str]:
-    """Dates of tests, with the time where a day has several."""
+    """Dates of tests; dates and times, or numbers, where a day has several."""
     days = [f"{one.when:%Y-%m-%d}" for one in runs]
-    names = [
-        day if days.count(day) == 1 else f"{one.when:%m-%d %H:%M:%S}"
-        for day, one in zip(days, runs, strict=True)
-    ]
-    return names if len({*names}) == len(names) else [f"{k + 1}" for k in range(len(names))]
+    for names in (days, [f"{one.when:%m-%d %H:%M}" for one in runs]):
+        if len({*names}) == len(names):
+            return names
+    return [f"{k + 1}" for k in range(len(runs))]
 
 
 def _share_chart(runs: Sequence[Run]) -> Plot:
@@ -196,7 +195,7 @@ def _share_chart(runs: Sequence[Run]) -> Plot:
         marks=(
             RuleMark(name="threshold", axis="y", at=1.0, colour="bad"),
             LineMark(name="", colour="quiet", points=line_points(labels, values)),
-            DotsMark(name="tests", colour="calibrated", points=points),
+            DotsMark(name="tests", colour="good", points=points),
         ),
     )
 
@@ -330,11 +329,18 @@ def _others_table(w: Watch) -> Table:
     )
     return Table(
         "All legs together",
-        ("Test", "χ²", "degrees", "chance", "change"),
+        ("Test", "χ²", "Degrees", "By chance", "Change"),
         rows,
         "A common factor is seen against the readings: a frame that warmed, or readings of another"
         " scale.",
         brief=False,
+        hints=(
+            "",
+            "Statistic of the test.",
+            "Degrees of freedom of the statistic.",
+            LEG_COLUMNS["By chance"],
+            "Change and its standard deviation.",
+        ),
     )
 
 

@@ -5,7 +5,6 @@ import type { Image, Images } from "../document";
 import { h } from "../dom";
 import { legClass } from "../marks";
 import { imageSvg } from "../overlay";
-import { matches } from "../selection";
 import type { Context } from "./index";
 
 export function images(block: Images, { selection, viewer }: Context): HTMLElement {
@@ -21,8 +20,12 @@ export function images(block: Images, { selection, viewer }: Context): HTMLEleme
     viewer.open(inGroup().includes(image) ? inGroup() : block.images, image);
   };
   const figure = (image: Image): HTMLElement => {
-    const button = h("button", { type: "button", class: "enlarge", title: "Inspect", "aria-label": `Inspect ${image.title}` });
-    button.append(imageSvg(image));
+    const picture = imageSvg(image);
+    picture.setAttribute("aria-hidden", "true"); // the button has the name, with the texts in the image
+    const texts = block.size === "figure" ? [...picture.querySelectorAll("text")].map((text) => text.textContent) : [];
+    const button = h("button", {
+      type: "button", class: "enlarge", title: "Inspect", "aria-label": ["Inspect", image.title, ...texts].join(" "),
+    }, picture);
     button.addEventListener("click", (event) => {
       // an arrow leads to the image that it belongs to
       const key = (event.target as Element).closest<SVGElement>(".shape")?.dataset.key ?? "";
@@ -57,14 +60,7 @@ export function images(block: Images, { selection, viewer }: Context): HTMLEleme
     bar.hidden = !bar.childElementCount;
   };
   draw();
-  viewer.add({
-    element,
-    open: (key) => {
-      const image = block.images.find((one) => matches(one.key, key));
-      if (image) open(image);
-      return image !== undefined;
-    },
-  });
+  viewer.add({ element, images: block.images, open });
   return element;
 }
 

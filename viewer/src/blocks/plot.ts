@@ -143,6 +143,8 @@ function picture(block: PlotBlock, width: number): SVGElement {
   svg.setAttribute("role", "img");
   // the rules of this style element are in plot.css: the page's policy allows no other style
   svg.querySelector("style")?.remove();
+  // the image has one description; its groups have no role that could have another
+  for (const group of svg.querySelectorAll("g[aria-label]")) group.removeAttribute("aria-label");
   return svg;
 }
 

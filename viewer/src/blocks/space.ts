@@ -5,6 +5,7 @@ import type { Space } from "../document";
 import { h, number } from "../dom";
 import type { Key } from "../selection";
 import { legTable } from "../stage/legs";
+import { FrustumImages } from "../stage/frusta";
 import { type Shown, SpaceModel } from "../stage/space";
 import { NO_WEBGL, PLANE_VIEW, Stage, VIEWS } from "../stage/stage";
 import type { Context } from "./index";
@@ -18,7 +19,9 @@ const SLOWEST = 600;
 const BESIDE = 1.2; // largest angle between the eye and a camera, rad
 const HEIGHT = 0.4; // of the eye above the horizon, as a slope
 
-export function space(block: Space, context: Context): HTMLElement {
+type Links = Pick<Context, "selection"> & Partial<Pick<Context, "viewer">>;
+
+export function space(block: Space, context: Links): HTMLElement {
   const figure = h("figure", { class: "space-block" });
   if (block.title) figure.append(h("h3", {}, block.title));
   let stage: Stage;
@@ -36,11 +39,18 @@ export function space(block: Space, context: Context): HTMLElement {
   const state: Shown = {
     pose: 0, share: 1, enlargement: block.enlargement, ellipsoids: block.ellipsoid_enlargement,
   };
+  const frusta = new FrustumImages(block.machine.cameras, model.model.layers.cameras, stage);
   const draw = (): void => model.show(state);
+  /** Images of the pose's configuration, as far as the page has them. */
+  const project = (): void => {
+    const key = block.poses[state.pose]?.key ?? "";
+    frusta.show((camera) => context.viewer?.find(`image:${camera}/${key.slice(key.indexOf(":") + 1)}`));
+  };
 
   const poses = poseBar(block, (pose) => {
     state.pose = pose;
     draw();
+    project();
   });
   const change = changeBar(block, state, draw, stage.element);
   select(block, context, stage, model, poses.choose);
@@ -63,6 +73,7 @@ export function space(block: Space, context: Context): HTMLElement {
   );
   draw();
   fit(first);
+  setTimeout(project); // the blocks with images are drawn by then
   return figure;
 }
 
@@ -201,7 +212,7 @@ function enlarger(name: string, start: number, most: number, onchange: (factor: 
 
 /** Selection shared with the page: legs, and configurations by their points and the slider. */
 function select(
-  block: Space, { selection }: Context, stage: Stage, model: SpaceModel, go: (pose: number) => void,
+  block: Space, { selection }: Links, stage: Stage, model: SpaceModel, go: (pose: number) => void,
 ): void {
   const { legs } = block.machine;
   const legKey = (leg: number): Key => `leg:${legs[leg].number}`;

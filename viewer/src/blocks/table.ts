@@ -71,10 +71,11 @@ export function dataTable(block: DataTable, { selection, printSteps }: Context):
       copy("TSV", (rows) => tsv(block.columns, rows)), copy("YAML", (rows) => yaml(block.columns, rows)))];
   update();
 
-  const tools = filters.length || copies.length ? [h("div", { class: "tools" }, ...filters, ...copies)] : [];
+  const title = block.title && !block.folded ? [h("h3", {}, block.title)] : [];
+  const tools = filters.length ? [h("div", { class: "tools" }, ...filters, ...copies)] : copies;
   const content = [
-    ...tools,
-    scrollable(table, block.title || "Table"),
+    ...(filters.length ? [...title, ...tools] : [h("div", { class: "tools" }, ...title, ...tools)]),
+    scrollable(table, block.title || block.columns.map((column) => column.name).join(", ")),
     more,
     ...explanations(block.columns),
     ...(block.note ? [h("p", { class: "small" }, block.note)] : []),
@@ -86,7 +87,7 @@ export function dataTable(block: DataTable, { selection, printSteps }: Context):
     return () => { all = before; update(); };
   });
   if (block.folded) return h("details", {}, h("summary", {}, block.title), ...content);
-  return h("div", { class: "data-table" }, ...(block.title ? [h("h3", {}, block.title)] : []), ...content);
+  return h("div", { class: "data-table" }, ...content);
 }
 
 /** The columns' explanations, for paper, where nothing can be pointed at. */

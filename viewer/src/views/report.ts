@@ -36,7 +36,7 @@ export function reportView(host: HTMLElement, content: ReportDocument): void {
       verdictOf(content),
       ...certificate(content),
       ...findingsOf(content),
-      ...(content.cards.length ? [cardsOf(content.cards, content.verdict.tone === "bad")] : []),
+      ...(content.cards.length ? [cardsOf(content.cards, content.sections.some((one) => one.void))] : []),
       ...sections),
     viewer.dialog,
   );
