@@ -7,7 +7,7 @@ export const paragraph = (block: Paragraph): HTMLElement =>
   h("p", block.small ? { class: "small" } : {}, block.text);
 
 export function listing(block: Listing): HTMLElement {
-  const items = h("ul", {}, ...block.items.map((text) => {
+  const items = h("ul", { class: "listing" }, ...block.items.map((text) => {
     const [what, ...next] = text.split("\n");
     return h("li", {}, what!, ...next.map((step) => h("span", { class: "step" }, step)));
   }));

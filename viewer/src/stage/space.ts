@@ -68,6 +68,7 @@ export class SpaceModel {
   private readonly arrows: { lines: Lines; content: SpaceArrows }[] = [];
   private readonly clouds: { mesh: InstancedMesh; content: SpacePoints }[] = [];
   private marked: string | null | undefined;
+  private drawn: Configuration["legs"] = [];
 
   constructor(
     private readonly block: Space,
@@ -123,6 +124,7 @@ export class SpaceModel {
     const drawn = own ? displaced(one, own as LegChange[], share * enlargement - 1) : one;
     if (own) this.before.place(skeleton(displaced(one, own as LegChange[], -1)));
     this.model.show(drawn);
+    this.drawn = drawn.legs;
     const turn = new Matrix4().extractRotation(matrix(one.T_base_platform));
     for (const { mesh, own: { leg, side, axes } } of this.ellipsoids) {
       const at = vector(drawn.legs[leg][side].at(-1) as Point);
@@ -162,14 +164,14 @@ export class SpaceModel {
     ];
   }
 
-  /** Points of the machine in all its poses, without the cameras. */
+  /** Points of the machine in all its poses, and of its enlarged change, without the cameras. */
   machinePoints(): Vector3[] {
     const { cameras } = this.model.layers;
     const shown = cameras.visible;
     cameras.visible = false;
     const own = this.model.fitPoints();
     cameras.visible = shown;
-    const legs = this.block.poses.flatMap((pose) => pose.configuration.legs);
+    const legs = [...this.block.poses.flatMap((pose) => pose.configuration.legs), ...this.drawn];
     return [...own, ...legs.flatMap((leg) => [...leg.base, ...leg.platform] as Point[]).map(vector)];
   }
 
