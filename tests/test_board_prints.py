@@ -11,7 +11,7 @@ import pytest
 
 from conftest import run
 from pkmcal.boards.detect import detect_boards
-from pkmcal.boards.prints import PAPER_SIZES, sheet_pdf
+from pkmcal.boards.prints import PAPER_SIZES, board_digest, sheet_pdf
 from pkmcal.errors import InputError
 from pkmcal.simulation.board import board_from_fields
 
@@ -84,12 +84,58 @@ def test_everything_is_on_the_paper_and_the_rulers_are_as_long_as_they_say(paper
         assert np.all(points > 5)
         assert np.all(points < size - 5)
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1)
-    words = float(re.search(r"\((\d+) mm here", text)[1])
+    words = float(re.search(r"both rulers are (\d+)", text)[1])
     assert sorted(lengths)[-2:] == pytest.approx([words, words], abs=0.01)
+    # all letters are on the page too, and large enough
+    for points, x, y, pitch, rows in re.findall(
+        r"/F (\d+) Tf ([\d.]+) ([\d.]+) Td (\d+) TL (.*?) ET", text
+    ):
+        written = re.findall(r"\((.*?)\) Tj", rows)
+        assert float(points) >= 8
+        assert (float(y) - (len(written) - 1) * float(pitch)) * POINT > 5
+        widest = max(map(len, written)) * 0.5 * float(points)
+        assert (float(x) + widest) * POINT < size[0] - 5
     # neither touches the board
     low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
     inside = (lines > low - 2).all(axis=-1) & (lines < high + 2).all(axis=-1)
     assert not inside.any()
+
+
+def test_rulers_have_numbers_and_axes_begin_at_the_origin():
+    board = board_from_fields(BOARDS["chessboard"])
+    text = content_of(sheet_pdf(board, file="mine.yaml")[0])[1]
+    letters = re.findall(r"/F \d+ Tf ([\d.]+) ([\d.]+) Td \d+ TL \((.*?)\) Tj T\* ET", text)
+    place = {}
+    for x, y, words in letters:
+        place.setdefault(words, []).append((float(x) * POINT, float(y) * POINT))
+    assert {*place} >= {"0", "20", "40", "60", "80", "100", "x", "y"}
+    # 20 mm apart, on both rulers
+    along = [place[str(mm)][0][0] for mm in (20, 40, 60, 80)]
+    up = [place[str(mm)][1][1] for mm in (20, 40, 60, 80)]
+    np.testing.assert_allclose(np.diff(along), 20, atol=0.01)
+    np.testing.assert_allclose(np.diff(up), 20, atol=0.01)
+    # the first inner corner is a square inside the pattern
+    boxes = rectangles(text)
+    left, top = boxes[:, 0].min(), boxes[:, 3].max()
+    drawn = re.findall(r"([\d.-]+) ([\d.-]+) m ([\d.-]+) ([\d.-]+) l", text)
+    lines = np.array(drawn, dtype=float).reshape(-1, 2, 2) * POINT
+    shafts = lines[np.isclose(np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1), 12)]
+    (x_axis,) = shafts[np.isclose(shafts[:, 0, 1], shafts[:, 1, 1])]
+    (y_axis,) = shafts[np.isclose(shafts[:, 0, 0], shafts[:, 1, 0])]
+    assert x_axis[0, 0] == pytest.approx(left + 20, abs=0.01)
+    assert x_axis[1, 0] > x_axis[0, 0]
+    assert y_axis[0, 1] == pytest.approx(top - 20, abs=0.01)
+    assert y_axis[1, 1] < y_axis[0, 1]
+
+
+def test_prints_of_two_boards_have_other_digests():
+    small, large = (
+        board_from_fields(BOARDS["chessboard"] | {"square": side}) for side in (0.02, 0.0201)
+    )
+    digests = {board_digest(one) for one in (small, large, small)}
+    assert len(digests) == 2
+    text = content_of(sheet_pdf(small, file="mine.yaml")[0])[1]
+    assert f"(mine.yaml, digest {board_digest(small)}" in text
 
 
 def test_the_file_is_a_pdf_whose_table_leads_to_its_objects():

@@ -107,5 +107,5 @@ def board(file: Path | str = "board.yaml", *, paper: str | None = None) -> Board
     """
     path = Path(file) / "board.yaml" if Path(file).is_dir() else Path(file)
     described = load_board(path, label=str(path))
-    pdf, name = sheet_pdf(described, paper)
+    pdf, name = sheet_pdf(described, paper, path.name)
     return BoardResult(described, name, pdf, path)

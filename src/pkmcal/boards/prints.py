@@ -7,9 +7,11 @@ millimetre unless "fit to page" is active; rulers of known length beside the boa
 from __future__ import annotations
 
 import re
+import textwrap
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.boards.board import Board
 from pkmcal.boards.find import dictionary, marker_bits
 from pkmcal.errors import InputError
-from pkmcal.files import closest
+from pkmcal.files import closest, json_text
 
 PDF_POINT = 0.0254 / 72
 """PDF's unit of length, m."""
@@ -27,13 +29,36 @@ PAPER_SIZES = {
     "tabloid": (0.2794, 0.4318), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189),
 }  # fmt: skip
 """Width and height in portrait format, m."""
-UNPRINTABLE_EDGE_WIDTH, LETTERING_STRIP_WIDTH = 0.008, 0.022
-"""White margin of printers, and width of the strip for ruler and text at the left and below, m. A
-board also needs a white border."""
-PRINTED_RULER_LENGTHS = (0.2, 0.1, 0.05)
-"""Lengths of printed rulers, m; the longest that is not longer than the board is used."""
-PRINTED_LETTER_POINTS = 8
-"""Size of the text in points."""
+
+
+@dataclass(frozen=True)
+class SheetOptions:
+    """Measures of the page around a board, m."""
+
+    # white margin of printers, at every side; a board also needs a white border
+    margin: float = 0.008
+    # strips at the left and below for axes, rulers and text, the margin included
+    left: float = 0.026
+    below: float = 0.046
+    # distances from the board: of the axes' arrows, of the rulers, of their numbers, of the text
+    axes: float = 0.004
+    ruler: float = 0.009
+    numbers: float = 0.0145
+    text: float = 0.0215
+    arrow: float = 0.012
+    # lengths of rulers; the longest that is not longer than the board is used
+    rulers: tuple[float, ...] = (0.2, 0.1, 0.05)
+    # sizes of numbers and text, and distance of lines, in points
+    number_points: int = 8
+    text_points: int = 11
+    line_points: int = 13
+    # width of a board below which the text begins at the page's margin
+    narrow: float = 0.18
+    # mean width of a letter, in sizes of the text
+    letter: float = 0.5
+
+
+SHEET = SheetOptions()
 
 
 @dataclass(frozen=True)
@@ -109,61 +134,88 @@ def _modules(name: str, number: int) -> Booleans:
     return np.asarray(image) < 128
 
 
-def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
-    """PDF page with the board in true size, two rulers and a description, and the name of the
-    paper.
+def sheet_pdf(
+    board: Board, paper: str | None = None, file: str = "board.yaml", sheet: SheetOptions = SHEET
+) -> tuple[bytes, str]:
+    """PDF page with the board in true size, its axes, two rulers and a description, and the name
+    of the paper.
 
     paper : one of PAPER_SIZES, by default the smallest ISO size that holds the board.
+    file : name of the board's file, for the page.
     Raises InputError if the paper is too small or unknown.
     """
     printed = Print.of(board)
     size = np.array([printed.x[-1] - printed.x[0], printed.y[-1] - printed.y[0]])
-    name, page = _paper_for(size, paper)
-    corner = (
-        np.array([LETTERING_STRIP_WIDTH, UNPRINTABLE_EDGE_WIDTH])
-        + (page - size - LETTERING_STRIP_WIDTH - UNPRINTABLE_EDGE_WIDTH) / 2
-    )
+    name, page = _paper_for(size, paper, sheet)
+    before, after = np.array([sheet.left, sheet.margin]), np.array([sheet.margin, sheet.below])
+    corner = before + (page - size - before - after) / 2
+    # corner of the board at the lower left, and its origin
+    low = np.array([corner[0], corner[1] + size[1]])
+    origin = corner - np.array([printed.x[0], printed.y[0]])
 
     def on_page(x: float, y: float) -> str:
         """Point in PDF coordinates, from m right of and below the page's upper left corner."""
         return f"{x / PDF_POINT:.4f} {(page[1] - y) / PDF_POINT:.4f}"
 
+    def lettering(x: float, y: float, points: int, *lines: str) -> str:
+        """Lines of text from a point on."""
+        escaped = (re.sub(r"([\\()])", r"\\\1", line) for line in lines)
+        rows = " ".join(f"({line}) Tj T*" for line in escaped)
+        return f"BT /F {points} Tf {on_page(x, y)} Td {sheet.line_points} TL {rows} ET"
+
     rectangles = [
         f"{on_page(x0, y1)} {(x1 - x0) / PDF_POINT:.4f} {(y1 - y0) / PDF_POINT:.4f} re"
         for x0, y0, x1, y1 in _rectangles(printed, corner)
     ]
-    ruler = next(
-        (length for length in PRINTED_RULER_LENGTHS if length <= size.min()),
-        PRINTED_RULER_LENGTHS[-1],
-    )
-    left, below = (
-        corner[0] - 0.6 * LETTERING_STRIP_WIDTH,
-        corner[1] + size[1] + 0.35 * LETTERING_STRIP_WIDTH,
-    )
+    ruler = next((one for one in sheet.rulers if one <= size.min()), sheet.rulers[-1])
+    across = np.array([low[0], low[1] + sheet.ruler])
+    upward = np.array([low[0] - sheet.ruler, low[1]])
+    x_axis, y_axis = (origin[0], low[1] + sheet.axes), (corner[0] - sheet.axes, origin[1])
     lines = [
-        *_ruler(np.array([corner[0], below]), np.array([ruler, 0.0]), on_page),
-        *_ruler(np.array([left, corner[1] + size[1]]), np.array([0.0, -ruler]), on_page),
+        *_ruler(across, np.array([ruler, 0.0]), on_page),
+        *_ruler(upward, np.array([0.0, -ruler]), on_page),
+        *_arrow(np.array(x_axis), np.array([sheet.arrow, 0.0]), on_page),
+        *_arrow(np.array(y_axis), np.array([0.0, sheet.arrow]), on_page),
     ]
+    letters = [
+        lettering(x_axis[0] + 1.15 * sheet.arrow, x_axis[1] + 0.001, sheet.number_points, "x"),
+        lettering(y_axis[0] - 0.001, y_axis[1] + 1.4 * sheet.arrow, sheet.number_points, "y"),
+    ]
+    half = 0.25 * sheet.number_points * PDF_POINT  # of a digit's width and of its height
+    for k in range(0, 11, 2):
+        at, digits = ruler * k / 10, f"{1e2 * ruler * k:.0f}"
+        right = across[0] + at - len(digits) * half
+        letters += [
+            lettering(right, low[1] + sheet.numbers, sheet.number_points, digits),
+            lettering(
+                corner[0] - sheet.numbers - 2 * len(digits) * half, upward[1] - at + half,
+                sheet.number_points, digits,
+            ),
+        ]  # fmt: skip
     captions = [
-        f"{1e3 * ruler:.0f} mm here, along the ruler at the left as well: print in actual size"
-        " (100 %), not fitted to the page.",
-        f"Over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm: measure it, and correct board.yaml"
-        " by what you found. Fix it to something stiff and flat.",
-        f"{_description(board)}.",
+        f"{file}, digest {board_digest(board)}: {_description(board)}.",
+        f"Print in actual size (100 %): both rulers are {1e3 * ruler:.0f} mm. The arrows x and y"
+        " begin at the board's origin.",
+        f"Over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm: measure it, correct the file by"
+        " it, and fix it to something stiff and flat.",
     ]
-    # Text begins left of a small board, which is narrower than a line.
-    text = [
-        f"BT /F {PRINTED_LETTER_POINTS} Tf"
-        f" {on_page(min(corner[0], LETTERING_STRIP_WIDTH), below + 0.005)} Td 10 TL"
-    ]
-    escaped = [re.sub(r"([\\()])", r"\\\1", line) for line in captions]
-    text += [f"({line}) Tj T*" for line in escaped] + ["ET"]
+    # The text begins at the board's edge, or left of a board that is narrower than a line.
+    start = float(corner[0]) if size[0] > sheet.narrow else sheet.margin
+    room = int((page[0] - start - sheet.margin) / (sheet.letter * sheet.text_points * PDF_POINT))
+    wrapped = [line for one in captions for line in textwrap.wrap(one, room)]
+    letters.append(lettering(start, low[1] + sheet.text, sheet.text_points, *wrapped))
     # One path for all rectangles: antialiasing viewers draw seams between separate ones.
-    content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *text])
+    content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *letters])
     return _document(page / PDF_POINT, content), name
 
 
-def _paper_for(size: Array, paper: str | None) -> tuple[str, Array]:
+def board_digest(board: Board) -> str:
+    """Short digest of a board's description, which tells two prints apart."""
+    text = json_text(board.document).encode("utf-8")
+    return blake2b(text, digest_size=4).hexdigest()
+
+
+def _paper_for(size: Array, paper: str | None, sheet: SheetOptions) -> tuple[str, Array]:
     """Name of the paper and its width and height, m, in portrait or landscape format."""
     if paper is not None and paper.lower() not in PAPER_SIZES:
         raise InputError(
@@ -173,7 +225,8 @@ def _paper_for(size: Array, paper: str | None) -> tuple[str, Array]:
             expected=closest(paper, PAPER_SIZES) or ", ".join(PAPER_SIZES),
         )
     names = [paper.lower()] if paper else [name for name in PAPER_SIZES if name.startswith("a")]
-    need = size + LETTERING_STRIP_WIDTH + UNPRINTABLE_EDGE_WIDTH
+    border = np.array([sheet.left, sheet.below]) + sheet.margin
+    need = size + border
     for name in names:
         short, long = PAPER_SIZES[name]
         for page in (np.array([short, long]), np.array([long, short])):
@@ -182,8 +235,8 @@ def _paper_for(size: Array, paper: str | None) -> tuple[str, Array]:
     raise InputError(
         "the board is larger than the paper",
         where="--paper" if paper else None,
-        found=f"{1e3 * size[0]:.0f} x {1e3 * size[1]:.0f} mm, and a white border of"
-        f" {1e3 * (LETTERING_STRIP_WIDTH + UNPRINTABLE_EDGE_WIDTH):.0f} mm",
+        found=f"{1e3 * size[0]:.0f} x {1e3 * size[1]:.0f} mm, and borders of"
+        f" {1e3 * border[0]:.0f} and {1e3 * border[1]:.0f} mm",
         expected=f"at most {names[-1]}",
         next_step="Take a larger paper" if paper else "Choose smaller or fewer squares",
     )
@@ -209,6 +262,19 @@ def _ruler(start: Array, along: Array, on_page: Any) -> list[str]:
     return out
 
 
+def _arrow(start: Array, along: Array, on_page: Any) -> list[str]:
+    """Arrow with a bar across its start, as PDF operators."""
+    across = np.array([along[1], -along[0]])
+    end = start + along
+    pieces = [
+        (start, end),
+        (start - 0.12 * across, start + 0.12 * across),
+        (end, end - 0.2 * along + 0.1 * across),
+        (end, end - 0.2 * along - 0.1 * across),
+    ]
+    return [f"{on_page(*a)} m {on_page(*b)} l" for a, b in pieces]
+
+
 def _description(board: Board) -> str:
     """Description of the board for the printed page."""
     data = board.document
@@ -216,12 +282,12 @@ def _description(board: Board) -> str:
         f"{key} {1e3 * data[key]:.6g} mm" for key in ("square", "marker", "gap") if key in data
     ]
     lettering = [data["dictionary"]] if "dictionary" in data else []
-    return f"pkmcal: {board.described}, {', '.join(lengths + lettering)}"
+    return f"{board.described}, {', '.join(lengths + lettering)}"
 
 
 def _document(size: Array, content: str) -> bytes:
     """PDF 1.7 file (ISO 32000-1, 7.5) of one page of `size` points, with print scaling off."""
-    stream = zlib.compress(content.encode("latin-1"))
+    stream = zlib.compress(content.encode("latin-1", "replace"))
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",

@@ -19,7 +19,7 @@ const SLOWEST = 600;
 const BESIDE = 1.2; // largest angle between the eye and a camera, rad
 const HEIGHT = 0.4; // of the eye above the horizon, as a slope
 
-type Links = Pick<Context, "selection"> & Partial<Pick<Context, "viewer">>;
+type Links = Pick<Context, "selection"> & Partial<Pick<Context, "viewer" | "printSteps">>;
 
 export function space(block: Space, context: Links): HTMLElement {
   const figure = h("figure", { class: "space-block" });
@@ -73,6 +73,7 @@ export function space(block: Space, context: Links): HTMLElement {
   );
   draw();
   fit(first);
+  context.printSteps?.push(() => stage.forPaper());
   setTimeout(project); // the blocks with images are drawn by then
   return figure;
 }

@@ -21,6 +21,7 @@ import { type Label, Labels } from "./labels";
 import { Palette } from "./palette";
 
 const FIELD = 26; // vertical field of view, degrees
+const PAPER = ["680px", "290px"]; // within the margins of A4, at 96 px an inch
 const MARGIN = 0.88; // share of the picture for what is fitted
 const KEY_TURN = Math.PI / 36;
 const KEY_ZOOM = 1.15;
@@ -115,6 +116,26 @@ export class Stage {
     this.pending = false;
     this.renderer.render(this.scene, this.camera);
     this.labels.place(this.camera, width, height);
+  }
+
+  /**
+   * Take the size of a picture on paper, before the page is laid out for it, and be drawn in it;
+   * returns the step that undoes this.
+   */
+  forPaper(): () => void {
+    const { style } = this.element;
+    const { position, target } = { position: this.camera.position.clone(), target: this.controls.target.clone() };
+    const untouched = this.untouched;
+    [style.width, style.height] = PAPER;
+    this.drawNow();
+    return () => {
+      style.width = style.height = "";
+      this.resize();
+      if (untouched) return;
+      this.camera.position.copy(position);
+      this.controls.target.copy(target);
+      this.controls.update();
+    };
   }
 
   setLabels(labels: Label[]): void {
