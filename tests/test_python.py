@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import is_dataclass, replace
 from html import unescape
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -228,6 +229,27 @@ def test_plots_show_the_numbers(result, loaded, axes):
         assert f"{one.overview().residuals.size} residuals" in ax.get_legend_handles_labels()[1]
     few = result.plot_tool(poses[:2]).get_lines()[0].get_ydata()
     assert len(few) == 2
+
+
+def test_labels_of_the_tools_error_do_not_overlap(result):
+    ax = result.plot_tool()
+    ax.figure.canvas.draw()
+    low, high = ax.get_ylim()
+    boxes = [
+        label.get_window_extent()
+        for at, label in zip(ax.get_yticks(), ax.get_yticklabels(), strict=True)
+        if low <= at <= high
+    ]
+    assert len(boxes) >= 3
+    assert all(one.y1 < other.y0 for one, other in pairwise(sorted(boxes, key=lambda b: b.y0)))
+    assert not ax.get_yticks(minor=True).size
+
+
+def test_plots_have_the_colours_of_the_pages():
+    style = (Path(__file__).parents[1] / "viewer" / "src" / "style.css").read_text()
+    assert f"--calibrated: {plots.CALIBRATED_COLOUR};" in style
+    assert f"--drawing: {plots.NOMINAL_COLOUR};" in style
+    assert f"--quiet: {plots.QUIET_COLOUR};" in style
 
 
 def test_residuals_of_a_file_are_those_of_the_result(result, loaded):

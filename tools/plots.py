@@ -9,10 +9,11 @@ from html import escape
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.plots import CALIBRATED_COLOUR, NOMINAL_COLOUR
 from pkmcal.outcome.blocks.plot import linear_ticks
 
 INK, MUTED, RULE = "#1a1e24", "#58626d", "#dde2e7"
-NOMINAL, CALIBRATED, GOOD = "#0068a8", "#c2480c", "#00664b"
+NOMINAL, CALIBRATED, GOOD = NOMINAL_COLOUR, CALIBRATED_COLOUR, "#00664b"
 
 Point = tuple[float, float]
 

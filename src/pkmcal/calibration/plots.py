@@ -10,13 +10,16 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.identify.parameter_estimates import ParameterEstimates
 from pkmcal.identify.tool import ToolError
+from pkmcal.outcome.blocks.plot import log_axis
 from pkmcal.wording import install_step
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-CALIBRATED_COLOUR, DRAWING_COLOUR, QUIET_COLOUR = "#2a6fb0", "#b5651d", "#888888"
-"""Colours of the calibrated machine, of the nominal model, and of reference lines."""
+CALIBRATED_COLOUR, NOMINAL_COLOUR, QUIET_COLOUR = "#c2480c", "#0068a8", "#8d97a1"
+"""Colours of the calibrated machine, of the nominal model, and of reference lines: those of the
+pages.
+"""
 PARAMETER_ROW_HEIGHT = 0.17
 """Height of a parameter's row in inches."""
 RESIDUAL_PLOT_REACH = 5.0
@@ -66,15 +69,15 @@ def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None 
     ax = _axes(ax, (6.0, 1.2 + PARAMETER_ROW_HEIGHT * len(rows)))
     for place, k in enumerate(rows):
         row, size = estimates[k], float(tolerance[k])
-        colour = CALIBRATED_COLOUR if row.decided_by == "data" else DRAWING_COLOUR
+        colour = CALIBRATED_COLOUR if row.decided_by == "data" else NOMINAL_COLOUR
         reach = 2 * row.sigma / size
         ax.errorbar(row.change / size, place, xerr=reach, fmt="o", ms=3, color=colour, lw=1)
     ax.axvline(0, color=QUIET_COLOUR, linewidth=0.8)
     ax.axvspan(-1, 1, color=QUIET_COLOUR, alpha=0.12, linewidth=0)
     ax.set_yticks(range(len(rows)), [estimates[k].name for k in rows], fontsize=7)
     ax.set_ylim(len(rows) - 0.5, -0.5)
-    ax.set_xlabel("calibrated less nominal model ± 2σ, in tolerances of the nominal model")
-    ax.set_title("Parameters: blue by the data, brown by the nominal model", fontsize=10)
+    ax.set_xlabel("change ± 2σ, in tolerances")
+    ax.set_title("Parameters: orange by the data, blue by the nominal model", fontsize=10)
     return ax
 
 
@@ -87,14 +90,16 @@ def tool(error: ToolError, ax: Axes | None = None) -> Axes:
     order = finite[np.argsort(error.position[finite])]
     place = np.arange(len(order))
     for values, colour, name in (
-        (error.off_position, DRAWING_COLOUR, "the nominal model's error"),
+        (error.off_position, NOMINAL_COLOUR, "the nominal model's error"),
         (error.position, CALIBRATED_COLOUR, "calibrated, 1σ"),
     ):
         ax.plot(place, values[order] * 1e3, "o", ms=4, color=colour, label=name)
+    axis = log_axis("tool position, mm", [*error.position * 1e3, *error.off_position * 1e3])
     ax.set_yscale("log")
+    ax.set_ylim(axis.limits)
+    ax.set_yticks([tick.at for tick in axis.ticks], [tick.label for tick in axis.ticks])
+    ax.set_yticks([], minor=True)
     ax.set_xlabel("pose, by how sure it is")
-    ax.set_ylabel("tool position, mm")
-    for formatted in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
-        formatted("{x:g}")
+    ax.set_ylabel(axis.label)
     ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
     return ax
