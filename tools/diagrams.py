@@ -222,12 +222,15 @@ def measured_places(case: Case) -> Places:
     truth = case.truth
     for p in case.images:
         poses = truth.T_camera_base[p.station], truth.T_base_platform[p.configuration]
-        prediction = legs._predicted_edges(ImageWindow.of([Placed(p, *poses)]), truth.machine)
+        window = ImageWindow.of([Placed(p, *poses)])
+        prediction = legs._predicted_edges(window, truth.machine, legs.EDGE_OPTIONS)
         blur = {p.station: profiles.estimate_blur(prediction.across)}
         dull, _ = profiles.without_highlights(prediction.across, blur)
         curves = profiles.residual_curves(dull, blur)
         chances = profiles.shift_log_likelihoods(dull, curves)
-        about = legs._leg_lines(chances, prediction.places.along, prediction.full, prediction.tubes)
+        about = legs._leg_lines(
+            chances, prediction.places.along, prediction.full, prediction.tubes, legs.EDGE_OPTIONS
+        )
         at = profiles.locate(dull, curves, about)
         tube = prediction.tubes.tube[np.nonzero(prediction.full)[1]]
         steep = strongest_gradient(prediction.across.grey)
@@ -242,7 +245,7 @@ def measured_places(case: Case) -> Places:
 def strongest_gradient(grey: Array) -> Array:
     """Where profiles (N, samples) change fastest within REACH of their middle, (N,) px."""
     fine = np.arange(-REACH, REACH + 0.005, 0.01)
-    slope = np.abs(CubicSpline(profiles.profile_offsets(), grey.T)(fine, 1))
+    slope = np.abs(CubicSpline(profiles.PROFILE_OPTIONS.profile_offsets, grey.T)(fine, 1))
     return fine[np.argmax(slope, axis=0)]
 
 
@@ -260,9 +263,11 @@ def two_profiles(places: Places) -> str:
 
 
 def _one_profile(places: Places, n: int, title: str) -> Plot:
-    grey, at = places.grey[n], profiles.profile_offsets()
+    grey, at = places.grey[n], profiles.PROFILE_OPTIONS.profile_offsets
     place, model = profiles._blurred_model(
-        round(float(places.blur[n]), 3), float(places.half_width[n])
+        round(float(places.blur[n]), 3),
+        float(places.half_width[n]),
+        profiles.PROFILE_OPTIONS,
     )
     shift = float(places.model_error[n])
     rows = np.stack([np.interp(at - shift, place, c) for c in model.T], axis=-1)
@@ -286,7 +291,7 @@ def _one_profile(places: Places, n: int, title: str) -> Plot:
         )
     ):
         plot.upright(x, colour, dash)
-        plot.words(0.4, high + (3.3 - 0.9 * row) * room, words, colour)
+        plot.words(0.1, high + (3.3 - 0.9 * row) * room, words, colour)
     return plot
 
 

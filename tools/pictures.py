@@ -99,10 +99,11 @@ def result(case: Case) -> Shot:
     html = guide.parts_page(
         image,
         geometry,
-        style="main { display: grid; grid-template-columns: 640px 500px; gap: 22px; padding: 8px; }"
-        " main h2 { display: none; }",
+        style="main { display: grid; grid-template-columns: 640px 470px; gap: 22px; padding: 8px; }"
+        " main h2, .bar, .images-bar, .space-block figcaption { display: none !important; }"
+        " .space-block .space-stage { height: 480px; }",
     )
-    return Shot(html, 1180, 545)
+    return Shot(html, 1180, 530)
 
 
 def outward(case: Case) -> Array:
@@ -163,7 +164,7 @@ def residuals(case: Case) -> Shot:
         residual_plots.by_leg(case.session, edges, estimate),
     )
     html = guide.parts_page(Part("residuals", "", blocks=plots), style="main h2 { display: none; }")
-    return Shot(html, 900, 330)
+    return Shot(html, 900, 300)
 
 
 def repeats(case: Case) -> Shot:
@@ -303,7 +304,7 @@ def plan(_case: Case) -> Shot:
     subject = of_machine(machine, [default_camera()], machine.joint_names)
     outcome = outcome_of(make_plan(subject, free_stations=3))
     (where,) = (part for part in outcome.parts if part.name == "where")
-    return Shot(guide.parts_page(where), 1000, 700)
+    return Shot(guide.parts_page(where), 1000, 690)
 
 
 def view(case: Case) -> Shot:

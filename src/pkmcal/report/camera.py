@@ -90,7 +90,7 @@ def outcome_of(
             Part(
                 "field",
                 "Field",
-                blocks=(_field_block(c), *field_plots(c)),
+                blocks=(_field_block(c, [Path(path) for path in paths]), *field_plots(c)),
             ),
             Part(
                 "images",
@@ -266,8 +266,8 @@ def _image(c: CameraCalibration, v: int, webp: str, factor: float, path: Path | 
     )
 
 
-def _field_block(c: CameraCalibration) -> Images:
-    """Number of corners in each cell, and mean residuals of cells with three or more.
+def _field_block(c: CameraCalibration, paths: list[Path]) -> Images:
+    """Mean residuals of cells with three or more corners, over the mean of the images.
 
     The means have an enlargement of their own, as they are smaller than single residuals.
     """
@@ -295,4 +295,5 @@ def _field_block(c: CameraCalibration) -> Images:
     middle = float(c.camera.parameters[2]), float(c.camera.parameters[3])
     field = ImageField("Mean residual", 0, (width, height), middle, tuple(arrows))
     caption = f"arrows × {factor:g}; without order where the model fits"
-    return Images(images=(field_image(field, factor, (), caption),), size="figure")
+    pictures = Pictures(paths, c.camera.image_size, [path.name for path in paths])
+    return Images(images=(field_image(field, factor, pictures, caption),), size="figure")
