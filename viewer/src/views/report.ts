@@ -19,6 +19,8 @@ const TONE_MARKS: Record<ReportDocument["verdict"]["tone"], Mark | null> = {
   neutral: null,
 };
 
+const LONG_HEADLINE = 110; // characters, from which on a smaller font keeps it in two lines
+
 export function reportView(host: HTMLElement, content: ReportDocument): void {
   const selection = new Selection();
   const viewer = new ImageViewer(selection);
@@ -49,7 +51,7 @@ function verdictOf({ verdict }: ReportDocument): HTMLElement {
   const mark = TONE_MARKS[verdict.tone];
   return h("section", { class: `verdict ${verdict.tone}`, "aria-labelledby": "verdict" },
     h("p", { class: "stamp" }, ...(mark ? [sign(mark), " "] : []), verdict.stamp),
-    h("h2", { id: "verdict" }, verdict.headline),
+    h("h2", { id: "verdict", class: verdict.headline.length > LONG_HEADLINE && "long" }, verdict.headline),
     ...(verdict.explanation ? [h("p", { class: "explanation" }, verdict.explanation)] : []),
     ...(verdict.reasons.length ? [h("ul", { class: "reasons" }, ...items(verdict.reasons))] : []),
     ...(verdict.comparison ? [logBar(verdict.comparison)] : []));
