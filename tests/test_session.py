@@ -332,7 +332,7 @@ EDITS = [
     ("joints.csv", "0001,", "1,",
      ["images/front/0001.png is of a configuration without joint readings",
       "session.yaml, line 7, stations.front.images", "found configuration 0001",
-      "The table has 1 where the image says 0001", "leading zeros"]),
+      "The table has 1 where the image has 0001", "leading zeros"]),
     ("joints.csv", JOINTS[JOINTS.index("0001"):], "",
      ["joints.csv: there is only one configuration; found 0000, expected two"]),
 ]  # fmt: skip

@@ -793,7 +793,8 @@ CHECKS: tuple[tuple[str, str, str, Callable[[Study, Before], Checked]], ...] = (
     ("Sec. IV.B", "χ² per degree of freedom of one axis of rotation, mean", NOT_PRINTED, _one_axis),
     ("Sec. IV", "joint estimate over the Cramér-Rao bound, Models 12 and 31", NOT_PRINTED,
      _over_bound),
-    ("Sec. IV", "χ² per degree of freedom: right models, and models too poor", NOT_PRINTED, _explained),
+    ("Sec. IV", "χ² per degree of freedom: right models, and models too poor", NOT_PRINTED,
+     _explained),
 )  # fmt: skip
 """Place in the paper, claim, the paper's value, and the check."""
 
