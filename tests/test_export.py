@@ -39,11 +39,11 @@ EXPRESSED = {
     "ros": (),
 }
 REFUSALS = {
-    "c": "do not just hold its platform",
+    "c": "do not constrain its platform exactly",
     "reprap": "RepRapFirmware has settings for linear and rotary deltas",
     "klipper": "Klipper has settings for linear and rotary deltas",
     "linuxcnc": "LinuxCNC moves as many joints as coordinates",
-    "ros": "no camera is known to stand anywhere",
+    "ros": "no camera has a pose",
 }
 
 

@@ -451,7 +451,7 @@ def test_somebody_elses_change_is_not_written_over(session, truth):
 def test_a_camera_by_hand_has_no_pose_to_be_written(session, truth):
     station = replace(load_session(session).stations[0], handheld=True)
     before = (session / "session.yaml").read_bytes()
-    with pytest.raises(InputError, match="held by hand has no one pose"):
+    with pytest.raises(InputError, match="hand-held camera has no single pose"):
         PoseFile(session).write(station, truth.T_camera_base[0])
     assert (session / "session.yaml").read_bytes() == before
 

@@ -96,7 +96,7 @@ def test_an_unchanged_machine(demo, later):
     assert done.code == done.json["exit_code"] == 0
     assert_keys("watch --json", done.json)
     assert done.json["verdict"]["headline"].startswith(
-        "Still as calibrated, as far as 4 new configurations can tell: a change of any leg's length"
+        "Still as calibrated, as far as 4 new configurations can show: a change of any leg's length"
     )
     assert not done.json["changed"]
     assert [leg["legs"] for leg in done.json["legs"]] == [[k] for k in range(1, 7)]

@@ -117,7 +117,7 @@ def as_it_stands(
             )
     if same_place and saved is None:
         raise InputError(
-            "there is no calibration in which the cameras stood anywhere",
+            "there is no calibration with poses of the cameras",
             where="--same-place",
             expected="--after CALIBRATION, or a session with its calibration",
         )
@@ -249,7 +249,7 @@ def subject_of_session(
     by_hand = [station.name for station in session.stations if station.handheld]
     if by_hand:
         raise InputError(
-            "a camera that is held by hand has no place to come back to, so none is planned for",
+            "a hand-held camera has no fixed pose to plan for",
             where="session.yaml, stations",
             found=listed(by_hand, 3),
             next_step="Plan the places of a camera on a tripod: --places 3",
@@ -412,7 +412,7 @@ def _station_poses(
             continue
         if station.T_camera_base is None:
             raise InputError(
-                f"nothing determines where station {station.name} stands",
+                f"the pose of station {station.name} is not determined",
                 where=f"session.yaml, stations.{station.name}",
                 expected="pose: {position: [...], look_at: [...]}, three images, or a calibration",
                 next_step="Give its pose, or let places be chosen: --places 3",
