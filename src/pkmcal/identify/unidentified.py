@@ -339,7 +339,8 @@ def _explained(around: Situation, space: _Open) -> list[OpenMotion]:
         own = numbers @ motion.columns.T / space.unit
         parts.append(OpenMotion(motion, motion.legs, names, numbers, own, len(new)))
         if motion.convention:
-            space, cosines = _without(space, new), {}
+            space = _without(space, new)
+            cosines.clear()
     return parts
 
 
