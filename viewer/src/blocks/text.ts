@@ -32,6 +32,6 @@ export function downloads(block: Downloads): HTMLElement {
     for (const event of ["pointerdown", "focus", "click"]) link.addEventListener(event, prepare);
     return link;
   });
-  return h("p", { class: "downloads small" }, "To take along: ",
+  return h("p", { class: "downloads small" }, "Downloads: ",
     ...links.flatMap((link, k) => (k ? [", ", link] : [link])), ".");
 }
