@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import pickle
 import re
 import subprocess
 from dataclasses import replace
@@ -405,6 +406,8 @@ def test_sections_lead_from_the_contents(page):
 def test_a_probability_is_words_with_its_number(probability, text):
     chance = Chance(probability)
     assert chance == text
+    copied = pickle.loads(pickle.dumps(chance))
+    assert (copied, repr(copied.value)) == (text, repr(probability))
     rows = (Row("leg 1", (chance,)),)
     block = table_block(Table("", ("Test", "By chance"), rows, hints=("", "Of noise alone.")))
     assert block.columns[1].form == "chance"

@@ -22,6 +22,8 @@ from pkmcal.commands.cli import command_named
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
 from pkmcal.outcome.finding import Finding
+from pkmcal.placement.default_camera import default_camera
+from pkmcal.planning.defaults import PLANNED_IMAGE_SIZE
 from pkmcal.simulation import Settings
 from printers import calibrated_cfg
 from test_cli_camera import boards  # noqa: F401 - a fixture
@@ -263,6 +265,9 @@ def test_a_command_and_its_function_have_the_same_options_and_defaults(verb):
         arguments |= {one.name: one.default for one in fields(Settings) if one.name in options}
     for name in options.keys() - arguments.keys() - FOR_OUTPUT:
         assert OTHERWISE[name] in arguments or verb == "new"
+        if name == "size":
+            usual = PLANNED_IMAGE_SIZE if verb == "plan" else default_camera().image_size
+            assert "default: {}x{}".format(*usual) in options[name].help
     for name, option in options.items():
         if name not in arguments:
             continue

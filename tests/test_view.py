@@ -488,6 +488,20 @@ def test_the_command_serves_until_it_is_interrupted(demo):
         assert values.stdout.read() == values.stderr.read() == ""
 
 
+def test_a_page_without_a_browser_prints_its_address(demo):
+    code = "import sys, pkmcal; pkmcal.view(sys.argv[1]).show()"
+    hidden = ("DISPLAY", "WAYLAND_DISPLAY")
+    env = {k: v for k, v in os.environ.items() if k not in hidden} | {"BROWSER": "false"}
+    with subprocess.Popen(
+        [sys.executable, "-uc", code, str(demo.calibration)], stdout=subprocess.PIPE, text=True,
+        env=env,
+    ) as served:  # fmt: skip
+        with urllib.request.urlopen(served.stdout.readline().strip(), timeout=60) as answer:
+            assert answer.status == 200
+        served.send_signal(signal.SIGINT)
+        assert served.wait(60) == 0
+
+
 def test_answers_are_sent_at_once():
     """asyncio sends without delay (TCP_NODELAY) if the protocol is registered, else 40 ms later."""
     with serving.listening_socket(0) as socket_:
@@ -555,7 +569,9 @@ def results(demo, tmp_path_factory):
     pkmcal.diff(demo.calibration, demo.session / "mechanism.yaml").save(folder / "diff")
     pkmcal.show("3-rpr").save(folder / "machine.html")
     text = (folder / "diff" / "diff.html").read_text(encoding="utf-8")
-    (folder / "older.html").write_text(text.replace('"version": 1', '"version": 0'))
+    older = text.replace('"version":1', '"version":0')
+    assert older != text
+    (folder / "older.html").write_text(older)
     (folder / "mine.html").write_text("<p>mine</p>")
     (folder / "broken").mkdir()
     (folder / "broken" / "session.yaml").write_text("pkmcal: [")
@@ -670,7 +686,7 @@ def test_a_hostile_page_stays_text(demo, tmp_path):
     """Of a stored page only the document is served, and of that only texts."""
     text = (demo.calibration / "report.html").read_text(encoding="utf-8")
     title = json.dumps(HOSTILE).replace("<", "\\u003c")
-    text = text.replace('"title": "Calibration of gough-stewart"', f'"title": {title}', 1)
+    text = text.replace('"title":"Calibration of gough-stewart"', f'"title":{title}', 1)
     (tmp_path / "report.html").write_text(text.replace("<body>", f"<body>{HOSTILE}"))
     served = Opened(tmp_path).get().text
     assert page_document(served)["title"] == HOSTILE

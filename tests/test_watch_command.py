@@ -13,6 +13,7 @@ import pytest
 from conftest import run
 from document_keys import assert_keys
 from page_documents import page_blocks, page_document, page_text
+from pkmcal.api.watch import WatchResult
 from pkmcal.calibration.calibrate import calibrate_session
 from pkmcal.calibration.saved_calibration import CalibrationPrior, load
 from pkmcal.cameras import load_camera
@@ -180,14 +181,35 @@ def test_runs_against_another_calibration_are_kept_and_not_drawn(demo, later, tm
     assert not page_blocks(page, "panels", "history")
 
 
-def test_a_history_that_cannot_be_read_is_refused_before_the_work(demo, later, tmp_path):
+ZERO = {"legs": [1], "unit": "m", "value": 0.0, "sigma": 1e-5, "limit": 3e-5}
+RUN = {
+    "time": "2026-01-31T12:00:00", "session": "s", "digest": "0", "calibration": "0",
+    "configurations": 5, "result": "as_calibrated", "share": 0.5, "zeros": [ZERO],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        ({"time": 3}, "time"),
+        ({"time": "yesterday"}, "time"),
+        ({"time": "2026-01-31T12:00:00+01:00"}, "time"),
+        ({"zeros": [{**ZERO, "limit": 0.0}]}, "limit"),
+        ({"zeros": [{**ZERO, "legs": []}]}, "legs"),
+    ],
+)
+def test_a_history_that_cannot_be_read_is_refused_before_the_work(
+    demo, later, tmp_path, change, place
+):
     folder = tmp_path / "watch"
     folder.mkdir()
-    (folder / "watch.json").write_text('{"runs": [{"time": 3}]}')
+    (folder / "watch.json").write_text(json.dumps({"runs": [RUN]}))
+    assert len(WatchResult.check_folder(folder)) == 1
+    (folder / "watch.json").write_text(json.dumps({"runs": [{**RUN, **change}]}))
     done = run("watch", demo.calibration, later.same, "-o", folder)
     assert done.code == 2
     assert "watch.json" in done.err
-    assert "runs" in done.err
+    assert place in done.err
 
 
 def test_configurations_that_the_calibration_used_are_left_out(demo, later, calibration):

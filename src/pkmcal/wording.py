@@ -148,6 +148,10 @@ class Chance(str):
     def __init__(self, probability: float) -> None:
         self.value = probability
 
+    def __getnewargs__(self) -> tuple[float]:  # type: ignore[override]
+        """Argument with which a copy is made."""
+        return (self.value,)
+
 
 def percent(share: float) -> str:
     """Share as whole percent, rounded down so that it never claims certainty."""

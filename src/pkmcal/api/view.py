@@ -39,15 +39,21 @@ class View:
         return serving.application(self.source.routes(), token, port)
 
     def show(self, port: int = 0) -> None:
-        """Serve the page to this computer, open it in a browser, and wait for Ctrl-C.
+        """Serve the page to this computer, open it in a browser, and wait for Ctrl-C; where no
+        browser opens, print the page's address.
 
         port : 0 for a free one. Raises InputError if it is taken.
         """
         import webbrowser
 
+        from pkmcal import terminal
         from pkmcal.web.serving import serve
 
-        serve(self.application, port, webbrowser.open)
+        def announce(address: str) -> None:
+            if not webbrowser.open(address):
+                terminal.out().print(address, soft_wrap=True)
+
+        serve(self.application, port, announce)
 
     def _repr_html_(self) -> str | None:
         """Page of a result in a frame, for notebooks; None for a page that needs its server."""

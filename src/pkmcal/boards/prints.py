@@ -210,7 +210,7 @@ def sheet_pdf(
 
 
 def board_digest(board: Board) -> str:
-    """Short digest of a board's description, which tells two prints apart."""
+    """Short digest of a board's description, by which two prints are distinguished."""
     text = json_text(board.document).encode("utf-8")
     return blake2b(text, digest_size=4).hexdigest()
 

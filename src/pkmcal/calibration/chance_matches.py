@@ -57,7 +57,7 @@ def explain_images(case: Case, turns: RefinementResult | None, seed: int) -> Exp
     if error is None and (value := search.leg_localization) is not None:
         unconfirmed = tuple(replace(pose, by_chance=1.0) for pose in value.localizations)
         error = mistake_in(session, images, replace(value, localizations=unconfirmed), rng)
-    # that the machine is not recognised is said by the verdict, with a report to see why
+    # that a station was not localized is in the verdict, and the report shows why
     if not isinstance(error, InputError) or error.code == "station.not_recognised":
         return Explanation()
     return Explanation(error, OPTIONS.report)

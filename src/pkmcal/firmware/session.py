@@ -211,7 +211,8 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
             raise InputError(
                 f"a carriage would have been {where} when the bed was probed",
                 where=touches.origin,
-                found=f"{printer.firmware.motors[motor]} {distance[motor]:.4g} mm {where}",
+                found=f"{printer.firmware.motors[motor]} {distance[motor]:.4g} mm"
+                f" {where.removeprefix('far ')}",
                 expected=f"points that belong to the values in {printer.label}",
             )
     return touches

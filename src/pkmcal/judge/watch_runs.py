@@ -10,9 +10,9 @@ import math
 from datetime import datetime
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import ConfigDict
+from pydantic import AfterValidator, ConfigDict, Field
 
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.files import Schema, json_text, read_json, validated_document
@@ -29,6 +29,13 @@ DIGEST_BYTES = 8
 Result = Literal["as_calibrated", "changed", "undecided", "another_machine"]
 
 
+def _iso_time(text: str) -> str:
+    """A time as it is, local and ISO 8601. Raises ValueError for another text."""
+    if datetime.fromisoformat(text).tzinfo is not None:
+        raise ValueError("a local time has no zone")
+    return text
+
+
 class LegRun(Schema):
     """Zero of a leg's reading in a run.
 
@@ -36,11 +43,11 @@ class LegRun(Schema):
     limit : change beyond which its test fails.
     """
 
-    legs: tuple[int, ...]
+    legs: Annotated[tuple[int, ...], Field(min_length=1)]
     unit: Literal["m", "rad"]
     value: float
     sigma: float
-    limit: float
+    limit: float = Field(gt=0)
 
 
 class Run(Schema):
@@ -51,7 +58,7 @@ class Run(Schema):
     statistic of all tests, relative to its threshold. zeros : of the legs that have one.
     """
 
-    time: str
+    time: Annotated[str, AfterValidator(_iso_time)]
     session: str
     digest: str
     calibration: str

@@ -73,6 +73,7 @@ class Album:
 
     rejected : images that could not be localized.
     total : number of all other images.
+    held_out : whether some of the images were held out.
     factor : enlargement of the corners' residuals.
     corners : corners of the board in all images.
     """
@@ -80,6 +81,7 @@ class Album:
     images: tuple[blocks.Image, ...]
     rejected: tuple[blocks.Image, ...]
     total: int
+    held_out: bool
     factor: float
     corners: BoardCorners
 
@@ -110,8 +112,7 @@ def _order_text(album: Album) -> str:
     n, strips = len(album.images), sum(bool(one.strips) for one in album.images)
     some = f"{n} of {album.total} images" if n < album.total else f"All {count(n, 'image')}"
     text = f"{some}: those without data in use first, then by their residuals, the largest first"
-    held_out = any("held out" in one.caption for one in album.images)
-    text += "; last those that were held out." if held_out else "."
+    text += "; last those that were held out." if album.held_out else "."
     if strips:
         which = "every image" if strips == n else f"{count(strips, 'image')}"
         text += (
@@ -185,6 +186,7 @@ def album(
         ),
         tuple(_rejected(session, largest.images, room)),
         len(every),
+        any(photo.configuration in held_out for _, photo in chosen),
         overlays.factor,
         overlays.corners,
     )

@@ -20,9 +20,9 @@ LARGEST_PAGE_BYTES = 100_000_000
 
 def is_page(path: Path) -> bool:
     """Whether a regular file is a page of the viewer, by its first bytes."""
-    if path.suffix != ".html" or not path.is_file():
-        return False
     try:
+        if path.suffix != ".html" or not path.is_file():
+            return False
         with path.open("rb") as stream:
             return PAGE_MARK.encode() in stream.read(HEAD_BYTES)
     except OSError:  # a file that cannot be read is no page that can be listed
