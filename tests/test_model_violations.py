@@ -28,7 +28,7 @@ from pkmcal.identify.score import ScoreTests, columns_of
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Column, EdgeSet, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.outcome.finding import doubtful
+from pkmcal.outcome.finding import Level, doubtful
 from pkmcal.placement.configurations import draw_configurations
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.placement.edges import EdgeNoise, simulate_edges
@@ -387,10 +387,10 @@ def test_a_sleeve_is_named_and_harms_little(session):
     path.write_text(yaml.safe_dump(document))
     value = calibrate(session)
     (one,) = value.violations
-    assert (one.code, one.subject) == ("tube.radius", "legs[2].tubes[1]")
+    assert (one.code, one.of) == ("tube.radius", "legs[2].tubes[1]")
     assert abs(one.value[0] - 2e-3) < 4 * one.sigma[0]
     assert one.value[0] > 1e-3
-    assert not one.against
+    assert one.finding.level is not Level.WRONG
 
 
 def scaled_readings(folder, column, factor):
@@ -424,7 +424,7 @@ def test_another_camera_is_named(session):
     path.write_text(yaml.safe_dump(document))
     value = calibrate(session)
     (one,) = value.violations
-    assert (one.code, one.subject) == ("camera.focal", "cameras/camera.yaml")
+    assert (one.code, one.of) == ("camera.focal", "cameras/camera.yaml")
     assert one.value[0] == pytest.approx(-0.03, rel=0.3)
     assert "--refine-camera" in one.finding.next_step
     assert one.finding in value.verdict.of("camera.focal")
