@@ -20,12 +20,12 @@ from pkmcal.exporters.delta import DEGREES_A_RADIAN, Freedoms, delta_of, nearest
 from pkmcal.exporters.linuxcnc import linear_joints, rotary_joints
 from pkmcal.exporters.samples import samples
 from pkmcal.firmware import klipper, reprap
-from pkmcal.firmware.contract import firmwares
+from pkmcal.firmware.contract import firmware_of, firmwares
 from pkmcal.geometry.rigid import rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level
 
-FIRMWARES = ("reprap", "klipper")
+FIRMWARES = ("reprap", "klipper", "marlin")
 SMALL = np.array([0.004, -0.003, 0.002])
 
 
@@ -96,11 +96,12 @@ def test_an_ideal_linear_delta_is_recovered():
 
 @pytest.mark.parametrize("firmware", firmwares(), ids=lambda one: one.name)
 def test_a_firmware_reads_what_it_writes(firmware):
-    (text,) = firmware.files(source_of(with_radius(ideal_linear(), 0.0905))).values()
-    assert [one for one in firmwares() if one.reads(text)] == [firmware]
-    printer = firmware.printer(text, "x")
+    machine = with_values(ideal_linear(), workspace_radius=0.0905, height_offset=0.0)
+    (text,) = firmware.files(source_of(machine)).values()
+    assert [one for one in firmwares() if one.evidence(text, "x")] == [firmware]
+    printer = firmware_of(text, "x").printer(text, "x")
     assert printer.radius == pytest.approx(110, abs=1e-3)
-    assert printer.reach == 90.5
+    assert printer.reach == (None if firmware.name == "marlin" else 90.5)
     np.testing.assert_allclose(np.sort(printer.rod), [269.5, 270, 271.2], atol=1e-3)
     # carriages at the bed's centre, from the rods' lengths and the towers' circle
     heights = printer.carriages(np.zeros((1, 3)))[0]
@@ -157,10 +158,14 @@ def test_linuxcnc_gets_a_module_of_what_its_own_do_not_follow(name):
 # Limits and switches that a printer has of its own
 
 
+def with_values(machine, **values):
+    """The machine with entries of its mechanism file that exports keep."""
+    return replace(machine, document=machine.document.model_copy(update=values))
+
+
 def with_radius(machine, radius):
     """The machine whose printer keeps to a radius, m."""
-    document = machine.document.model_copy(update={"workspace_radius": radius})
-    return replace(machine, document=document)
+    return with_values(machine, workspace_radius=radius)
 
 
 def klipper_config(text):

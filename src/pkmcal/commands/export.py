@@ -30,7 +30,7 @@ def export(
         str,
         typer.Option(
             metavar="FORMAT",
-            help="c, json, klipper, linuxcnc, mujoco, reprap, ros, sdf, urdf or yaml.",
+            help="c, json, klipper, linuxcnc, marlin, mujoco, reprap, ros, sdf, urdf or yaml.",
         ),
     ],
     out: Annotated[Path | None, console.folder("export-FORMAT unless given.")] = None,

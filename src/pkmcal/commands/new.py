@@ -37,13 +37,20 @@ def new(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A delta printer's printer.cfg, or config.g with M665: its nominal model"
-            " and heights.",
+            help="A delta printer's printer.cfg, config.g, Configuration.h or M503 output: its"
+            " nominal model and heights.",
         ),
     ] = None,
     probed: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="What the printer said while it probed its bed."),
+    ] = None,
+    firmware: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="The printer's firmware, if its file does not show it: klipper, marlin, reprap.",
+        ),
     ] = None,
     as_json: console.Json = False,
 ) -> int:
@@ -52,12 +59,18 @@ def new(
     from pkmcal.api.new import NewResult
 
     NewResult.check_folder(folder)
-    plain = not (machine or board or legs or places or printer or probed)
+    plain = not (machine or board or legs or places or printer or probed or firmware)
     if plain and not as_json and on_terminal():
         machine, board, legs, places = _dialogue()
     with console.progress(as_json) as progress:
         result = pkmcal.new(
-            machine, board=board, legs=legs, places=places, printer=printer, probed=probed
+            machine,
+            board=board,
+            legs=legs,
+            places=places,
+            printer=printer,
+            probed=probed,
+            firmware=firmware,
         )
         return finish(result, folder, progress, as_json=as_json)
 

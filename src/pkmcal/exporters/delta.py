@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
-from pkmcal.exporters.contract import Difference
+from pkmcal.exporters.contract import Difference, largest
 from pkmcal.exporters.limbs import (
     FLOAT_CARRIER,
     SLIDE_CARRIER,
@@ -65,6 +65,8 @@ SWITCH_ROUNDING = 1e-3
 Values are written to 0.1 µm, and the height depends weakly on the angle of an arm that is nearly
 upright.
 """
+STEPS_ROUNDING = 1e-4
+"""Tolerance of motor steps per mm."""
 TOOL_ROUNDING = 2e-6
 """Tolerance at the tool, m: settings have 0.1 µm and 0.00001 degrees, amplified up to eightfold."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
@@ -148,6 +150,17 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
         raise _no_delta(machine, program, what)
     arm = np.ones(3) if linear else np.sqrt(dot(rods.arm, rods.arm))
     poses, readings, by_reading = _workspace(machine, rods.joint, arm)
+    if linear:
+        # beyond a horizontal rod lies the other assembly mode, with the tool above a carriage;
+        # the inverse of firmwares has it not
+        home = machine.home()
+        at_home = machine.inverse(home)[rods.joint]
+        above, above_home = (
+            rate * q + zero - MM_A_METRE * (z + rods.platform[:, 2])
+            for q, z in ((readings, poses[:, 2, 3, None]), (at_home, home[2, 3]))
+        )
+        hangs = (above * above_home > 0).all(axis=1)
+        poses, readings, by_reading = poses[hangs], readings[hangs], by_reading[hangs]
     return Delta(
         machine=machine,
         program=program,
@@ -569,6 +582,43 @@ def workspace_radius(source: MachineSource) -> str | None:
     return None if radius is None else _digits(MM_A_METRE * radius)
 
 
+def height_offset(source: MachineSource) -> float | None:
+    """``height_offset`` of the mechanism file, mm; None without one."""
+    offset = source.machine.document.height_offset
+    return None if offset is None else MM_A_METRE * offset
+
+
+def corrected_steps(source: MachineSource, fit: Fit) -> Array | None:
+    """Motor steps per mm (3,) with which carriages go as far as their readings say.
+
+    None if they do already, or if the mechanism file has no ``steps_per_mm``.
+    """
+    own = source.machine.document.steps_per_mm
+    scales = scales_of(fit)
+    exact = np.abs(scales - 1).max() <= UNTOLD_SCALE_DIFFERENCE
+    if own is None or fit.kind != "linear" or exact:
+        return None
+    return np.array(own)[fit.order] / scales
+
+
+def steps_correction(steps: Array | None, unit: str = "mm") -> str:
+    """Instruction on the steps of a motor whose reading has a scale other than 1.
+
+    steps : those that a file sets, None for none.
+    """
+    if steps is None:
+        return f"Divide its steps per {unit} (M92) by that."
+    return "M92 below has the printer's own steps per mm, by the mechanism file, divided by that."
+
+
+def steps_difference(steps: Sequence[float], source: MachineSource, fit: Fit) -> Difference:
+    """Difference of a text's motor steps per mm, none or three, from the corrected ones."""
+    expected = corrected_steps(source, fit)
+    same = np.zeros(0) if expected is None else expected
+    off = largest(steps, same) if len(steps) == len(same) else np.inf
+    return Difference("motor steps", off, STEPS_ROUNDING, "steps per mm")
+
+
 def end_switches(fit: Fit) -> str:
     """Sentence on the assumed readings at the end switches."""
     word = "m" if fit.kind == "linear" else "rad"
@@ -650,11 +700,11 @@ def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array)
     readings[:, delta.joint[fit.order]] = (inverse(points) - zero) / fit.rate
     result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)
     off = np.linalg.norm(result.T_base_platform[:, :3, 3] - delta.positions, axis=1)
-    largest = float(np.where(result.converged, off, np.inf).max())
+    tool_error = float(np.where(result.converged, off, np.inf).max())
     stated_error = stated(text)
     return Difference(
         f"tool over {len(delta.poses)} poses by the firmware's formulas",
-        largest,
+        tool_error,
         # the fit's error is of first order, so a large one may be 2 % larger
         1.02 * stated_error + TOOL_ROUNDING,
     )

@@ -18,7 +18,8 @@ import numpy as np
 from pkmcal.arrays import Array, short_repr
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import Exporter, exporters
-from pkmcal.files import LARGEST_WRITTEN_FILE, quoted, read_text
+from pkmcal.files import LARGEST_WRITTEN_FILE, closest, quoted, read_text
+from pkmcal.wording import listed
 
 CARRIAGE_STEP = 1 / 80
 """Default carriage travel per step, mm.
@@ -56,11 +57,15 @@ class Printer:
     angle : (3,) directions of the towers.
     rod : (3,) lengths of the rods.
     homed : (3,) heights of the carriages at their end switches.
-    reach : print radius.
+    reach : print radius, None if unknown.
     carriages : map from tool points (n, 3) to carriage heights (n, 3), by the firmware's formulas.
     offset : (x, y, z) of the probe from the nozzle.
     touches : probed points in the same file, None for none.
     step : carriage travel per motor step.
+    steps : (3,) motor steps per mm of carriage travel, None if unknown.
+    height_offset : what the firmware's height at home contains beyond the nozzle's, None for a
+        firmware whose values contain nothing else.
+    remarks : sentences on what the file leaves open.
     """
 
     firmware: Firmware
@@ -69,11 +74,14 @@ class Printer:
     angle: Array
     rod: Array
     homed: Array
-    reach: float
+    reach: float | None
     carriages: Callable[[Array], Array]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     touches: Touches | None = None
     step: float = CARRIAGE_STEP
+    steps: Array | None = None
+    height_offset: float | None = None
+    remarks: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -82,17 +90,23 @@ class Firmware(Exporter, ABC):
     """Firmware of delta printers. Firmwares are stateless, as all exporters.
 
     program : its name.
+    configuration : the files that it is read from, in words.
     motors : names of the motors.
     carriage_source : where a user reads the heights of the carriages, in two lines.
     """
 
     program: ClassVar[str]
+    configuration: ClassVar[str]
     motors: ClassVar[tuple[str, str, str]]
     carriage_source: ClassVar[str]
 
     @abstractmethod
-    def reads(self, text: str) -> bool:
-        """Whether a text is a configuration of this firmware."""
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """Reasons, in words, to take a text for a configuration of this firmware; none to not.
+
+        Commands that other firmwares have as well are no reasons: M665 and M666 mean other things
+        to each. label : name of the file.
+        """
 
     @abstractmethod
     def printer(self, text: str, label: str) -> Printer:
@@ -137,24 +151,86 @@ def buildable_delta(printer: Printer) -> Printer:
     return printer
 
 
-def read_printer(path: Path) -> Printer:
-    """Read a printer from printer.cfg (Klipper), or config.g or config-override.g (RepRapFirmware).
+def read_printer(path: Path, firmware: str | None = None) -> Printer:
+    """Read a printer from a configuration of one of the firmwares.
 
-    Raises InputError for any other file, and for a printer that is not a linear delta.
+    firmware : name of the firmware, for a file that does not show which one it is of.
+
+    Raises InputError for a file without evidence of a firmware or with that of several, and for a
+    printer that is not a linear delta.
     """
     label = path.name
     text = read_text(path, largest=LARGEST_WRITTEN_FILE)
-    for firmware in firmwares():
-        if firmware.reads(text):
-            return buildable_delta(firmware.printer(text, label))
+    return buildable_delta(firmware_of(text, label, firmware).printer(text, label))
+
+
+def firmware_of(text: str, label: str, name: str | None = None) -> Firmware:
+    """The firmware that a configuration is of.
+
+    name : the user's own statement, which decides unless there is evidence of others alone.
+
+    Raises InputError if the text does not decide, and for an unknown name.
+    """
+    by_name = {one.name: one for one in firmwares()}
+    if name is not None and name not in by_name:
+        guess = closest(name, by_name)
+        raise InputError(
+            "there is no such firmware",
+            where="--firmware",
+            found=quoted(name),
+            expected=(f"{guess}, or another of " if guess else "") + listed(list(by_name)),
+        )
+    claims = {one.name: one.evidence(text, label) for one in by_name.values()}
+    claims = {one: reasons for one, reasons in claims.items() if reasons}
+    if name is not None and (name in claims or not claims):
+        return by_name[name]
+    if name is None and len(claims) == 1:
+        return by_name[next(iter(claims))]
+    words = [f"{by_name[one].program} ({reasons[0]})" for one, reasons in claims.items()]
+    if claims:
+        raise InputError(
+            "this file shows another firmware than the one named"
+            if name is not None
+            else "this file shows two firmwares"
+            if len(claims) == 2
+            else "this file shows several firmwares",
+            where=label,
+            found=" and ".join(words),
+            expected="the values of one firmware: signs and meanings differ between them",
+            next_step="Leave out --firmware"
+            if name is not None
+            else f"Keep one firmware's lines, or name it: --firmware {' or '.join(claims)}",
+        )
     first = next((line.strip() for line in text.splitlines() if line.strip()), "an empty file")
     raise InputError(
-        "this is neither a Klipper nor a RepRapFirmware configuration of a delta",
+        "nothing in this file shows which firmware of a delta it is of",
         where=label,
         found=quoted(first),
-        expected="a printer.cfg with a section [printer], or G-code with a line M665",
-        next_step="Name the file that holds these values; files that it includes are not followed",
+        expected=", or ".join(one.configuration for one in by_name.values()),
+        next_step="Name the file that holds these values (files that it includes are not followed),"
+        f" or its firmware: --firmware {' or '.join(by_name)}; M665 and M666 mean other things to"
+        " each",
     )
+
+
+def touches_at(points: Array, height: float, printer: Printer, label: str) -> Touches:
+    """Touches of the tool at points (n, 3) mm, at one height above the bed.
+
+    label : the file that they are from. Raises InputError for points that the printer does not
+    reach.
+    """
+    with np.errstate(all="ignore"):
+        carriages = printer.carriages(points)
+    bad = np.flatnonzero(~(np.abs(carriages) <= LARGEST_PRINTER_VALUE).all(axis=1))
+    if bad.size:
+        x, y, z = points[bad[0]]
+        raise InputError(
+            "the printer does not reach this point",
+            where=label,
+            found=f"x {x:g}, y {y:g}, z {z:g} mm",
+            expected="the tool's own places, in mm, of the printer described in " + printer.label,
+        )
+    return Touches(carriages, np.full(len(points), height), label)
 
 
 def means_by_position(points: Array) -> Array:

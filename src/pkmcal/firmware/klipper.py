@@ -98,12 +98,13 @@ class Klipper(Firmware):
     name: ClassVar = "klipper"
     title: ClassVar = "Klipper: values for printer.cfg"
     program: ClassVar = "Klipper"
+    configuration: ClassVar = "a printer.cfg with a section [printer] (Klipper)"
     motors: ClassVar = ("stepper_a", "stepper_b", "stepper_c")
     carriage_source: ClassVar = "what Klipper's\nGET_POSITION prints behind stepper:"
 
-    def reads(self, text: str) -> bool:
-        """Whether a text has a section [printer]."""
-        return "printer" in sections(text, "")
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """The section [printer]."""
+        return ("it has a section [printer]",) if "printer" in sections(text, label) else ()
 
     def printer(self, text: str, label: str) -> Printer:
         """Printer of a printer.cfg.
@@ -113,7 +114,7 @@ class Klipper(Firmware):
         """
         _check_saved(text, label)
         entries = sections(text, label)
-        kinematics = entries["printer"].get("kinematics", ("", f"{label}, [printer]"))
+        kinematics = entries.get("printer", {}).get("kinematics", ("", f"{label}, [printer]"))
         if kinematics[0] != "delta":
             raise InputError(
                 "heights of a bed are read of linear deltas",

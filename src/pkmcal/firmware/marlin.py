@@ -1,0 +1,743 @@
+"""Marlin: M665, M666, M92 and M851 of linear deltas, read from what M503 prints, from G-code or
+from Configuration.h, written by ``export --to marlin``, and bed points of G29 and G30.
+
+Semantics: Marlin's module/delta.cpp, module/motion.cpp, module/probe.cpp and
+gcode/calibrate/M665.cpp, M666.cpp, G33.cpp. Towers X, Y, Z are at 210 + X, 330 + Y and 90 + Z
+degrees, counted anticlockwise, on one circle of radius R. A rod has the length L plus its trim A, B
+or C.
+
+After its switch triggered, a carriage retracts by the amount of its M666 offset, which is never
+positive. The three carriages are then where they belong with the nozzle in the middle, at its
+height at home. So a carriage is at ``height + sqrt(rod^2 - R^2) - offset`` where its switch
+triggers, while RepRapFirmware adds the adjustment of M666.
+
+The nozzle's height at home is H less the Z of M851 in Marlin 2 with a probe (motion.cpp,
+set_axis_is_at_home), and H without a probe and in earlier versions. What H contains beyond that
+height is ``height_offset`` of the mechanism file: a printer is read and written with the same, so
+that H is right even where the version is not known.
+
+Versions of M665, by what M503 prints: L R S A B C (1.1.0, without the height); L R H S B X Y Z,
+B the calibration radius (up to 2.0.5); L R H S X Y Z A B C, rod trims (since 2.0.6).
+
+``G29 V4`` and ``G30`` print ``Bed X: 50.00 Y: 0.00 Z: -0.01``: the place under the probe, and the
+nozzle's height when the probe triggered plus the Z of M851.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.calibration.machine_source import MachineSource
+from pkmcal.errors import InputError
+from pkmcal.exporters.contract import Difference, commented, largest
+from pkmcal.exporters.delta import (
+    DEGREES_A_RADIAN,
+    SWITCH_ROUNDING,
+    Fit,
+    Freedoms,
+    about,
+    corrected_steps,
+    end_switches,
+    firmware_angle,
+    firmware_length,
+    firmware_tool_difference,
+    fit_of,
+    height_offset,
+    proportional_switches,
+    readings_elsewhere,
+    redo,
+    steps_correction,
+    steps_difference,
+    switch_values,
+    workspace_radius,
+)
+from pkmcal.files import quoted
+from pkmcal.firmware.contract import (
+    CARRIAGE_STEP,
+    LARGEST_PRINTER_VALUE,
+    NUMBER,
+    Firmware,
+    Printer,
+    means_by_position,
+    touches_at,
+)
+from pkmcal.outcome.finding import Finding
+
+FILE = "pkmcal_marlin.gcode"
+MARLIN_FREEDOMS = Freedoms((210.0, 330.0, 90.0))
+LEAST_RETRACTION = 0.2
+"""Least distance, mm, by which a carriage is made to retract from its switch, if it is at all.
+
+Marlin 2 ignores an offset of at most MIN_STEPS_PER_SEGMENT motor steps, 6 by default: 0.075 mm with
+80 steps per mm, 0.15 mm with 40.
+"""
+MOST_IGNORED_STEPS = 6
+"""Default of MIN_STEPS_PER_SEGMENT."""
+FIRST_WITH_ROD_TRIMS = "02000600"
+"""CONFIGURATION_H_VERSION of 2.0.6, in eight digits."""
+LONGEST_EXPRESSION = 200
+"""Bound on the characters of a value in Configuration.h."""
+DEEPEST_DEFINITION = 10
+"""Bound on names that are defined by other names."""
+
+_ECHO = r"[^A-Za-z;]*(?:(?:recv|read)\b[^A-Za-z;]*)?echo:\s*"
+_SENT = r"(?:[^A-Za-z;]*(?:recv|read|send|sent)\b[\s:>]*)?(?:N\d+\s*)?"
+_COMMAND = re.compile(rf"(?P<echo>{_ECHO})?(?(echo)|{_SENT})([GM]\d+)\b(.*)", re.IGNORECASE)
+_COMMANDS = ("M665", "M666", "M92", "M851", "M206", "G20")
+_DELTA_HEADING = re.compile(r"echo:[\s;]*Delta settings|Delta settings: L[<=]", re.IGNORECASE)
+_PROGRAM = re.compile(r"FIRMWARE_NAME:\s*Marlin|echo:\s*Marlin|For Marlin\.", re.IGNORECASE)
+_DEFINE = re.compile(r"#\s*define\s+([A-Za-z_]\w*)(?:\s+(.*))?")
+_BED_POINT = re.compile(rf"\bBed X:\s*{NUMBER}\s+Y:\s*{NUMBER}\s+Z:\s*{NUMBER}")
+_PLACELESS = {
+    "Bilinear Leveling Grid:": "a grid of heights without its places",
+    "Bed Topography Report": "a map of heights without its places",
+    "G33 Auto Calibrate": "means of several points as G33 prints them, without their radius",
+}
+_OPERATORS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
+
+
+@final
+class Marlin(Firmware):
+    """Marlin's commands, and its Configuration.h."""
+
+    name: ClassVar = "marlin"
+    title: ClassVar = "Marlin: commands to send"
+    program: ClassVar = "Marlin"
+    configuration: ClassVar = "the output of M503, or Configuration.h (Marlin)"
+    motors: ClassVar = ("X", "Y", "Z")
+    carriage_source: ClassVar = "what M114\nprints behind Count, divided by M92"
+
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """Lines as Marlin prints or reads them."""
+        del label
+        commands = [c for c in _commands(text) if c.code in ("M665", "M666")]
+        defined = next((d for d in _defines(text) if d.name.startswith("DELTA_")), None)
+        reasons: list[str] = []
+        if defined is not None:
+            reasons.append(f"line {defined.line} defines {defined.name}")
+        if not commands:
+            return tuple(reasons)
+        if echoed := [c for c in commands if c.echoed]:
+            reasons.append(f"line {echoed[0].line} is {echoed[0].code} behind 'echo:'")
+        for what, pattern in (("M503's heading", _DELTA_HEADING), ("Marlin's name", _PROGRAM)):
+            if match := pattern.search(text):
+                reasons.append(f"line {text.count(chr(10), 0, match.start()) + 1} has {what}")
+        for command in commands:
+            letters = {word[0].upper() for word in command.rest.split()}
+            # Smoothieware's M665 has other letters beside A, B and C, RepRapFirmware's has lists
+            if command.code != "M665" or letters & set("DEIJK") or ":" in command.rest:
+                continue
+            if "S" in letters:
+                reasons.append(f"line {command.line} gives M665 segments per second, S")
+            if letters & set("AC"):
+                reasons.append(f"line {command.line} gives M665 rod trims, A and C")
+            if letters & set("SAC"):
+                break
+        return tuple(reasons)
+
+    def printer(self, text: str, label: str) -> Printer:
+        """Printer of what M503 printed, or of Configuration.h; of repeated values the last counts.
+
+        Raises InputError for missing, malformed or impossible values, and for values whose meaning
+        depends on what the file does not contain.
+        """
+        words = _words(text, label)
+        settings = (
+            _configured(text, label)
+            if not any(k[:3] == "665" for k in words)
+            else (_commanded(words, label))
+        )
+        with np.errstate(invalid="ignore"):
+            homed = switch_heights(settings)
+        printer = Printer(
+            firmware=self,
+            label=label,
+            radius=settings.radius,
+            angle=settings.angle,
+            rod=settings.rod,
+            homed=homed,
+            reach=settings.reach,
+            carriages=partial(marlin_carriage_heights, settings),
+            offset=settings.probe,
+            step=CARRIAGE_STEP if settings.steps is None else float(1 / settings.steps.min()),
+            steps=settings.steps,
+            height_offset=settings.height_offset,
+            remarks=settings.remarks,
+        )
+        touched = self._bed_points(text, label, printer)
+        if touched is None:
+            return printer
+        return replace(printer, touches=touches_at(*touched, printer, label))
+
+    def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
+        """Points of ``G29 V4`` and ``G30``; repeats at one place are averaged.
+
+        Raises InputError for maps that do not contain the places of their heights.
+        """
+        points = self._bed_points(text, label, printer)
+        heading = next((heading for heading in _PLACELESS if heading in text), None)
+        if points is not None or heading is None:
+            return points
+        raise InputError(
+            f"this is {_PLACELESS[heading]}",
+            where=label,
+            found=quoted(heading),
+            expected="lines such as 'Bed X: 50.00 Y: 0.00 Z: -0.01'",
+            next_step="Probe with G29 V4, or with G30 X Y at each place, and save what it prints",
+        )
+
+    def files(self, source: MachineSource) -> dict[str, str]:
+        """One file of G-code, with the same values for Configuration.h in comments."""
+        fit = self._fit(source)
+        offset = height_offset(source)
+        steps = corrected_steps(source, fit)
+        values = _rounded(fit)
+        lines = about(source, fit, "XYZ", steps_correction(steps))
+        lines += [end_switches(fit)]
+        lines += proportional_switches(fit, [f"Z of {c}'s switch" for c in "XYZ"], _heights(fit))
+        lines += [
+            "These are heights of the nozzle. Its height at home is at most the least of them, and"
+            " M666 is that height less each. M665 H is that height plus height_offset.",
+            f"Height of the nozzle at home: {firmware_length(values.height)} mm.",
+        ]
+        if offset:
+            lines.append(
+                f"H contains height_offset, {firmware_length(offset)} mm, as the printer's own H:"
+                " home moves with the Z of M851."
+            )
+        if offset is None:
+            lines += [
+                "There is no H here, and no M500: H is the nozzle's height at home in Marlin"
+                " without a probe and before 2.0, and that height plus the Z of M851 in Marlin 2"
+                " with a probe. A wrong H drives the nozzle into the bed. Set H yourself, or write"
+                " height_offset into the mechanism file: 0, or the Z of M851.",
+            ]
+        commands = _commands_text(values, offset, steps)
+        defines = _defines_text(values, offset, steps, workspace_radius(source))
+        return {
+            FILE: commented(lines, ";")
+            + "\n".join(commands)
+            + "\n"
+            + commented(["The same in Configuration.h:", *defines], ";")
+        }
+
+    def check(self, files: dict[str, str], source: MachineSource) -> list[Difference]:
+        """Differences by Marlin's formulas, with the values read as Marlin reads them."""
+        fit = self._fit(source)
+        text = files[FILE]
+        words = _words(text, FILE)
+        offset = height_offset(source)
+        stated = float(text.partition("Height of the nozzle at home: ")[2].partition(" ")[0])
+        own = words["665H"][0] - offset if offset is not None else stated
+        settings = Settings(
+            rod=words["665L"][0] + np.array([words["665" + c][0] for c in "ABC"]),
+            radius=words["665R"][0],
+            angle=np.array(MARLIN_FREEDOMS.nominal) + [words["665" + c][0] for c in "XYZ"],
+            offset=np.array([words["666" + c][0] for c in "XYZ"]),
+            height=own,
+        )
+        # offsets that Marlin does not take, or ignores
+        refused = settings.offset[settings.offset > 0]
+        ignored = settings.offset[np.abs(settings.offset) < LEAST_RETRACTION]
+        # switches at other readings, by the heights that the text gives for them
+        rise = np.sqrt(settings.rod**2 - settings.radius**2)
+        elsewhere = [
+            switch_values(text, readings) + rise - (fit.rate * readings + fit.zero)
+            for readings in readings_elsewhere(fit)
+        ]
+        ends = fit.rate * fit.delta.ends[fit.order]
+        zero = switch_heights(settings) - ends
+        steps = [words["92" + c][0] for c in "XYZ" if "92" + c in words]
+        return [
+            firmware_tool_difference(
+                text, fit, lambda points: marlin_carriage_heights(settings, points), zero
+            ),
+            Difference(
+                "motors at end switches elsewhere", largest(elsewhere), SWITCH_ROUNDING, "mm"
+            ),
+            Difference("height at home", abs(own - stated), SWITCH_ROUNDING, "mm"),
+            Difference("offsets above 0", largest(refused), 0.0, "mm"),
+            Difference("offsets that Marlin ignores", largest(ignored), 0.0, "mm"),
+            steps_difference(steps, source, fit),
+        ]
+
+    def notes(self, source: MachineSource) -> tuple[Finding, ...]:
+        """Agreement of settings and machine, and the steps after installing them."""
+        return (self._fit(source).following, *redo(source))
+
+    def _fit(self, source: MachineSource) -> Fit:
+        """Marlin's parameters of a source's machine. Raises InputError for a rotary delta."""
+        fit = fit_of(source, self.program, MARLIN_FREEDOMS, MARLIN_FREEDOMS)
+        if fit.kind != "linear":
+            raise InputError(
+                f"Marlin has settings for linear deltas, and mechanism {source.machine.name!r} is a"
+                " rotary one",
+                expected="three sliders",
+                next_step="Export it with --to klipper or --to reprap",
+            )
+        return fit
+
+    def _bed_points(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
+        """Tool positions (n, 3) mm at contact, and the tool's height above the bed there."""
+        values = [
+            match.groups() for line in text.splitlines() if (match := _BED_POINT.search(line))
+        ]
+        if not values:
+            return None
+        if not np.isfinite(printer.offset).all():
+            raise InputError(
+                "where the probe is beside the nozzle is not known",
+                where=printer.label,
+                expected="M851 X Y Z, as M503 prints it, or NOZZLE_TO_PROBE_OFFSET",
+                next_step=f"Add a line M851 with X, Y and Z; the points in {label} are those under"
+                " the probe",
+            )
+        points = np.array(values, dtype=float) - np.array(printer.offset)
+        return means_by_position(points), -printer.offset[2]
+
+
+# Marlin's values and formulas
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Values of a printer, mm and degrees.
+
+    rod, angle, offset : (3,) lengths of the rods, directions of the towers, and M666.
+    height : of the nozzle at home.
+    height_offset : what H contains beyond `height`.
+    probe : (x, y, z) from the nozzle; NaN where unknown.
+    reach : print radius, None if unknown.
+    steps : (3,) motor steps per mm, None if unknown.
+    remarks : sentences on what the file leaves open.
+    """
+
+    rod: Array
+    radius: float
+    angle: Array
+    offset: Array
+    height: float
+    height_offset: float = 0.0
+    probe: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    reach: float | None = None
+    steps: Array | None = None
+    remarks: tuple[str, ...] = field(default=())
+
+    __repr__ = short_repr
+
+
+def switch_heights(settings: Settings) -> Array:
+    """Carriage heights (3,) mm at which the end switches trigger."""
+    rise = np.sqrt(settings.rod**2 - settings.radius**2)
+    return settings.height + rise - settings.offset
+
+
+def marlin_carriage_heights(settings: Settings, points: Array) -> Array:
+    """Carriage heights (n, 3) mm at points (n, 3) mm."""
+    angle = settings.angle / DEGREES_A_RADIAN
+    towers = settings.radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    off = points[:, None, :2] - towers
+    return points[:, 2:] + np.sqrt(settings.rod**2 - np.sum(off**2, axis=-1))
+
+
+# Reading commands
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command with its line's number and words. echoed : whether ``echo:`` stands before it."""
+
+    line: int
+    code: str
+    rest: str
+    echoed: bool
+
+
+def _commands(text: str) -> Iterator[Command]:
+    """Commands of a delta's geometry, of G-code, a console's output or a host's log of it."""
+    for n, line in enumerate(text.splitlines(), 1):
+        match = _COMMAND.match(line.strip())
+        if match and match[2].upper() in _COMMANDS:
+            rest = match[3].partition(";")[0].partition("*")[0]
+            yield Command(n, match[2].upper(), rest.strip(), bool(match["echo"]))
+
+
+def _words(text: str, label: str) -> dict[str, tuple[float, str]]:
+    """Value and place in the file by command and letter, as ``665L``; the last counts.
+
+    Raises InputError for words that are no numbers within bounds, and for inches.
+    """
+    out: dict[str, tuple[float, str]] = {}
+    for command in _commands(text):
+        place = f"{label}, line {command.line}"
+        if command.code == "G20":
+            raise InputError(
+                "these values are in inches", where=place, expected="G21, millimetres",
+                next_step="Send G21 before M503",
+            )  # fmt: skip
+        for word in command.rest.split():
+            if word.lower() == "sensorless":  # values of another kind follow
+                break
+            out[command.code[1:] + word[0].upper()] = _number(word[1:], place, command), place
+    return out
+
+
+def _number(text: str, place: str, command: Command) -> float:
+    """Number of a word. Raises InputError for anything else."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LARGEST_PRINTER_VALUE:
+        raise InputError(
+            "a value of this line is no number that a printer can have",
+            where=place,
+            found=quoted(f"{command.code} {command.rest}"),
+            expected="a letter and a number in mm, or degrees, in each word",
+        )
+    return value
+
+
+def _commanded(words: dict[str, tuple[float, str]], label: str) -> Settings:
+    """Settings of commands. Raises InputError for missing or impossible values."""
+
+    def value(name: str, default: float | None = None) -> float:
+        if name in words:
+            return words[name][0]
+        if default is not None:
+            return default
+        raise InputError(
+            f"M{name[:-1]} has no value {name[-1]}",
+            where=label,
+            expected="the line M665 that M503 prints, with L, R and H",
+        )
+
+    if "665H" not in words and {"665L", "665R"} <= words.keys():
+        raise InputError(
+            "the height at home is not among these values",
+            where=words["665R"][1],
+            found="M665 without H, as Marlin 1.1.0 prints it",
+            expected="H, the height of the nozzle at home in mm",
+            next_step="Add H to this line: DELTA_HEIGHT or MANUAL_Z_HOME_POS of Configuration.h,"
+            " plus Z of M206",
+        )
+    for name in ("665L", "665R", "665H", "92X", "92Y", "92Z"):
+        if name in words and words[name][0] <= 0:
+            raise _impossible(words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "above 0")
+    # B is a rod's trim only where A or C are as well; alone it is the calibration radius
+    trimmed = bool({"665A", "665C"} & words.keys())
+    trims = [value("665" + c, 0.0) if trimmed else 0.0 for c in "ABC"]
+    offset = np.array([value("666" + c, 0.0) for c in "XYZ"])
+    _check_offsets(offset, [words.get("666" + c, (0.0, label))[1] for c in "XYZ"])
+    for name in ("206X", "206Y", *(("206Z",) if trimmed else ())):
+        if words.get(name, (0.0, ""))[0]:
+            raise _impossible(words[name][1], f"M206 {name[-1]}", words[name][0], "0",
+                              "Send M206 X0 Y0 Z0 and M500, home, and probe again")  # fmt: skip
+    probe = tuple(value("851" + c, math.nan) for c in "XYZ")
+    steps = [value("92" + c, math.nan) for c in "XYZ"]
+    if trimmed:
+        height_offset = value("851Z", 0.0)
+        remarks = () if "851Z" in words else (
+            "The file has no M851: H is taken for the nozzle's height at home.",
+        )  # fmt: skip
+    else:
+        height_offset = 0.0
+        remarks = (
+            "H is taken for the nozzle's height at home. Some versions of Marlin with a probe home"
+            " it at H less the Z of M851; export --to marlin is right for both, another firmware"
+            " needs that height measured.",
+        )
+    return Settings(
+        rod=value("665L") + np.array(trims),
+        radius=value("665R"),
+        angle=np.array(MARLIN_FREEDOMS.nominal) + [value("665" + c, 0.0) for c in "XYZ"],
+        offset=offset,
+        height=value("665H") - height_offset,
+        height_offset=height_offset,
+        probe=(probe[0], probe[1], probe[2]),
+        steps=None if np.isnan(steps).any() else np.array(steps),
+        remarks=(*remarks, *_small_offsets(offset, steps)),
+    )
+
+
+def _impossible(
+    place: str, what: str, found: float, expected: str, next_step: str | None = None
+) -> InputError:
+    """Error for a value that no printer has."""
+    return InputError(
+        f"{what} is no number that this printer can have",
+        where=place,
+        found=f"{found:g}",
+        expected=expected,
+        next_step=next_step,
+    )
+
+
+def _check_offsets(offset: Array, places: list[str]) -> None:
+    """Raise InputError for end switch offsets above zero."""
+    for value, place in zip(offset, places, strict=True):
+        if value > 0:
+            raise _impossible(
+                place, "an end switch's offset, M666,", value, "at most 0, as Marlin takes it",
+                "RepRapFirmware's M666 has the opposite sign: name the firmware that these values"
+                " are of",
+            )  # fmt: skip
+
+
+def _small_offsets(offset: Array, steps: list[float]) -> tuple[str, ...]:
+    """Remark on end switch offsets that some versions ignore."""
+    least = MOST_IGNORED_STEPS / float(np.nan_to_num(np.min(steps), nan=1 / CARRIAGE_STEP))
+    small = offset[(offset != 0) & (np.abs(offset) <= least)]
+    if not small.size:
+        return ()
+    return (
+        f"M666 has {', '.join(f'{v:g}' for v in small)} mm: Marlin 2 ignores offsets of at most"
+        f" MIN_STEPS_PER_SEGMENT steps ({least:.3g} mm), and the export sets larger ones.",
+    )
+
+
+# Reading Configuration.h
+
+
+@dataclass(frozen=True)
+class Define:
+    """Definition in Configuration.h with its line's number."""
+
+    line: int
+    name: str
+    value: str
+
+
+def _defines(text: str) -> Iterator[Define]:
+    """Definitions that are not commented out."""
+    within = False  # a comment /* */
+    for n, line in enumerate(text.splitlines(), 1):
+        plain, rest = "", line
+        while rest:
+            if within:
+                _, end, rest = rest.partition("*/")
+                within = not end
+            else:
+                before, begin, rest = rest.partition("/*")
+                code, remark, _ = before.partition("//")
+                plain += code
+                within = bool(begin) and not remark
+                rest = "" if remark else rest
+        if match := _DEFINE.fullmatch(plain.strip()):
+            yield Define(n, match[1], (match[2] or "").strip())
+
+
+def _configured(text: str, label: str) -> Settings:
+    """Settings of Configuration.h. Raises InputError for missing or impossible values."""
+    values: dict[str, list[Define]] = {}
+    for define in _defines(text):
+        values.setdefault(define.name, []).append(define)
+
+    def numbers(name: str, size: int, *default: float) -> Array:
+        """Numbers (size,) of a definition; further ones are of extruders."""
+        if name not in values and default:
+            return np.array(default)
+        one = _single(values, name, label)
+        inside = one.value.removeprefix("{").removesuffix("}") if size > 1 else one.value
+        parts = inside.split(",") if size > 1 else [inside]
+        found = [_evaluated(part, values, label, one) for part in parts]
+        if len(found) < size:
+            raise InputError(
+                f"{name} does not give one number for each tower",
+                where=f"{label}, line {one.line}",
+                found=quoted(one.value),
+                expected="numbers in braces, such as { 0.0, -0.5, -1.2 }",
+            )
+        return np.array(found[:size])
+
+    def positive(name: str) -> float:
+        value = float(numbers(name, 1)[0])
+        if value <= 0:
+            raise _impossible(f"{label}, line {values[name][-1].line}", name, value, "above 0")
+        return value
+
+    zeros = (0.0, 0.0, 0.0)
+    by_tower = numbers("DELTA_RADIUS_TRIM_TOWER", 3, *zeros)
+    if by_tower.any():
+        raise InputError(
+            "towers on circles of their own are not read",
+            where=f"{label}, line {values['DELTA_RADIUS_TRIM_TOWER'][-1].line}",
+            found=quoted(values["DELTA_RADIUS_TRIM_TOWER"][-1].value),
+            expected="DELTA_RADIUS_TRIM_TOWER { 0.0, 0.0, 0.0 }",
+            next_step="Remove it and build Marlin anew: tower angles and rods take its place",
+        )
+    offset = numbers("DELTA_ENDSTOP_ADJ", 3, *zeros)
+    place = f"{label}, line {values['DELTA_ENDSTOP_ADJ'][-1].line}" if offset.any() else label
+    _check_offsets(offset, 3 * [place])
+    probe = numbers("NOZZLE_TO_PROBE_OFFSET", 3, *(3 * [math.nan]))
+    # 020006, and since 2.0.9 with two digits more, 02000902
+    version = values.get("CONFIGURATION_H_VERSION", [])
+    newer = any(d.value.ljust(8, "0") >= FIRST_WITH_ROD_TRIMS for d in version)
+    height_offset = float(probe[2]) if newer and not math.isnan(probe[2]) else 0.0
+    steps = None
+    if "DEFAULT_AXIS_STEPS_PER_UNIT" in values:
+        steps = numbers("DEFAULT_AXIS_STEPS_PER_UNIT", 3)
+        if steps.min() <= 0:
+            at = f"{label}, line {values['DEFAULT_AXIS_STEPS_PER_UNIT'][-1].line}"
+            raise _impossible(at, "DEFAULT_AXIS_STEPS_PER_UNIT", float(steps.min()), "above 0")
+    reach = next(
+        (name for name in ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS") if name in values), None
+    )
+    own_steps = [math.nan] if steps is None else steps.tolist()
+    return Settings(
+        rod=positive("DELTA_DIAGONAL_ROD") + numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros),
+        radius=positive("DELTA_RADIUS"),
+        angle=np.array(MARLIN_FREEDOMS.nominal) + numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros),
+        offset=offset,
+        height=positive("DELTA_HEIGHT") - height_offset,
+        height_offset=height_offset,
+        probe=(float(probe[0]), float(probe[1]), float(probe[2])),
+        reach=None if reach is None else positive(reach),
+        steps=steps,
+        remarks=_small_offsets(offset, own_steps),
+    )
+
+
+def _single(values: dict[str, list[Define]], name: str, label: str) -> Define:
+    """The definition of a name. Raises InputError for none, and for several that differ."""
+    all_of_it = values.get(name, [])
+    if not all_of_it:
+        raise InputError(
+            f"this value of the printer is missing: {name}",
+            where=label,
+            expected=f"#define {name} with a number",
+        )
+    other = next((d for d in all_of_it if d.value != all_of_it[0].value), None)
+    if other is not None:
+        raise InputError(
+            f"{name} is defined twice, and which one counts depends on other settings",
+            where=f"{label}, lines {all_of_it[0].line} and {other.line}",
+            found=f"{quoted(all_of_it[0].value)} and {quoted(other.value)}",
+            expected="one definition",
+            next_step="Remove the one that is not your printer's",
+        )
+    return all_of_it[0]
+
+
+def _evaluated(
+    text: str, values: dict[str, list[Define]], label: str, at: Define, depth: int = 0
+) -> float:
+    """Number of an expression of numbers, other definitions, + - * / and parentheses.
+
+    Raises InputError for anything else.
+    """
+
+    def value_of(node: ast.expr) -> float:
+        match node:
+            case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+                return float(number)
+            case ast.Name(id=name) if depth < DEEPEST_DEFINITION:
+                one = _single(values, name, label)
+                return _evaluated(one.value, values, label, one, depth + 1)
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return -value_of(operand)
+            case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+                return value_of(operand)
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+                return _OPERATORS[type(op)](value_of(left), value_of(right))
+            case _:
+                raise ValueError(ast.dump(node))
+
+    value = math.nan
+    if len(text) <= LONGEST_EXPRESSION:
+        try:
+            value = value_of(ast.parse(text.strip(), mode="eval").body)
+        except (SyntaxError, ValueError, ArithmeticError, MemoryError, RecursionError):
+            value = math.nan
+    if not abs(value) <= LARGEST_PRINTER_VALUE:
+        raise InputError(
+            f"{at.name} is no number that a printer can have",
+            where=f"{label}, line {at.line}",
+            found=quoted(at.value),
+            expected="a number in mm, or degrees, or other definitions with + - * / between them",
+        )
+    return value
+
+
+# Writing
+
+
+def _heights(fit: Fit) -> Array:
+    """Heights (3,) mm of the nozzle at which the carriages are at their switches."""
+    return fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
+
+
+def _rounded(fit: Fit) -> Settings:
+    """Settings for a fit. The height at home is the least that leaves no offset to be ignored."""
+    heights = np.round(_heights(fit), 4)
+    height = float(heights.min())
+    beyond = heights - height
+    if ((beyond > 0) & (beyond < LEAST_RETRACTION)).any():
+        height -= LEAST_RETRACTION
+    return Settings(fit.rod, fit.radius, fit.angle, height - heights, height)
+
+
+def _commands_text(values: Settings, offset: float | None, steps: Array | None) -> list[str]:
+    """Commands; without H and M500 where `offset`, mm, is not known."""
+    rod = float(np.round(values.rod.mean(), 4))
+    trims = values.angle - np.array(MARLIN_FREEDOMS.nominal)
+    height = "" if offset is None else f" H{firmware_length(values.height + offset)}"
+    return [
+        f"M665 L{firmware_length(rod)} R{firmware_length(values.radius)}{height}"
+        f" {_letters('XYZ', trims, firmware_angle)}"
+        " ; L rods, R radius, H height, XYZ towers' angles",
+        f"M665 {_letters('ABC', values.rod - rod, firmware_length)}"
+        " ; rods' trims; leave this line out before Marlin 2.0.6, where B is another value",
+        f"M666 {_letters('XYZ', values.offset, firmware_length)} ; end switches' offsets, mm",
+        *([] if steps is None else [f"M92 {_letters('XYZ', steps, firmware_length)}"]),
+        *([] if offset is None else ["M500"]),
+    ]
+
+
+def _defines_text(
+    values: Settings, offset: float | None, steps: Array | None, reach: str | None
+) -> list[str]:
+    """Definitions for Configuration.h."""
+    rod = float(np.round(values.rod.mean(), 4))
+    trims = values.angle - np.array(MARLIN_FREEDOMS.nominal)
+    height = None if offset is None else firmware_length(values.height + offset)
+    scalars = {
+        "DELTA_DIAGONAL_ROD": firmware_length(rod),
+        "DELTA_RADIUS": firmware_length(values.radius),
+        "DELTA_HEIGHT": height,
+        "DELTA_PRINTABLE_RADIUS": reach,
+        "DELTA_ENDSTOP_ADJ": _braces(values.offset, firmware_length),
+        "DELTA_TOWER_ANGLE_TRIM": _braces(trims, firmware_angle),
+        "DELTA_DIAGONAL_ROD_TRIM_TOWER": _braces(values.rod - rod, firmware_length),
+        "DELTA_RADIUS_TRIM_TOWER": _braces(np.zeros(3), firmware_length),
+    }
+    lines = [f"#define {name} {text}" for name, text in scalars.items() if text is not None]
+    if steps is not None:
+        xyz = ", ".join(firmware_length(v) for v in steps)
+        lines.append(f"#define DEFAULT_AXIS_STEPS_PER_UNIT {{ {xyz}, the extruder's own }}")
+    return lines
+
+
+def _letters(letters: str, values: Array, write: Callable[[float], str]) -> str:
+    """Values behind letters."""
+    return " ".join(f"{c}{write(float(v))}" for c, v in zip(letters, values, strict=True))
+
+
+def _braces(values: Array, write: Callable[[float], str]) -> str:
+    """Values in braces, as in C."""
+    return "{ " + ", ".join(write(float(v)) for v in values) + " }"
