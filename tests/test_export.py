@@ -41,9 +41,9 @@ EXPRESSED = {
 }
 REFUSALS = {
     "c": "do not just hold its platform",
-    "reprap": "RepRapFirmware has settings for linear and rotary deltas",
-    "marlin": "Marlin has settings for linear",
-    "klipper": "Klipper has settings for linear and rotary deltas",
+    "reprap": "RepRapFirmware has settings for deltas",
+    "marlin": "Marlin has settings for",
+    "klipper": "Klipper has settings for deltas",
     "linuxcnc": "LinuxCNC moves as many joints as coordinates",
     "ros": "no camera is known to stand anywhere",
 }

@@ -125,8 +125,11 @@ def test_an_ideal_rotary_delta_is_recovered():
     assert "tilted arms" in made.notes[0].text
 
 
-@pytest.mark.parametrize("name", ["delta", "linear-delta"])
-@pytest.mark.parametrize("to", FIRMWARES)
+KINDS = [(to, name) for to in FIRMWARES for name in ("delta", "linear-delta")]
+KINDS.remove(("marlin", "delta"))
+
+
+@pytest.mark.parametrize(("to", "name"), KINDS)
 def test_a_machine_off_its_nominal_model_is_followed_as_far_as_stated(name, to):
     machine = built(name, seed=4)
     made = make_export(source_of(machine), to)
@@ -198,8 +201,7 @@ def switch_lines(text):
     return [line for line in text.splitlines() if "reading - " in line or " rad, " in line]
 
 
-@pytest.mark.parametrize("to", FIRMWARES)
-@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+@pytest.mark.parametrize(("to", "name"), KINDS)
 def test_an_end_switch_elsewhere_has_a_number_of_its_own(to, name):
     """The tool's place by the firmware, homed by that number, is the machine's."""
     machine = built(name, seed=4)
@@ -236,6 +238,14 @@ def test_an_end_switch_elsewhere_has_a_number_of_its_own(to, name):
             config = klipper_config(text)
             config["stepper_" + "abc"[k]]["position_endstop"] = repr(number)
             homed = klipper.homed(config)
+        elif to == "marlin":
+            rod, tower = (
+                [float(v) for v in re.findall(rf"^M665 .*{c}(-?[\d.]+)", text, re.MULTILINE)]
+                for c in ("ABC"[k], "R")
+            )
+            length = float(re.search(r"^M665 L([\d.]+)", text, re.MULTILINE)[1]) + rod[0]
+            # the carriage, with the nozzle in the middle at this switch's height
+            homed = np.full(3, number + np.sqrt(length**2 - tower[0] ** 2))
         else:
             words = reprap.read_words(text)
             words["666" + "XYZ"[k]] = np.array([number])
@@ -268,6 +278,12 @@ def test_parallel_towers_are_followed_where_leaning_ones_are_not():
         ("reprap", "pkmcal_delta.g", " ; L rods", " B162 ; L rods"),
         ("reprap", "pkmcal_delta.g", "M666 Y = 0 + 1000", "M666 Y = 0 - 1000"),
         ("klipper", "pkmcal_printer.cfg", "delta_radius: ", "print_radius: 99\ndelta_radius: "),
+        ("marlin", "pkmcal_marlin.gcode", "R104.9", "R104.8"),
+        ("marlin", "pkmcal_marlin.gcode", "M666 X0.0000", "M666 X-0.5000"),
+        ("marlin", "pkmcal_marlin.gcode", "M666 X0.0000", "M666 X0.0003"),
+        ("marlin", "pkmcal_marlin.gcode", "M666 X0.0000", "M666 X-0.0003"),
+        ("marlin", "pkmcal_marlin.gcode", "A0.0000", "A0.1000"),
+        ("marlin", "pkmcal_marlin.gcode", "Z of Y's switch = 3", "Z of Y's switch = 4"),
     ],
 )  # fmt: skip
 def test_tampered_settings_are_found(to, file, old, new):
@@ -376,7 +392,7 @@ def test_ranges_are_needed(tmp_path):
 
 def test_towers_lean_too_much():
     machine = put(load_mechanism("linear-delta"), 1, base__axis=[0.7, 0.0, 0.7])
-    with pytest.raises(InputError, match="is neither; found towers that lean"):
+    with pytest.raises(InputError, match="is none; found towers that lean"):
         delta_of(machine, "Klipper")
 
 

@@ -566,7 +566,7 @@ WRONG_PRINTERS = {
     changed(CFG, "height0_pos = ", "height0_pos = 1e8,1e8,1e8 #"): "far below the bed",
     changed(CFG, "microsteps: 16", "microsteps: 16\ngear_ratio: 3"): "the gears cannot be read",
     changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not give",
-    "M584 X0\nM665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer can have",
+    "M584 X0\nM665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer",
     "M584 X0\nM665 R105 H300 B90\n": "M665 has no value L that could be used",
     printers.printer_cfg(SAYS, np.tile(SAYS.homed + 2, (7, 1))): "stepper_a 2.0 mm above it",
     printers.printer_cfg(SAYS): "no point of the bed is known",

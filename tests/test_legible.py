@@ -32,7 +32,8 @@ INVISIBLE = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 FORMATS = {
     "c": "gough-stewart", "json": "gough-stewart", "klipper": "linear-delta",
-    "linuxcnc": "gough-stewart", "marlin": "linear-delta", "mujoco": "gough-stewart", "reprap": "linear-delta",
+    "linuxcnc": "gough-stewart", "marlin": "linear-delta", "mujoco": "gough-stewart",
+    "reprap": "linear-delta",
     "ros": "gough-stewart", "sdf": "gough-stewart", "urdf": "gough-stewart",
     "yaml": "gough-stewart",
 }  # fmt: skip

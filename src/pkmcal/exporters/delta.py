@@ -182,8 +182,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
 def _no_delta(machine: Machine, program: str, text: str) -> InputError:
     """Error for a machine that is no delta."""
     return InputError(
-        f"{program} has settings for linear and rotary deltas, and mechanism {machine.name!r}"
-        " is neither",
+        f"{program} has settings for deltas, and mechanism {machine.name!r} is none",
         found=text,
         expected="motion: translation with three sliders, or three cranks, and rods",
         next_step="Export it with --to c",
@@ -345,10 +344,23 @@ class Fit:
         return np.where(np.abs(both[0] - near) < np.abs(both[1] - near), both[0], both[1])
 
 
-def fit_of(source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms) -> Fit:
-    """Parameters of a firmware for a source's machine, with the free parameters of its kind."""
+def fit_of(
+    source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms | None = None
+) -> Fit:
+    """Parameters of a firmware for a source's machine, with the free parameters of its kind.
+
+    Raises InputError for a machine that is no delta, or a rotary one without `rotary`.
+    """
     delta = delta_of(source.machine, program, source.bed)
-    return nearest_fit(delta, linear if delta.kind == "linear" else rotary)
+    freedoms = linear if delta.kind == "linear" else rotary
+    if freedoms is None:
+        raise InputError(
+            f"{program} has settings for linear deltas, and mechanism {source.machine.name!r} is a"
+            " rotary one",
+            expected="three sliders",
+            next_step="Export it with --to klipper or --to reprap",
+        )
+    return nearest_fit(delta, freedoms)
 
 
 def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:

@@ -97,6 +97,7 @@ _COMMANDS = ("M665", "M666", "M92", "M851", "M206", "G20")
 _DELTA_HEADING = re.compile(r"echo:[\s;]*Delta settings|Delta settings: L[<=]", re.IGNORECASE)
 _PROGRAM = re.compile(r"FIRMWARE_NAME:\s*Marlin|echo:\s*Marlin|For Marlin\.", re.IGNORECASE)
 _DEFINE = re.compile(r"#\s*define\s+([A-Za-z_]\w*)(?:\s+(.*))?")
+_COMMENT_MARK = re.compile(r"(//|/\*|\*/)")
 _BED_POINT = re.compile(rf"\bBed X:\s*{NUMBER}\s+Y:\s*{NUMBER}\s+Z:\s*{NUMBER}")
 _PLACELESS = {
     "Bilinear Leveling Grid:": "a grid of heights without its places",
@@ -281,16 +282,8 @@ class Marlin(Firmware):
         return (self._fit(source).following, *redo(source))
 
     def _fit(self, source: MachineSource) -> Fit:
-        """Marlin's parameters of a source's machine. Raises InputError for a rotary delta."""
-        fit = fit_of(source, self.program, MARLIN_FREEDOMS, MARLIN_FREEDOMS)
-        if fit.kind != "linear":
-            raise InputError(
-                f"Marlin has settings for linear deltas, and mechanism {source.machine.name!r} is a"
-                " rotary one",
-                expected="three sliders",
-                next_step="Export it with --to klipper or --to reprap",
-            )
-        return fit
+        """Marlin's parameters of a source's machine."""
+        return fit_of(source, self.program, MARLIN_FREEDOMS)
 
     def _bed_points(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
         """Tool positions (n, 3) mm at contact, and the tool's height above the bed there."""
@@ -527,18 +520,15 @@ def _defines(text: str) -> Iterator[Define]:
     """Definitions that are not commented out."""
     within = False  # a comment /* */
     for n, line in enumerate(text.splitlines(), 1):
-        plain, rest = "", line
-        while rest:
-            if within:
-                _, end, rest = rest.partition("*/")
-                within = not end
-            else:
-                before, begin, rest = rest.partition("/*")
-                code, remark, _ = before.partition("//")
-                plain += code
-                within = bool(begin) and not remark
-                rest = "" if remark else rest
-        if match := _DEFINE.fullmatch(plain.strip()):
+        code: list[str] = []
+        for mark in _COMMENT_MARK.split(line):
+            if mark == "//" and not within:
+                break
+            if mark in ("/*", "*/"):
+                within = mark == "/*"
+            elif not within:
+                code.append(mark)
+        if match := _DEFINE.fullmatch("".join(code).strip()):
             yield Define(n, match[1], (match[2] or "").strip())
 
 
