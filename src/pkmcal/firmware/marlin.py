@@ -30,35 +30,26 @@ import math
 import operator
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import ClassVar, final
 
 import numpy as np
 
-from pkmcal.arrays import Array, short_repr
+from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import Difference, commented, largest
 from pkmcal.exporters.delta import (
-    DEGREES_A_RADIAN,
-    SWITCH_ROUNDING,
     Fit,
-    Freedoms,
     about,
     corrected_steps,
-    end_switches,
     firmware_angle,
     firmware_length,
-    firmware_tool_difference,
     fit_of,
     height_offset,
-    proportional_switches,
-    readings_elsewhere,
     redo,
     steps_correction,
     steps_difference,
-    switch_values,
     workspace_radius,
 )
 from pkmcal.files import quoted
@@ -71,10 +62,22 @@ from pkmcal.firmware.contract import (
     means_by_position,
     touches_at,
 )
+from pkmcal.firmware.towers import (
+    TOWER_FREEDOMS,
+    Settings,
+    Words,
+    commands,
+    fitted_settings,
+    impossible,
+    lettered,
+    read_commands,
+    stated_height,
+    switch_lines,
+    tower_differences,
+)
 from pkmcal.outcome.finding import Finding
 
 FILE = "pkmcal_marlin.gcode"
-MARLIN_FREEDOMS = Freedoms((210.0, 330.0, 90.0))
 LEAST_RETRACTION = 0.2
 """Least distance, mm, by which a carriage is made to retract from its switch, if it is at all.
 
@@ -90,10 +93,7 @@ LONGEST_EXPRESSION = 200
 DEEPEST_DEFINITION = 10
 """Bound on names that are defined by other names."""
 
-_ECHO = r"[^A-Za-z;]*(?:(?:recv|read)\b[^A-Za-z;]*)?echo:\s*"
-_SENT = r"(?:[^A-Za-z;]*(?:recv|read|send|sent)\b[\s:>]*)?(?:N\d+\s*)?"
-_COMMAND = re.compile(rf"(?P<echo>{_ECHO})?(?(echo)|{_SENT})([GM]\d+)\b(.*)", re.IGNORECASE)
-_COMMANDS = ("M665", "M666", "M92", "M851", "M206", "G20")
+MARLIN_COMMANDS = ("M665", "M666", "M92", "M851", "M206")
 _DELTA_HEADING = re.compile(r"echo:[\s;]*Delta settings|Delta settings: L[<=]", re.IGNORECASE)
 _PROGRAM = re.compile(r"FIRMWARE_NAME:\s*Marlin|echo:\s*Marlin|For Marlin\.", re.IGNORECASE)
 _DEFINE = re.compile(r"#\s*define\s+([A-Za-z_]\w*)(?:\s+(.*))?")
@@ -126,19 +126,19 @@ class Marlin(Firmware):
     def evidence(self, text: str, label: str) -> tuple[str, ...]:
         """Lines as Marlin prints or reads them."""
         del label
-        commands = [c for c in _commands(text) if c.code in ("M665", "M666")]
+        geometry = list(commands(text, ("M665", "M666")))
         defined = next((d for d in _defines(text) if d.name.startswith("DELTA_")), None)
         reasons: list[str] = []
         if defined is not None:
             reasons.append(f"line {defined.line} defines {defined.name}")
-        if not commands:
+        if not geometry:
             return tuple(reasons)
-        if echoed := [c for c in commands if c.echoed]:
+        if echoed := [c for c in geometry if c.echoed]:
             reasons.append(f"line {echoed[0].line} is {echoed[0].code} behind 'echo:'")
         for what, pattern in (("M503's heading", _DELTA_HEADING), ("Marlin's name", _PROGRAM)):
             if match := pattern.search(text):
                 reasons.append(f"line {text.count(chr(10), 0, match.start()) + 1} has {what}")
-        for command in commands:
+        for command in geometry:
             letters = {word[0].upper() for word in command.rest.split()}
             # Smoothieware's M665 has other letters beside A, B and C, RepRapFirmware's has lists
             if command.code != "M665" or letters & set("DEIJK") or ":" in command.rest:
@@ -157,29 +157,17 @@ class Marlin(Firmware):
         Raises InputError for missing, malformed or impossible values, and for values whose meaning
         depends on what the file does not contain.
         """
-        words = _words(text, label)
-        settings = (
-            _configured(text, label)
-            if not any(k[:3] == "665" for k in words)
-            else (_commanded(words, label))
-        )
-        with np.errstate(invalid="ignore"):
-            homed = switch_heights(settings)
-        printer = Printer(
-            firmware=self,
-            label=label,
-            radius=settings.radius,
-            angle=settings.angle,
-            rod=settings.rod,
-            homed=homed,
-            reach=settings.reach,
-            carriages=partial(marlin_carriage_heights, settings),
-            offset=settings.probe,
-            step=CARRIAGE_STEP if settings.steps is None else float(1 / settings.steps.min()),
-            steps=settings.steps,
-            height_offset=settings.height_offset,
-            remarks=settings.remarks,
-        )
+        if inches := next(commands(text, ("G20",)), None):
+            raise InputError(
+                "these values are in inches",
+                where=f"{label}, line {inches.line}",
+                expected="G21, millimetres",
+                next_step="Send G21 before M503",
+            )
+        words = read_commands(text, label, MARLIN_COMMANDS)
+        by_command = any(name.startswith("665") for name in words)
+        settings = _commanded(words, label) if by_command else _configured(text, label)
+        printer = settings.printer(self, label)
         touched = self._bed_points(text, label, printer)
         if touched is None:
             return printer
@@ -207,15 +195,10 @@ class Marlin(Firmware):
         fit = self._fit(source)
         offset = height_offset(source)
         steps = corrected_steps(source, fit)
-        values = _rounded(fit)
+        values = fitted_settings(fit, LEAST_RETRACTION)
+        rule = "M666 is that height less each, and M665 H that height plus height_offset."
         lines = about(source, fit, "XYZ", steps_correction(steps))
-        lines += [end_switches(fit)]
-        lines += proportional_switches(fit, [f"Z of {c}'s switch" for c in "XYZ"], _heights(fit))
-        lines += [
-            "These are heights of the nozzle. Its height at home is at most the least of them, and"
-            " M666 is that height less each. M665 H is that height plus height_offset.",
-            f"Height of the nozzle at home: {firmware_length(values.height)} mm.",
-        ]
+        lines += switch_lines(fit, values.height, rule)
         if offset:
             lines.append(
                 f"H contains height_offset, {firmware_length(offset)} mm, as the printer's own H:"
@@ -228,11 +211,11 @@ class Marlin(Firmware):
                 " with a probe. A wrong H drives the nozzle into the bed. Set H yourself, or write"
                 " height_offset into the mechanism file: 0, or the Z of M851.",
             ]
-        commands = _commands_text(values, offset, steps)
+        lines_of_code = _commands_text(values, offset, steps)
         defines = _defines_text(values, offset, steps, workspace_radius(source))
         return {
             FILE: commented(lines, ";")
-            + "\n".join(commands)
+            + "\n".join(lines_of_code)
             + "\n"
             + commented(["The same in Configuration.h:", *defines], ";")
         }
@@ -241,38 +224,20 @@ class Marlin(Firmware):
         """Differences by Marlin's formulas, with the values read as Marlin reads them."""
         fit = self._fit(source)
         text = files[FILE]
-        words = _words(text, FILE)
+        words = read_commands(text, FILE, MARLIN_COMMANDS)
         offset = height_offset(source)
-        stated = float(text.partition("Height of the nozzle at home: ")[2].partition(" ")[0])
-        own = words["665H"][0] - offset if offset is not None else stated
+        height = stated_height(text) if offset is None else words["665H"][0] - offset
         settings = Settings(
             rod=words["665L"][0] + np.array([words["665" + c][0] for c in "ABC"]),
             radius=words["665R"][0],
-            angle=np.array(MARLIN_FREEDOMS.nominal) + [words["665" + c][0] for c in "XYZ"],
+            angle=np.array(TOWER_FREEDOMS.nominal) + [words["665" + c][0] for c in "XYZ"],
             offset=np.array([words["666" + c][0] for c in "XYZ"]),
-            height=own,
+            height=height,
         )
-        # offsets that Marlin does not take, or ignores
-        refused = settings.offset[settings.offset > 0]
         ignored = settings.offset[np.abs(settings.offset) < LEAST_RETRACTION]
-        # switches at other readings, by the heights that the text gives for them
-        rise = np.sqrt(settings.rod**2 - settings.radius**2)
-        elsewhere = [
-            switch_values(text, readings) + rise - (fit.rate * readings + fit.zero)
-            for readings in readings_elsewhere(fit)
-        ]
-        ends = fit.rate * fit.delta.ends[fit.order]
-        zero = switch_heights(settings) - ends
         steps = [words["92" + c][0] for c in "XYZ" if "92" + c in words]
         return [
-            firmware_tool_difference(
-                text, fit, lambda points: marlin_carriage_heights(settings, points), zero
-            ),
-            Difference(
-                "motors at end switches elsewhere", largest(elsewhere), SWITCH_ROUNDING, "mm"
-            ),
-            Difference("height at home", abs(own - stated), SWITCH_ROUNDING, "mm"),
-            Difference("offsets above 0", largest(refused), 0.0, "mm"),
+            *tower_differences(text, fit, settings),
             Difference("offsets that Marlin ignores", largest(ignored), 0.0, "mm"),
             steps_difference(steps, source, fit),
         ]
@@ -283,7 +248,7 @@ class Marlin(Firmware):
 
     def _fit(self, source: MachineSource) -> Fit:
         """Marlin's parameters of a source's machine."""
-        return fit_of(source, self.program, MARLIN_FREEDOMS)
+        return fit_of(source, self.program, TOWER_FREEDOMS)
 
     def _bed_points(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
         """Tool positions (n, 3) mm at contact, and the tool's height above the bed there."""
@@ -304,109 +269,10 @@ class Marlin(Firmware):
         return means_by_position(points), -printer.offset[2]
 
 
-# Marlin's values and formulas
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Values of a printer, mm and degrees.
-
-    rod, angle, offset : (3,) lengths of the rods, directions of the towers, and M666.
-    height : of the nozzle at home.
-    height_offset : what H contains beyond `height`.
-    probe : (x, y, z) from the nozzle; NaN where unknown.
-    reach : print radius, None if unknown.
-    steps : (3,) motor steps per mm, None if unknown.
-    remarks : sentences on what the file leaves open.
-    """
-
-    rod: Array
-    radius: float
-    angle: Array
-    offset: Array
-    height: float
-    height_offset: float = 0.0
-    probe: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    reach: float | None = None
-    steps: Array | None = None
-    remarks: tuple[str, ...] = field(default=())
-
-    __repr__ = short_repr
-
-
-def switch_heights(settings: Settings) -> Array:
-    """Carriage heights (3,) mm at which the end switches trigger."""
-    rise = np.sqrt(settings.rod**2 - settings.radius**2)
-    return settings.height + rise - settings.offset
-
-
-def marlin_carriage_heights(settings: Settings, points: Array) -> Array:
-    """Carriage heights (n, 3) mm at points (n, 3) mm."""
-    angle = settings.angle / DEGREES_A_RADIAN
-    towers = settings.radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    off = points[:, None, :2] - towers
-    return points[:, 2:] + np.sqrt(settings.rod**2 - np.sum(off**2, axis=-1))
-
-
 # Reading commands
 
 
-@dataclass(frozen=True)
-class Command:
-    """Command with its line's number and words. echoed : whether ``echo:`` stands before it."""
-
-    line: int
-    code: str
-    rest: str
-    echoed: bool
-
-
-def _commands(text: str) -> Iterator[Command]:
-    """Commands of a delta's geometry, of G-code, a console's output or a host's log of it."""
-    for n, line in enumerate(text.splitlines(), 1):
-        match = _COMMAND.match(line.strip())
-        if match and match[2].upper() in _COMMANDS:
-            rest = match[3].partition(";")[0].partition("*")[0]
-            yield Command(n, match[2].upper(), rest.strip(), bool(match["echo"]))
-
-
-def _words(text: str, label: str) -> dict[str, tuple[float, str]]:
-    """Value and place in the file by command and letter, as ``665L``; the last counts.
-
-    Raises InputError for words that are no numbers within bounds, and for inches.
-    """
-    out: dict[str, tuple[float, str]] = {}
-    for command in _commands(text):
-        place = f"{label}, line {command.line}"
-        if command.code == "G20":
-            raise InputError(
-                "these values are in inches", where=place, expected="G21, millimetres",
-                next_step="Send G21 before M503",
-            )  # fmt: skip
-        for word in command.rest.split():
-            if word.lower() == "sensorless":  # values of another kind follow
-                break
-            out[command.code[1:] + word[0].upper()] = _number(word[1:], place, command), place
-    return out
-
-
-def _number(text: str, place: str, command: Command) -> float:
-    """Number of a word. Raises InputError for anything else."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= LARGEST_PRINTER_VALUE:
-        raise InputError(
-            "a value of this line is no number that a printer can have",
-            where=place,
-            found=quoted(f"{command.code} {command.rest}"),
-            expected="a letter and a number in mm, or degrees, in each word",
-        )
-    return value
-
-
-def _commanded(words: dict[str, tuple[float, str]], label: str) -> Settings:
+def _commanded(words: Words, label: str) -> Settings:
     """Settings of commands. Raises InputError for missing or impossible values."""
 
     def value(name: str, default: float | None = None) -> float:
@@ -431,7 +297,7 @@ def _commanded(words: dict[str, tuple[float, str]], label: str) -> Settings:
         )
     for name in ("665L", "665R", "665H", "92X", "92Y", "92Z"):
         if name in words and words[name][0] <= 0:
-            raise _impossible(words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "above 0")
+            raise impossible(words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "above 0")
     # B is a rod's trim only where A or C are as well; alone it is the calibration radius
     trimmed = bool({"665A", "665C"} & words.keys())
     trims = [value("665" + c, 0.0) if trimmed else 0.0 for c in "ABC"]
@@ -439,7 +305,7 @@ def _commanded(words: dict[str, tuple[float, str]], label: str) -> Settings:
     _check_offsets(offset, [words.get("666" + c, (0.0, label))[1] for c in "XYZ"])
     for name in ("206X", "206Y", *(("206Z",) if trimmed else ())):
         if words.get(name, (0.0, ""))[0]:
-            raise _impossible(words[name][1], f"M206 {name[-1]}", words[name][0], "0",
+            raise impossible(words[name][1], f"M206 {name[-1]}", words[name][0], "0",
                               "Send M206 X0 Y0 Z0 and M500, home, and probe again")  # fmt: skip
     probe = tuple(value("851" + c, math.nan) for c in "XYZ")
     steps = [value("92" + c, math.nan) for c in "XYZ"]
@@ -458,7 +324,7 @@ def _commanded(words: dict[str, tuple[float, str]], label: str) -> Settings:
     return Settings(
         rod=value("665L") + np.array(trims),
         radius=value("665R"),
-        angle=np.array(MARLIN_FREEDOMS.nominal) + [value("665" + c, 0.0) for c in "XYZ"],
+        angle=np.array(TOWER_FREEDOMS.nominal) + [value("665" + c, 0.0) for c in "XYZ"],
         offset=offset,
         height=value("665H") - height_offset,
         height_offset=height_offset,
@@ -468,24 +334,11 @@ def _commanded(words: dict[str, tuple[float, str]], label: str) -> Settings:
     )
 
 
-def _impossible(
-    place: str, what: str, found: float, expected: str, next_step: str | None = None
-) -> InputError:
-    """Error for a value that no printer has."""
-    return InputError(
-        f"{what} is no number that this printer can have",
-        where=place,
-        found=f"{found:g}",
-        expected=expected,
-        next_step=next_step,
-    )
-
-
 def _check_offsets(offset: Array, places: list[str]) -> None:
     """Raise InputError for end switch offsets above zero."""
     for value, place in zip(offset, places, strict=True):
         if value > 0:
-            raise _impossible(
+            raise impossible(
                 place, "an end switch's offset, M666,", value, "at most 0, as Marlin takes it",
                 "RepRapFirmware's M666 has the opposite sign: name the firmware that these values"
                 " are of",
@@ -558,7 +411,7 @@ def _configured(text: str, label: str) -> Settings:
     def positive(name: str) -> float:
         value = float(numbers(name, 1)[0])
         if value <= 0:
-            raise _impossible(f"{label}, line {values[name][-1].line}", name, value, "above 0")
+            raise impossible(f"{label}, line {values[name][-1].line}", name, value, "above 0")
         return value
 
     zeros = (0.0, 0.0, 0.0)
@@ -584,7 +437,7 @@ def _configured(text: str, label: str) -> Settings:
         steps = numbers("DEFAULT_AXIS_STEPS_PER_UNIT", 3)
         if steps.min() <= 0:
             at = f"{label}, line {values['DEFAULT_AXIS_STEPS_PER_UNIT'][-1].line}"
-            raise _impossible(at, "DEFAULT_AXIS_STEPS_PER_UNIT", float(steps.min()), "above 0")
+            raise impossible(at, "DEFAULT_AXIS_STEPS_PER_UNIT", float(steps.min()), "above 0")
     reach = next(
         (name for name in ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS") if name in values), None
     )
@@ -592,7 +445,7 @@ def _configured(text: str, label: str) -> Settings:
     return Settings(
         rod=positive("DELTA_DIAGONAL_ROD") + numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros),
         radius=positive("DELTA_RADIUS"),
-        angle=np.array(MARLIN_FREEDOMS.nominal) + numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros),
+        angle=np.array(TOWER_FREEDOMS.nominal) + numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros),
         offset=offset,
         height=positive("DELTA_HEIGHT") - height_offset,
         height_offset=height_offset,
@@ -667,34 +520,19 @@ def _evaluated(
 # Writing
 
 
-def _heights(fit: Fit) -> Array:
-    """Heights (3,) mm of the nozzle at which the carriages are at their switches."""
-    return fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
-
-
-def _rounded(fit: Fit) -> Settings:
-    """Settings for a fit. The height at home is the least that leaves no offset to be ignored."""
-    heights = np.round(_heights(fit), 4)
-    height = float(heights.min())
-    beyond = heights - height
-    if ((beyond > 0) & (beyond < LEAST_RETRACTION)).any():
-        height -= LEAST_RETRACTION
-    return Settings(fit.rod, fit.radius, fit.angle, height - heights, height)
-
-
 def _commands_text(values: Settings, offset: float | None, steps: Array | None) -> list[str]:
     """Commands; without H and M500 where `offset`, mm, is not known."""
     rod = float(np.round(values.rod.mean(), 4))
-    trims = values.angle - np.array(MARLIN_FREEDOMS.nominal)
+    trims = values.angle - np.array(TOWER_FREEDOMS.nominal)
     height = "" if offset is None else f" H{firmware_length(values.height + offset)}"
     return [
         f"M665 L{firmware_length(rod)} R{firmware_length(values.radius)}{height}"
-        f" {_letters('XYZ', trims, firmware_angle)}"
+        f" {lettered('XYZ', trims, firmware_angle)}"
         " ; L rods, R radius, H height, XYZ towers' angles",
-        f"M665 {_letters('ABC', values.rod - rod, firmware_length)}"
+        f"M665 {lettered('ABC', values.rod - rod, firmware_length)}"
         " ; rods' trims; leave this line out before Marlin 2.0.6, where B is another value",
-        f"M666 {_letters('XYZ', values.offset, firmware_length)} ; end switches' offsets, mm",
-        *([] if steps is None else [f"M92 {_letters('XYZ', steps, firmware_length)}"]),
+        f"M666 {lettered('XYZ', values.offset, firmware_length)} ; end switches' offsets, mm",
+        *([] if steps is None else [f"M92 {lettered('XYZ', steps, firmware_length)}"]),
         *([] if offset is None else ["M500"]),
     ]
 
@@ -704,7 +542,7 @@ def _defines_text(
 ) -> list[str]:
     """Definitions for Configuration.h."""
     rod = float(np.round(values.rod.mean(), 4))
-    trims = values.angle - np.array(MARLIN_FREEDOMS.nominal)
+    trims = values.angle - np.array(TOWER_FREEDOMS.nominal)
     height = None if offset is None else firmware_length(values.height + offset)
     scalars = {
         "DELTA_DIAGONAL_ROD": firmware_length(rod),
@@ -721,11 +559,6 @@ def _defines_text(
         xyz = ", ".join(firmware_length(v) for v in steps)
         lines.append(f"#define DEFAULT_AXIS_STEPS_PER_UNIT {{ {xyz}, the extruder's own }}")
     return lines
-
-
-def _letters(letters: str, values: Array, write: Callable[[float], str]) -> str:
-    """Values behind letters."""
-    return " ".join(f"{c}{write(float(v))}" for c, v in zip(letters, values, strict=True))
 
 
 def _braces(values: Array, write: Callable[[float], str]) -> str:
