@@ -99,7 +99,7 @@ def export(
         A calibration's folder, a mechanism file, or the name of a built-in machine.
     to :
         Name of the format: ``c``, ``json``, ``klipper``, ``linuxcnc``, ``marlin``, ``mujoco``,
-        ``reprap``, ``ros``, ``sdf``, ``urdf``, ``yaml``.
+        ``repetier``, ``reprap``, ``ros``, ``smoothie``, ``sdf``, ``urdf``, ``yaml``.
     session :
         The calibration's session, for its cameras, where it is not found around the folder.
     force :

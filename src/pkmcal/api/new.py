@@ -118,12 +118,14 @@ def new(
         Number of stations of the camera; 1 by default.
     printer :
         Configuration of a delta printer: Klipper's printer.cfg, RepRapFirmware's config.g with
-        M665, Marlin's Configuration.h or what M503 printed. The session has its nominal model, and
-        the heights of its bed unless ``board``.
+        M665, Marlin's Configuration.h, Smoothieware's config, what M503 printed (Marlin,
+        Smoothieware) or M205 (Repetier-Firmware). The session has its nominal model, and the
+        heights of its bed unless ``board``.
     probed :
         Console output of a printer that probed its bed; by default the heights in ``printer``.
     firmware :
-        ``klipper``, ``marlin`` or ``reprap``, for a ``printer`` that does not show which it is of.
+        ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
+        does not show which it is of.
 
     Returns
     -------

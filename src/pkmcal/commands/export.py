@@ -30,7 +30,8 @@ def export(
         str,
         typer.Option(
             metavar="FORMAT",
-            help="c, json, klipper, linuxcnc, marlin, mujoco, reprap, ros, sdf, urdf or yaml.",
+            help="c, json, klipper, linuxcnc, marlin, mujoco, repetier, reprap, ros, sdf, smoothie,"
+            " urdf or yaml.",
         ),
     ],
     out: Annotated[Path | None, console.folder("export-FORMAT unless given.")] = None,

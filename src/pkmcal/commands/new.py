@@ -37,8 +37,8 @@ def new(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="A delta printer's printer.cfg, config.g, Configuration.h or M503 output: its"
-            " nominal model and heights.",
+            help="A delta printer's printer.cfg, config.g, Configuration.h, or what M503 or M205"
+            " printed: its nominal model and heights.",
         ),
     ] = None,
     probed: Annotated[
@@ -49,7 +49,8 @@ def new(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="The printer's firmware, if its file does not show it: klipper, marlin, reprap.",
+            help="The printer's firmware, if its file does not show it: klipper, marlin, repetier,"
+            " reprap or smoothie.",
         ),
     ] = None,
     as_json: console.Json = False,

@@ -41,6 +41,7 @@ GRID_READINGS_A_MOTOR = 7
 """Grid readings of each motor: ends, middle, and two on either side."""
 LEAST_DELTA_SINGULARITY = 0.12
 """Least singular value of the scaled inverse Jacobian: readings' errors grow at most eightfold."""
+MOST_AMPLIFICATION = 1 / LEAST_DELTA_SINGULARITY
 FASTEST_MOTOR_RATIO = 4.0
 """Largest ratio of a carriage's or elbow's speed to the tool's.
 
@@ -698,12 +699,15 @@ def stated(text: str) -> float:
     return float(match.group(1)) / MM_A_METRE if match else 0.0
 
 
-def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
+def firmware_tool_difference(
+    text: str, fit: Fit, inverse: Inverse, zero: Array, end_rounding: float = 0.0
+) -> Difference:
     """Tool error by the firmware's formulas with the text's values, over the workspace.
 
     The machine's forward kinematics follows the firmware's inverse.
 
     zero : (3,) motor positions at reading zero by the text's end switches.
+    end_rounding : of these positions, mm or degrees, beyond that of lengths.
     """
     delta = fit.delta
     points = MM_A_METRE * apply(read_firmware_from_base(text), delta.positions)
@@ -718,7 +722,7 @@ def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array)
         f"tool over {len(delta.poses)} poses by the firmware's formulas",
         tool_error,
         # the fit's error is of first order, so a large one may be 2 % larger
-        1.02 * stated_error + TOOL_ROUNDING,
+        1.02 * stated_error + TOOL_ROUNDING + MOST_AMPLIFICATION * end_rounding / MM_A_METRE,
     )
 
 

@@ -208,8 +208,8 @@ def firmware_of(text: str, label: str, name: str | None = None) -> Firmware:
         found=quoted(first),
         expected=", or ".join(one.configuration for one in by_name.values()),
         next_step="Name the file that holds these values (files that it includes are not followed),"
-        f" or its firmware: --firmware {' or '.join(by_name)}; M665 and M666 mean other things to"
-        " each",
+        f" or its firmware with --firmware ({listed(list(by_name))}): M665 and M666 mean other"
+        " things to each",
     )
 
 

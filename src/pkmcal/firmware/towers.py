@@ -205,8 +205,13 @@ def stated_height(text: str) -> float:
     return float(text.partition(HEIGHT_AT_HOME)[2].partition(" ")[0])
 
 
-def tower_differences(text: str, fit: Fit, settings: Settings) -> list[Difference]:
-    """Differences of a text's settings, as the firmware reads them, from the machine."""
+def tower_differences(
+    text: str, fit: Fit, settings: Settings, end_rounding: float = 0.0
+) -> list[Difference]:
+    """Differences of a text's settings, as the firmware reads them, from the machine.
+
+    end_rounding : mm, of the end switches' offsets beyond that of lengths.
+    """
     rise = np.sqrt(settings.rod**2 - settings.radius**2)
     # switches at other readings, by the heights that the text gives for them
     elsewhere = [
@@ -216,7 +221,11 @@ def tower_differences(text: str, fit: Fit, settings: Settings) -> list[Differenc
     zero = switch_heights(settings) - fit.rate * fit.delta.ends[fit.order]
     return [
         firmware_tool_difference(
-            text, fit, lambda points: tower_carriage_heights(settings, points), zero
+            text,
+            fit,
+            lambda points: tower_carriage_heights(settings, points),
+            zero,
+            end_rounding,
         ),
         Difference("motors at end switches elsewhere", largest(elsewhere), SWITCH_ROUNDING, "mm"),
         Difference(
