@@ -189,7 +189,7 @@ def test_h_keeps_the_convention_in_which_it_was_read(text, tmp_path):
 def test_the_other_assembly_mode_is_not_compared(to, tmp_path):
     """Without a print radius carriages go as low as a tool between the towers needs, where a rod
     can lie beyond the horizontal."""
-    text = M503.replace("L270.0000 R105.0000 H284", "L280.0000 R141.9439 H354.3339")
+    text = M503.replace("L270.0000 R105.0000 H284.0000", "L280 R141.9439 H354.3339")
     machine = machine_of(tmp_path, read_printer(text_file(tmp_path, text)))
     made = make_export(source_of(machine), to)
     assert made.differences[0].largest < 1e-6
