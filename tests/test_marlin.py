@@ -298,6 +298,7 @@ CLAIMS = {
     "configuration": (CONFIGURATION, "marlin"),
     "rod trims": ("M665 L270 R105 H300 A0 B0 C0.1\n", "marlin"),
     "segments": ("M665 L270 R105 H300 S100\n", "marlin"),
+    "probe": (PLAIN + "M851 X0 Y0 Z-1.5\n", "marlin"),
     "own name": ("FIRMWARE_NAME:Marlin 2.1.2\n" + PLAIN, "marlin"),
     "rods": ("M665 L270:270:271 R105 H300 B90\n", "reprap"),
     "tilt": ("M665 L270 R105 H300 B90\nM666 X0 Y0 Z0 A0.1 B0\n", "reprap"),

@@ -138,6 +138,8 @@ class Marlin(Firmware):
         for what, pattern in (("M503's heading", _DELTA_HEADING), ("Marlin's name", _PROGRAM)):
             if match := pattern.search(text):
                 reasons.append(f"line {text.count(chr(10), 0, match.start()) + 1} has {what}")
+        if probe := next((c for c in commands(text, ("M851",)) if c.rest), None):
+            reasons.append(f"line {probe.line} is M851")
         for command in geometry:
             letters = {word[0].upper() for word in command.rest.split()}
             # Smoothieware's M665 has other letters beside A, B and C, RepRapFirmware's has lists

@@ -224,4 +224,8 @@ def _settings(eeprom: Words, label: str) -> Settings:
         probe=(0.0, 0.0, 0.0),
         reach=None if reach is None else reach[0],
         steps=np.full(3, steps),
+        remarks=(
+            "ENDSTOP_Z_BACK_ON_HOME of the firmware is taken for 0; export --to repetier is right"
+            " with any.",
+        ),
     )

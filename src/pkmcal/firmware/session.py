@@ -96,8 +96,8 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: Klipper's PROBE_ACCURACY prints it. A bed that is not flat
-      # to that counts as well, and is reported.
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print it. A bed
+      # that is not flat to that counts as well, and is reported.
       noise: {{position: 0.02 mm}}
       level: true             # the firmware's Z is counted from the bed
 
