@@ -68,6 +68,7 @@ CONFIGURATION = """\
   #define DELTA_TOWER_ANGLE_TRIM { 0.2, -0.1, 0.3 }
   //#define DELTA_RADIUS_TRIM_TOWER { 1.0, 2.0, 3.0 }
   #define DELTA_DIAGONAL_ROD_TRIM_TOWER { 0.1, -0.2, 0.4 }
+#define FIX_MOUNTED_PROBE
 #define NOZZLE_TO_PROBE_OFFSET { 10, -20, -16 }
 #define DEFAULT_AXIS_STEPS_PER_UNIT { 80, 80, 100, 412.99 }
 """
@@ -108,6 +109,11 @@ def test_steps_are_corrected_where_readings_are_off(scale):
 # ------------------------------------------------------------------ reading
 
 
+def changed(text, old, new):
+    assert old in text
+    return text.replace(old, new)
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -136,6 +142,41 @@ def test_a_printer_is_read(text, tmp_path):
     # towards the tower at the front left its carriage rises
     left = printer.carriages(np.array([[-10.0, -6.0, 0.0]]))[0]
     assert left[0] > left[1:].max()
+
+
+def test_expressions_are_those_of_c(tmp_path):
+    """Integers divide as integers; the values of extruders are not looked at."""
+    text = changed(CONFIGURATION, "{ 80, 80, 100, 412.99 }", "{ STEPS, STEPS, 2*STEPS, NONE }")
+    text += "#define STEPS ((200) * 16 / double(PITCH) / double(20))\n#define PITCH 5/2\n"
+    text += "".join(f"#define A{k} {'+'.join(60 * [f'A{k + 1}'])}\n" for k in range(7))
+    text += "#define A7 0\n#define OTHER A0\n"
+    text = changed(text, "EFFECTOR 30.0", "EFFECTOR (30+A0)")
+    printer = read_printer(text_file(tmp_path, text))
+    assert printer.steps.tolist() == [80.0, 80.0, 160.0]
+    assert printer.radius == 105.0
+
+
+def test_branches_that_do_not_hold_are_skipped(tmp_path):
+    """Where a condition cannot be evaluated, two values are refused."""
+    inner = "#define PRINTABLE_RADIUS 82.0f\n"
+    branches = (
+        "#if ENABLED(POLAR) || PROBES >= 3\n" + inner + "#elif defined(DELTA) && !ENABLED(SCARA)\n"
+        "#define PROBES 2\n#if PROBES == 2\n#define PRINTABLE_RADIUS 77.0\n#else\n" + inner
+        + "#endif\n#else\n" + inner + "#endif\n"
+    )  # fmt: skip
+    text = changed(CONFIGURATION, "  #define DELTA_PRINTABLE_RADIUS 90.0\n", "")
+    assert read_printer(text_file(tmp_path, text + branches)).reach == 77.0
+    odd = "#if odd @ condition\n#define DELTA_HEIGHT 99\n#endif\n"
+    with pytest.raises(InputError, match="DELTA_HEIGHT is defined twice"):
+        read_printer(text_file(tmp_path, text + odd))
+
+
+def test_without_a_probe_h_is_the_nozzles_height(tmp_path):
+    """Configuration.h has an offset of the probe without a probe as well."""
+    text = changed(CONFIGURATION, "#define FIX_MOUNTED_PROBE\n", "")
+    printer = read_printer(text_file(tmp_path, text))
+    assert printer.height_offset == 0.0
+    np.testing.assert_allclose(printer.homed[1], 284 + np.sqrt(printer.rod[1] ** 2 - 105**2))
 
 
 def test_b_alone_is_no_rods_trim(tmp_path):
@@ -361,11 +402,6 @@ def test_a_firmware_is_named_for_a_printer():
 # ------------------------------------------------------------------ what cannot be read
 
 
-def changed(text, old, new):
-    assert old in text
-    return text.replace(old, new)
-
-
 WRONG = {
     OLDEST: "the height at home is not among these values",
     changed(M503, "Y0.0000 Z-1.5", "Y0.5000 Z-1.5"): "an end switch's offset, M666,",
@@ -383,6 +419,7 @@ WRONG = {
     changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR DELTA_RADIUS"): "is no number",
     changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR " + 900 * "("): "is no number",
     changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR " + 200_000 * "("): "is no number",
+    changed(CONFIGURATION, "#define DELTA\n", "#if ENABLED(DELTA)\n"): "is not of a delta",
     changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR 1/0"): "is no number",
     changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR 9**9**9"): "is no number",
     changed(CONFIGURATION, "EFFECTOR 30.0", "EFFECTOR exit()"): "is no number",

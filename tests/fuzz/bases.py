@@ -74,7 +74,7 @@ def delta_printers(folder: Path) -> None:
     (folder / "configuration.txt").write_text(
         "#define CONFIGURATION_H_VERSION 02010205\n#define DELTA_DIAGONAL_ROD 270.0 // (mm)\n"
         "#define OFFSET 30.0\n#define DELTA_RADIUS (135.0-(OFFSET))\n#define DELTA_HEIGHT 300\n"
-        "#define DELTA_ENDSTOP_ADJ { 0.0, -0.5, -0.2 }\n"
+        "#define DELTA_ENDSTOP_ADJ { 0.0, -0.5, -0.2 }\n#define NOZZLE_AS_PROBE\n"
         f"#define NOZZLE_TO_PROBE_OFFSET {{ 0, 0, -1.5 }}\n{bed}"
     )
     lines = [f"// probe at {x:.3f},{y:.3f} is z=1.{k}" for k, (x, y) in enumerate(places)]

@@ -25,12 +25,10 @@ nozzle's height when the probe triggered plus the Z of M851.
 
 from __future__ import annotations
 
-import ast
 import math
-import operator
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import ClassVar, final
 
 import numpy as np
@@ -55,13 +53,13 @@ from pkmcal.exporters.delta import (
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
     CARRIAGE_STEP,
-    LARGEST_PRINTER_VALUE,
     NUMBER,
     Firmware,
     Printer,
     means_by_position,
     touches_at,
 )
+from pkmcal.firmware.definitions import Definitions
 from pkmcal.firmware.towers import (
     TOWER_FREEDOMS,
     Settings,
@@ -88,27 +86,24 @@ MOST_IGNORED_STEPS = 6
 """Default of MIN_STEPS_PER_SEGMENT."""
 FIRST_WITH_ROD_TRIMS = "02000600"
 """CONFIGURATION_H_VERSION of 2.0.6, in eight digits."""
-LONGEST_EXPRESSION = 200
-"""Bound on the characters of a value in Configuration.h."""
-DEEPEST_DEFINITION = 10
-"""Bound on names that are defined by other names."""
+BED_PROBES = {
+    "BD_SENSOR", "BIQU_MICROPROBE_V1", "BIQU_MICROPROBE_V2", "BLTOUCH", "FIX_MOUNTED_PROBE",
+    "MAGLEV4", "MAG_MOUNTED_PROBE", "NOZZLE_AS_PROBE", "RACK_AND_PINION_PROBE",
+    "SENSORLESS_PROBING", "SOLENOID_PROBE", "TOUCH_MI_PROBE", "Z_PROBE_ALLEN_KEY",
+    "Z_PROBE_SERVO_NR", "Z_PROBE_SLED",
+}  # fmt: skip
+"""Definitions of which a printer with a probe has one; NOZZLE_TO_PROBE_OFFSET stands without."""
 
 MARLIN_COMMANDS = ("M665", "M666", "M92", "M851", "M206")
 _DELTA_HEADING = re.compile(r"echo:[\s;]*Delta settings|Delta settings: L[<=]", re.IGNORECASE)
 _PROGRAM = re.compile(r"FIRMWARE_NAME:\s*Marlin|echo:\s*Marlin|For Marlin\.", re.IGNORECASE)
-_DEFINE = re.compile(r"#\s*define\s+([A-Za-z_]\w*)(?:\s+(.*))?")
-_COMMENT_MARK = re.compile(r"(//|/\*|\*/)")
+_DELTA_DEFINE = re.compile(r"^[^\S\n]*#[^\S\n]*define[^\S\n]+(DELTA_\w+)", re.MULTILINE)
+_DELTA_CONDITION = re.compile(r"\s*#\s*if.*\bDELTA\b")
 _BED_POINT = re.compile(rf"\bBed X:\s*{NUMBER}\s+Y:\s*{NUMBER}\s+Z:\s*{NUMBER}")
 _PLACELESS = {
     "Bilinear Leveling Grid:": "a grid of heights without its places",
     "Bed Topography Report": "a map of heights without its places",
     "G33 Auto Calibrate": "means of several points as G33 prints them, without their radius",
-}
-_OPERATORS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
 }
 
 
@@ -127,10 +122,10 @@ class Marlin(Firmware):
         """Lines as Marlin prints or reads them."""
         del label
         geometry = list(commands(text, ("M665", "M666")))
-        defined = next((d for d in _defines(text) if d.name.startswith("DELTA_")), None)
         reasons: list[str] = []
-        if defined is not None:
-            reasons.append(f"line {defined.line} defines {defined.name}")
+        if define := _DELTA_DEFINE.search(text):
+            line = text.count("\n", 0, define.start()) + 1
+            reasons.append(f"line {line} defines {define[1]}")
         if not geometry:
             return tuple(reasons)
         if echoed := [c for c in geometry if c.echoed]:
@@ -362,161 +357,65 @@ def _small_offsets(offset: Array, steps: list[float]) -> tuple[str, ...]:
 # Reading Configuration.h
 
 
-@dataclass(frozen=True)
-class Define:
-    """Definition in Configuration.h with its line's number."""
-
-    line: int
-    name: str
-    value: str
-
-
-def _defines(text: str) -> Iterator[Define]:
-    """Definitions that are not commented out."""
-    within = False  # a comment /* */
-    for n, line in enumerate(text.splitlines(), 1):
-        code: list[str] = []
-        for mark in _COMMENT_MARK.split(line):
-            if mark == "//" and not within:
-                break
-            if mark in ("/*", "*/"):
-                within = mark == "/*"
-            elif not within:
-                code.append(mark)
-        if match := _DEFINE.fullmatch("".join(code).strip()):
-            yield Define(n, match[1], (match[2] or "").strip())
-
-
 def _configured(text: str, label: str) -> Settings:
     """Settings of Configuration.h. Raises InputError for missing or impossible values."""
-    values: dict[str, list[Define]] = {}
-    for define in _defines(text):
-        values.setdefault(define.name, []).append(define)
-
-    def numbers(name: str, size: int, *default: float) -> Array:
-        """Numbers (size,) of a definition; further ones are of extruders."""
-        if name not in values and default:
-            return np.array(default)
-        one = _single(values, name, label)
-        inside = one.value.removeprefix("{").removesuffix("}") if size > 1 else one.value
-        parts = inside.split(",") if size > 1 else [inside]
-        found = [_evaluated(part, values, label, one) for part in parts]
-        if len(found) < size:
-            raise InputError(
-                f"{name} does not give one number for each tower",
-                where=f"{label}, line {one.line}",
-                found=quoted(one.value),
-                expected="numbers in braces, such as { 0.0, -0.5, -1.2 }",
-            )
-        return np.array(found[:size])
+    condition = next((one for one in text.splitlines() if _DELTA_CONDITION.match(one)), None)
+    values = Definitions(text, label)
+    if condition is not None and "DELTA" not in values.by_name:
+        raise InputError(
+            "this configuration is not of a delta: its values are those of an example",
+            where=label,
+            found=f"{quoted(condition.strip())} without #define DELTA",
+            expected="#define DELTA",
+        )
 
     def positive(name: str) -> float:
-        value = float(numbers(name, 1)[0])
+        value = float(values.numbers(name, 1)[0])
         if value <= 0:
-            raise impossible(f"{label}, line {values[name][-1].line}", name, value, "above 0")
+            raise impossible(values.place(name), name, value, "above 0")
         return value
 
     zeros = (0.0, 0.0, 0.0)
-    by_tower = numbers("DELTA_RADIUS_TRIM_TOWER", 3, *zeros)
+    by_tower = values.numbers("DELTA_RADIUS_TRIM_TOWER", 3, *zeros)
     if by_tower.any():
         raise InputError(
             "towers on circles of their own are not read",
-            where=f"{label}, line {values['DELTA_RADIUS_TRIM_TOWER'][-1].line}",
-            found=quoted(values["DELTA_RADIUS_TRIM_TOWER"][-1].value),
+            where=values.place("DELTA_RADIUS_TRIM_TOWER"),
+            found=", ".join(f"{value:g}" for value in by_tower) + " mm",
             expected="DELTA_RADIUS_TRIM_TOWER { 0.0, 0.0, 0.0 }",
             next_step="Remove it and build Marlin anew: tower angles and rods take its place",
         )
-    offset = numbers("DELTA_ENDSTOP_ADJ", 3, *zeros)
-    place = f"{label}, line {values['DELTA_ENDSTOP_ADJ'][-1].line}" if offset.any() else label
-    _check_offsets(offset, 3 * [place])
-    probe = numbers("NOZZLE_TO_PROBE_OFFSET", 3, *(3 * [math.nan]))
+    offset = values.numbers("DELTA_ENDSTOP_ADJ", 3, *zeros)
+    if offset.any():
+        _check_offsets(offset, 3 * [values.place("DELTA_ENDSTOP_ADJ")])
+    probe = values.numbers("NOZZLE_TO_PROBE_OFFSET", 3, *(3 * [math.nan]))
     # 020006, and since 2.0.9 with two digits more, 02000902
-    version = values.get("CONFIGURATION_H_VERSION", [])
+    version = values.by_name.get("CONFIGURATION_H_VERSION", [])
     newer = any(d.value.ljust(8, "0") >= FIRST_WITH_ROD_TRIMS for d in version)
-    height_offset = float(probe[2]) if newer and not math.isnan(probe[2]) else 0.0
+    contained = newer and BED_PROBES & values.by_name.keys() and not math.isnan(probe[2])
+    height_offset = float(probe[2]) if contained else 0.0
     steps = None
-    if "DEFAULT_AXIS_STEPS_PER_UNIT" in values:
-        steps = numbers("DEFAULT_AXIS_STEPS_PER_UNIT", 3)
+    if "DEFAULT_AXIS_STEPS_PER_UNIT" in values.by_name:
+        name = "DEFAULT_AXIS_STEPS_PER_UNIT"
+        steps = values.numbers(name, 3)
         if steps.min() <= 0:
-            at = f"{label}, line {values['DEFAULT_AXIS_STEPS_PER_UNIT'][-1].line}"
-            raise impossible(at, "DEFAULT_AXIS_STEPS_PER_UNIT", float(steps.min()), "above 0")
-    reach = next(
-        (name for name in ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS") if name in values), None
-    )
+            raise impossible(values.place(name), name, float(steps.min()), "above 0")
+    radii = [n for n in ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS") if n in values.by_name]
     own_steps = [math.nan] if steps is None else steps.tolist()
     return Settings(
-        rod=positive("DELTA_DIAGONAL_ROD") + numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros),
+        rod=positive("DELTA_DIAGONAL_ROD")
+        + values.numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros),
         radius=positive("DELTA_RADIUS"),
-        angle=np.array(TOWER_FREEDOMS.nominal) + numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros),
+        angle=np.array(TOWER_FREEDOMS.nominal)
+        + values.numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros),
         offset=offset,
         height=positive("DELTA_HEIGHT") - height_offset,
         height_offset=height_offset,
         probe=(float(probe[0]), float(probe[1]), float(probe[2])),
-        reach=None if reach is None else positive(reach),
+        reach=positive(radii[0]) if radii else None,
         steps=steps,
         remarks=_small_offsets(offset, own_steps),
     )
-
-
-def _single(values: dict[str, list[Define]], name: str, label: str) -> Define:
-    """The definition of a name. Raises InputError for none, and for several that differ."""
-    all_of_it = values.get(name, [])
-    if not all_of_it:
-        raise InputError(
-            f"this value of the printer is missing: {name}",
-            where=label,
-            expected=f"#define {name} with a number",
-        )
-    other = next((d for d in all_of_it if d.value != all_of_it[0].value), None)
-    if other is not None:
-        raise InputError(
-            f"{name} is defined twice, and which one counts depends on other settings",
-            where=f"{label}, lines {all_of_it[0].line} and {other.line}",
-            found=f"{quoted(all_of_it[0].value)} and {quoted(other.value)}",
-            expected="one definition",
-            next_step="Remove the one that is not your printer's",
-        )
-    return all_of_it[0]
-
-
-def _evaluated(
-    text: str, values: dict[str, list[Define]], label: str, at: Define, depth: int = 0
-) -> float:
-    """Number of an expression of numbers, other definitions, + - * / and parentheses.
-
-    Raises InputError for anything else.
-    """
-
-    def value_of(node: ast.expr) -> float:
-        match node:
-            case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
-                return float(number)
-            case ast.Name(id=name) if depth < DEEPEST_DEFINITION:
-                one = _single(values, name, label)
-                return _evaluated(one.value, values, label, one, depth + 1)
-            case ast.UnaryOp(op=ast.USub(), operand=operand):
-                return -value_of(operand)
-            case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-                return value_of(operand)
-            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-                return _OPERATORS[type(op)](value_of(left), value_of(right))
-            case _:
-                raise ValueError(ast.dump(node))
-
-    value = math.nan
-    if len(text) <= LONGEST_EXPRESSION:
-        try:
-            value = value_of(ast.parse(text.strip(), mode="eval").body)
-        except (SyntaxError, ValueError, ArithmeticError, MemoryError, RecursionError):
-            value = math.nan
-    if not abs(value) <= LARGEST_PRINTER_VALUE:
-        raise InputError(
-            f"{at.name} is no number that a printer can have",
-            where=f"{label}, line {at.line}",
-            found=quoted(at.value),
-            expected="a number in mm, or degrees, or other definitions with + - * / between them",
-        )
-    return value
 
 
 # Writing
