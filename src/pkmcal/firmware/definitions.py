@@ -37,6 +37,13 @@ _COMPARISONS: Mapping[type[ast.cmpop], Callable[[float, float], bool]] = {
     ast.Lt: operator.lt,
     ast.LtE: operator.le,
 }
+_MACROS: Mapping[str, Callable[[list[bool]], bool]] = {
+    "defined": all,
+    **dict.fromkeys(("ENABLED", "BOTH", "ALL"), all),
+    **dict.fromkeys(("ANY", "EITHER"), any),
+    **dict.fromkeys(("DISABLED", "NONE"), lambda on: not any(on)),
+}
+"""Marlin's macros of conditions: whether all, any or none of several names are on."""
 _OPERATORS: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -110,18 +117,14 @@ def _condition(text: str, values: dict[str, str]) -> bool | None:
 
     def holds(node: ast.expr) -> float:
         match node:
-            case ast.Call(func=ast.Name(id=macro), args=[*names], keywords=[]):
+            case ast.Call(func=ast.Name(id=macro), args=names) if macro in _MACROS:
                 of_each = [name.id for name in names if isinstance(name, ast.Name)]
-                if macro == "defined":
-                    return all(name in values for name in of_each)
+                if len(of_each) != len(names):
+                    raise ValueError(ast.dump(node))
                 on = [values.get(name, "0") in ("", "1", "true") for name in of_each]
-                if macro in ("ENABLED", "BOTH", "ALL"):
-                    return all(on)
-                if macro in ("ANY", "EITHER"):
-                    return any(on)
-                if macro in ("DISABLED", "NONE"):
-                    return not any(on)
-                raise ValueError(macro)
+                if macro == "defined":
+                    on = [name in values for name in of_each]
+                return _MACROS[macro](on)
             case ast.BoolOp(op=op, values=parts):
                 return (any if isinstance(op, ast.Or) else all)([holds(part) for part in parts])
             case ast.UnaryOp(op=ast.Not(), operand=operand):

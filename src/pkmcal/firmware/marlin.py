@@ -402,12 +402,12 @@ def _configured(text: str, label: str) -> Settings:
             raise impossible(values.place(name), name, float(steps.min()), "above 0")
     radii = [n for n in ("DELTA_PRINTABLE_RADIUS", "PRINTABLE_RADIUS") if n in values.by_name]
     own_steps = [math.nan] if steps is None else steps.tolist()
+    rod_trims = values.numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros)
+    angle_trims = values.numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros)
     return Settings(
-        rod=positive("DELTA_DIAGONAL_ROD")
-        + values.numbers("DELTA_DIAGONAL_ROD_TRIM_TOWER", 3, *zeros),
+        rod=positive("DELTA_DIAGONAL_ROD") + rod_trims,
         radius=positive("DELTA_RADIUS"),
-        angle=np.array(TOWER_FREEDOMS.nominal)
-        + values.numbers("DELTA_TOWER_ANGLE_TRIM", 3, *zeros),
+        angle=np.array(TOWER_FREEDOMS.nominal) + angle_trims,
         offset=offset,
         height=positive("DELTA_HEIGHT") - height_offset,
         height_offset=height_offset,
