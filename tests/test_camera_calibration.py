@@ -227,7 +227,7 @@ def test_corners_with_wrong_numbers_are_no_lens():
     """All fit but those of one column: the board is another, however well the rest fits."""
     true = TRUE["pinhole"]
     value = detections(true, poses_for(true, 10, 1), 2)
-    with pytest.raises(InputError, match="do not lie as its file numbers them") as caught:
+    with pytest.raises(InputError, match="are numbered otherwise than in its file") as caught:
         calibrate_camera(misnumbered(value), BOARD, "pinhole", alone("pinhole"))
     assert caught.value.found.startswith(f"{BOARD.counts[1] - 1} of {len(BOARD.points)} corners")
 

@@ -502,7 +502,7 @@ def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
         (
             "center: [319.5, 239.5]",
             "center: [3.2e+10, 239.5]",
-            "a.yaml: the camera sees nothing in the middle of its image; found image_size "
+            "a.yaml: the camera has no ray in the middle of its image; found image_size "
             "[640, 480], and lens numbers by which no ray of light ends there, expected focal, "
             "center and distortion of images of this size.",
         ),

@@ -183,8 +183,8 @@ def test_a_stations_findings(station, message):
 def test_crowded_and_few_configurations(demo):
     session = load_session(demo.session)
     joints = (
-        JointCheck("leg1", 0.4, 0.41, 0.07, (0, 0)),
-        JointCheck("leg2", 0.35, 0.48, 0.9, (3, 3)),
+        JointCheck("leg1", "m", 0.4, 0.41, 0.07, (0, 0)),
+        JointCheck("leg2", "m", 0.35, 0.48, 0.9, (3, 3)),
     )
     results = joint_findings(replace(session, configurations=("a", "b")), joints)
     assert [finding.level for finding in results] == [Level.NOTE] * 2

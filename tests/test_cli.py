@@ -615,7 +615,7 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--size", "3x4", "no size of an image; found 3x4, expected width x height"),
+        ("--size", "3x4", "this is not an image size; found 3x4, expected width x height"),
         ("--size", "large", "found large, expected width x height"),
         (
             "--joint-noise",

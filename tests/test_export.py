@@ -43,14 +43,14 @@ EXPRESSED = {
     "ros": (),
 }
 REFUSALS = {
-    "c": "do not just hold its platform",
+    "c": "do not constrain its platform exactly",
     "reprap": "RepRapFirmware has settings for deltas",
     "marlin": "Marlin has settings for",
     "repetier": "Repetier-Firmware (has settings for|counts end switches in motor steps)",
     "smoothie": "Smoothieware has settings for",
     "klipper": "Klipper has settings for deltas",
     "linuxcnc": "LinuxCNC moves as many joints as coordinates",
-    "ros": "no camera is known to stand anywhere",
+    "ros": "no camera has a pose",
 }
 
 

@@ -110,7 +110,7 @@ def library(tmp_path_factory):
 @pytest.mark.parametrize("name", sorted(catalogue()))
 def test_c_is_our_own_kinematics(name, library):
     if load_mechanism(name).redundancy:  # Newton's method is for as many rows as unknowns
-        with pytest.raises(InputError, match="do not just hold its platform"):
+        with pytest.raises(InputError, match="do not fix its platform exactly"):
             library(name)
         return
     c = library(name)
@@ -433,7 +433,9 @@ def test_as_many_equations_as_unknowns(tmp_path):
     driven = text.replace("{passive: true}", "{actuated: true, range: [0.3, 0.5]}")
     assert driven != text
     (tmp_path / "m.yaml").write_text(driven + "home: {position: [0, 0, 0.36]}\n")
-    with pytest.raises(InputError, match="do not just hold its platform; found 7 equations for 6"):
+    with pytest.raises(
+        InputError, match="do not fix its platform exactly; found 7 equations for 6"
+    ):
         CSource().files(source_of(load_mechanism(tmp_path / "m.yaml")))
 
 

@@ -414,7 +414,7 @@ def test_four_towers_are_no_delta(tmp_path):
     fourth = text[text.index("  - base") : text.index("  - base", text.index("  - base") + 1)]
     fourth = fourth.replace("-0.1212, -0.07", "0.14, 0.1")
     (tmp_path / "m.yaml").write_text(text.replace("home:", fourth + "home:"))
-    with pytest.raises(InputError, match="do not just hold"):
+    with pytest.raises(InputError, match="do not fix its platform exactly"):
         delta_of(load_mechanism(tmp_path / "m.yaml"), "Klipper")
 
 

@@ -99,7 +99,7 @@ def test_a_label_stands_for_the_path(tmp_path):
         ("a: 1\nb: [1, 2\nc: 3\n", ["a.yaml, line 3: not valid YAML", "Check indentation"]),
         ("a: 1\n\tb: 2\n", ["a.yaml, line 2: not valid YAML"]),
         ("a: 1\n---\nb: 2\n", ["not valid YAML"]),
-        ("a:\n  x: 1\n  y: 2\n  x: 3\n", ["line 4, a.x: the key x stands twice, on lines 2 and 4"]),
+        ("a:\n  x: 1\n  y: 2\n  x: 3\n", ["line 4, a.x: the key x occurs twice, on lines 2 and 4"]),
         ("a: !!python/object:os.system x\n", ["line 1: the tag", "is not allowed"]),
         ("a: !!set {x}\n", ["is not allowed"]),
         ("a: !!int many\n", ["'many' is not a usable int"]),

@@ -169,7 +169,7 @@ def test_lengths_that_the_distances_do_not_determine():
     k = np.arange(12)
     u = np.broadcast_to(u[None, :, None], (1, 12, 6, 3)).copy()
     axes = Axes(0 * k, k, np.ones((12, 6), dtype=bool), u, 0 * u, np.zeros((1, 12, 6)))
-    with pytest.raises(ResultError, match="do not tell the lengths of legs 1 to 6"):
+    with pytest.raises(ResultError, match="do not determine the lengths of legs 1 to 6"):
         checks.lengths_are_fixed(
             scene.nominal,
             axes,

@@ -167,13 +167,13 @@ def test_a_pose_of_a_camera_by_hand(folder):
     posed = "handheld: true\n    pose: {position: [1, 0, 0], look_at: [0, 0, 0]}"
     replaced(folder / "session.yaml", "handheld: true", posed)
     message = fault(load_session, folder)
-    assert "stations.phone.pose: a camera that is held by hand has no one pose" in message
+    assert "stations.phone.pose: a hand-held camera has no single pose" in message
 
 
 def test_a_board_alone_by_hand(folder):
     replaced(folder / "session.yaml", "observe: legs", "observe: board")
     replaced(folder / "session.yaml", "stations:", "board: cameras/phone.yaml\nstations:")
-    assert "images by hand of a board alone determine nothing of the machine" in fault(
+    assert "hand-held images of a board alone do not determine the machine" in fault(
         load_session, folder
     )
 
@@ -187,7 +187,7 @@ def test_two_stations_of_one_name(folder):
         ' images: "other/{configuration}.jpg", observe: legs}',
     )
     message = fault(load_session, folder)
-    assert "two stations, or images by hand, have the same name; found phone-0001-1" in message
+    assert "two stations, or hand-held images, have the same name; found phone-0001-1" in message
 
 
 # cameras by EXIF, and rotated images

@@ -639,7 +639,7 @@ def test_points_that_cannot_be_read(text, cfg):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--probed", "x"), "read with the printer's own values"),
+        (("--probed", "x"), "need the printer's configuration"),
         (("--printer", "x"), "the file does not exist"),
         (("--printer", "x", "--machine", "delta"), "--machine besides"),
         (("--printer", "x", "--board", "--probed", "y"), "--probed besides"),

@@ -12,7 +12,7 @@ import pytest
 from faults import fault
 from pkmcal.errors import InputError
 from pkmcal.files import read_text
-from pkmcal.observe.images import decode
+from pkmcal.observe.images import decode, upright_turns
 from pkmcal.session.image_files import image_header
 
 
@@ -54,6 +54,30 @@ def test_sizes_of_headers_that_opencv_does_not_write(tmp_path):
         entries += struct.pack(order + "HHII", 273, 4, 1, 100)  # where its one strip begins
         ifd = struct.pack(order + "IH", 8, 4) + entries
         assert size(start + ifd) == (37, 21)
+
+
+def chunk(kind, data):
+    """Chunk of a PNG file."""
+    checksum = zlib.crc32(kind + data)
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_the_orientation_of_a_png_file_is_read_without_its_pixels(tmp_path, behind):
+    """Its EXIF may stand before or behind the pixels, which here cannot be decoded."""
+    path = tmp_path / "a.png"
+    image(path, 40, 20)
+    assert upright_turns(path, (40, 20)) == 0
+    entry = struct.pack("<HHII", 0x0112, 3, 1, 6)
+    exif = chunk(b"eXIf", b"II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0))
+    data = path.read_bytes()
+    header, pixels, end = data[:33], chunk(b"IDAT", b"none"), data[-12:]
+    path.write_bytes(header + (pixels + exif if behind else exif + pixels) + end)
+    assert upright_turns(path, (40, 20)) == 1
+    assert upright_turns(path, (20, 40)) == 0  # turned when it is decoded
+    for cut in range(33, len(path.read_bytes())):
+        path.write_bytes(data[:33] + exif[: cut - 33])
+        assert upright_turns(path, (40, 20)) in (0, 1)
 
 
 @pytest.mark.parametrize("suffix", ["bmp", "tiff", "pgm"])

@@ -346,7 +346,7 @@ def test_carriers_broadcast(side, carrier):
         (
             "motion: planar\n",
             "motion: planar\nmotion: spatial\n",
-            "m.yaml, line 3, motion: the key motion stands twice, on lines 2 and 3. Remove one "
+            "m.yaml, line 3, motion: the key motion occurs twice, on lines 2 and 3. Remove one "
             "of the two.",
         ),
         (

@@ -359,7 +359,7 @@ def test_a_tube_that_is_thicker_is_named():
     facts = one.facts(np.array([0.0015]), np.array([0.0001]))
     assert (facts["leg"], facts["tube"], facts["value"]) == (3, 1, 0.0015)
     text = doubtful("tube.radius", **facts, tool_shift=1e-4, tool_shift_sigmas=0.5).text
-    assert "Tube 1 of leg 3 is 1.5 mm thicker in radius than mechanism.yaml says" in text
+    assert "Tube 1 of leg 3 is 1.5 mm thicker in radius than mechanism.yaml states" in text
     assert "correct legs[3].tubes[1].radius" in text
 
 

@@ -383,7 +383,7 @@ def test_a_session_without_places(demo, quick_plans, tmp_path):
     [
         (["gough-stewart", "-n", "1"], "--configurations: this number cannot be used"),
         (["gough-stewart", "--after", "x"], "this option is for a session"),
-        (["gough-stewart", "--tracker", "far"], "a tracker's noise cannot be this"),
+        (["gough-stewart", "--tracker", "far"], "this tracker noise cannot be used"),
         (["gough-stewart", "--tracker", "2e-5", "--places", "2"], "no camera whose place"),
         (["gough-stewart", "--edge-noise", "0"], "over 0 to 100"),
         (["gough-stewart", "--joint-noise", "2"], "--joint-noise: this number cannot be used"),
@@ -407,14 +407,14 @@ def test_a_camera_that_sees_nothing():
         T_station_base=away[None],
         instruments=(replace(one, T_camera_base=away),),
     )
-    with pytest.raises(InputError, match="nothing is seen in any configuration"):
+    with pytest.raises(InputError, match="observes nothing in any configuration"):
         small(replace(subject, rig=rig))
 
 
 def test_a_hand_held_session_is_not_planned(demo):
     session = load_session(demo.session)
     stations = tuple(replace(s, handheld=True) for s in session.stations)
-    with pytest.raises(InputError, match="no place to come back to"):
+    with pytest.raises(InputError, match="no fixed pose to plan for"):
         subject_of_session(replace(session, stations=stations))
 
 

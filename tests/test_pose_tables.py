@@ -85,7 +85,7 @@ def spoilt(row, column, value):
     [
         ("configuration,x,y,z,qw,qx,qy,qs\n" + rows(whole()[1]),
          ["poses.csv, line 1", "this column is not known", "found qs", "qw, qx, qy, qz"]),
-        ("configuration,x,y,z,qw\n" + rows(whole()[1][:, :4]), ["line 1", "together mean nothing"]),
+        ("configuration,x,y,z,qw\n" + rows(whole()[1][:, :4]), ["line 1", "has no meaning"]),
         (spoilt(2, 3, 0.2), ["poses.csv, line 4", "qw, qx, qy, qz", "not of length one"]),
         (FULL + "\n" + rows(whole()[1], ("000", "001", "1", "003")),
          ["line 4", "no joint readings", "found 1", "expected 001", "leading zeros"]),

@@ -186,7 +186,7 @@ def test_a_session_of_readings_is_calibrated_from_the_command_line(belts):
     low, high = out["statistics"]["reading_range"]
     assert low < 10 < high
     (rows,) = [text for text in out["verdict"]["warnings"] if "scatter" in text]
-    assert "joints.noise in session.yaml says 0.1 mm" in rows
+    assert "joints.noise in session.yaml states 0.1 mm" in rows
     values = {p["name"]: p for p in out["parameters"]}
     width = values["legs[2].base.center.x"]
     true = truth.base_centers()

@@ -28,7 +28,8 @@ from pkmcal.web.report_page import (
     report_page,
     verdict_lines,
 )
-from pkmcal.web.tables import leading_number
+from pkmcal.web.tables import leading_number, table_block
+from pkmcal.wording import Chance
 from test_report_case import Case, calibration, case_document, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
@@ -385,3 +386,27 @@ def test_sections_lead_from_the_contents(page):
     document = page_document(page)
     assert page_section(document, "parameters")["menu"] == "Parameters"
     assert len({section["name"] for section in document["sections"]}) == len(document["sections"])
+
+
+@pytest.mark.parametrize(
+    ("probability", "text"),
+    [
+        (0.975, "98%"),
+        (0.12, "12%"),
+        (0.05, "1 in 20"),
+        (1 / 254, "1 in 250"),
+        (1 / 25_400, "1 in 25\N{NARROW NO-BREAK SPACE}000"),
+        (3e-7, "< 1 in a million"),
+        (4e-8, "≪ 1 in a million"),
+        (0.0, "≪ 1 in a million"),
+        (float("nan"), "–"),
+    ],
+)
+def test_a_probability_is_words_with_its_number(probability, text):
+    chance = Chance(probability)
+    assert chance == text
+    rows = (Row("leg 1", (chance,)),)
+    block = table_block(Table("", ("Test", "By chance"), rows, hints=("", "Of noise alone.")))
+    assert block.columns[1].form == "chance"
+    assert block.columns[1].hint == "Of noise alone."
+    assert block.rows[0].values[1] == (None if np.isnan(probability) else probability)

@@ -273,13 +273,13 @@ def test_other_files(tmp_path, text, message):
 
 def test_a_changed_value(folder):
     text = rewritten(folder, lambda data: data["parameters"][4].update(value=0.1))
-    assert "parameters[5].value: the calibration does not agree with itself" in text
+    assert "parameters[5].value: the calibration file is inconsistent" in text
     assert "Calibrate again" in text
 
 
 def test_a_lost_reading(folder):
     text = rewritten(folder, lambda data: data["configurations"][2]["joints"].pop())
-    assert "configurations[3].joints: the calibration does not agree with itself" in text
+    assert "configurations[3].joints: the calibration file is inconsistent" in text
     assert "expected the 6 readings of its machine, not 5" in text
 
 
@@ -297,7 +297,7 @@ def test_a_covariance_that_is_none(folder):
     def turn(data):
         data["covariance"][7][8] += 1e-6
 
-    assert "not symmetric, or a combination" in rewritten(folder, turn)
+    assert "not symmetric and positive semidefinite" in rewritten(folder, turn)
 
 
 def test_covariances_of_stations_come_back_with_the_machine(calibrated, tmp_path):
@@ -356,7 +356,7 @@ def test_stations_that_do_not_fit(folder, what):
             row[:n] = [3 * value for value in row[:n]]
 
     text = rewritten(folder, change)
-    wanted = {"renamed": "expected names of the stations", "stretched": "a negative variance"}
+    wanted = {"renamed": "expected names of the stations", "stretched": "positive semidefinite"}
     assert wanted[what] in text
 
 

@@ -324,7 +324,7 @@ EDITS = [
     ("joints.csv", "leg1,leg2", "leg2,leg1",
      ["joints.csv, line 1: the columns are not in the order", "expected leg1 leg2 leg3",
       "Sort the columns"]),
-    ("joints.csv", "0001,", "0000,", ["line 3: the configuration 0000 stands twice, on lines 2"]),
+    ("joints.csv", "0001,", "0000,", ["line 3: the configuration 0000 occurs twice, on lines 2"]),
     ("joints.csv", "0.37", "nan",
      ["line 2, column leg2: this is not a finite number; found 'nan'"]),
     ("joints.csv", "0.37", "0.87",
@@ -332,7 +332,7 @@ EDITS = [
     ("joints.csv", "0001,", "1,",
      ["images/front/0001.png is of a configuration without joint readings",
       "session.yaml, line 7, stations.front.images", "found configuration 0001",
-      "The table has 1 where the image says 0001", "leading zeros"]),
+      "The table has 1 where the image has 0001", "leading zeros"]),
     ("joints.csv", JOINTS[JOINTS.index("0001"):], "",
      ["joints.csv: there is only one configuration; found 0000, expected two"]),
 ]  # fmt: skip
@@ -440,7 +440,7 @@ def test_all_configurations_alike(folder):
     rows = [row, row.replace("0000", "0001").replace("0.36", "0.360001"), row.replace("0000", "2")]
     (folder / "joints.csv").write_text("\n".join([header, *rows]))
     message = fault(load_session, folder)
-    assert "joints.csv: all configurations are alike: no joint moves by more than its" in message
+    assert "joints.csv: all configurations are equal: no joint moves by more than its" in message
     assert "joints.noise, 3e-06" in message
 
 

@@ -71,7 +71,7 @@ def test_a_grid_has_every_combination():
         (["stations=1,x"], "stations cannot be this.*a whole number of 1 to 100"),
         (["stations=1.5"], "stations cannot be this"),
         (["edge_noise=-1"], "edge_noise cannot be this.*px"),
-        (["stations=1,1"], "a value stands twice"),
+        (["stations=1,1"], "a value occurs twice"),
         (["stations=1", "stations=2"], "varied twice"),
         (["camera=telescope"], "no such camera.*a camera's file"),
         (["observe=arms"], "no such observe.*legs, board and legs\\+board"),
@@ -103,7 +103,7 @@ def test_too_many_combinations_are_refused():
 
 
 def test_an_unknown_subject_is_reported():
-    with pytest.raises(InputError, match=r"there is nothing of this name to study.*gough-stewart"):
+    with pytest.raises(InputError, match=r"no machine or session has this name.*gough-stewart"):
         subject_of("gough")
 
 

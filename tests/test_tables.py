@@ -57,7 +57,7 @@ def test_lines_count_through_quoted_cells(tmp_path):
         (HEADER + '1,2,"0,35"\n', ["decimal comma; found '0,35', expected 0.35"]),
         (
             HEADER + "1,2,3\n2,2,3\n1,4,5\n",
-            ["line 4: the configuration 1 stands twice, on lines 2"],
+            ["line 4: the configuration 1 occurs twice, on lines 2"],
         ),
         (HEADER + '1,2,"3\n', ["not valid CSV", "Check the quotes"]),
     ],
@@ -120,7 +120,7 @@ def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
         (b"x,1,\n", "line {}, column leg2: the cell is empty"),
         (b"x,1,2 000\n", "line {}, column leg2: this is not a number"),
         (b"x,1,2e308\n", "line {}, column leg2: this is not a finite number"),
-        (b"000000,1,2\n", "line {0}: the configuration 000000 stands twice, on lines 2 and {0}"),
+        (b"000000,1,2\n", "line {0}: the configuration 000000 occurs twice, on lines 2 and {0}"),
         (b"x,1,\xff\n", "line {}: the file is not UTF-8 text"),
         (b"x,1,\0\n", "line {}: the file is not text"),
         (b'x,1,"2\n', "line {}: not valid CSV"),

@@ -516,6 +516,17 @@ def test_calibrate_with_some_held_out(saved_result):
     assert not any("did not take part" in w for w in saved_result.made.json["verdict"]["warnings"])
 
 
+def test_the_worst_image_comes_first_and_bars_lead_to_images(saved_result):
+    page = page_document((saved_result.folder / "v" / "validation.html").read_text())
+    (block,) = page_blocks(page, "images", "photographs")
+    bars = page_blocks(page, "panels", "readings")[0]["plots"][0]["marks"][0]["points"]
+    worst = max(bars, key=lambda bar: bar["y"])["x"]
+    assert block["images"][0]["key"].endswith(f"/{worst}")
+    of_images = {image["key"].partition("/")[2] for image in block["images"]}
+    assert of_images == {bar["x"] for bar in bars}
+    assert all(image["webp"] for image in block["images"])
+
+
 def test_validate_on_what_was_held_out(saved_result, demo):
     assert saved_result.result.err == ""
     result = saved_result.result.json

@@ -34,8 +34,8 @@ VERBS = (
 )  # fmt: skip
 PLACES = {"files", "file", "folder", "kept", "trial"}
 """Keys of the printed object with paths, which a result that is not saved has not."""
-VOLATILE = {"timings", "seconds", "wall", "cpu", "solving", "workers"}
-"""Keys of durations."""
+VOLATILE = {"timings", "seconds", "wall", "cpu", "solving", "workers", "time"}
+"""Keys of durations and times."""
 OWN_SUMMARY = {"calibrate", "study"}
 """Verbs whose results have a shorter summary than the command prints."""
 

@@ -451,7 +451,7 @@ def test_somebody_elses_change_is_not_written_over(session, truth):
 def test_a_camera_by_hand_has_no_pose_to_be_written(session, truth):
     station = replace(load_session(session).stations[0], handheld=True)
     before = (session / "session.yaml").read_bytes()
-    with pytest.raises(InputError, match="held by hand has no one pose"):
+    with pytest.raises(InputError, match="hand-held camera has no single pose"):
         PoseFile(session).write(station, truth.T_camera_base[0])
     assert (session / "session.yaml").read_bytes() == before
 
@@ -790,6 +790,9 @@ def test_a_session_is_worked_on_in_a_browser(session, demo, truth, tmp_path, wid
     marks = json.loads(root["remarks"])[: len(station.images)]
     assert "wrong" not in marks
     assert root["stage"] == "true"
+    # the image fills the window again
+    assert float(root["scale"]) == pytest.approx(float(root["whole"]), abs=0.06)
+    assert min(json.loads(root["window"])) > 250
     assert (session / "session.yaml").read_text() != before
     angle, _ = off(load_session(session).stations[0].T_camera_base, truth.T_camera_base[0])
     assert angle < 1.0

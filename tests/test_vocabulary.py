@@ -71,7 +71,6 @@ ALLOWED = {
     "from_drawing": "an option of `pkmcal plan`",
     "photographs": "a key of the documents of `check`",
     "rejected_photographs": "a key of calibration.json",
-    "DRAWING_COLOUR": "a colour of the pages' style sheet",
     "ask": "a message to a page in its test",
 }
 """Names that are part of a file, of the command line or of Python's public interface."""

@@ -96,7 +96,7 @@ def test_an_unchanged_machine(demo, later):
     assert done.code == done.json["exit_code"] == 0
     assert_keys("watch --json", done.json)
     assert done.json["verdict"]["headline"].startswith(
-        "Still as calibrated, as far as 4 new configurations can tell: a change of any leg's length"
+        "Still as calibrated, as far as 4 new configurations can show: a change of any leg's length"
     )
     assert not done.json["changed"]
     assert [leg["legs"] for leg in done.json["legs"]] == [[k] for k in range(1, 7)]
@@ -127,12 +127,67 @@ def test_a_changed_machine_in_words(demo, later):
     text = " ".join(done.out.split())
     assert "The machine is not as calibrated: leg 3 has changed" in text
     assert "zero of leg 3's reading by +2." in text
-    assert "found from" in text
+    assert "Found from" in text
     page = page_document((later.off / "watch" / "watch.html").read_text())
     assert page["verdict"]["stamp"] == "Changed"
     tests, _ = (block["plots"] for block in page_blocks(page, "panels"))
     (bars,) = (mark for mark in tests[0]["marks"] if mark["mark"] == "bars")
     assert max(bars["points"], key=lambda bar: bar["y"])["key"] == "leg:3"
+
+
+def test_one_folder_holds_the_history_of_a_machine(demo, later, tmp_path):
+    """Each later test adds its run; the same data again replace theirs."""
+    folder = tmp_path / "watch"
+    results = []
+    for session in (later.same, later.off, later.off):
+        run("watch", demo.calibration, session, "-o", folder)
+        document = json.loads((folder / "watch.json").read_text())
+        results.append([one["result"] for one in document["runs"]])
+    first, second, again = results
+    assert first == ["as_calibrated"]
+    assert second == again == ["as_calibrated", "changed"]
+    same, off = document["runs"]
+    assert same["session"].endswith("same")
+    assert same["share"] < 1 < off["share"]
+    assert same["calibration"] == off["calibration"]
+    zero = next(one for one in off["zeros"] if one["legs"] == [3])
+    assert abs(zero["value"]) > zero["limit"] > zero["sigma"]
+    plots = [
+        plot
+        for block in page_blocks(
+            page_document((folder / "watch.html").read_text()), "panels", "history"
+        )
+        for plot in block["plots"]
+    ]
+    (dots,) = (mark for mark in plots[0]["marks"] if mark["mark"] == "dots")
+    assert [dot["y"] for dot in dots["points"]] == pytest.approx(
+        [same["share"], off["share"]], 1e-4
+    )
+    (limit,) = (mark for mark in plots[0]["marks"] if mark["mark"] == "rule")
+    assert limit["at"] == 1
+
+
+def test_runs_against_another_calibration_are_kept_and_not_drawn(demo, later, tmp_path):
+    folder = tmp_path / "watch"
+    run("watch", demo.calibration, later.same, "-o", folder)
+    path = folder / "watch.json"
+    document = json.loads(path.read_text())
+    other = {**document["runs"][0], "calibration": "0" * 16, "result": "another_machine"}
+    path.write_text(json.dumps({**document, "runs": [other]}))
+    run("watch", demo.calibration, later.same, "-o", folder)
+    assert len(json.loads(path.read_text())["runs"]) == 2
+    page = page_document((folder / "watch.html").read_text())
+    assert not page_blocks(page, "panels", "history")
+
+
+def test_a_history_that_cannot_be_read_is_refused_before_the_work(demo, later, tmp_path):
+    folder = tmp_path / "watch"
+    folder.mkdir()
+    (folder / "watch.json").write_text('{"runs": [{"time": 3}]}')
+    done = run("watch", demo.calibration, later.same, "-o", folder)
+    assert done.code == 2
+    assert "watch.json" in done.err
+    assert "runs" in done.err
 
 
 def test_configurations_that_the_calibration_used_are_left_out(demo, later, calibration):

@@ -62,7 +62,7 @@ def test_the_half_width_is_never_distinguished_from_the_base():
     values, findings, _ = findings_of("h4")
     assert len(values.unidentified) == 2
     (width,) = of(findings, "Of y of the base joints and of the side bars' joints (half a bar's")
-    assert "only the difference is seen: both can shift alike in one way" in width.text
+    assert "only the difference is determined: both can shift alike in one way" in width.text
     assert set(width.parameters) == {
         f"legs[{j}].{side}.center.y" for j in range(1, 5) for side in ("base", "platform")
     }
@@ -111,8 +111,8 @@ def test_of_both_radii_only_the_difference_is_seen(name):
     _, findings, _ = findings_of(name)
     first = findings.unidentified[0]
     assert first.text.startswith(
-        "Of x, y and z of the base joints and of the platform joints, only the difference is seen, "
-        "as the difference of base and platform radius"
+        "Of x, y and z of the base joints and of the platform joints, only the difference is "
+        "determined, as the difference of base and platform radius"
     )
     assert (first.dimensions, first.matters) == (6, False)
     assert ".base." not in first.advice
@@ -273,7 +273,7 @@ def test_the_design_models_assumptions_are_no_conventions():
     assert findings.also_conventional > 0  # the heights' sum among them
     text = held_in_words(findings, estimate.machine.parameters)
     assert "held by the model that the mechanism file describes" in text
-    assert "of which with a camera and a board only the sum is seen" in text
+    assert "of which with a camera and a board only the sum is determined" in text
 
 
 def test_a_held_arm_is_no_convention():

@@ -327,7 +327,7 @@ def tutorial_report(case: Case) -> Shot:
 
 def tutorial_workspace(case: Case) -> Shot:
     """The tool over the workspace, before and after."""
-    return Shot(guide.report_part(case.work, "workspace"), 1000, 880)
+    return Shot(guide.report_part(case.work, "workspace"), 1000, 770)
 
 
 def tutorial_residuals(case: Case) -> Shot:

@@ -131,8 +131,6 @@ class Chance(str):
     value : the probability.
     """
 
-    value: float = math.nan
-
     def __new__(cls, probability: float) -> Chance:
         """Text of a probability."""
         if not math.isfinite(probability):
@@ -145,9 +143,10 @@ class Chance(str):
             text = f"1 in {round(often, -places):,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
         else:
             text = f"{'<' if probability > 1e-7 else '≪'} 1 in a million"
-        out = super().__new__(cls, text)
-        out.value = probability
-        return out
+        return super().__new__(cls, text)
+
+    def __init__(self, probability: float) -> None:
+        self.value = probability
 
 
 def percent(share: float) -> str:

@@ -34,7 +34,10 @@ addEventListener("load", async () => {
     full.onload = () => done(`${full.naturalWidth}x${full.naturalHeight}`);
     full.src = $(".inspected image").getAttribute("href");
   });
-  out.thumbnails = all(".session-images img").length;
+  const list = all(".session-images img");
+  list.forEach((one) => one.scrollIntoView());
+  await settled();
+  out.thumbnails = list.filter((one) => one.naturalWidth > 50).length;
   out.marks = JSON.stringify(marks());
   out.fit = $(".session-fit").className;
   key("ArrowRight");
@@ -103,6 +106,13 @@ addEventListener("load", async () => {
   await settled();
   await wait(500);
   out.stage = $(".session-stage canvas")?.width > 100;
+  key("ArrowRight");
+  await settled();
   press("Image");
+  await settled();
+  const image = $(".inspected image"), window_ = $(".inspected").getBoundingClientRect();
+  out.window = JSON.stringify([window_.width, window_.height]);
+  out.whole = Math.min(window_.width / image.width.baseVal.value, window_.height / image.height.baseVal.value);
+  out.scale = $(".inspector-where").textContent.replace("×", "");
   finish();
 });

@@ -20,7 +20,9 @@ from pathlib import Path
 from fuzz.cases import Case, make
 
 SECONDS = 60
-"""After which a case is killed; the aim is ten."""
+"""Processor time after which a case is killed; the aim is ten."""
+MOST_WAITING = 600
+"""Seconds by the clock after which a case is killed, too, if it waits for something."""
 ADDRESSES = 6 << 30
 """Bytes of address space, libraries and threads' stacks included; the aim is 1 GB of memory."""
 LONGEST = 2000
@@ -105,7 +107,8 @@ def _forked(case: Case, place: Path, scratch: Path) -> tuple[int, float, int]:
         resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(SECONDS)
+        signal.alarm(MOST_WAITING)
+        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
         # as at a terminal, but every time and not once a place
         warnings.resetwarnings()
         warnings.simplefilter("always")

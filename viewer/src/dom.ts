@@ -31,6 +31,15 @@ export function svg<K extends keyof SVGElementTagNameMap>(
   return element;
 }
 
+const CODE = /`([^`]+)`|(--[a-z][a-z-]*)/;
+
+/** Sentences, with commands in backticks and options as code, which no line breaks. */
+export function prose(text: string): Child[] {
+  // a match gives two parts, of which one is absent
+  return text.split(CODE).flatMap((part, k) =>
+    part ? [k % 3 ? h("code", { class: k % 3 === 2 && "option" }, part) : part] : []);
+}
+
 /** Factor and name of the unit in which a quantity is shown. */
 export const UNITS = {
   m: { factor: 1e3, name: "mm", decimals: 1 },

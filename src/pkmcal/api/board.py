@@ -64,7 +64,7 @@ class BoardResult(Result):
         regular = target.is_file() and not target.is_symlink()
         if os.path.lexists(target) and not (regular and PDF_PRODUCER in target.read_bytes()):
             raise InputError(
-                "this is not a board that pkmcal wrote, and stays as it is",
+                "the file exists and is not a board of pkmcal, so it was not replaced",
                 where=str(target),
                 next_step="Name another file with -o",
             )

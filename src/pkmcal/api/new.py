@@ -152,7 +152,7 @@ def new(
         )
     if printer is None:
         raise InputError(
-            "points of a bed are read with the printer's own values",
+            "probed points need the printer's configuration",
             where="--probed",
             expected="--printer FILE besides: its printer.cfg, its config.g with M665, or what M503"
             " printed",
@@ -160,7 +160,7 @@ def new(
     others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
     if extra := [name for name, given in others.items() if given]:
         raise InputError(
-            "a printer's session is of its heights, or with --board of a board on its tool",
+            "a printer's session has probed heights, or with --board a board on the tool",
             where="--printer",
             found=" and ".join(extra) + " besides",
             expected="neither --machine nor --legs, and --probed or --board",

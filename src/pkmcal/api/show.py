@@ -71,7 +71,7 @@ class MachineView:
         regular = path.is_file() and not path.is_symlink()
         if os.path.lexists(path) and not (regular and PAGE_MARK.encode() in path.read_bytes()):
             raise InputError(
-                "this is not a page of the viewer, and stays as it is",
+                "the file exists and is not a page of the viewer, so it was not replaced",
                 where=str(path),
                 next_step="Name another file with -o",
             )

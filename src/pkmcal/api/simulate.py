@@ -209,7 +209,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         if name not in (*names, *RANGES["simulate"]):
             guess = closest(name, names)
             raise InputError(
-                "this is no setting of a simulation",
+                "a simulation has no such setting",
                 found=name,
                 expected=guess or listed(names, len(names)),
             )

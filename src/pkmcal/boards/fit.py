@@ -313,7 +313,7 @@ def check_numbering(
     if wrong.sum() <= options.marker_corners or 2 * wrong.sum() > len(wrong):
         return  # where most lie elsewhere there is no board to be numbered
     raise InputError(
-        "the board's corners do not lie as its file numbers them",
+        "the board's corners are numbered otherwise than in its file",
         where=where,
         found=f"{int(wrong.sum())} of {len(wrong)} corners at other ones' places",
         expected=board.described,

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE
+from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE
 from pkmcal.files import entries, resolved, staged_folder
 
 

@@ -12,10 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.results import (
-    CALIBRATED_MECHANISM_FILE,
-    CALIBRATION_DOCUMENT_FILE,
-)
+from pkmcal.calibration.file_names import CALIBRATED_MECHANISM_FILE, CALIBRATION_DOCUMENT_FILE
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera, written_camera

@@ -19,6 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.file_names import (
+    CALIBRATED_MECHANISM_FILE,
+    CALIBRATION_DOCUMENT_FILE,
+    CALIBRATION_REPORT_FILE,
+)
 from pkmcal.errors import InputError, legible
 from pkmcal.files import check_writable, entries, json_text, json_value, resolved
 from pkmcal.geometry.rigid import inverse, skew
@@ -35,11 +40,6 @@ if TYPE_CHECKING:
     from pkmcal.calibration.toolmap import ToolMap
     from pkmcal.identify.unidentified import Findings
 
-CALIBRATED_MECHANISM_FILE, CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE = (
-    "mechanism.yaml",
-    "calibration.json",
-    "report.html",
-)
 CALIBRATION_RESULT_FILES = (
     CALIBRATION_REPORT_FILE,
     CALIBRATED_MECHANISM_FILE,

@@ -13,8 +13,8 @@ import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
 from pkmcal.arrays import Array, Booleans, short_repr
+from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE
 from pkmcal.calibration.results import (
-    CALIBRATION_DOCUMENT_FILE,
     CALIBRATION_FORMAT,
     EDGE_COLUMNS,
     EDGE_RESIDUALS,
@@ -177,7 +177,7 @@ class SavedCalibration(CalibrationSummary):
                 continue
             hand = any(station.name == name for station in self.stations) and self.placed
             raise InputError(
-                "where this station stood is not known together with the machine",
+                "the calibration has no covariance of this station and the machine",
                 where=str(self.path),
                 found=name,
                 expected=listed(self.placed, 8) or "a calibration with the stations' covariance",
@@ -476,7 +476,7 @@ def _read(source: Path) -> Document:
     value = document.data.get(FORMAT_KEY)
     if value != CALIBRATION_FORMAT:
         raise InputError(
-            "this is not a calibration of a version that is known" if value else
+            "this version of calibration files is not supported" if value else
             "this is not a calibration",
             where=f"{path}, {FORMAT_KEY}",
             found=value,
@@ -558,8 +558,7 @@ def _check_covariance(document: Document, key: str, matrix: Array) -> None:
         good = least > -ROUNDING * len(matrix)
     if not good:
         raise InputError(
-            "the covariance is not that of any numbers: not symmetric, or a combination of them has"
-            " a negative variance",
+            "the covariance is not symmetric and positive semidefinite",
             where=document.where(key),
             next_step="Calibrate again; this file was changed after it was written",
         )
@@ -580,7 +579,7 @@ def _check_poses(document: Document, group: str, key: str, items: tuple[Any, ...
 def _edited(document: Document, field: str, expected: str) -> InputError:
     """Error for a file that contradicts itself."""
     return InputError(
-        "the calibration does not agree with itself",
+        "the calibration file is inconsistent",
         where=f"{document.label}, {field}",
         expected=expected,
         next_step="Calibrate again; this file was changed after it was written",

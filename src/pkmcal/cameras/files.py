@@ -103,7 +103,7 @@ def camera_from_document(document: Document) -> Camera:
     width, height = camera.image_size
     if not np.isfinite(camera.ray(np.array([[(width - 1) / 2, (height - 1) / 2]]))).all():
         raise InputError(
-            "the camera sees nothing in the middle of its image",
+            "the camera has no ray in the middle of its image",
             where=document.label,
             found=f"image_size {quoted(list(camera.image_size))}, and lens numbers by which no ray"
             " of light ends there",
@@ -446,7 +446,7 @@ def _numbers_at(document: Document, keys: tuple[str, ...], counts: Sequence[int]
         return np.array(values, dtype=float)
     wanted = f"{counts[0]}" if len(counts) == 1 else f"up to {max(counts)}"
     raise InputError(
-        "this is not the list of numbers that it should be",
+        "this is not the expected list of numbers",
         where=document.where(*keys),
         found=quoted(values),
         expected=f"{wanted} numbers",
@@ -474,7 +474,7 @@ def _size_at(
 def _unsupported(where: str, text: str, models: Any) -> InputError:
     """Error about a camera or lens model that pkmcal does not support."""
     return InputError(
-        "this model of camera or lens is not known here",
+        "this camera or lens model is not supported",
         where=where,
         found=text,
         expected=listed(list(models)),

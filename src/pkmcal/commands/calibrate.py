@@ -51,10 +51,11 @@ def calibrate(
 
     with console.progress(quiet or as_json) as progress:
         from pkmcal.api.calibrate import CalibrationResult
+        from pkmcal.calibration.file_names import CALIBRATION_FOLDER
 
         loaded = pkmcal.load_session(session, model)
         folder = console.output_folder(
-            out, loaded.folder / "calibration", CalibrationResult, force=force
+            out, loaded.folder / CALIBRATION_FOLDER, CalibrationResult, force=force
         )
         result = pkmcal.calibrate(loaded, progress=progress.work, **options)
         return finish(result, folder, progress, force=force, as_json=as_json, quiet=quiet)

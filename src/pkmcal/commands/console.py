@@ -40,7 +40,7 @@ def parsed_size(text: str) -> tuple[int, int]:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if min(size) < SMALLEST_PICTURE_SIDE or max(size) > LARGEST_PICTURE_SIDE:
         raise InputError(
-            "no size of an image",
+            "this is not an image size",
             where="--size",
             found=text,
             expected=f"width x height, each {SMALLEST_PICTURE_SIDE} to {LARGEST_PICTURE_SIDE},"

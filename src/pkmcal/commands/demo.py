@@ -40,7 +40,7 @@ def demo(fast: bool, no_open: bool, out: Path | None, as_json: bool) -> int:
     import pkmcal
 
     with console.progress(as_json) as progress:
-        from pkmcal.calibration.results import CALIBRATION_REPORT_FILE
+        from pkmcal.calibration.file_names import CALIBRATION_REPORT_FILE
         from pkmcal.files import default_output, write_text
         from pkmcal.judge.against_truth import compare_with_truth
         from pkmcal.placement.default_camera import camera_of_size, default_camera

@@ -109,7 +109,7 @@ def _tracker(text: str) -> tuple[float, float | None]:
         numbers = list[float]()
     if len(numbers) != len(parts) or not all(0 < x < 1 for x in numbers):
         raise InputError(
-            "a tracker's noise cannot be this",
+            "this tracker noise cannot be used",
             where="--tracker",
             found=text,
             expected="metres, and radians where it measures turns: 2e-5 or 2e-5,1e-4, or with"

@@ -156,7 +156,7 @@ def pose_of_text(text: str, where: str) -> Array:
         numbers = np.zeros(0)
     if numbers.shape != (6,) or not np.isfinite(numbers).all():
         raise InputError(
-            "no pose of the platform",
+            "this is not a platform pose",
             where=where,
             found=text,
             expected="x,y,z,rx,ry,rz: metres and a rotation vector in radians, or with units",
@@ -172,7 +172,7 @@ def legs_of_text(text: str) -> tuple[int, ...]:
         numbers = list[int]()
     if not numbers or min(numbers) < 1 or len(set(numbers)) < len(numbers):
         raise InputError(
-            "no list of legs",
+            "this is not a list of legs",
             where="--legs",
             found=text,
             expected="numbers from 1, each once, such as 1,3,5",

@@ -127,7 +127,7 @@ def rod_limbs(machine: Machine) -> Limbs:
     unknowns = layout.motion.shape[1] + layout.n_internal
     if layout.n_equations != unknowns:
         raise InputError(
-            f"the rods and axes of mechanism {machine.name!r} do not just hold its platform",
+            f"the rods and axes of mechanism {machine.name!r} do not fix its platform exactly",
             found=f"{layout.n_equations} equations for {unknowns} unknowns",
             expected="as many of both, for Newton's method",
         )

@@ -45,7 +45,7 @@ class Ros(Exporter):
         """
         if not source.T_base_camera:
             raise InputError(
-                "no camera is known to stand anywhere, so there is nothing for ROS",
+                "no camera has a pose, so there is nothing for ROS",
                 where=source.origin,
                 expected="a folder that pkmcal calibrate wrote",
                 next_step="Calibrate first; a mechanism file alone has no cameras",

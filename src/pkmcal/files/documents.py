@@ -418,7 +418,7 @@ class _Builder:
             key, line = self._key(key_node), key_node.start_mark.line + 1
             if key in names_so_far:
                 raise InputError(
-                    f"the key {key} stands twice, on lines {names_so_far[key]} and {line}",
+                    f"the key {key} occurs twice, on lines {names_so_far[key]} and {line}",
                     where=f"{self.label}, line {line}, {field_path((*keys, key))}",
                     next_step="Remove one of the two",
                 )

@@ -20,6 +20,7 @@ from pkmcal.files.limits import MOST_PIXELS, check_count
 from pkmcal.wording import install_step
 
 if TYPE_CHECKING:
+    from PIL.Image import Exif as Entries
     from PIL.ImageFile import ImageFile
 
 IMAGE_FILE_ENDINGS = frozenset(
@@ -36,6 +37,7 @@ MOST_PIXELS_PER_BYTE = 8 * 1032
 1951: 258 bytes in two bits). Other formats reach less."""
 _HEAD_BYTES = 1000
 """Bytes in which the size of a PNM file stands, comments before it included."""
+_PNG_SIGNATURE_BYTES, _PNG_CHECKSUM_BYTES = 8, 4
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
 _TRANSPOSING_ORIENTATIONS = range(5, 9)
@@ -124,9 +126,11 @@ def sensor_size(image: ImageFile) -> tuple[int, int]:
 
 
 def read_exif(image: ImageFile) -> Exif:
-    """EXIF of an opened image; entries that are absent or broken have their defaults."""
+    """EXIF of an opened image, whose pixels are not decoded; entries that are absent or broken have
+    their defaults.
+    """
     try:
-        exif = image.getexif()
+        exif = _png_exif(image) if image.format == "PNG" else image.getexif()
         orientation = image.info.get("original_orientation") or exif.get(_ORIENTATION, 1)
         focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM) or 0)
     except IMAGE_ERRORS:
@@ -135,6 +139,27 @@ def read_exif(image: ImageFile) -> Exif:
     return Exif(
         orientation if orientation in range(1, 9) else 1, focal if 0 < focal < inf else None
     )
+
+
+def _png_exif(image: ImageFile) -> Entries:
+    """EXIF entries of a PNG file, from its chunks.
+
+    The entries may stand behind the pixels, all of which Pillow's own method decodes to look there.
+    """
+    from PIL.Image import Image
+
+    stream = image.fp
+    if stream is not None and "exif" not in image.info:
+        start = stream.tell()
+        stream.seek(_PNG_SIGNATURE_BYTES)
+        while len(head := stream.read(8)) == 8 and head[4:] != b"IEND":
+            length = int.from_bytes(head[:4], "big")
+            if head[4:] == b"eXIf":
+                image.info["exif"] = stream.read(length)
+                break
+            stream.seek(length + _PNG_CHECKSUM_BYTES, 1)
+        stream.seek(start)
+    return Image.getexif(image)
 
 
 def with_exif(data: bytes, exif: Exif) -> bytes:

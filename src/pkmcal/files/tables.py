@@ -107,7 +107,7 @@ def read_csv(
             _check_length([name], f"{label}, line {line}")
         if (first := lines.setdefault(name, line)) != line:
             raise InputError(
-                f"the {CONFIGURATION_COLUMN} {name} stands twice, on lines {first} and {line}",
+                f"the {CONFIGURATION_COLUMN} {name} occurs twice, on lines {first} and {line}",
                 where=f"{label}, line {line}",
                 next_step="Give each row its own name, or remove one of the two",
             )

@@ -63,7 +63,7 @@ def dot(a: Array, b: Array) -> Array:
     """
     out = a[..., 0] * b[..., 0]
     for k in range(1, a.shape[-1]):
-        out = out + a[..., k] * b[..., k]
+        out += a[..., k] * b[..., k]
     return out
 
 

@@ -265,7 +265,7 @@ def _difference(s: Situation, coefficients: Array) -> str:
     one_body = not any(g.carrier.floats or g.carrier.turns for g in layout.platform)
     size = one_body and {"x", "y"} <= set(axes)
     visible = ", as the difference of base and platform radius" if size else ""
-    return f"{joined(axes)} of {base} and of {platform}, only the difference is seen{visible}"
+    return f"{joined(axes)} of {base} and of {platform}, only the difference is determined{visible}"
 
 
 # ------------------------------------------------------------------ one leg

@@ -264,11 +264,11 @@ class NoiseShares:
         """-2 log profile likelihood (B, G) of s^2 (B, G), and the best log t^2."""
         own = square[..., None] * self.own[:, None] + self.fixed[:, None]
         others, squares = self.others[:, None], np.square(self.z)[:, None]
-        options = self.options
+        options, least_variance = self.options, self.options.least_variance
 
         def value(log: Array) -> Array:
             """-2 log likelihood (B, G) at log t^2 (B, G)."""
-            variance = np.maximum(own + np.exp(log)[..., None] * others, options.least_variance)
+            variance = np.maximum(own + np.exp(log)[..., None] * others, least_variance)
             return np.sum(np.log(variance) + squares / variance, axis=-1)
 
         end = options.largest_log_others

@@ -264,7 +264,7 @@ def _check_usable(saved: SavedCalibration) -> None:
     if saved.verdict.usable:
         return
     raise InputError(
-        "this calibration should not be used, so nothing can be held against it",
+        "this calibration should not be used, so no data can be tested against it",
         where=str(saved.path),
         found=saved.verdict.reasons[0] if saved.verdict.reasons else saved.verdict.headline,
         expected="a calibration that was not refused",

@@ -95,8 +95,8 @@ def camera_ring_poses(
     """
     if view_angle(camera) > PANORAMIC_HALF_VIEW:
         raise InputError(
-            what="a camera that looks all round sees the legs best from their middle, so no place"
-            " round the machine is looked for",
+            what="an omnidirectional camera belongs in the middle of the legs, so no station around"
+            " the machine is planned",
             where="--places",
             next_step="give its pose in session.yaml, between the legs",
         )

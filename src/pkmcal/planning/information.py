@@ -204,7 +204,7 @@ def _check_observed(rig: Rig, candidates: Candidates, measurements: Measurements
         return
     names = [rig.names[s] for s in candidates.groups[lost[0]]]
     raise InputError(
-        f"from {listed(names)} nothing is seen in any configuration",
+        f"{listed(names)} observes nothing in any configuration",
         where=None if rig.where is None else rig.where + names[0],
         found="no leg, or board, in the picture",
         expected="a camera that looks at the machine",

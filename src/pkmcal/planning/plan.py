@@ -455,7 +455,7 @@ def _with_stations(
     first = next((info for info in infos if info is not None), None)
     if first is None:
         raise InputError(
-            "from no place about the machine anything is seen",
+            "no station around the machine observes anything",
             where="--places",
             expected="a camera that sees the legs, or a board that faces some place",
         )

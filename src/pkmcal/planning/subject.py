@@ -15,6 +15,7 @@ from pkmcal.arrays import Array, numbered, short_repr
 from pkmcal.boards.board import Board, load_board
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import measurements_of
+from pkmcal.calibration.file_names import CALIBRATION_DOCUMENT_FILE, CALIBRATION_FOLDER
 from pkmcal.calibration.localization import (
     boards_of,
     localize_stations,
@@ -22,7 +23,6 @@ from pkmcal.calibration.localization import (
     read_images,
 )
 from pkmcal.calibration.machine_identity import read_same_machine
-from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE
 from pkmcal.calibration.saved_calibration import CalibrationPrior, SavedCalibration, load
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
@@ -57,8 +57,6 @@ PLAN_IMAGES_A_STATION = 12
 together. A plan is made once, and few edges determine the shading badly.
 """
 BOARD_MOUNT_NAME = "board"
-LAST_CALIBRATION_FOLDER = "calibration"
-"""Output folder of `calibrate` inside a session."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +101,9 @@ def as_it_stands(
     if (
         after is None
         and not from_nominal
-        and (session.folder / LAST_CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
+        and (session.folder / CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
     ):
-        after = load(session.folder / LAST_CALIBRATION_FOLDER)
+        after = load(session.folder / CALIBRATION_FOLDER)
         if not after.verdict.usable:  # a default must not be an unusable calibration
             after = None
     if after is not None:
@@ -119,7 +117,7 @@ def as_it_stands(
             )
     if same_place and saved is None:
         raise InputError(
-            "there is no calibration in which the cameras stood anywhere",
+            "there is no calibration with poses of the cameras",
             where="--same-place",
             expected="--after CALIBRATION, or a session with its calibration",
         )
@@ -251,7 +249,7 @@ def subject_of_session(
     by_hand = [station.name for station in session.stations if station.handheld]
     if by_hand:
         raise InputError(
-            "a camera that is held by hand has no place to come back to, so none is planned for",
+            "a hand-held camera has no fixed pose to plan for",
             where="session.yaml, stations",
             found=listed(by_hand, 3),
             next_step="Plan the places of a camera on a tripod: --places 3",
@@ -414,7 +412,7 @@ def _station_poses(
             continue
         if station.T_camera_base is None:
             raise InputError(
-                f"nothing determines where station {station.name} stands",
+                f"the pose of station {station.name} is not determined",
                 where=f"session.yaml, stations.{station.name}",
                 expected="pose: {position: [...], look_at: [...]}, three images, or a calibration",
                 next_step="Give its pose, or let places be chosen: --places 3",

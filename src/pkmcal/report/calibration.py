@@ -13,8 +13,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.archive import keep_earlier
+from pkmcal.calibration.file_names import CALIBRATION_REPORT_FILE
 from pkmcal.calibration.results import (
-    CALIBRATION_REPORT_FILE,
     calibration_document,
     check_output,
     rejected_photographs,
@@ -493,7 +493,8 @@ def _data(
     return Figure(
         DATA_QUESTION,
         ((f"{used} of {taken}", "images"),),
-        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected{remainder}",
+        f"{'; '.join(parts)}; {count(len(observation.rejected), 'measurement')} rejected"
+        f"{remainder}",
     )
 
 

@@ -181,7 +181,7 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
         parts.append(
             f"Of these, {count(findings.also_conventional, 'combination')} would only move a frame "
             "too, such as the heights of base joints and platform joints, of which with a camera "
-            "and a board only the sum is seen."
+            "and a board only the sum is determined."
         )
     return " ".join(parts)
 

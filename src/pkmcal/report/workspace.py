@@ -59,13 +59,13 @@ def _headline(tool_map: ToolMap) -> str:
     sigma, off = (x[np.isfinite(x)] * 1e3 for x in (after.position, after.off_position))
     text = (
         f"Over {tool_map.region}, {count(tool_map.spread, 'pose')} spread evenly, the calibrated"
-        f" platform's place is known to {brief(float(np.median(sigma)))} mm (1σ, median), at worst"
-        f" to {brief(float(sigma.max()))} mm"
+        f" platform's position is known to {brief(float(np.median(sigma)))} mm (1σ, median), at"
+        f" worst to {brief(float(sigma.max()))} mm"
     )
     if not off.size:
         return f"{text}."
     return (
-        f"{text}; the nominal model's was {brief(float(np.median(off)))} mm off, at worst"
+        f"{text}; the nominal model is {brief(float(np.median(off)))} mm off, at worst"
         f" {brief(float(off.max()))} mm."
     )
 

@@ -618,7 +618,7 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
     keys: Keys = ("stations", name)
     if station.pose is not None:
         raise InputError(
-            "a camera that is held by hand has no one pose",
+            "a hand-held camera has no single pose",
             where=document.where(*keys, "pose"),
             found="handheld: true, and a pose",
             expected="one of them",
@@ -626,7 +626,7 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
         )
     if "legs" not in station.observe:
         raise InputError(
-            "images by hand of a board alone determine nothing of the machine",
+            "hand-held images of a board alone do not determine the machine",
             where=document.where(*keys, "observe"),
             found="board",
             expected="legs, or [legs, board]: only the legs determine where the board is",
@@ -735,7 +735,7 @@ def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) 
     twice = next((name for name, count in many.items() if count > 1), None)
     if twice is not None:
         raise InputError(
-            "two stations, or images by hand, have the same name",
+            "two stations, or hand-held images, have the same name",
             where=document.where("stations"),
             found=twice,
             expected="names that differ; an image by hand is called by its station,"

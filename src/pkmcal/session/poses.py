@@ -170,7 +170,7 @@ def _kind(table: CsvTable) -> type[TargetKind]:
     unknown = [name for name in table.columns if name not in names]
     guess = closest(unknown[0], names) if unknown else None
     raise InputError(
-        "this column is not known" if unknown else "these columns together mean nothing",
+        "this column is not known" if unknown else "this combination of columns has no meaning",
         where=f"{table.label}, line 1",
         found=unknown[0] if unknown else listed(table.columns, 12),
         expected=guess or "configuration and " + "; or ".join(", ".join(c) for c in headers),

@@ -186,8 +186,8 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
         return None
     names = [columns[k] for k in still]
     return InputError(
-        f"the readings of {listed(names)} are frozen: they never change, and what was seen does not"
-        " fit the readings",
+        f"the readings of {listed(names)} are frozen: they never change, and the measurements do"
+        " not fit the readings",
         where=f"{file}, column {names[0]}",
         found=f"{joints[0, still[0]]:g} in all {len(joints)} configurations",
         expected="readings that follow the motor",
@@ -251,7 +251,7 @@ def _check_movement(table: CsvTable, noise: float) -> list[Finding]:
     still = unmoved_readings(table.values, noise)
     if still.all():
         raise InputError(
-            "all configurations are alike: no joint moves by more than its noise",
+            "all configurations are equal: no joint moves by more than its noise",
             where=table.label,
             found=f"differences of {np.ptp(table.values, axis=0).max():g} at most",
             expected=f"much more than joints.noise, {noise:g}",

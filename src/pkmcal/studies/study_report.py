@@ -246,14 +246,23 @@ def _table(study: SweepResult) -> Table:
         )
         mark = Level.DOUBTFUL if cell.honest is False else None
         rows.append(Row(in_words(cell.values) or study.subject.name, cells, mark=mark))
-    heads = ("", "tool, mm", "stated", "held, %", "tool's, %", "95 % below, mm")
-    heads += ("tool, °", "stated, °", "95 % below, °") if turns else ()
-    heads += ("failed, %",)
-    legend = (
-        "stated: standard deviation that the calibrations state; held: share of 95 % intervals that"
-        " hold the truth, of all parameters and of the tool's pose"
-    )
-    return Table("Errors after a calibration", heads, tuple(rows), first=5, legend=legend)
+    error = "Root mean square error of the tool after a calibration, with its standard error."
+    stated = "Standard deviation that the calibrations state."
+    largest = "Error that is not exceeded in 95 % of all runs and poses."
+    heads = {
+        "Varied": "",
+        "Tool, mm": error,
+        "Stated, mm": stated,
+        "Held, %": "Share of the 95 % intervals of all parameters that hold the truth.",
+        "Tool held, %": "Share of the 95 % intervals of the tool's pose that hold the truth.",
+        "95 % below, mm": largest,
+        **({"Tool, °": error, "Stated, °": stated, "95 % below, °": largest} if turns else {}),
+        "Failed, %": "Share of the runs that did not converge or had to be refused.",
+    }
+    return Table(
+        "Errors after a calibration", tuple(heads), tuple(rows), first=5,
+        hints=tuple(heads.values()),
+    )  # fmt: skip
 
 
 def _with_error(value: float, error: float) -> str:

@@ -105,7 +105,7 @@ def subject_of(origin: str) -> StudySubject:
         return _of_session(session)
     if origin not in catalogue() and Path(origin).suffix not in (".yaml", ".yml"):
         raise InputError(
-            "there is nothing of this name to study",
+            "no machine or session has this name",
             found=origin,
             expected=closest(origin, catalogue())
             or f"a session's folder, a mechanism file, the paper {STUDIED_PAPER}, or"
@@ -197,7 +197,7 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
             )
         values = [_value(name, subject.names[name], part) for part in parts]
         if len(set(values)) < len(values):
-            raise InputError("a value stands twice", where="--vary", found=text)
+            raise InputError("a value occurs twice", where="--vary", found=text)
         out[name] = tuple(values)
     return out
 
@@ -217,7 +217,7 @@ def _value(name: str, varied: Varied, text: str) -> Value:
     if not good:
         most = f" to {varied.most:g}" if math.isfinite(varied.most) else " or more"
         raise InputError(
-            f"{name} cannot be this ({varied.cell_text})",
+            f"{name} cannot have this value ({varied.cell_text})",
             where="--vary",
             found=text,
             expected=("a whole number of " if varied.whole else "")

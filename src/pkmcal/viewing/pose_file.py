@@ -31,7 +31,7 @@ class PoseFile:
         keys = ("stations", station.entry, "pose")
         if station.handheld:
             raise InputError(
-                "a camera that is held by hand has no one pose to be written",
+                "a hand-held camera has no single pose to be written",
                 where=f"{SESSION_FILE_NAME}, {'.'.join(keys[:2])}",
                 next_step="Every such image is placed when you calibrate",
             )

@@ -12,7 +12,11 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pkmcal.calibration.results import CALIBRATION_DOCUMENT_FILE, CALIBRATION_REPORT_FILE
+from pkmcal.calibration.file_names import (
+    CALIBRATION_DOCUMENT_FILE,
+    CALIBRATION_FOLDER,
+    CALIBRATION_REPORT_FILE,
+)
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import resolved
 from pkmcal.outcome.finding import Level, Mark
@@ -34,8 +38,6 @@ if TYPE_CHECKING:
     from starlette.routing import BaseRoute
     from starlette.types import ASGIApp, Receive, Scope, Send
 
-CALIBRATION_FOLDER = "calibration"
-"""Folder of a session in which `pkmcal calibrate` writes by default."""
 DEEPEST_RESULT = 4
 """Depth of subfolders that are searched."""
 MOST_ENTRIES = 200

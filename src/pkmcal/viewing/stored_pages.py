@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -15,9 +16,6 @@ from pkmcal.web.page import DOCUMENT_END, DOCUMENT_START, PAGE_MARK
 HEAD_BYTES = 1000
 """Bytes of a file in which the mark of a page stands."""
 LARGEST_PAGE_BYTES = 100_000_000
-_ADAPTER: TypeAdapter[PageDocument] = TypeAdapter(
-    Annotated[PageDocument, Field(discriminator="kind")]
-)
 
 
 def is_page(path: Path) -> bool:
@@ -52,10 +50,16 @@ def stored_document(path: Path) -> PageDocument:
             expected="a page that a command of pkmcal wrote, such as report.html",
         )
     try:
-        return _ADAPTER.validate_json(rest.partition(DOCUMENT_END)[0])
+        return _document_type().validate_json(rest.partition(DOCUMENT_END)[0])
     except ValidationError:
         raise InputError(
             "this page was written by another version of pkmcal, or changed since",
             where=str(path),
             next_step="Open the file itself in a browser, or run its command again",
         ) from None
+
+
+@cache
+def _document_type() -> TypeAdapter[PageDocument]:
+    """Validator of a page's document; building it takes as long as reading a report."""
+    return TypeAdapter(Annotated[PageDocument, Field(discriminator="kind")])

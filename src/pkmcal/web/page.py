@@ -10,7 +10,6 @@ import json
 from base64 import b64encode
 from hashlib import sha256
 from html import escape
-from typing import Any
 
 from pkmcal.web.bundle_files import SCRIPT_FILE, STYLE_FILE, bundle_file
 from pkmcal.web.document import AnyDocument, PageDocument
@@ -82,12 +81,8 @@ are switched off in this browser.</p></noscript></div>
 
 
 def embedded_json(document: AnyDocument) -> str:
-    """Document inside a script element; see :func:`script_json`."""
-    return script_json(document.model_dump(mode="json"))
-
-
-def script_json(value: Any) -> str:
-    """JSON of a value inside a script element, which no text in it can end."""
+    """JSON of a document inside a script element, which no text in it can end."""
+    value = document.model_dump(mode="json")
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for sign in "<>&\u2028\u2029":
         text = text.replace(sign, f"\\u{ord(sign):04x}")

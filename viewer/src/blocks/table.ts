@@ -10,6 +10,8 @@ import { copyText, tsv, yaml } from "./table_text";
 /** Rows of a long table before all are asked for, and from how many rows on a table is long. */
 const FIRST_ROWS = 12, LONG = 18;
 const SORTABLE = 3, COPYABLE = 4;
+/** Letters of a row's name that stays on one line. */
+const SHORT_NAME = 16;
 
 export function dataTable(block: DataTable, { selection, printSteps }: Context): HTMLElement {
   const most = Math.max(...block.rows.flatMap((row) =>
@@ -167,7 +169,7 @@ function tableRow(row: TableRow, columns: Column[], most: number): HTMLTableRowE
       return cell;
     }
     const attributes = {
-      scope: "row", class: column.form, "data-tip": row.hint || false, tabindex: row.hint && !row.key ? 0 : false,
+      scope: "row", class: `${column.form}${text.length <= SHORT_NAME ? " short" : ""}`, "data-tip": row.hint || false, tabindex: row.hint && !row.key ? 0 : false,
     };
     return h("th", attributes, ...(row.mark ? [sign(row.mark), " "] : []), ...children);
   });

@@ -1,15 +1,15 @@
 /** Blocks of text. */
 
 import type { Downloads, Facts, Listing, Paragraph } from "../document";
-import { h } from "../dom";
+import { h, prose } from "../dom";
 
 export const paragraph = (block: Paragraph): HTMLElement =>
-  h("p", block.small ? { class: "small" } : {}, block.text);
+  h("p", block.small ? { class: "small" } : {}, ...prose(block.text));
 
 export function listing(block: Listing): HTMLElement {
   const items = h("ul", { class: "listing" }, ...block.items.map((text) => {
     const [what, ...next] = text.split("\n");
-    return h("li", {}, what!, ...next.map((step) => h("span", { class: "step" }, step)));
+    return h("li", {}, ...prose(what!), ...next.map((step) => h("span", { class: "step" }, ...prose(step))));
   }));
   if (block.folded) return h("details", {}, h("summary", {}, block.title), items);
   return h("div", {}, ...(block.title ? [h("h3", {}, block.title)] : []), items);
@@ -32,6 +32,6 @@ export function downloads(block: Downloads): HTMLElement {
     for (const event of ["pointerdown", "focus", "click"]) link.addEventListener(event, prepare);
     return link;
   });
-  return h("p", { class: "downloads small" }, "To take along: ",
+  return h("p", { class: "downloads small" }, "Downloads: ",
     ...links.flatMap((link, k) => (k ? [", ", link] : [link])), ".");
 }

@@ -4,7 +4,7 @@ import "./report.css";
 import { drawBlock, type Context } from "../blocks";
 import { logBar } from "../blocks/log_bar";
 import type { Card, ReportDocument, Section } from "../document";
-import { h } from "../dom";
+import { h, prose } from "../dom";
 import { sign, type Mark } from "../marks";
 import { ImageViewer } from "../image_viewer";
 import { connect, Selection } from "../selection";
@@ -18,6 +18,8 @@ const TONE_MARKS: Record<ReportDocument["verdict"]["tone"], Mark | null> = {
   bad: "wrong",
   neutral: null,
 };
+
+const LONG_HEADLINE = 110; // characters, from which on a smaller font keeps it in two lines
 
 export function reportView(host: HTMLElement, content: ReportDocument): void {
   const selection = new Selection();
@@ -49,13 +51,13 @@ function verdictOf({ verdict }: ReportDocument): HTMLElement {
   const mark = TONE_MARKS[verdict.tone];
   return h("section", { class: `verdict ${verdict.tone}`, "aria-labelledby": "verdict" },
     h("p", { class: "stamp" }, ...(mark ? [sign(mark), " "] : []), verdict.stamp),
-    h("h2", { id: "verdict" }, verdict.headline),
-    ...(verdict.explanation ? [h("p", { class: "explanation" }, verdict.explanation)] : []),
+    h("h2", { id: "verdict", class: verdict.headline.length > LONG_HEADLINE && "long" }, verdict.headline),
+    ...(verdict.explanation ? [h("p", { class: "explanation" }, ...prose(verdict.explanation))] : []),
     ...(verdict.reasons.length ? [h("ul", { class: "reasons" }, ...items(verdict.reasons))] : []),
     ...(verdict.comparison ? [logBar(verdict.comparison)] : []));
 }
 
-const items = (texts: readonly string[]): HTMLElement[] => texts.map((text) => h("li", {}, text));
+const items = (texts: readonly string[]): HTMLElement[] => texts.map((text) => h("li", {}, ...prose(text)));
 
 /** The user's notes, warnings, advice and remarks; a list of several remarks is collapsed. */
 function findingsOf(content: ReportDocument): HTMLElement[] {

@@ -22,6 +22,7 @@ import { h } from "../dom";
 import { type DragTool, Inspector, type Pixel } from "../inspector";
 import { legClass, sign } from "../marks";
 import { Selection, connect } from "../selection";
+import { button, choice, press } from "./buttons";
 import { ImageList, type ImageMark } from "./session_images";
 import { type Pose, StationPose } from "./session_poses";
 
@@ -388,7 +389,8 @@ class SessionView {
     this.stage.hidden = !visible;
     this.inspector.element.hidden = visible;
     this.showState();
-    if (visible && this.stageState === "absent") void this.drawStage();
+    if (!visible) this.inspector.fit();
+    else if (this.stageState === "absent") void this.drawStage();
   }
 
   private async drawStage(): Promise<void> {
@@ -478,7 +480,7 @@ class SessionView {
   private async endDrag(cancelled: boolean): Promise<void> {
     const { drag } = this;
     this.drag = null;
-    if (!drag?.moved) return;
+    if (!drag?.moved) return this.markOthers(); // which the drag interrupted
     await this.overlaying;
     if (cancelled) this.undo();
     // two joints determine the place well enough for the machine to be localized there
@@ -563,39 +565,16 @@ class SessionView {
     addEventListener("beforeunload", (event) => {
       if (this.poses.some((pose) => pose.changed)) event.preventDefault();
     });
-    // an image that does not come has its reason in words
+    // the first image precedes the thumbnails; one that does not come has its reason in words
+    this.inspector.element.addEventListener("load", () => this.list.load(), { capture: true, once: true });
     this.inspector.element.addEventListener("error", () => {
+      this.list.load();
       const fault = (answer: { message?: string } | null): void =>
         this.notify(answer?.message ?? "The image does not come.", "bad");
       fetch(this.image.url).then((response) => response.json() as Promise<{ message?: string }>)
         .then(fault, () => fault(null));
     }, true);
   }
-}
-
-function button(text: string, act: () => void, title = ""): HTMLButtonElement {
-  return h("button", { type: "button", onclick: act, ...(title ? { title } : {}) }, text);
-}
-
-/** Group of buttons of which one is pressed. */
-function choice<T extends string>(
-  label: string, items: [T, string, string?][], first: T, onchoose: (name: T) => void,
-): HTMLElement {
-  const group = h("span", { class: "choice", role: "group", "aria-label": label });
-  group.append(...items.map(([name, text, title]) => {
-    const one = button(text, () => {
-      press(group, name);
-      onchoose(name);
-    }, title);
-    one.dataset.name = name;
-    return one;
-  }));
-  press(group, first);
-  return group;
-}
-
-function press(group: HTMLElement, name: string): void {
-  for (const one of group.querySelectorAll("button")) one.setAttribute("aria-pressed", String(one.dataset.name === name));
 }
 
 function legend(): HTMLElement {

@@ -19,9 +19,8 @@ export class ImageList {
   constructor({ stations }: SessionDocument, choose: (s: number, k: number) => void) {
     this.buttons = stations.map((station, s) => station.images.map((image, k) => {
       const { width, height } = uprightSize(image);
-      const address = image.url.replace("image", "thumbnail");
       const picture = h("img", {
-        src: address, alt: "", loading: "lazy", fetchpriority: "low", width, height,
+        "data-src": image.url.replace("image", "thumbnail"), alt: "", loading: "lazy", width, height,
         onerror: () => picture.removeAttribute("src"), // its mark and its image say why
       });
       return h("button", { type: "button", title: image.title, onclick: () => choose(s, k) },
@@ -34,6 +33,14 @@ export class ImageList {
         ...(station.handheld ? [h("p", { class: "small" }, "by hand")] : []),
         h("ol", {}, ...this.buttons[s].map((button) => h("li", {}, button)))));
     });
+  }
+
+  /** Request the thumbnails as they come into view. */
+  load(): void {
+    for (const picture of this.element.querySelectorAll<HTMLImageElement>("[data-src]")) {
+      picture.src = picture.dataset.src ?? "";
+      delete picture.dataset.src;
+    }
   }
 
   select(s: number, k: number): void {

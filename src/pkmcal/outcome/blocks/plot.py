@@ -127,11 +127,11 @@ def linear_ticks(low: float, high: float, least: int = LEAST_TICKS) -> tuple[Tic
 
 def log_ticks(low: float, high: float) -> tuple[Tick, ...]:
     """Labels at powers of ten; between them, too, where these are fewer than
-    ``LEAST_LOG_TICKS``.
+    ``LEAST_LOG_TICKS``, and at equal steps where the axis is shorter than that.
     """
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     every = -(-len(decades) // MOST_DECADES)
-    for factors in ((1,), (1, 3), (1, 2, 5), range(1, 10)):
+    for factors in ((1,), (1, 3), (1, 2, 5)):
         values = [m * 10.0**k for k in decades if k % every == 0 for m in factors]
         values = [v for v in values if low <= v <= high]
         if len(values) >= LEAST_LOG_TICKS:
