@@ -43,7 +43,7 @@ EXPRESSED = {
     "ros": (),
 }
 REFUSALS = {
-    "c": "do not constrain its platform exactly",
+    "c": "do not fix its platform exactly",
     "reprap": "RepRapFirmware has settings for deltas",
     "marlin": "Marlin has settings for",
     "repetier": "Repetier-Firmware (has settings for|counts end switches in motor steps)",
