@@ -132,8 +132,8 @@ def test_files_as_others_write_them(tmp_path):
     [
         (ROS, "[500, 0,", "[500, 2,", "c.yaml, line 4, camera_matrix: the camera has skew, which "
          "no model here has; found 2."),
-        (ROS, "plumb_bob", "rational_polynomial", "c.yaml, line 5, distortion_model: this model of "
-         "camera or lens is not known here; found rational_polynomial, expected plumb_bob, "
+        (ROS, "plumb_bob", "rational_polynomial", "c.yaml, line 5, distortion_model: this camera "
+         "or lens model is not supported; found rational_polynomial, expected plumb_bob, "
          "equidistant and fisheye. Calibrate again from images of a board: pkmcal camera."),
         (ROS, "0.3]", "0.3, 0.1]", "c.yaml, line 4, camera_matrix: the camera has distortion "
          "beyond the model's 5 terms; found 6 terms."),

@@ -23,7 +23,8 @@ from pkmcal.geometry.rigid import apply, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
 
-OURS = ("c", "json", "klipper", "linuxcnc", "reprap", "ros", "yaml")
+OURS = ("c", "json", "klipper", "linuxcnc", "marlin", "repetier", "reprap", "ros", "smoothie",
+        "yaml")  # fmt: skip
 ELSEWHERE = ("mujoco", "sdf", "urdf")
 """Formats of test_export_mujoco.py and test_export_trees.py."""
 MACHINES = sorted(catalogue())
@@ -35,13 +36,19 @@ EXPRESSED = {
     "yaml": MACHINES,
     "reprap": DELTAS,
     "klipper": DELTAS,
+    "marlin": ("linear-delta",),
+    "repetier": (),
+    "smoothie": ("linear-delta",),
     "linuxcnc": (*DELTAS, *HEXAPODS, "3-rpr", "6-rus", "h4", "hexaglide"),
     "ros": (),
 }
 REFUSALS = {
-    "c": "do not constrain its platform exactly",
-    "reprap": "RepRapFirmware has settings for linear and rotary deltas",
-    "klipper": "Klipper has settings for linear and rotary deltas",
+    "c": "do not fix its platform exactly",
+    "reprap": "RepRapFirmware has settings for deltas",
+    "marlin": "Marlin has settings for",
+    "repetier": "Repetier-Firmware (has settings for|counts end switches in motor steps)",
+    "smoothie": "Smoothieware has settings for",
+    "klipper": "Klipper has settings for deltas",
     "linuxcnc": "LinuxCNC moves as many joints as coordinates",
     "ros": "no camera has a pose",
 }

@@ -20,12 +20,12 @@ from pkmcal.exporters.delta import DEGREES_A_RADIAN, Freedoms, delta_of, nearest
 from pkmcal.exporters.linuxcnc import linear_joints, rotary_joints
 from pkmcal.exporters.samples import samples
 from pkmcal.firmware import klipper, reprap
-from pkmcal.firmware.contract import firmwares
+from pkmcal.firmware.contract import firmware_of, firmwares
 from pkmcal.geometry.rigid import rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level
 
-FIRMWARES = ("reprap", "klipper")
+FIRMWARES = ("reprap", "klipper", "marlin")
 SMALL = np.array([0.004, -0.003, 0.002])
 
 
@@ -96,11 +96,13 @@ def test_an_ideal_linear_delta_is_recovered():
 
 @pytest.mark.parametrize("firmware", firmwares(), ids=lambda one: one.name)
 def test_a_firmware_reads_what_it_writes(firmware):
-    (text,) = firmware.files(source_of(with_radius(ideal_linear(), 0.0905))).values()
-    assert [one for one in firmwares() if one.reads(text)] == [firmware]
-    printer = firmware.printer(text, "x")
+    entries = {"workspace_radius": 0.0905, "height_offset": 0.0, "steps_per_mm": 3 * (800.0,)}
+    machine = with_values(ideal_linear(), **entries)
+    (text,) = firmware.files(source_of(machine)).values()
+    assert [one for one in firmwares() if one.evidence(text, "x")] == [firmware]
+    printer = firmware_of(text, "x").printer(text, "x")
     assert printer.radius == pytest.approx(110, abs=1e-3)
-    assert printer.reach == 90.5
+    assert printer.reach == (None if firmware.name in ("marlin", "smoothie") else 90.5)
     np.testing.assert_allclose(np.sort(printer.rod), [269.5, 270, 271.2], atol=1e-3)
     # carriages at the bed's centre, from the rods' lengths and the towers' circle
     heights = printer.carriages(np.zeros((1, 3)))[0]
@@ -124,8 +126,11 @@ def test_an_ideal_rotary_delta_is_recovered():
     assert "tilted arms" in made.notes[0].text
 
 
-@pytest.mark.parametrize("name", ["delta", "linear-delta"])
-@pytest.mark.parametrize("to", FIRMWARES)
+KINDS = [(to, name) for to in FIRMWARES for name in ("delta", "linear-delta")]
+KINDS.remove(("marlin", "delta"))
+
+
+@pytest.mark.parametrize(("to", "name"), KINDS)
 def test_a_machine_off_its_nominal_model_is_followed_as_far_as_stated(name, to):
     machine = built(name, seed=4)
     made = make_export(source_of(machine), to)
@@ -157,10 +162,14 @@ def test_linuxcnc_gets_a_module_of_what_its_own_do_not_follow(name):
 # Limits and switches that a printer has of its own
 
 
+def with_values(machine, **values):
+    """The machine with entries of its mechanism file that exports keep."""
+    return replace(machine, document=machine.document.model_copy(update=values))
+
+
 def with_radius(machine, radius):
     """The machine whose printer keeps to a radius, m."""
-    document = machine.document.model_copy(update={"workspace_radius": radius})
-    return replace(machine, document=document)
+    return with_values(machine, workspace_radius=radius)
 
 
 def klipper_config(text):
@@ -193,8 +202,7 @@ def switch_lines(text):
     return [line for line in text.splitlines() if "reading - " in line or " rad, " in line]
 
 
-@pytest.mark.parametrize("to", FIRMWARES)
-@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+@pytest.mark.parametrize(("to", "name"), KINDS)
 def test_an_end_switch_elsewhere_has_a_number_of_its_own(to, name):
     """The tool's place by the firmware, homed by that number, is the machine's."""
     machine = built(name, seed=4)
@@ -231,6 +239,14 @@ def test_an_end_switch_elsewhere_has_a_number_of_its_own(to, name):
             config = klipper_config(text)
             config["stepper_" + "abc"[k]]["position_endstop"] = repr(number)
             homed = klipper.homed(config)
+        elif to == "marlin":
+            rod, tower = (
+                [float(v) for v in re.findall(rf"^M665 .*{c}(-?[\d.]+)", text, re.MULTILINE)]
+                for c in ("ABC"[k], "R")
+            )
+            length = float(re.search(r"^M665 L([\d.]+)", text, re.MULTILINE)[1]) + rod[0]
+            # the carriage, with the nozzle in the middle at this switch's height
+            homed = np.full(3, number + np.sqrt(length**2 - tower[0] ** 2))
         else:
             words = reprap.read_words(text)
             words["666" + "XYZ"[k]] = np.array([number])
@@ -263,6 +279,12 @@ def test_parallel_towers_are_followed_where_leaning_ones_are_not():
         ("reprap", "pkmcal_delta.g", " ; L rods", " B162 ; L rods"),
         ("reprap", "pkmcal_delta.g", "M666 Y = 0 + 1000", "M666 Y = 0 - 1000"),
         ("klipper", "pkmcal_printer.cfg", "delta_radius: ", "print_radius: 99\ndelta_radius: "),
+        ("marlin", "pkmcal_marlin.gcode", "R104.9", "R104.8"),
+        ("marlin", "pkmcal_marlin.gcode", "M666 X0.0000", "M666 X-0.5000"),
+        ("marlin", "pkmcal_marlin.gcode", "M666 X0.0000", "M666 X0.0003"),
+        ("marlin", "pkmcal_marlin.gcode", "M666 X0.0000", "M666 X-0.0003"),
+        ("marlin", "pkmcal_marlin.gcode", "A0.0000", "A0.1000"),
+        ("marlin", "pkmcal_marlin.gcode", "Z of Y's switch = 3", "Z of Y's switch = 4"),
     ],
 )  # fmt: skip
 def test_tampered_settings_are_found(to, file, old, new):
@@ -371,7 +393,7 @@ def test_ranges_are_needed(tmp_path):
 
 def test_towers_lean_too_much():
     machine = put(load_mechanism("linear-delta"), 1, base__axis=[0.7, 0.0, 0.7])
-    with pytest.raises(InputError, match="is neither; found towers that lean"):
+    with pytest.raises(InputError, match="is none; found towers that lean"):
         delta_of(machine, "Klipper")
 
 

@@ -557,7 +557,7 @@ def changed(text, old, new):
 
 CFG = printers.printer_cfg(SAYS, np.tile(SAYS.homed - 200, (7, 1)))
 WRONG_PRINTERS = {
-    "G28\nG29\n": "neither a Klipper nor a RepRapFirmware configuration",
+    "G28\nG29\n": "nothing in this file shows which firmware",
     changed(CFG, "kinematics: delta", "kinematics: corexy"): "heights of a bed are read of linear",
     changed(CFG, "delta_radius: 105.0", ""): "this value of the printer is missing: delta_radius",
     changed(CFG, "arm_length: 270.0", "arm_length: long"): "arm_length is no number",
@@ -566,8 +566,8 @@ WRONG_PRINTERS = {
     changed(CFG, "height0_pos = ", "height0_pos = 1e8,1e8,1e8 #"): "far below the bed",
     changed(CFG, "microsteps: 16", "microsteps: 16\ngear_ratio: 3"): "the gears cannot be read",
     changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not give",
-    "M665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer can have",
-    "M665 R105 H300 B90\n": "M665 has no value L that could be used",
+    "M584 X0\nM665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer",
+    "M584 X0\nM665 R105 H300 B90\n": "M665 has no value L that could be used",
     printers.printer_cfg(
         SAYS, np.tile(SAYS.homed + 2, (7, 1))
     ): "stepper_a 2 mm above its end switch",

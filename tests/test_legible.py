@@ -32,7 +32,8 @@ INVISIBLE = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 FORMATS = {
     "c": "gough-stewart", "json": "gough-stewart", "klipper": "linear-delta",
-    "linuxcnc": "gough-stewart", "mujoco": "gough-stewart", "reprap": "linear-delta",
+    "linuxcnc": "gough-stewart", "marlin": "linear-delta", "mujoco": "gough-stewart",
+    "repetier": "linear-delta", "reprap": "linear-delta", "smoothie": "linear-delta",
     "ros": "gough-stewart", "sdf": "gough-stewart", "urdf": "gough-stewart",
     "yaml": "gough-stewart",
 }  # fmt: skip
@@ -101,7 +102,9 @@ def test_pages_are_legible():
 
 
 def named(machine, name):
-    return machine_from_document(machine.document.model_copy(update={"name": name}))
+    """The machine with a name, and with motor steps, which Repetier-Firmware needs."""
+    entries = {"name": name, "steps_per_mm": machine.n_legs * (80.0,)}
+    return machine_from_document(machine.document.model_copy(update=entries))
 
 
 @pytest.mark.parametrize("name", FORMATS)

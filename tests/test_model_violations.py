@@ -387,7 +387,7 @@ def test_a_sleeve_is_named_and_harms_little(session):
     path.write_text(yaml.safe_dump(document))
     value = calibrate(session)
     (one,) = value.violations
-    assert (one.code, one.subject) == ("tube.radius", "legs[2].tubes[1]")
+    assert (one.code, one.of) == ("tube.radius", "legs[2].tubes[1]")
     assert abs(one.value[0] - 2e-3) < 4 * one.sigma[0]
     assert one.value[0] > 1e-3
     assert not one.against
@@ -424,7 +424,7 @@ def test_another_camera_is_named(session):
     path.write_text(yaml.safe_dump(document))
     value = calibrate(session)
     (one,) = value.violations
-    assert (one.code, one.subject) == ("camera.focal", "cameras/camera.yaml")
+    assert (one.code, one.of) == ("camera.focal", "cameras/camera.yaml")
     assert one.value[0] == pytest.approx(-0.03, rel=0.3)
     assert "--refine-camera" in one.finding.next_step
     assert one.finding in value.verdict.of("camera.focal")

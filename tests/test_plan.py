@@ -373,7 +373,7 @@ def test_a_session_without_places(demo, quick_plans, tmp_path):
     (session / "session.yaml").write_text(head + rest[rest.index("  station2") :])
     result = run("plan", str(session))
     assert result.code == 2
-    assert "nothing determines where station station1 stands" in (result.out + result.err).replace(
+    assert "the pose of station station1 is not determined" in (result.out + result.err).replace(
         "\n", " "
     )
 

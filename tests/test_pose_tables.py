@@ -89,7 +89,7 @@ def spoilt(row, column, value):
         (spoilt(2, 3, 0.2), ["poses.csv, line 4", "qw, qx, qy, qz", "not of length one"]),
         (FULL + "\n" + rows(whole()[1], ("000", "001", "1", "003")),
          ["line 4", "no joint readings", "found 1", "expected 001", "leading zeros"]),
-        (FULL + "\n" + rows(whole()[1], ("000", "001", "001", "003")), ["line 4", "stands twice"]),
+        (FULL + "\n" + rows(whole()[1], ("000", "001", "001", "003")), ["line 4", "occurs twice"]),
         (FULL + "\n" + rows(whole()[1][:2]), ["too few poses", "found 2 rows"]),
         ("configuration,z\n" + rows(whole()[1][:6, :1]), ["too few heights", "7 at least"]),
         ("configuration,x,y,z,rx,ry,rz\n" + rows(np.rad2deg(whole()[2])),

@@ -301,9 +301,7 @@ def test_a_session_is_simulated(tmp_path):
     assert session.machine.name == "delta"
     assert len(session.configurations) == 2
     assert (tmp_path / "s" / "truth.json").is_file()
-    with pytest.raises(
-        InputError, match="no setting of a simulation; found station, expected stat"
-    ):
+    with pytest.raises(InputError, match="no such setting; found station, expected stat"):
         pkmcal.simulate(tmp_path / "t", station=1)
     with pytest.raises(InputError, match="is not empty"):
         pkmcal.simulate(tmp_path / "s")

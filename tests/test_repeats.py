@@ -234,7 +234,7 @@ def test_an_edge_that_shows_now_and_then_is_left_out(machine, poses):
     late = np.arange(len(many)) >= 2 * len(edges)
     one = combine_repeats(look_of(many.select(~((keys(many) == keys(many)[7]).all(axis=1) & late))))
     (values,) = one.rejected
-    assert values.reason == "seen in only 2 of 4 repeats"
+    assert values.reason == "measured in only 2 of 4 repeats"
     assert len(one.edges) == len(edges) - 1
 
 

@@ -161,6 +161,8 @@ def test_derivatives_by_scales_and_readings(name):
     [
         ("linear-delta", "klipper", "Multiply its rotation_distance by that."),
         ("delta", "klipper", "Divide its gear_ratio by that."),
+        ("linear-delta", "marlin", "Divide its steps per mm (M92) by that."),
+        ("linear-delta", "smoothie", "Divide its steps per mm (M92) by that."),
         ("linear-delta", "reprap", "Divide its steps per mm (M92) by that."),
         ("delta", "reprap", "Divide its steps per degree (M92) by that."),
         (

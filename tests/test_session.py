@@ -304,7 +304,7 @@ EDITS = [
      ["cameras/front.yaml, line 3, focal[2]", "a number above 0"]),
     # pattern of the images
     ("session.yaml", "{configuration}", "0000",
-     ["line 7, stations.front.images: the pattern does not say", "'images/front/0000.png'"]),
+     ["line 7, stations.front.images: the pattern has no place", "'images/front/0000.png'"]),
     ("session.yaml", "{configuration}", "{configration}",
      ["placeholder is not known; found {configration}, expected {configuration}"]),
     ("session.yaml", "{configuration}", "{configuration", ["the braces do not match"]),

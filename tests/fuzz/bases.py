@@ -65,6 +65,18 @@ def delta_printers(folder: Path) -> None:
     (folder / "config.g").write_text(
         "G90 ; absolute\nM665 L270:270.1:269.9 R105 H300 B90 X0.1 Y0 Z-0.1\nM666 X0.2 Y0 Z-0.2\n"
     )
+    bed = "".join(f"Bed X: {x:.2f} Y: {y:.2f} Z: 0.1{k}\n" for k, (x, y) in enumerate(places))
+    (folder / "m503.txt").write_text(
+        "Recv: echo: M92 X80.00 Y80.00 Z80.00\nRecv: echo:  M666 X0.00 Y-0.50 Z-0.25\n"
+        "Recv: echo:  M665 L270.00 R105.00 H300.00 S200.00 X0.10 Y0.00 Z-0.10 A0.10 B0.00 C0.00\n"
+        f"Recv: echo:  M851 X0.00 Y0.00 Z-1.50\n{bed}"
+    )
+    (folder / "configuration.txt").write_text(
+        "#define CONFIGURATION_H_VERSION 02010205\n#define DELTA_DIAGONAL_ROD 270.0 // (mm)\n"
+        "#define OFFSET 30.0\n#define DELTA_RADIUS (135.0-(OFFSET))\n#define DELTA_HEIGHT 300\n"
+        "#define DELTA_ENDSTOP_ADJ { 0.0, -0.5, -0.2 }\n#define NOZZLE_AS_PROBE\n"
+        f"#define NOZZLE_TO_PROBE_OFFSET {{ 0, 0, -1.5 }}\n{bed}"
+    )
     lines = [f"// probe at {x:.3f},{y:.3f} is z=1.{k}" for k, (x, y) in enumerate(places)]
     (folder / "console.txt").write_text("\n".join(lines))
     lines = [f"G30 P{k} X{x:.1f} Y{y:.1f} Z-99999" for k, (x, y) in enumerate(places)]

@@ -53,6 +53,9 @@ TRACKER = tuple(
 LATER = tuple(f"later/{n}" for n in ("session.yaml", "mechanism.yaml", "joints.csv", "poses.csv"))
 BOARD = ("board/session.yaml", "board/board.yaml", "board/cameras/camera.yaml", "board/joints.csv",
          "board/images/*.png")  # fmt: skip
+PRINTERS = tuple(
+    f"printers/{n}" for n in ("printer.cfg", "config.g", "m503.txt", "configuration.txt")
+)
 POINTS = tuple(f"printers/{n}" for n in ("console.txt", "bed.g", "heightmap.txt", "points.csv"))
 RESULT = ("calibration/calibration.json",)
 TASKS = (
@@ -92,7 +95,7 @@ TASKS = (
     Task("study 3-rpr --vary configurations=3 --runs 2 -o study",
          ("study/batches/study.json", "study/batches/*.npz"), "", 1),
     Task("read-camera FILE", ("cameras/*.*",), "", 10),
-    Task("new OUT --printer FILE", ("printers/printer.cfg", "printers/config.g"), "", 4),
+    Task("new OUT --printer FILE", PRINTERS, "", 4),
     Task("new OUT --printer printers/printer.cfg --probed FILE", POINTS, "", 4),
     Task("look-at legs", LEGS, "", 2),
     Task("look-at board", BOARD, "", 1),

@@ -102,6 +102,7 @@ def new(
     places: int | None = None,
     printer: Path | str | None = None,
     probed: Path | str | None = None,
+    firmware: str | None = None,
 ) -> NewResult:
     """Make a commented session to fill in, or the session of a delta printer, without writing
     files.
@@ -116,10 +117,15 @@ def new(
     places :
         Number of stations of the camera; 1 by default.
     printer :
-        Configuration file of a delta printer, printer.cfg or config.g with M665: the session has
-        its nominal model, and the heights of its bed unless ``board``.
+        Configuration of a delta printer: Klipper's printer.cfg, RepRapFirmware's config.g with
+        M665, Marlin's Configuration.h, Smoothieware's config, what M503 printed (Marlin,
+        Smoothieware) or M205 (Repetier-Firmware). The session has its nominal model, and the
+        heights of its bed unless ``board``.
     probed :
         Console output of a printer that probed its bed; by default the heights in ``printer``.
+    firmware :
+        ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
+        does not show which it is of.
 
     Returns
     -------
@@ -133,6 +139,12 @@ def new(
 
     """
     check_number("new", "places", places)
+    if printer is None and firmware is not None:
+        raise InputError(
+            "a firmware is named for a printer's file",
+            where="--firmware",
+            expected="--printer FILE besides",
+        )
     if printer is None and probed is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
         return NewResult(
@@ -142,7 +154,8 @@ def new(
         raise InputError(
             "probed points need the printer's configuration",
             where="--probed",
-            expected="--printer FILE besides: its printer.cfg, or its config.g with M665",
+            expected="--printer FILE besides: its printer.cfg, its config.g with M665, or what M503"
+            " printed",
         )
     others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
     if extra := [name for name, given in others.items() if given]:
@@ -157,5 +170,6 @@ def new(
         None if probed is None else Path(probed),
         "board" if board else None,
         places or 1,
+        firmware,
     )
     return NewResult(texts, of_printer=True, complete=not board)

@@ -29,10 +29,14 @@ pkmcal new my-printer --printer printer.cfg
     flag("--board", "The cameras observe a board."),
     number("new", "places", "N", "Number of stations.", usual="1"),
     option(
-        "--printer", "FILE", "Delta printer's printer.cfg, or config.g with M665: source of the"
-        " nominal model and the probed heights.", Path,
+        "--printer", "FILE", "Delta printer's printer.cfg, config.g, Configuration.h, or output of"
+        " M503 or M205: source of the nominal model and the probed heights.", Path,
     ),
     option("--probed", "FILE", "Terminal output of the printer's bed probing.", Path),
+    option(
+        "--firmware", "NAME", "Printer's firmware, if its file does not show it: klipper, marlin,"
+        " repetier, reprap or smoothie.",
+    ),
     as_json(),
 )  # fmt: skip
 def new(folder: Path, as_json: bool, **options: Any) -> int:

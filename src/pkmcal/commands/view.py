@@ -28,7 +28,7 @@ pkmcal view my-machine --calibration out --no-browser --port 8000
     as_json(),
 )  # fmt: skip
 def view(source: Path, calibration: Path | None, port: int, no_browser: bool, as_json: bool) -> int:
-    """Show a session's images with the machine overlaid, or results; edit station poses."""
+    """Show a session's images with the machine overlaid, or results."""
     from pkmcal.api.view import view as run
 
     opened = run(source, calibration=calibration)

@@ -41,6 +41,7 @@ GRID_READINGS_A_MOTOR = 7
 """Grid readings of each motor: ends, middle, and two on either side."""
 LEAST_DELTA_SINGULARITY = 0.12
 """Least singular value of the scaled inverse Jacobian: readings' errors grow at most eightfold."""
+MOST_AMPLIFICATION = 1 / LEAST_DELTA_SINGULARITY
 FASTEST_MOTOR_RATIO = 4.0
 """Largest ratio of a carriage's or elbow's speed to the tool's.
 
@@ -65,6 +66,8 @@ SWITCH_ROUNDING = 1e-3
 Values are written to 0.1 µm, and the height depends weakly on the angle of an arm that is nearly
 upright.
 """
+STEPS_ROUNDING = 1e-4
+"""Tolerance of motor steps per mm."""
 TOOL_ROUNDING = 2e-6
 """Tolerance at the tool, m: settings have 0.1 µm and 0.00001 degrees, amplified up to eightfold."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
@@ -148,6 +151,17 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
         raise _no_delta(machine, program, what)
     arm = np.ones(3) if linear else np.sqrt(dot(rods.arm, rods.arm))
     poses, readings, by_reading = _workspace(machine, rods.joint, arm)
+    if linear:
+        # beyond a horizontal rod lies the other assembly mode, with the tool above a carriage;
+        # the inverse of firmwares has it not
+        home = machine.home()
+        at_home = machine.inverse(home)[rods.joint]
+        above, above_home = (
+            rate * q + zero - MM_A_METRE * (z + rods.platform[:, 2])
+            for q, z in ((readings, poses[:, 2, 3, None]), (at_home, home[2, 3]))
+        )
+        hangs = (above * above_home > 0).all(axis=1)
+        poses, readings, by_reading = poses[hangs], readings[hangs], by_reading[hangs]
     return Delta(
         machine=machine,
         program=program,
@@ -169,8 +183,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
 def _no_delta(machine: Machine, program: str, text: str) -> InputError:
     """Error for a machine that is no delta."""
     return InputError(
-        f"{program} has settings for linear and rotary deltas, and mechanism {machine.name!r}"
-        " is neither",
+        f"{program} has settings for deltas, and mechanism {machine.name!r} is none",
         found=text,
         expected="motion: translation with three sliders, or three cranks, and rods",
         next_step="Export it with --to c",
@@ -332,10 +345,23 @@ class Fit:
         return np.where(np.abs(both[0] - near) < np.abs(both[1] - near), both[0], both[1])
 
 
-def fit_of(source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms) -> Fit:
-    """Parameters of a firmware for a source's machine, with the free parameters of its kind."""
+def fit_of(
+    source: MachineSource, program: str, linear: Freedoms, rotary: Freedoms | None = None
+) -> Fit:
+    """Parameters of a firmware for a source's machine, with the free parameters of its kind.
+
+    Raises InputError for a machine that is no delta, or a rotary one without `rotary`.
+    """
     delta = delta_of(source.machine, program, source.bed)
-    return nearest_fit(delta, linear if delta.kind == "linear" else rotary)
+    freedoms = linear if delta.kind == "linear" else rotary
+    if freedoms is None:
+        raise InputError(
+            f"{program} has settings for linear deltas, and mechanism {source.machine.name!r} is a"
+            " rotary one",
+            expected="three sliders",
+            next_step="Export it with --to klipper or --to reprap",
+        )
+    return nearest_fit(delta, freedoms)
 
 
 def nearest_fit(delta: Delta, freedoms: Freedoms) -> Fit:
@@ -560,13 +586,42 @@ def about(source: MachineSource, fit: Fit, names: str, correcting: str) -> list[
     ]
 
 
-def workspace_radius(source: MachineSource) -> str | None:
+def workspace_radius(machine: Machine) -> str | None:
     """Print radius of the mechanism file, mm, as firmwares read it; None without one.
 
     The radius is a limit rather than a property of the machine, so no export invents it.
     """
-    radius = source.machine.document.workspace_radius
+    radius = machine.document.workspace_radius
     return None if radius is None else _digits(MM_A_METRE * radius)
+
+
+def height_offset(machine: Machine) -> float | None:
+    """``height_offset`` of the mechanism file, mm; None without one."""
+    offset = machine.document.height_offset
+    return None if offset is None else MM_A_METRE * offset
+
+
+def corrected_steps(fit: Fit) -> Array | None:
+    """Motor steps per mm (3,) with which every reading's scale is 1.
+
+    None if the scales are 1 already, or if the mechanism file has no ``steps_per_mm``.
+    """
+    own = fit.delta.machine.document.steps_per_mm
+    scales = scales_of(fit)
+    exact = np.abs(scales - 1).max() <= UNTOLD_SCALE_DIFFERENCE
+    if own is None or fit.kind != "linear" or exact:
+        return None
+    return np.array(own)[fit.order] / scales
+
+
+def steps_correction(steps: Array | None, unit: str = "mm") -> str:
+    """Instruction on the steps of a motor whose reading has a scale other than 1.
+
+    steps : those that a file sets, None for none.
+    """
+    if steps is None:
+        return f"Divide its steps per {unit} (M92) by that."
+    return "M92 below has the mechanism file's steps per mm, divided by that."
 
 
 def end_switches(fit: Fit) -> str:
@@ -636,12 +691,15 @@ def stated(text: str) -> float:
     return float(match.group(1)) / MM_A_METRE if match else 0.0
 
 
-def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
+def firmware_tool_difference(
+    text: str, fit: Fit, inverse: Inverse, zero: Array, end_rounding: float = 0.0
+) -> Difference:
     """Tool error by the firmware's formulas with the text's values, over the workspace.
 
     The machine's forward kinematics follows the firmware's inverse.
 
     zero : (3,) motor positions at reading zero by the text's end switches.
+    end_rounding : of these positions, mm or degrees, beyond that of lengths.
     """
     delta = fit.delta
     points = MM_A_METRE * apply(read_firmware_from_base(text), delta.positions)
@@ -656,7 +714,7 @@ def firmware_tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array)
         f"tool over {len(delta.poses)} poses by the firmware's formulas",
         largest,
         # the fit's error is of first order, so a large one may be 2 % larger
-        1.02 * stated_error + TOOL_ROUNDING,
+        1.02 * stated_error + TOOL_ROUNDING + MOST_AMPLIFICATION * end_rounding / MM_A_METRE,
     )
 
 
@@ -665,4 +723,4 @@ def redo(source: MachineSource) -> tuple[Finding, ...]:
     if not source.calibrated:
         return ()
     bed = "unknown" if source.bed is None else "probed"
-    return (note("export.redo", radius=workspace_radius(source), bed=bed),)
+    return (note("export.redo", radius=workspace_radius(source.machine), bed=bed),)

@@ -8,7 +8,7 @@ writing share the firmware's names, units, signs and formulas.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -20,10 +20,12 @@ from pkmcal.calibration.machine_source import MachineSource
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import Difference, Exporter, exporters, largest
 from pkmcal.exporters.delta import (
+    STEPS_ROUNDING,
     SWITCH_ROUNDING,
     Fit,
     Freedoms,
     Inverse,
+    corrected_steps,
     firmware_tool_difference,
     fit_of,
     readings_elsewhere,
@@ -31,8 +33,9 @@ from pkmcal.exporters.delta import (
     switch_values,
     workspace_radius,
 )
-from pkmcal.files import LARGEST_WRITTEN_FILE, quoted, read_text
+from pkmcal.files import LARGEST_WRITTEN_FILE, closest, quoted, read_text
 from pkmcal.outcome.finding import Finding
+from pkmcal.wording import listed
 
 CARRIAGE_STEP = 1 / 80
 """Default carriage travel per step, mm.
@@ -41,6 +44,8 @@ CARRIAGE_STEP = 1 / 80
 """
 LARGEST_PRINTER_VALUE = 1e6
 """Bound on lengths (mm) and angles (degrees); larger values would overflow when squared."""
+TOWER_ANGLES = (210.0, 330.0, 90.0)
+"""Usual directions of the towers X, Y and Z, degrees, counted anticlockwise."""
 NUMBER = r"(-?\d+(?:\.\d+)?)"
 """Pattern of a number that a console prints."""
 
@@ -70,11 +75,15 @@ class Printer:
     angle : (3,) directions of the towers.
     rod : (3,) lengths of the rods.
     homed : (3,) heights of the carriages at their end switches.
-    reach : print radius.
+    reach : print radius, None if unknown.
     carriages : map from tool points (n, 3) to carriage heights (n, 3), by the firmware's formulas.
     offset : (x, y, z) of the probe from the nozzle.
     touches : probed points in the same file, None for none.
     step : carriage travel per motor step.
+    steps : (3,) motor steps per mm of carriage travel, None if unknown.
+    height_offset : what the firmware's height at home contains beyond the nozzle's, None for a
+        firmware whose values contain nothing else.
+    remarks : sentences on what the file leaves open.
     """
 
     firmware: Firmware
@@ -83,11 +92,14 @@ class Printer:
     angle: Array
     rod: Array
     homed: Array
-    reach: float
+    reach: float | None
     carriages: Callable[[Array], Array]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     touches: Touches | None = None
     step: float = CARRIAGE_STEP
+    steps: Array | None = None
+    height_offset: float | None = None
+    remarks: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -100,37 +112,49 @@ class WrittenValues:
     homed : (3,) motor positions at the end switches.
     homed_by : the same for other values (3,) of the end switches.
     print_radius : mm, None without one.
+    steps : motor steps per mm, three or none.
     switches : readings of end switches elsewhere and the values that the text gives for them, (3,)
         each and NaN for a motor without; None for a text with values proportional to readings.
+    end_rounding : rounding of `homed` beyond that of lengths, mm or degrees.
+    others : differences of values that this firmware alone has.
     """
 
     inverse: Inverse
     homed: Array
     homed_by: Callable[[Array], Array]
     print_radius: float | None
+    steps: Sequence[float] = ()
     switches: list[tuple[Array, Array]] | None = None
+    end_rounding: float = 0.0
+    others: tuple[Difference, ...] = ()
 
 
 class Firmware(Exporter, ABC):
     """Firmware of delta printers. Firmwares are stateless, as all exporters.
 
     program : its name.
+    configuration : the files that are read, in words.
     file : name of the exported file.
     motors : names of the motors.
     carriage_source : where a user reads the heights of the carriages, in two lines.
-    linear, rotary : free parameters of its kinematics.
+    linear, rotary : free parameters of its kinematics; `rotary` is None without a rotary one.
     """
 
     program: ClassVar[str]
+    configuration: ClassVar[str]
     file: ClassVar[str]
-    motors: ClassVar[tuple[str, str, str]]
+    motors: ClassVar[tuple[str, str, str]] = ("X", "Y", "Z")
     carriage_source: ClassVar[str]
-    linear: ClassVar[Freedoms]
-    rotary: ClassVar[Freedoms]
+    linear: ClassVar[Freedoms] = Freedoms(TOWER_ANGLES)
+    rotary: ClassVar[Freedoms | None] = None
 
     @abstractmethod
-    def reads(self, text: str) -> bool:
-        """Whether a text is a configuration of this firmware."""
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """Features of a text, in words, that only configurations of this firmware have.
+
+        Commands that other firmwares have as well do not count: the meaning of M665 and M666
+        depends on the firmware. label : name of the file.
+        """
 
     @abstractmethod
     def printer(self, text: str, label: str) -> Printer:
@@ -139,13 +163,15 @@ class Firmware(Exporter, ABC):
         Raises InputError for missing, malformed or impossible values.
         """
 
-    @abstractmethod
     def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
         """Probed points of the bed in a console's output or a file of the firmware.
 
         Tool positions (n, 3) mm at contact, and the height of the tool's tip above the bed there;
-        None for a text without any. Raises InputError for points that cannot be read.
+        None for a text without any, and for a firmware whose points are not read. Raises InputError
+        for points that cannot be read.
         """
+        del text, label, printer
+        return None
 
     @abstractmethod
     def text(self, fit: Fit, source: MachineSource) -> str:
@@ -155,10 +181,13 @@ class Firmware(Exporter, ABC):
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values of an exported text."""
 
-    def print_radius(self, source: MachineSource, kind: str) -> str | None:
-        """Print radius of a machine, linear or rotary, mm, as written; None without one."""
-        del kind
-        return workspace_radius(source)
+    def print_radius(self, fit: Fit) -> str | None:
+        """Print radius of the exported file, mm, as written; None without one."""
+        return workspace_radius(fit.delta.machine)
+
+    def steps(self, fit: Fit) -> Array | None:
+        """Motor steps per mm (3,) of the exported file; None without any."""
+        return corrected_steps(fit)
 
     def fit(self, source: MachineSource) -> Fit:
         """The firmware's parameters of a source's machine."""
@@ -181,10 +210,12 @@ class Firmware(Exporter, ABC):
             np.where(np.isnan(q), 0.0, values.homed_by(value) - (fit.rate * q + fit.zero))
             for q, value in switches
         ]
-        radius = self.print_radius(source, fit.kind)
+        radius, steps = self.print_radius(fit), self.steps(fit)
         same = values.print_radius == (None if radius is None else float(radius))
+        expected = np.zeros(0) if steps is None else steps
+        same_number = len(values.steps) == len(expected)
         return [
-            firmware_tool_difference(text, fit, values.inverse, zero),
+            firmware_tool_difference(text, fit, values.inverse, zero, values.end_rounding),
             Difference(
                 f"motors at end switches elsewhere, {len(off)} readings",
                 largest(off) if off else np.inf,
@@ -192,6 +223,13 @@ class Firmware(Exporter, ABC):
                 "mm or degrees",
             ),
             Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
+            Difference(
+                "motor steps",
+                largest(values.steps, expected) if same_number else np.inf,
+                STEPS_ROUNDING,
+                "steps per mm",
+            ),
+            *values.others,
         ]
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:
@@ -226,24 +264,86 @@ def buildable_delta(printer: Printer) -> Printer:
     return printer
 
 
-def read_printer(path: Path) -> Printer:
-    """Read a printer from printer.cfg (Klipper), or config.g or config-override.g (RepRapFirmware).
+def read_printer(path: Path, firmware: str | None = None) -> Printer:
+    """Read a printer from a configuration of one of the firmwares.
 
-    Raises InputError for any other file, and for a printer that is not a linear delta.
+    firmware : name of the firmware, for a file that does not show which one it is of.
+
+    Raises InputError for a file without evidence of a firmware or with that of several, and for a
+    printer that is not a linear delta.
     """
     label = path.name
     text = read_text(path, largest=LARGEST_WRITTEN_FILE)
-    for firmware in firmwares():
-        if firmware.reads(text):
-            return buildable_delta(firmware.printer(text, label))
+    return buildable_delta(firmware_of(text, label, firmware).printer(text, label))
+
+
+def firmware_of(text: str, label: str, name: str | None = None) -> Firmware:
+    """The firmware that a configuration is of.
+
+    name : the user's own statement, which decides unless there is evidence of others alone.
+
+    Raises InputError if the text does not decide, and for an unknown name.
+    """
+    by_name = {one.name: one for one in firmwares()}
+    if name is not None and name not in by_name:
+        guess = closest(name, by_name)
+        raise InputError(
+            "there is no such firmware",
+            where="--firmware",
+            found=quoted(name),
+            expected=(f"{guess}, or another of " if guess else "") + listed(list(by_name)),
+        )
+    claims = {one.name: one.evidence(text, label) for one in by_name.values()}
+    claims = {one: reasons for one, reasons in claims.items() if reasons}
+    if name is not None and (name in claims or not claims):
+        return by_name[name]
+    if name is None and len(claims) == 1:
+        return by_name[next(iter(claims))]
+    words = [f"{by_name[one].program} ({reasons[0]})" for one, reasons in claims.items()]
+    if claims:
+        raise InputError(
+            "this file shows another firmware than the one named"
+            if name is not None
+            else "this file shows two firmwares"
+            if len(claims) == 2
+            else "this file shows several firmwares",
+            where=label,
+            found=" and ".join(words),
+            expected="the values of one firmware: signs and meanings differ between them",
+            next_step="Leave out --firmware"
+            if name is not None
+            else f"Keep one firmware's lines, or name it: --firmware {' or '.join(claims)}",
+        )
     first = next((line.strip() for line in text.splitlines() if line.strip()), "an empty file")
     raise InputError(
-        "this is neither a Klipper nor a RepRapFirmware configuration of a delta",
+        "nothing in this file shows which firmware of a delta it is of",
         where=label,
         found=quoted(first),
-        expected="a printer.cfg with a section [printer], or G-code with a line M665",
-        next_step="Name the file that holds these values; files that it includes are not followed",
+        expected=", or ".join(one.configuration for one in by_name.values()),
+        next_step="Name the file that holds these values (files that it includes are not followed),"
+        f" or its firmware with --firmware ({listed(list(by_name))}): M665 and M666 mean other"
+        " things to each",
     )
+
+
+def touches_at(points: Array, height: float, printer: Printer, label: str) -> Touches:
+    """Touches of the tool at points (n, 3) mm, at one height above the bed.
+
+    label : the file that they are from. Raises InputError for points that the printer does not
+    reach.
+    """
+    with np.errstate(all="ignore"):
+        carriages = printer.carriages(points)
+    bad = np.flatnonzero(~(np.abs(carriages) <= LARGEST_PRINTER_VALUE).all(axis=1))
+    if bad.size:
+        x, y, z = points[bad[0]]
+        raise InputError(
+            "the printer does not reach this point",
+            where=label,
+            found=f"x {x:g}, y {y:g}, z {z:g} mm",
+            expected="the tool's own places, in mm, of the printer described in " + printer.label,
+        )
+    return Touches(carriages, np.full(len(points), height), label)
 
 
 def means_by_position(points: Array) -> Array:

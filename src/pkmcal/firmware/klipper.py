@@ -91,15 +91,15 @@ class Klipper(Firmware):
     name: ClassVar = "klipper"
     title: ClassVar = "Klipper: values for printer.cfg"
     program: ClassVar = "Klipper"
+    configuration: ClassVar = "a printer.cfg with a section [printer] (Klipper)"
     file: ClassVar = "pkmcal_printer.cfg"
-    linear: ClassVar = Freedoms((210.0, 330.0, 90.0))
-    rotary: ClassVar = Freedoms((30.0, 150.0, 270.0), heights=False)
     motors: ClassVar = ("stepper_a", "stepper_b", "stepper_c")
+    rotary: ClassVar = Freedoms((30.0, 150.0, 270.0), heights=False)
     carriage_source: ClassVar = "what Klipper's\nGET_POSITION prints behind stepper:"
 
-    def reads(self, text: str) -> bool:
-        """Whether a text has a section [printer]."""
-        return "printer" in sections(text, "")
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """The section [printer]."""
+        return ("it has a section [printer]",) if "printer" in sections(text, label) else ()
 
     def printer(self, text: str, label: str) -> Printer:
         """Printer of a printer.cfg.
@@ -109,7 +109,7 @@ class Klipper(Firmware):
         """
         _check_saved(text, label)
         entries = sections(text, label)
-        kinematics = entries["printer"].get("kinematics", ("", f"{label}, [printer]"))
+        kinematics = entries.get("printer", {}).get("kinematics", ("", f"{label}, [printer]"))
         if kinematics[0] != "delta":
             raise InputError(
                 "heights of a bed are read of linear deltas",
@@ -181,7 +181,7 @@ class Klipper(Firmware):
         lines.append("Put these values into the sections of the printer's own configuration.")
         lines.append(note("export.klipper_saved").text)
         lines.append(end_switches(fit))
-        radius = self.print_radius(source, fit.kind)
+        radius = self.print_radius(fit)
         if fit.kind == "linear":
             names = [f"stepper_{s}.position_endstop" for s in KLIPPER_STEPPERS]
             lines += proportional_switches(fit, names, _tower_endstops(fit))
@@ -197,9 +197,14 @@ class Klipper(Firmware):
         )
         return commented(lines, "#") + body
 
-    def print_radius(self, source: MachineSource, kind: str) -> str | None:
+    def print_radius(self, fit: Fit) -> str | None:
         """Print radius, which Klipper has for linear deltas alone."""
-        return super().print_radius(source, kind) if kind == "linear" else None
+        return super().print_radius(fit) if fit.kind == "linear" else None
+
+    def steps(self, fit: Fit) -> Array | None:
+        """None: Klipper has rotation_distance instead, with the printer's gears."""
+        del fit
+        return None
 
     def written(self, text: str, fit: Fit) -> WrittenValues:
         """Values as Klipper reads them."""
@@ -211,7 +216,7 @@ class Klipper(Firmware):
             homed(config),
             partial(_homed_by, config),
             config.getfloat("printer", "print_radius", fallback=None),
-            None if linear else _arm_switches(text),
+            switches=None if linear else _arm_switches(text),
         )
 
     def notes(self, source: MachineSource) -> tuple[Finding, ...]:

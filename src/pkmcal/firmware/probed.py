@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.exporters.delta import MM_A_METRE
 from pkmcal.files import read_csv, read_text
-from pkmcal.firmware.contract import LARGEST_PRINTER_VALUE, Printer, Touches, firmwares
+from pkmcal.firmware.contract import Printer, Touches, firmwares, touches_at
 
 FEWEST_BED_POINTS = 7
 """Fewest points that determine more than the bed's height and tilt; DELTA_CALIBRATE probes as many.
@@ -41,24 +39,12 @@ def read_touches(path: Path, printer: Printer) -> Touches:
         raise InputError(
             "there is no point of a bed in this file",
             where=label,
-            expected="Klipper's lines 'probe at X,Y is z=Z', RepRapFirmware's heightmap.csv or"
-            " 'bed probe heights:' with the lines G30 P0 X Y Z-99999, or a table"
+            expected="Klipper's lines 'probe at X,Y is z=Z', Marlin's 'Bed X: X Y: Y Z: Z',"
+            " RepRapFirmware's heightmap.csv or 'bed probe heights:' with the lines"
+            " G30 P0 X Y Z-99999, or a table"
             " configuration,x [mm],y [mm],z [mm]",
         )
-    points, heights = values
-    # carriages at these positions, by the printer's own formulas
-    with np.errstate(all="ignore"):
-        carriages = printer.carriages(points)
-    bad = np.flatnonzero(~(np.abs(carriages) <= LARGEST_PRINTER_VALUE).all(axis=1))
-    if bad.size:
-        x, y, z = points[bad[0]]
-        raise InputError(
-            "the printer does not reach this point",
-            where=label,
-            found=f"x {x:g}, y {y:g}, z {z:g} mm",
-            expected="the tool's own places, in mm, of the printer described in " + printer.label,
-        )
-    return Touches(carriages, np.full(len(points), heights), label)
+    return touches_at(*values, printer, label)
 
 
 def _table_points(path: Path, label: str) -> Array:

@@ -35,9 +35,11 @@ from pkmcal.exporters.delta import (
     firmware_angle,
     firmware_length,
     proportional_switches,
+    steps_correction,
 )
 from pkmcal.files import quoted
 from pkmcal.firmware.contract import (
+    CARRIAGE_STEP,
     LARGEST_PRINTER_VALUE,
     NUMBER,
     Firmware,
@@ -52,6 +54,13 @@ NO_REPRAP_PRINT_RADIUS = (
     "There is no print radius, B: it stays the printer's own; where none was set it is 80 mm."
 )
 _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
+FILE_NAMES = ("config.g", "config-override.g")
+OWN_WORDS = ("RepRapFirmware", "config-override.g")
+_OWN_COMMAND = re.compile(
+    r"\s*(?:M665\b.*?[LR][\d.]+:|M666\b.*?[AB]-?[\d.]|M669 K|M584 |M569 P|M350 .*?I\d|M671 |M558 |"
+    r"M307 )"
+)
+"""Commands, or their words, that Marlin has not: M666 A and B are the bed's tilt."""
 _M665 = re.compile(r"^[^\S\n]*M665\b", re.MULTILINE)
 _OURS = re.compile(r"\s*M66[56]\b")
 HEIGHT_MAP_TITLE = "RepRapFirmware height map file"
@@ -67,15 +76,25 @@ class RepRap(Firmware):
     name: ClassVar = "reprap"
     title: ClassVar = "RepRapFirmware: lines for config.g"
     program: ClassVar = "RepRapFirmware"
+    configuration: ClassVar = "config.g or config-override.g with M665 (RepRapFirmware)"
     file: ClassVar = "pkmcal_delta.g"
+    carriage_source: ClassVar = "what M114\nprints behind Count, divided by M92"
     linear: ClassVar = Freedoms(REPRAP_TOWER_ANGLES)
     rotary: ClassVar = linear
-    motors: ClassVar = ("X", "Y", "Z")
-    carriage_source: ClassVar = "what M114\nprints behind Count, divided by M92"
 
-    def reads(self, text: str) -> bool:
-        """Whether a text has a line M665."""
-        return bool(_M665.search(text))
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """The file's name, or commands and words that this firmware alone has beside M665."""
+        if not _M665.search(text):
+            return ()
+        reasons = [f"it is called {label}"] if label.lower() in FILE_NAMES else []
+        for n, line in enumerate(text.splitlines(), 1):
+            names = [name for name in OWN_WORDS if name in line]
+            if command := _OWN_COMMAND.match(line.partition(";")[0]):
+                names.append(command[0].strip())
+            if names:
+                reasons.append(f"line {n} has {names[0]}")
+                break
+        return tuple(reasons)
 
     def printer(self, text: str, label: str) -> Printer:
         """Printer of a file with M665 and M666; of repeated values the last counts.
@@ -104,6 +123,7 @@ class RepRap(Firmware):
         with np.errstate(invalid="ignore"):
             ends = homed_carriages(command)
         corrections = np.array([command[f"665{letter}"][0] for letter in "XYZ"])
+        steps = _steps_per_mm(text, label)
         return Printer(
             firmware=self,
             label=label,
@@ -113,6 +133,8 @@ class RepRap(Firmware):
             homed=ends,
             reach=float(reach[0]),
             carriages=partial(reprap_carriage_heights, command),
+            step=CARRIAGE_STEP if steps is None else float(1 / steps.min()),
+            steps=steps,
         )
 
     def touched(self, text: str, label: str, printer: Printer) -> tuple[Array, float] | None:
@@ -127,14 +149,16 @@ class RepRap(Firmware):
     def text(self, fit: Fit, source: MachineSource) -> str:
         """Commands under a header of comments."""
         unit = "mm" if fit.kind == "linear" else "degree"
-        correcting = f"Divide its steps per {unit} (M92) by that."
-        lines = about(source, fit, "XYZ", correcting)
+        steps = self.steps(fit)
+        lines = about(source, fit, "XYZ", steps_correction(steps, unit))
         names = [f"M666 {letter}" for letter in "XYZ"]
         lines += [end_switches(fit), *proportional_switches(fit, names, _adjustments(fit))]
-        radius = self.print_radius(source, fit.kind)
+        radius = self.print_radius(fit)
         if radius is None:
             lines.append(NO_REPRAP_PRINT_RADIUS)
         commands = (_linear if fit.kind == "linear" else _rotary)(fit, radius)
+        if steps is not None:
+            commands.append(f"M92 {_letters(steps, firmware_length)} ; behind M350, steps per mm")
         return commented(lines, ";") + "\n".join(commands) + "\n"
 
     def written(self, text: str, fit: Fit) -> WrittenValues:
@@ -150,7 +174,11 @@ class RepRap(Firmware):
 
         radius = words.get("665B", words.get("669B"))
         return WrittenValues(
-            partial(move, words), homed(words), homed_by, None if radius is None else radius[0]
+            partial(move, words),
+            homed(words),
+            homed_by,
+            None if radius is None else radius[0],
+            [words[f"92{c}"][0] for c in "XYZ" if f"92{c}" in words],
         )
 
 
@@ -241,6 +269,34 @@ def _checked_words(text: str, label: str) -> tuple[dict[str, Array], dict[str, s
         words.update({name.upper(): values for name, values in value.items()})
         places.update({name.upper(): f"{label}, line {n}" for name in value})
     return words, places
+
+
+def _steps_per_mm(text: str, label: str) -> Array | None:
+    """Motor steps per mm (3,) of the last M92 with X, Y and Z; None without one.
+
+    Raises InputError for impossible ones.
+    """
+    lines = [(n, line.partition(";")[0].strip()) for n, line in enumerate(text.splitlines(), 1)]
+    steps: Array | None = None
+    for n, line in lines:
+        if line.startswith("M350 "):  # changes the steps that were set before
+            steps = None
+        if not line.startswith("M92 "):
+            continue
+        try:
+            words = read_words(line)
+        except ValueError:
+            words = {"92X": np.array([np.nan]), "92Y": np.ones(1), "92Z": np.ones(1)}
+        if {"92X", "92Y", "92Z"} <= words.keys():
+            steps = np.array([words[f"92{c}"][0] for c in "XYZ"])
+            if not ((steps > 0) & (steps <= LARGEST_PRINTER_VALUE)).all():
+                raise InputError(
+                    "a value of this line is no number that a printer can have",
+                    where=f"{label}, line {n}",
+                    found=quoted(line),
+                    expected="steps per mm above zero",
+                )
+    return steps
 
 
 def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:

@@ -35,8 +35,7 @@ motion: translation
 legs:
 {legs}
 home: {{position: [0, 0, {home} mm]}}
-# The printer's own print radius, by the same file; it calibrates nothing, and exports keep it.
-workspace_radius: {reach} mm
+{kept}
 # Standard deviations of the firmware's values: of radius and towers (a radius that was measured
 # from joint to joint is off by one or two millimetres), of end switches and of rods. Rods measured
 # to 0.1 mm, hole to hole, determine sizes along x and y better.
@@ -55,7 +54,7 @@ CARRIED_BOARD_SESSION_TEXT = """\
 #
 # What to do, in this order:
 #   1. mechanism.yaml      the printer by its firmware: see whether its tolerances are right
-#   2. board.yaml          pkmcal board prints it, in a size for a print radius of {reach} mm:
+#   2. board.yaml          pkmcal board prints it, in {size}:
 #                          measure it, and fix it to the effector, flat, facing the camera
 #   3. cameras/front.yaml  the calibration of your camera
 #   4. Put the camera in place. Home. Move to 25 places over the whole bed and half of the height,
@@ -97,8 +96,8 @@ stations:
   probe:
     tracker:
       poses: poses.csv        # the tool's height above the bed
-      # Standard deviation of the probe: Klipper's PROBE_ACCURACY prints it. A bed that is not flat
-      # to that counts as well, and is reported.
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY and Marlin's M48 print it. A bed
+      # that is not flat to that counts as well, and is reported.
       noise: {{position: 0.02 mm}}
       level: true             # the firmware's Z is counted from the bed
 
@@ -116,6 +115,7 @@ def write_printer_session(
     probed: Path | None = None,
     in_view: Literal["board"] | None = None,
     places: int = 1,
+    firmware: str | None = None,
 ) -> tuple[str, ...]:
     """Write a printer's session into a new or empty folder and return the names of its files.
 
@@ -123,10 +123,11 @@ def write_printer_session(
     probed : file with bed points; None for the points in the configuration file.
     in_view : ``board`` for a session with a board on the tool; None for a session of heights.
     places : number of stations of a session with a board.
+    firmware : the firmware's name, for a file that does not show it.
 
     Raises InputError for files that lack necessary values.
     """
-    return write_texts(folder, printer_session_texts(printer, probed, in_view, places))
+    return write_texts(folder, printer_session_texts(printer, probed, in_view, places, firmware))
 
 
 def printer_session_texts(
@@ -134,9 +135,10 @@ def printer_session_texts(
     probed: Path | None = None,
     in_view: Literal["board"] | None = None,
     places: int = 1,
+    firmware: str | None = None,
 ) -> dict[str, str]:
     """Files of a printer's session by name; arguments as for `write_printer_session`."""
-    delta = read_printer(printer)
+    delta = read_printer(printer, firmware)
     if in_view is None:
         touches = delta.touches if probed is None else read_touches(probed, delta)
         return heights_texts(delta, _checked_touches(delta, touches))
@@ -152,10 +154,13 @@ def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
     heads = [f"{motor} [mm]" for motor in printer.firmware.motors]
     # the corners of 7 by 5 squares stay within the print radius while the tool goes half as far:
     # only there no tower is in the way
-    square = int(printer.reach / np.hypot(7, 5))
+    reach = printer.reach
+    square = 0 if reach is None else int(reach / np.hypot(7, 5))
     head = CARRIED_BOARD_SESSION_TEXT.format(
         where=printer.firmware.carriage_source.replace("\n", "\n#" + 26 * " "),
-        reach=_mm(printer.reach),
+        size="the smallest size, since the file has no print radius"
+        if reach is None
+        else f"a size for a print radius of {_mm(reach)} mm",
         **_resolution(printer),
     )
     session = texts["session.yaml"]
@@ -187,7 +192,7 @@ def _checked_touches(printer: Printer, touches: Touches | None) -> Touches:
             "there is no probed point of the bed",
             where=printer.label,
             expected="a section [delta_calibrate] with height0 and height0_pos, which Klipper's"
-            " DELTA_CALIBRATE and SAVE_CONFIG write",
+            " DELTA_CALIBRATE and SAVE_CONFIG write, or Marlin's lines 'Bed X: Y: Z:'",
             next_step="Name the printer's console output of a probing with --probed FILE; or"
             " --board, for a session with a camera",
         )
@@ -242,7 +247,9 @@ def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
     """
     angle = np.deg2rad(printer.angle)
     towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    edge = printer.reach * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    # without a print radius the tool stays within the towers
+    reach = printer.radius if printer.reach is None else printer.reach
+    edge = reach * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     # lowest carriages at the bed's edge, towards the towers and away from them, and at the touches
     with np.errstate(invalid="ignore"):
         carriages = [printer.carriages(s * edge) for s in (-1.0, 1.0)]
@@ -259,8 +266,29 @@ def nominal_text(printer: Printer, touches: Touches | None = None) -> str:
         label=legible(printer.label),
         legs="\n".join(legs),
         home=_mm(top / 2),
-        reach=_mm(printer.reach),
+        kept=_controller_values(printer),
     )
+
+
+def _controller_values(printer: Printer) -> str:
+    """Entries that calibrate nothing and that exports keep, with comments."""
+    lines = [f"# {legible(remark)}" for remark in printer.remarks]
+    if printer.reach is not None:
+        lines += [
+            "# The printer's own print radius, by the same file; it calibrates nothing, and exports"
+            " keep it.",
+            f"workspace_radius: {_mm(printer.reach)} mm",
+        ]
+    if printer.height_offset is not None:
+        lines += [
+            f"# {printer.firmware.program}'s height at home contains this beyond the nozzle's own"
+            " height; exports keep it.",
+            f"height_offset: {_mm(printer.height_offset)} mm",
+        ]
+    if printer.steps is not None:
+        steps = ", ".join(_mm(value) for value in printer.steps)
+        lines += ["# Motor steps per mm, by the same file.", f"steps_per_mm: [{steps}]"]
+    return "\n".join(lines)
 
 
 def _mm(value: float) -> str:

@@ -248,6 +248,21 @@ class MechanismDocument(Schema):
         ]
         | None
     ) = None
+    height_offset: (
+        Annotated[
+            Metres,
+            Field(ge=-1, le=1, description="what a controller's height at home contains beyond the"
+                  " tool's, such as -16 mm"),
+        ]
+        | None
+    ) = None  # fmt: skip
+    steps_per_mm: (
+        Annotated[
+            tuple[Annotated[float, Field(gt=0, le=1e6)], ...],
+            Field(description="motor steps per mm of each leg's carriage, such as [80, 80, 80]"),
+        ]
+        | None
+    ) = None
     fixed: tuple[str, ...] = ()
     tied: Ties = ()
     models: dict[str, DocumentModel] = Field(default_factory=dict)

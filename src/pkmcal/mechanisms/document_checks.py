@@ -57,6 +57,13 @@ def check_nominal(document: MechanismDocument, where: PlaceInDocument | None = N
                 where=place("legs", j, "length"),
                 expected="length: {actuated: false, constant: the rod's length in metres}",
             )
+    if document.steps_per_mm is not None and len(document.steps_per_mm) != len(document.legs):
+        raise InputError(
+            "there is not one number of motor steps for each leg",
+            where=place("steps_per_mm"),
+            found=f"{len(document.steps_per_mm)} numbers",
+            expected=f"{len(document.legs)}, in the order of the legs",
+        )
     _check_motors(document, place)
     _check_scales(document, place)
     for side, legs, fields in sharing(document):

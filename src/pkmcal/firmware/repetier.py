@@ -1,0 +1,208 @@
+"""Repetier-Firmware: values of a linear delta in its EEPROM, read from what M205 prints and written
+as M206 by ``export --to repetier``.
+
+Semantics: Repetier-Firmware's Printer.cpp (homeZAxis, updateDerivedParameter) and Eeprom.cpp. Lines
+are ``EPR:type position value name``. The towers stand at the angles Alpha A, B and C on one circle,
+plus a correction of the radius for each, which is 0 here; rods have a correction of the length
+each. With the nozzle in the middle at Z max length, after homing, a carriage is lower than its
+switch by its endstop offset, in motor steps: the switch triggers at ``Z max length + sqrt(rod^2 -
+radius^2) + offset / steps per mm``.
+
+All motors have one number of steps per mm, and the firmware rounds towers and rods to whole steps.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.machine_source import MachineSource
+from pkmcal.errors import InputError
+from pkmcal.exporters.contract import commented
+from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length
+from pkmcal.files import quoted
+from pkmcal.firmware.contract import (
+    LARGEST_PRINTER_VALUE,
+    TOWER_ANGLES,
+    Firmware,
+    Printer,
+    WrittenValues,
+)
+from pkmcal.firmware.towers import (
+    Settings,
+    Words,
+    fitted_settings,
+    impossible,
+    switch_lines,
+    written_values,
+)
+
+INTEGER, FLOAT = 1, 3
+"""Types of the EEPROM's values."""
+ROD, RADIUS, HEIGHT, REACH, STEPS = 881, 885, 153, 925, 11
+SWITCHES, ANGLES = (893, 895, 897), (901, 905, 909)
+RADIUS_CORRECTIONS, ROD_CORRECTIONS = (913, 917, 921), (933, 937, 941)
+ZERO_POSITIONS = (133, 137, 141)
+"""Positions of X, Y and Z min pos, which move the end switches as well."""
+_EEPROM = re.compile(r"\bEPR:(\d+) (\d+) (\S+)(?: (.{0,60}))?")
+_WRITTEN = re.compile(r"M206 T(\d) P(\d+) [SX](\S+)(?: ; (.*))?")
+
+
+@final
+class Repetier(Firmware):
+    """Repetier-Firmware's EEPROM."""
+
+    name: ClassVar = "repetier"
+    title: ClassVar = "Repetier-Firmware: commands to send"
+    program: ClassVar = "Repetier-Firmware"
+    configuration: ClassVar = "the lines EPR: of M205 (Repetier-Firmware)"
+    file: ClassVar = "pkmcal_repetier.gcode"
+    carriage_source: ClassVar = "what M114\nprints, turned into motors by its values"
+
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """The rod's length in the EEPROM."""
+        del label
+        for n, line in enumerate(text.splitlines(), 1):
+            for pattern in (_EEPROM, _WRITTEN):
+                match = pattern.search(line)
+                if match and int(match[2]) == ROD and int(match[1]) == FLOAT:
+                    return (f"line {n} has the EEPROM's rod length, {ROD}",)
+        return ()
+
+    def printer(self, text: str, label: str) -> Printer:
+        """Printer of the EEPROM's values; of repeated ones the last counts.
+
+        Raises InputError for missing, malformed or impossible values.
+        """
+        return _settings(_eeprom(text, label), label).printer(self, label)
+
+    def text(self, fit: Fit, source: MachineSource) -> str:
+        """Commands under a header. Raises InputError for a machine without motor steps."""
+        values = fitted_settings(fit)
+        steps = self.steps(fit)
+        rod = float(np.round(values.rod.mean(), 4))
+        radius = self.print_radius(fit)
+        offsets = np.round(-values.offset * steps)
+        rule = (
+            "The offsets in the EEPROM are each height less that height, in motor steps, and Z max"
+            " length is that height."
+        )
+        entries = [
+            (ROD, rod, "Diagonal rod length [mm]"),
+            (RADIUS, values.radius, "Horizontal rod radius at 0,0 [mm]"),
+            (HEIGHT, values.height, "Z max length [mm]"),
+            *zip(ANGLES, values.angle, ("Alpha A", "Alpha B", "Alpha C"), strict=True),
+            *((position, 0.0, "Delta Radius") for position in RADIUS_CORRECTIONS),
+            *zip(ROD_CORRECTIONS, values.rod - rod, 3 * ["Corr. diagonal [mm]"], strict=True),
+            *((position, 0.0, "min pos [mm]") for position in ZERO_POSITIONS),
+        ]
+        code = [
+            f"M206 T{FLOAT} P{position}"
+            f" X{(firmware_angle if position in ANGLES else firmware_length)(value)} ; {name}"
+            for position, value, name in entries
+        ]
+        code += [
+            f"M206 T{INTEGER} P{position} S{int(offset)} ; Tower {name} endstop offset [steps]"
+            for position, offset, name in zip(SWITCHES, offsets, "XYZ", strict=True)
+        ]
+        own = firmware_length(float(steps[0]))
+        code.append(f"M206 T{FLOAT} P{STEPS} X{own} ; Steps per mm, as it was")
+        if radius is not None:
+            code.append(f"M206 T{FLOAT} P{REACH} X{radius} ; Max printable radius [mm]")
+        correcting = (
+            "All motors have one number of steps per mm in the EEPROM, 11: divide it by their mean,"
+            " if they agree."
+        )
+        lines = about(source, fit, "XYZ", correcting) + switch_lines(fit, values.height, rule)
+        return commented(lines, ";") + "\n".join(code) + "\n"
+
+    def steps(self, fit: Fit) -> Array:
+        """Motor steps per mm (3,) of the mechanism file, one number for all motors.
+
+        Raises InputError where the mechanism file has none.
+        """
+        steps = fit.delta.machine.document.steps_per_mm
+        if steps is None or np.ptp(steps) > 0:
+            raise InputError(
+                "Repetier-Firmware counts end switches in motor steps",
+                found="no steps_per_mm" if steps is None else f"steps_per_mm {[*steps]}",
+                expected="steps_per_mm in the mechanism file, equal for all legs, such as"
+                " [80, 80, 80]",
+            )
+        return np.array(steps)
+
+    def written(self, text: str, fit: Fit) -> WrittenValues:
+        """Values as Repetier-Firmware reads them, but for its rounding of towers and rods to motor
+        steps.
+        """
+        settings = _settings(_eeprom(text, self.file), self.file)
+        # offsets are whole steps
+        return written_values(text, settings, end_rounding=0.5 / float(self.steps(fit)[0]))
+
+
+def _eeprom(text: str, label: str) -> Words:
+    """Value and place by position. Raises InputError for values that are no numbers in bounds."""
+    out: Words = {}
+    for n, line in enumerate(text.splitlines(), 1):
+        match = _EEPROM.search(line) or _WRITTEN.match(line.strip())
+        if not match:
+            continue
+        try:
+            value = float(match[3])
+        except ValueError:
+            value = np.nan
+        if not abs(value) <= LARGEST_PRINTER_VALUE:
+            raise InputError(
+                "a value of this line is no number that a printer can have",
+                where=f"{label}, line {n}",
+                found=quoted(match[0]),
+                expected="a number in mm, degrees or steps",
+            )
+        out[match[2]] = value, f"{label}, line {n}"
+    return out
+
+
+def _settings(eeprom: Words, label: str) -> Settings:
+    """Settings of the EEPROM. Raises InputError for missing or impossible values."""
+    for position in (ROD, RADIUS, HEIGHT, STEPS):
+        if str(position) not in eeprom:
+            raise InputError(
+                f"the EEPROM's value {position} is missing",
+                where=label,
+                expected=f"a line EPR:3 {position} with a number, as M205 prints it",
+            )
+
+    def values(positions: tuple[int, ...], *default: float) -> Array:
+        pairs = zip(positions, default or 3 * (0.0,), strict=True)
+        return np.array([eeprom.get(str(k), (value, ""))[0] for k, value in pairs])
+
+    for position in (ROD, RADIUS, HEIGHT, STEPS, REACH):
+        value, place = eeprom.get(str(position), (1.0, ""))
+        if value <= 0:
+            raise impossible(place, f"the EEPROM's value {position}", value, "above 0")
+    for position in (*RADIUS_CORRECTIONS, *ZERO_POSITIONS):
+        value, place = eeprom.get(str(position), (0.0, ""))
+        if value:
+            raise impossible(
+                place, f"the EEPROM's value {position}", value, "0",
+                "Set it to 0, home, and probe again",
+            )  # fmt: skip
+    steps = eeprom[str(STEPS)][0]
+    reach = eeprom.get(str(REACH))
+    return Settings(
+        rod=eeprom[str(ROD)][0] + values(ROD_CORRECTIONS),
+        radius=eeprom[str(RADIUS)][0],
+        angle=values(ANGLES, *TOWER_ANGLES),
+        offset=-values(SWITCHES) / steps,
+        height=eeprom[str(HEIGHT)][0],
+        probe=(0.0, 0.0, 0.0),
+        reach=None if reach is None else reach[0],
+        steps=np.full(3, steps),
+        remarks=(
+            "ENDSTOP_Z_BACK_ON_HOME of the firmware is taken for 0; export --to repetier is right"
+            " with any.",
+        ),
+    )

@@ -1,0 +1,198 @@
+"""Smoothieware: M665, M666 and M92 of linear deltas, read from what M503 prints, config-override or
+the file config, and written by ``export --to smoothie``.
+
+Semantics: Smoothieware's LinearDeltaSolution.cpp, Endstops.cpp and Robot.cpp. The rods have the
+length L plus their trims I, J, K, the towers stand at 210 + D, 330 + E and 90 + H degrees on one
+circle of radius R, plus A, B and C, which are 0 here. Z of M665 and of M206 together are the
+nozzle's height at home. A carriage is at ``height + sqrt(rod^2 - R^2) - trim`` where its switch
+triggers; its trim is that of M666, negative downwards.
+
+The file config has the same as arm_length, arm1_trim, arm_radius, delta_tower1_offset,
+delta_tower1_angle, gamma_max, alpha_trim, beta_trim, gamma_trim and alpha_steps_per_mm.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.machine_source import MachineSource
+from pkmcal.errors import InputError
+from pkmcal.exporters.contract import commented
+from pkmcal.exporters.delta import Fit, about, firmware_angle, firmware_length, steps_correction
+from pkmcal.files import quoted
+from pkmcal.firmware.contract import (
+    LARGEST_PRINTER_VALUE,
+    TOWER_ANGLES,
+    Firmware,
+    Printer,
+    WrittenValues,
+)
+from pkmcal.firmware.towers import (
+    Settings,
+    Words,
+    commands,
+    fitted_settings,
+    impossible,
+    lettered,
+    read_commands,
+    switch_lines,
+    written_values,
+    xyz_values,
+)
+
+SMOOTHIE_COMMANDS = ("M665", "M666", "M92", "M206")
+RADIUS_LETTERS, ANGLE_LETTERS, ROD_LETTERS = "ABC", "DEH", "IJK"
+CONFIG_WORDS = {
+    "arm_length": "665L",
+    "arm_radius": "665R",
+    "gamma_max": "665Z",
+    **{f"delta_tower{k}_offset": "665" + c for k, c in enumerate(RADIUS_LETTERS, 1)},
+    **{f"delta_tower{k}_angle": "665" + c for k, c in enumerate(ANGLE_LETTERS, 1)},
+    **{f"arm{k}_trim": "665" + c for k, c in enumerate(ROD_LETTERS, 1)},
+    **{
+        f"{name}_trim": "666" + c for name, c in zip(("alpha", "beta", "gamma"), "XYZ", strict=True)
+    },
+    **{
+        f"{name}_steps_per_mm": "92" + c
+        for name, c in zip(("alpha", "beta", "gamma"), "XYZ", strict=True)
+    },
+}
+"""Words of commands by keys of the file config."""
+_HEADING = re.compile(r";\s*(Optional arm solution specific settings|Max Z\s*$)", re.MULTILINE)
+_CONFIG_LINE = re.compile(r"([a-z][a-z0-9_.]*)\s+(\S+)")
+
+
+@final
+class Smoothie(Firmware):
+    """Smoothieware's commands, and its file config."""
+
+    name: ClassVar = "smoothie"
+    title: ClassVar = "Smoothieware: commands to send"
+    program: ClassVar = "Smoothieware"
+    configuration: ClassVar = "the output of M503, config-override or config (Smoothieware)"
+    file: ClassVar = "pkmcal_smoothie.gcode"
+    carriage_source: ClassVar = "what M114.3\nprints"
+
+    def evidence(self, text: str, label: str) -> tuple[str, ...]:
+        """Headings of M503, letters of its M665, and keys of config."""
+        del label
+        key = next((line for line in _config(text) if line[1] == "arm_length"), None)
+        reasons = [] if key is None else [f"line {key[0]} has {key[1]}"]
+        geometry = [command for command in commands(text, ("M665",)) if ":" not in command.rest]
+        if geometry and (match := _HEADING.search(text)):
+            reasons.append(
+                f"line {text.count(chr(10), 0, match.start()) + 1} has {match[1].strip()}"
+            )
+        for command in geometry:
+            if {word[0].upper() for word in command.rest.split()} & set("DEIJK"):
+                reasons.append(f"line {command.line} gives M665 towers' angles or rods' trims")
+                break
+        return tuple(reasons)
+
+    def printer(self, text: str, label: str) -> Printer:
+        """Printer of commands, or of config; commands count more, as after config-override.
+
+        Raises InputError for missing, malformed or impossible values.
+        """
+        words = {**_config_words(text, label), **read_commands(text, label, SMOOTHIE_COMMANDS)}
+        return _settings(words, label).printer(self, label)
+
+    def text(self, fit: Fit, source: MachineSource) -> str:
+        """Commands under a header of comments."""
+        steps = self.steps(fit)
+        values = fitted_settings(fit)
+        rule = "M666 is that height less each, and M665 Z that height."
+        rod = float(np.round(values.rod.mean(), 4))
+        angles = values.angle - np.array(TOWER_ANGLES)
+        lines = about(source, fit, "XYZ", steps_correction(steps))
+        lines += switch_lines(fit, values.height, rule)
+        code = [
+            f"M665 L{firmware_length(rod)} R{firmware_length(values.radius)}"
+            f" Z{firmware_length(values.height)} ; L rods, R radius, Z height at home",
+            f"M665 {lettered(RADIUS_LETTERS, np.zeros(3), firmware_length)}"
+            f" {lettered(ANGLE_LETTERS, angles, firmware_angle)}"
+            f" {lettered(ROD_LETTERS, values.rod - rod, firmware_length)}"
+            " ; one radius, DEH towers' angles, IJK rods' trims",
+            f"M666 {lettered('XYZ', values.offset, firmware_length)} ; end switches' trims, mm",
+            "M206 X0 Y0 Z0 ; Z of M665 is the whole height",
+            *([] if steps is None else [f"M92 {lettered('XYZ', steps, firmware_length)}"]),
+            "M500",
+        ]
+        return commented(lines, ";") + "\n".join(code) + "\n"
+
+    def print_radius(self, fit: Fit) -> str | None:
+        """None: Smoothieware has no print radius."""
+        del fit
+        return None
+
+    def written(self, text: str, fit: Fit) -> WrittenValues:
+        """Values as Smoothieware reads them."""
+        del fit
+        words = read_commands(text, self.file, SMOOTHIE_COMMANDS)
+        return written_values(text, _settings(words, self.file))
+
+
+def _settings(words: Words, label: str) -> Settings:
+    """Settings of commands. Raises InputError for missing or impossible values."""
+    missing = [name for name in ("665L", "665R", "665Z") if name not in words]
+    if missing:
+        raise InputError(
+            f"M{missing[0][:-1]} has no value {missing[0][-1]}",
+            where=label,
+            expected="the lines M665 that M503 prints, with L, R and Z, or arm_length, arm_radius"
+            " and gamma_max",
+        )
+
+    def values(code: str, letters: str) -> Array:
+        return np.array([words.get(code + c, (0.0, ""))[0] for c in letters])
+
+    for name in ("665L", "665R", "665Z", "92X", "92Y", "92Z"):
+        if name in words and words[name][0] <= 0:
+            raise impossible(words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "above 0")
+    for name in (*("665" + c for c in RADIUS_LETTERS), "206X", "206Y"):
+        if words.get(name, (0.0, ""))[0]:
+            raise impossible(
+                words[name][1], f"M{name[:-1]} {name[-1]}", words[name][0], "0",
+                "Set it to 0, home, and probe again: towers' angles and rods take its place",
+            )  # fmt: skip
+    return Settings(
+        rod=words["665L"][0] + values("665", ROD_LETTERS),
+        radius=words["665R"][0],
+        angle=np.array(TOWER_ANGLES) + values("665", ANGLE_LETTERS),
+        offset=values("666", "XYZ"),
+        height=words["665Z"][0] + words.get("206Z", (0.0, ""))[0],
+        probe=(0.0, 0.0, 0.0),
+        steps=xyz_values(words, "92"),
+    )
+
+
+def _config(text: str) -> Iterator[tuple[int, str, str]]:
+    """Number, key and value of each line of a file config with a key that is read."""
+    for n, line in enumerate(text.splitlines(), 1):
+        match = _CONFIG_LINE.match(line.partition("#")[0].strip())
+        if match and match[1] in CONFIG_WORDS:
+            yield n, match[1], match[2]
+
+
+def _config_words(text: str, label: str) -> Words:
+    """Words of a file config. Raises InputError for values that are no numbers within bounds."""
+    out: Words = {}
+    for n, key, value in _config(text):
+        try:
+            number = float(value)
+        except ValueError:
+            number = np.nan
+        if not abs(number) <= LARGEST_PRINTER_VALUE:
+            raise InputError(
+                f"{key} is no number that a printer can have",
+                where=f"{label}, line {n}",
+                found=quoted(value),
+                expected="a number in mm, or degrees",
+            )
+        out[CONFIG_WORDS[key]] = number, f"{label}, line {n}"
+    return out

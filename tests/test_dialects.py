@@ -1,0 +1,166 @@
+"""Delta printers in every firmware's dialect, by an independent forward kinematics; Smoothieware's
+and Repetier-Firmware's files.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import printers
+from dialects import DIALECTS, HEIGHT_OFFSET, STEPS, Ideal, carried, commands, perturbed
+from export_sources import source_of
+from pkmcal.errors import InputError
+from pkmcal.exporters.contract import make_export
+from pkmcal.exporters.delta import read_firmware_from_base
+from pkmcal.firmware.contract import firmwares, read_printer
+from pkmcal.firmware.session import nominal_text
+from pkmcal.geometry.rigid import apply
+from pkmcal.mechanisms import load_mechanism
+
+SMOOTHIE = """\
+Recv: ;Steps per unit:
+Recv: M92 X80.00000 Y80.00000 Z100.00000
+Recv: ;Optional arm solution specific settings:
+Recv: M665 A0.0000 B0.0000 C0.0000 D0.2000 E-0.1000 H0.3000 I0.1000 J-0.2000 K0.4000 L270.0000\
+ R105.0000
+Recv: ;Home offset (mm):
+Recv: M206 X0.00 Y0.00 Z0.50
+Recv: ;Trim (mm):
+Recv: M666 X-0.250 Y0.000 Z-1.500
+Recv: ;Max Z
+Recv: M665 Z299.500
+"""
+CONFIG = """\
+# Robot module
+arm_solution         linear_delta   # a comment
+arm_length           270.0  # mm
+#arm_length          99.0
+arm_radius           105.0
+arm1_trim 0.1
+arm2_trim -0.2
+arm3_trim 0.4
+delta_tower1_angle 0.2
+delta_tower2_angle -0.1
+delta_tower3_angle 0.3
+alpha_steps_per_mm   80
+beta_steps_per_mm    80
+gamma_steps_per_mm   100
+alpha_trim -0.25
+gamma_trim -1.5
+gamma_max            300
+"""
+REPETIER = """\
+20:41:33.748 : EPR:3 11 80.0000 Steps per mm
+20:41:33.771 : EPR:3 153 300.000 Z max length [mm]
+20:41:33.785 : EPR:3 881 270.000 Diagonal rod length [mm]
+20:41:33.787 : EPR:3 885 105.000 Horizontal rod radius at 0,0 [mm]
+20:41:33.790 : EPR:3 925 90.000 Max printable radius [mm]
+20:41:33.793 : EPR:1 893 20 Tower X endstop offset [steps]
+20:41:33.795 : EPR:1 895 0 Tower Y endstop offset [steps]
+20:41:33.797 : EPR:1 897 120 Tower Z endstop offset [steps]
+20:41:33.801 : EPR:3 901 210.200 Alpha A(210):
+20:41:33.805 : EPR:3 905 329.900 Alpha B(330):
+20:41:33.808 : EPR:3 909 90.300 Alpha C(90):
+20:41:33.810 : EPR:3 913 0.000 Delta Radius A(0):
+20:41:33.819 : EPR:3 933 0.100 Corr. diagonal A [mm]
+20:41:33.822 : EPR:3 937 -0.200 Corr. diagonal B [mm]
+20:41:33.825 : EPR:3 941 0.400 Corr. diagonal C [mm]
+"""
+
+
+def text_file(folder, text, name="printer.txt"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_every_firmware_has_its_dialect():
+    assert [one.name for one in firmwares()] == sorted(DIALECTS)
+
+
+def test_the_forward_kinematics_in_known_places():
+    """In the middle all carriages are a rod's rise above the tool."""
+    delta = Ideal(105.0, np.array([210.0, 330.0, 90.0]), np.full(3, 270.0), np.zeros(3))
+    rise = np.sqrt(270.0**2 - 105.0**2)
+    np.testing.assert_allclose(delta.tool([[rise + 50] * 3]), [[0, 0, 50]], atol=1e-9)
+    # the tool goes away from the tower, at the front left, whose carriage is lowered
+    x, y, _ = delta.tool([[rise + 40, rise + 50, rise + 50]])[0]
+    assert x > 1
+    assert y > 1
+
+
+@pytest.mark.parametrize("to", DIALECTS)
+@pytest.mark.parametrize("seed", range(20))
+def test_a_firmware_goes_where_the_machine_goes(seed, to):
+    machine, rng = perturbed(seed)
+    (text,) = make_export(source_of(machine), to).files.values()
+    ideal = DIALECTS[to](text, HEIGHT_OFFSET)
+    travel = carried(machine, rng)
+    there = 1e3 * machine.forward(machine.joint_ranges[:, 1] + travel)[:, :3, 3]
+    there = 1e3 * apply(read_firmware_from_base(text), 1e-3 * there)
+    # Repetier's end switches are in whole steps
+    limit = 1e-3 if to != "repetier" else 3 * 0.5 / STEPS
+    np.testing.assert_allclose(ideal.tool(ideal.homed + 1e3 * travel), there, atol=limit)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [(SMOOTHIE, "smoothie"), (CONFIG, "smoothie"), (REPETIER, "repetier")]
+)
+def test_a_printer_is_read_and_written_back(text, name, tmp_path):
+    printer = read_printer(text_file(tmp_path, text))
+    assert printer.firmware.name == name
+    assert printer.radius == 105.0
+    np.testing.assert_allclose(printer.angle, [210.2, 329.9, 90.3])
+    np.testing.assert_allclose(printer.rod, [270.1, 269.8, 270.4])
+    # a carriage retracts from a switch that triggers higher
+    want = 300 + np.sqrt(printer.rod**2 - 105**2) + [0.25, 0.0, 1.5]
+    np.testing.assert_allclose(printer.homed, want)
+    assert printer.reach == (90.0 if name == "repetier" else None)
+    machine = load_mechanism(text_file(tmp_path, nominal_text(printer), "m.yaml"))
+    (out,) = make_export(source_of(machine), name).files.values()
+    ideal = DIALECTS[name](out, 0.0)
+    np.testing.assert_allclose(ideal.homed, want, atol=1e-3)
+    np.testing.assert_allclose(ideal.rod, printer.rod, atol=1e-3)
+    again = read_printer(text_file(tmp_path, out, "again.txt"))
+    assert again.firmware.name == name
+    np.testing.assert_allclose(again.homed, want, atol=1e-3)
+
+
+def test_steps_of_smoothieware_are_corrected():
+    machine, _ = perturbed(2, scale=(1.001, 1.0, 0.999))
+    (text,) = make_export(source_of(machine), "smoothie").files.values()
+    written = commands(text)
+    np.testing.assert_allclose(
+        [written["92" + c] for c in "XYZ"], STEPS / np.array([1.001, 1.0, 0.999]), atol=1e-4
+    )
+
+
+def test_repetier_needs_motor_steps():
+    with pytest.raises(InputError, match="in motor steps"):
+        make_export(source_of(printers.machine(printers.Settings())), "repetier")
+
+
+def changed(text, old, new):
+    assert old in text
+    return text.replace(old, new)
+
+
+WRONG = {
+    changed(SMOOTHIE, "M665 Z299.500", ""): "M665 has no value Z",
+    changed(SMOOTHIE, "A0.0000", "A0.5"): "M665 A is no number that this printer",
+    changed(SMOOTHIE, "R105.0000", "Rnan"): "a value of this line is no number",
+    changed(SMOOTHIE, "M206 X0.00", "M206 X1.00"): "M206 X is no number that this printer",
+    changed(CONFIG, "arm_radius           105.0", "arm_radius inf"): "arm_radius is no number",
+    changed(REPETIER, "EPR:3 153", "EPR:3 154"): "the EEPROM's value 153 is missing",
+    changed(REPETIER, "913 0.000", "913 0.100"): "the EEPROM's value 913 is no number",
+    changed(REPETIER, "EPR:3 885 105.000", "EPR:3 885 1e9"): "a value of this line is no number",
+    changed(REPETIER, "EPR:3 11 80.0000", "EPR:3 11 0"): "the EEPROM's value 11 is no number",
+}
+
+
+@pytest.mark.parametrize("text", WRONG, ids=WRONG.values())
+def test_what_these_firmwares_have_not_is_refused(text, tmp_path):
+    with pytest.raises(InputError) as caught:
+        read_printer(text_file(tmp_path, text))
+    assert WRONG[text] in str(caught.value)
