@@ -156,6 +156,7 @@ WRONG = {
     changed(REPETIER, "913 0.000", "913 0.100"): "the EEPROM's value 913 is no number",
     changed(REPETIER, "EPR:3 885 105.000", "EPR:3 885 1e9"): "a value of this line is no number",
     changed(REPETIER, "EPR:3 11 80.0000", "EPR:3 11 0"): "the EEPROM's value 11 is no number",
+    f"EPR:3 {5000 * '8'} 1 x\n": "nothing in this file shows which firmware",
 }
 
 

@@ -68,7 +68,7 @@ class Repetier(Firmware):
         for n, line in enumerate(text.splitlines(), 1):
             for pattern in (_EEPROM, _WRITTEN):
                 match = pattern.search(line)
-                if match and int(match[2]) == ROD and int(match[1]) == FLOAT:
+                if match and match.group(1, 2) == (str(FLOAT), str(ROD)):
                     return (f"line {n} has the EEPROM's rod length, {ROD}",)
         return ()
 
