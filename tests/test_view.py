@@ -555,7 +555,7 @@ def results(demo, tmp_path_factory):
     pkmcal.diff(demo.calibration, demo.session / "mechanism.yaml").save(folder / "diff")
     pkmcal.show("3-rpr").save(folder / "machine.html")
     text = (folder / "diff" / "diff.html").read_text(encoding="utf-8")
-    (folder / "older.html").write_text(text.replace('"version": 1', '"version": 0'))
+    (folder / "older.html").write_text(text.replace('"version":1', '"version":0'))
     (folder / "mine.html").write_text("<p>mine</p>")
     (folder / "broken").mkdir()
     (folder / "broken" / "session.yaml").write_text("pkmcal: [")
@@ -670,7 +670,7 @@ def test_a_hostile_page_stays_text(demo, tmp_path):
     """Of a stored page only the document is served, and of that only texts."""
     text = (demo.calibration / "report.html").read_text(encoding="utf-8")
     title = json.dumps(HOSTILE).replace("<", "\\u003c")
-    text = text.replace('"title": "Calibration of gough-stewart"', f'"title": {title}', 1)
+    text = text.replace('"title":"Calibration of gough-stewart"', f'"title":{title}', 1)
     (tmp_path / "report.html").write_text(text.replace("<body>", f"<body>{HOSTILE}"))
     served = Opened(tmp_path).get().text
     assert page_document(served)["title"] == HOSTILE

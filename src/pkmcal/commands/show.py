@@ -19,7 +19,7 @@ pkmcal show out -o machine.html
 @command(
     EXAMPLES,
     argument(
-        "machine", "MACHINE", "Name of a built-in machine, mechanism file, or folder of a session"
+        "source", "MACHINE", "Name of a built-in machine, mechanism file, or folder of a session"
         " or calibration.",
     ),
     number("show", "port", "N", "Port to listen on.", usual="a free one"),
@@ -27,7 +27,7 @@ pkmcal show out -o machine.html
     option("-o --out", "HTML", "Write a page instead of serving one.", Path, group=OUTPUT_GROUP),
     as_json(),
 )  # fmt: skip
-def show(machine: str, port: int, no_browser: bool, out: Path | None, as_json: bool) -> int:
+def show(source: str, port: int, no_browser: bool, out: Path | None, as_json: bool) -> int:
     """Show a machine in 3-D, with a slider for each joint reading."""
     from pkmcal.api.show import show as run
     from pkmcal.errors import GeometryError, InputError
@@ -39,7 +39,7 @@ def show(machine: str, port: int, no_browser: bool, out: Path | None, as_json: b
             next_step="Leave it out, or leave out -o",
         )
     try:
-        view = run(machine)
+        view = run(source)
         if out is None:
             from pkmcal.web.machine_page import application
 
@@ -50,7 +50,7 @@ def show(machine: str, port: int, no_browser: bool, out: Path | None, as_json: b
             )  # fmt: skip
         view.save(out)
     except GeometryError as error:  # the nominal model is the user's file
-        raise error.as_input(machine) from None
+        raise error.as_input(source) from None
     if as_json:
         console.print_json({"exit_code": 0, "file": str(out)})
     else:
