@@ -18,7 +18,6 @@ METHODS = ("match", "fullmatch", "search", "findall", "finditer", "split", "sub"
 PLACES_OF_FLAGS = {"compile": 1, "split": 3, "sub": 4, "subn": 4}
 """Number of arguments before a pattern's text in functions of `re`; two for the others."""
 MADE = {
-    "commands/cli.py: inside": "[pattern for pattern, _ in _TYPER_PHRASES]",
     "files/documents.py: f'(?:{_pattern})\\\\Z'": "[rf'(?:{p})\\Z' for _, p, _ in _SCALARS]",
 }
 """Arguments that are not written where they are used, and how to make all that they stand for."""

@@ -25,8 +25,8 @@ LONGEST_EXPRESSION = 200
 DEEPEST_DEFINITION = 10
 """Bound on names that are defined by other names."""
 
-_DIRECTIVE = re.compile(r"#\s*(\w+)\s*(.*)")
-_DEFINE = re.compile(r"([A-Za-z_]\w*)(?:\s+(.*))?")
+_DIRECTIVE = re.compile(r"#\s*(\w+)(.*)")
+_DEFINE = re.compile(r"([A-Za-z_]\w*)(?:\s(.*))?")
 _COMMENT_MARK = re.compile(r"(//|/\*|\*/)")
 _NOT = re.compile(r"!(?!=)")
 _COMPARISONS: Mapping[type[ast.cmpop], Callable[[float, float], bool]] = {
