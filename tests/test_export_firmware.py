@@ -285,6 +285,11 @@ def test_parallel_towers_are_followed_where_leaning_ones_are_not():
         ("marlin", "pkmcal_marlin.gcode", "M666 X0.0000", "M666 X-0.0003"),
         ("marlin", "pkmcal_marlin.gcode", "A0.0000", "A0.1000"),
         ("marlin", "pkmcal_marlin.gcode", "Z of Y's switch = 3", "Z of Y's switch = 4"),
+        ("marlin", "pkmcal_marlin.gcode", "M666 X", "M92 X80 Y80 Z80\nM666 X"),
+        ("marlin", "pkmcal_marlin.gcode", "; #define DELTA_RADIUS ",
+         "; #define DELTA_PRINTABLE_RADIUS 99\n; #define DELTA_RADIUS "),
+        ("smoothie", "pkmcal_smoothie.gcode", "M206 X0", "M92 X80 Y80 Z80\nM206 X0"),
+        ("reprap", "pkmcal_delta.g", "M669 K3", "M92 X80 Y80 Z80\nM669 K3"),
     ],
 )  # fmt: skip
 def test_tampered_settings_are_found(to, file, old, new):

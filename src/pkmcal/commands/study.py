@@ -62,7 +62,9 @@ def study(
         with console.progress(as_json) as progress:
             from pkmcal.api.study import StudyResult
 
-            folder = console.output_folder(out, STUDY_FOLDER, StudyResult)
+            # in the usual folder's place may stand a link of a stranger's session, named or not
+            given = None if out == STUDY_FOLDER else out
+            folder = console.output_folder(given, STUDY_FOLDER, StudyResult)
             result = pkmcal.study(subject, vary, out=folder, progress=progress.work, **options)
             return finish(result, folder, progress, as_json=as_json)
     except KeyboardInterrupt:

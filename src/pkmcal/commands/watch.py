@@ -21,7 +21,7 @@ from pkmcal.commands.options import (
 EXAMPLES = """\
 pkmcal watch out today
 pkmcal watch out today --same-place front
-pkmcal watch out today -o watch      (again with later sessions: a run chart)
+pkmcal watch out today -o machine-history
 """
 
 

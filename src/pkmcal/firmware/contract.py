@@ -280,7 +280,7 @@ def read_printer(path: Path, firmware: str | None = None) -> Printer:
 def firmware_of(text: str, label: str, name: str | None = None) -> Firmware:
     """The firmware that a configuration is of.
 
-    name : the user's own statement, which decides unless there is evidence of others alone.
+    name : of the firmware by the user; it decides unless the text has evidence of others alone.
 
     Raises InputError if the text does not decide, and for an unknown name.
     """
@@ -321,8 +321,8 @@ def firmware_of(text: str, label: str, name: str | None = None) -> Firmware:
         found=quoted(first),
         expected=", or ".join(one.configuration for one in by_name.values()),
         next_step="Name the file that holds these values (files that it includes are not followed),"
-        f" or its firmware with --firmware ({listed(list(by_name))}): M665 and M666 mean other"
-        " things to each",
+        f" or its firmware with --firmware ({listed(list(by_name))}): the meaning of M665 and M666"
+        " depends on it",
     )
 
 

@@ -25,8 +25,8 @@ LONGEST_EXPRESSION = 200
 DEEPEST_DEFINITION = 10
 """Bound on names that are defined by other names."""
 
-_DIRECTIVE = re.compile(r"#\s*(\w+)\s*(.*)")
-_DEFINE = re.compile(r"([A-Za-z_]\w*)(?:\s+(.*))?")
+_DIRECTIVE = re.compile(r"#\s*(\w+)(\W.*)?")
+_DEFINE = re.compile(r"([A-Za-z_]\w*)(?:\s(.*))?")
 _COMMENT_MARK = re.compile(r"(//|/\*|\*/)")
 _NOT = re.compile(r"!(?!=)")
 _COMPARISONS: Mapping[type[ast.cmpop], Callable[[float, float], bool]] = {
@@ -94,7 +94,7 @@ def active_definitions(text: str) -> Iterator[Define]:
         directive = _DIRECTIVE.fullmatch(code)
         if not directive:
             continue
-        word, rest = directive[1], directive[2].strip()
+        word, rest = directive[1], (directive[2] or "").strip()
         if word in ("if", "ifdef", "ifndef"):
             call = {"if": rest, "ifdef": f"defined({rest})", "ifndef": f"!defined({rest})"}[word]
             branches.append((_condition(call, values), False))

@@ -125,8 +125,9 @@ class Marlin(Firmware):
             return tuple(reasons)
         if echoed := [c for c in geometry if c.echoed]:
             reasons.append(f"line {echoed[0].line} is {echoed[0].code} behind 'echo:'")
-        for what, pattern in (("M503's heading", _DELTA_HEADING), ("Marlin's name", _PROGRAM)):
-            if match := pattern.search(text):
+        headings = _DELTA_HEADING.search(text), _PROGRAM.search(text)
+        for what, match in zip(("M503's heading", "Marlin's name"), headings, strict=True):
+            if match:
                 reasons.append(f"line {text.count(chr(10), 0, match.start()) + 1} has {what}")
         if probe := next((c for c in commands(text, ("M851",)) if c.rest), None):
             reasons.append(f"line {probe.line} is M851")

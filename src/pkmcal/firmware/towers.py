@@ -40,7 +40,7 @@ from pkmcal.firmware.contract import (
 HEIGHT_AT_HOME = "Height of the nozzle at home: "
 _ECHO = r"[^A-Za-z;]*(?:(?:recv|read)\b[^A-Za-z;]*)?echo:\s*"
 _SENT = r"(?:[^A-Za-z;]*(?:recv|read|send|sent)\b[\s:>]*)?(?:N\d+\s*)?"
-_COMMAND = re.compile(rf"(?P<echo>{_ECHO})?(?(echo)|{_SENT})([GM]\d+)\b(.*)", re.IGNORECASE)
+_COMMAND = re.compile(rf"(?:(?P<echo>{_ECHO})|{_SENT})([GM]\d+)\b(.*)", re.IGNORECASE)
 """Command of G-code, of a console's output, or of a host's log of it."""
 
 Words = dict[str, tuple[float, str]]
