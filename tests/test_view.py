@@ -33,7 +33,7 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 from pkmcal.viewing.content import SessionContent
 from pkmcal.viewing.pose_file import PoseFile
-from pkmcal.viewing.server import session_document, session_routes
+from pkmcal.viewing.server import session_routes
 from pkmcal.viewing.sources import MOST_ENTRIES
 from pkmcal.web import serving
 from pkmcal.web.bundle_files import SCRIPT_FILE, bundle_file
@@ -48,7 +48,7 @@ class Page(ServedPage):
 
     def __init__(self, folder, calibration=None):
         self.subject = SessionContent(load_session(folder), calibration)
-        routes = session_routes(self.subject, session_document(self.subject))
+        routes = session_routes(self.subject)
         self.app = serving.application(routes, TOKEN, PORT)
 
     def post(self, what, content=None, **body):
@@ -433,6 +433,8 @@ def test_the_pose_is_written_and_nothing_else(session, truth):
     angle, distance = off(load_session(session).stations[0].T_camera_base, true)
     assert angle < 0.02
     assert distance < 0.2
+    again = opened.ask("overlay")  # as a page that is opened again requests it
+    np.testing.assert_array_equal(again["pose"], opened.ask("overlay", pose=true.tolist())["pose"])
     same = load_session(session).stations[1].T_camera_base
     np.testing.assert_array_equal(same, opened.subject.station(1).T_camera_base)
     opened.ask("save", pose=true.tolist())  # again, on its own writing
@@ -555,7 +557,7 @@ def results(demo, tmp_path_factory):
     pkmcal.diff(demo.calibration, demo.session / "mechanism.yaml").save(folder / "diff")
     pkmcal.show("3-rpr").save(folder / "machine.html")
     text = (folder / "diff" / "diff.html").read_text(encoding="utf-8")
-    (folder / "older.html").write_text(text.replace('"version": 1', '"version": 0'))
+    (folder / "older.html").write_text(text.replace('"version":1', '"version":0'))
     (folder / "mine.html").write_text("<p>mine</p>")
     (folder / "broken").mkdir()
     (folder / "broken" / "session.yaml").write_text("pkmcal: [")
@@ -670,7 +672,7 @@ def test_a_hostile_page_stays_text(demo, tmp_path):
     """Of a stored page only the document is served, and of that only texts."""
     text = (demo.calibration / "report.html").read_text(encoding="utf-8")
     title = json.dumps(HOSTILE).replace("<", "\\u003c")
-    text = text.replace('"title": "Calibration of gough-stewart"', f'"title": {title}', 1)
+    text = text.replace('"title":"Calibration of gough-stewart"', f'"title":{title}', 1)
     (tmp_path / "report.html").write_text(text.replace("<body>", f"<body>{HOSTILE}"))
     served = Opened(tmp_path).get().text
     assert page_document(served)["title"] == HOSTILE
