@@ -62,7 +62,6 @@ ALLOWED = {
     "tells": "a key of the document of `check`",
     "known": "an argument of `pkmcal.compare`",
     "asked": "an argument of `pkmcal.simulate`",
-    "shown": "a key of the viewer's documents",
     "left": "the opposite of right",
     "drawing": "a column of the public table of parameters, and keys of documents",
     "by_drawing": "a key of calibration.json",

@@ -42,6 +42,7 @@ from pkmcal.errors import PkmcalError
 from pkmcal.wording import (
     DISPLAY_UNITS,
     amount,
+    brief,
     capital,
     count,
     how_often,
@@ -225,7 +226,7 @@ def _either(noise: tuple[float, Sequence[str]], spec: str) -> str:
 def _range(ends: tuple[float, float | None], _rest: str) -> str:
     """Interval with two digits; open upwards if the second end is None."""
     low, high = ends
-    return f"more than {low:.2g}" if high is None else f"{low:.2g} to {high:.2g}"
+    return f"more than {brief(low)}" if high is None else f"{brief(low)} to {brief(high)}"
 
 
 _FORMATS: dict[str, Callable[[Any, str], str]] = {
