@@ -39,7 +39,7 @@ EXPRESSED = {
     "ros": (),
 }
 REFUSALS = {
-    "c": "do not constrain its platform exactly",
+    "c": "do not fix its platform exactly",
     "reprap": "RepRapFirmware has settings for linear and rotary deltas",
     "klipper": "Klipper has settings for linear and rotary deltas",
     "linuxcnc": "LinuxCNC moves as many joints as coordinates",

@@ -791,7 +791,7 @@ def test_a_session_is_worked_on_in_a_browser(session, demo, truth, tmp_path, wid
     assert root["fitted"] == root["calibrated"] == "session-fit good"
     marks = json.loads(root["remarks"])[: len(station.images)]
     assert "wrong" not in marks
-    assert root["stage"] == root["redrawn"] == "true"
+    assert root["stage"] == "true"
     # the image fills the window again
     assert float(root["scale"]) == pytest.approx(float(root["whole"]), abs=0.06)
     assert min(json.loads(root["window"])) > 250

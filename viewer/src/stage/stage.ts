@@ -108,7 +108,6 @@ export class Stage {
 
   /** Draw at once, as a page needs that is about to be printed. */
   private drawNow(): void {
-    this.pending = false; // also where nothing is visible: `resize` draws when it is
     const { clientWidth: width, clientHeight: height } = this.element;
     if (!width || !height) return;
     // on paper the element has another size, before any observer is called
