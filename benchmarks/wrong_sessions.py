@@ -390,7 +390,7 @@ def main() -> None:
                 print_outcomes(f"{fact}, {in_view}", value)
                 if options.tell:
                     for seed, one in zip(seeds, value, strict=True):
-                        print(f"    {seed}: {one.what} {one.z:.2f} {one.said}")
+                        print(f"    {seed}: {one.what} {one.z:.2f} {one.message}")
     print(f"{time.perf_counter() - begin:.0f} s")
 
 

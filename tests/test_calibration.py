@@ -81,7 +81,7 @@ def test_slim_bare_rods_are_reported_honestly(tmp_path):
     folder = imaged(tmp_path / "session", seed=5)
     value = pkmcal.calibrate(folder)
     result = compare_with_truth(value, folder)
-    assert result.calibrated.centre < result.nominal.centre / 5
+    assert result.calibrated.centre < result.drawing.centre / 5
     assert np.sqrt(np.mean(errors_in_sigmas(value, folder) ** 2)) < 1.2
 
 

@@ -165,8 +165,8 @@ def test_a_localization_confirmed_by_chance_is_compared_with_mistakes(tmp_path):
     reversed_readings = replace(session, joints=session.joints[:, ::-1].copy())
     images = read_images(session)
     station = session.stations[0].T_camera_base
-    displaced = station @ pose(rotation(np.array([0.0, 0.0, 0.5])), np.array([0.1, 0.05, 0.0]))
-    scene = PriorScene.as_drawn(reversed_readings, displaced[None])
+    T_displaced = station @ pose(rotation(np.array([0.0, 0.0, 0.5])), np.array([0.1, 0.05, 0.0]))
+    scene = PriorScene.as_drawn(reversed_readings, T_displaced[None])
     case = Case(reversed_readings, images, Boards(), scene)
     with pytest.raises(InputError) as error:
         settle(reversed_readings, case, refine_camera=False, seed=0, clock=Clock())

@@ -33,7 +33,7 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 from pkmcal.viewing.content import SessionContent
 from pkmcal.viewing.pose_file import PoseFile
-from pkmcal.viewing.server import session_document, session_routes
+from pkmcal.viewing.server import session_routes
 from pkmcal.viewing.sources import MOST_ENTRIES
 from pkmcal.web import serving
 from pkmcal.web.bundle_files import SCRIPT_FILE, bundle_file
@@ -48,7 +48,7 @@ class Page(ServedPage):
 
     def __init__(self, folder, calibration=None):
         self.subject = SessionContent(load_session(folder), calibration)
-        routes = session_routes(self.subject, session_document(self.subject))
+        routes = session_routes(self.subject)
         self.app = serving.application(routes, TOKEN, PORT)
 
     def post(self, what, content=None, **body):
@@ -433,6 +433,8 @@ def test_the_pose_is_written_and_nothing_else(session, truth):
     angle, distance = off(load_session(session).stations[0].T_camera_base, true)
     assert angle < 0.02
     assert distance < 0.2
+    again = opened.ask("overlay")  # as a page that is opened again requests it
+    np.testing.assert_array_equal(again["pose"], opened.ask("overlay", pose=true.tolist())["pose"])
     same = load_session(session).stations[1].T_camera_base
     np.testing.assert_array_equal(same, opened.subject.station(1).T_camera_base)
     opened.ask("save", pose=true.tolist())  # again, on its own writing

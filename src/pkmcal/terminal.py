@@ -106,7 +106,7 @@ def print_table(console: Console, table: Table) -> None:
 
     columns = table.columns[: table.first]
     marked = any(row.mark for row in table.rows)
-    grid = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    grid = Rich(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="dim")
     if marked:
         grid.add_column()
     short = max((len(row.name) for row in table.rows), default=0) <= WIDEST_NAME

@@ -222,8 +222,8 @@ export class Inspector {
     const box = this.host.getBoundingClientRect();
     const [width, height] = [box.width / this.view.scale, box.height / this.view.scale];
     // the image stays in the window, in its middle where it is smaller
-    const inside = (at: number, low: number, size: number, shown: number): number =>
-      shown >= size ? low + size / 2 : Math.min(Math.max(at, low + shown / 2), low + size - shown / 2);
+    const inside = (at: number, low: number, size: number, visible: number): number =>
+      visible >= size ? low + size / 2 : Math.min(Math.max(at, low + visible / 2), low + size - visible / 2);
     this.view.x = inside(this.view.x, this.size.x, this.size.width, width);
     this.view.y = inside(this.view.y, this.size.y, this.size.height, height);
     this.picture.setAttribute(
@@ -328,10 +328,10 @@ export class Inspector {
       this.locate(event);
       const last = pointers.get(event.pointerId);
       if (!last) return;
-      if (this.dragging) return this.tool?.move(this.pixelAt(event), event);
-      const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
       const now = { x: event.clientX, y: event.clientY };
       pointers.set(event.pointerId, now);
+      if (this.dragging) return this.tool?.move(this.pixelAt(event), event);
+      const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
       if (other) {
         const distance = (p: { x: number; y: number }): number =>
           Math.hypot(p.x - other.x, p.y - other.y);

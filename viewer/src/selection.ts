@@ -19,13 +19,13 @@ export class Selection {
   hover(key: Key | null): void {
     if (key === this.hovered) return;
     this.hovered = key;
-    this.tell();
+    this.notify();
   }
 
   choose(key: Key | null): void {
     if (key === null && this.chosen === null) return;
     this.chosen = key === this.chosen ? null : key;
-    this.tell();
+    this.notify();
   }
 
   /** Classes of the elements with a key below a root, also of new ones. */
@@ -37,7 +37,7 @@ export class Selection {
     }
   }
 
-  private tell(): void {
+  private notify(): void {
     for (const listener of this.listeners) listener(this.hovered, this.chosen);
   }
 }

@@ -93,7 +93,7 @@ def station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
     """Findings on the images of a station. n_legs : of the machine."""
     findings: list[Finding] = []
     at = {"subject": station.name, "station": station.name}
-    where = "legs" if station.recognised else "pictures"
+    where = "legs" if station.recognised else "images"
     if station.saturated > OVEREXPOSED_PIXEL_SHARE:
         findings.append(doubtful("images.overexposed", **at, share=station.saturated, where=where))
     if station.black > MAJORITY:

@@ -53,5 +53,6 @@ def _default_folder(calibration: str, to: str) -> Path:
     path = Path(calibration)
     folder = path.parent if path.is_file() and path.suffix == ".json" else path
     if (folder / "calibration.json").is_file():
-        return Path(os.path.normpath(folder.absolute())).parent / f"export-{to}"
+        beside = Path(os.path.normpath(folder.absolute())).parent / f"export-{to}"
+        return beside if folder.is_absolute() else Path(os.path.relpath(beside))
     return Path(f"export-{to}")

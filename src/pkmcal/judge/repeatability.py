@@ -524,7 +524,7 @@ def part_of(study: RepeatStudy) -> Part:
     noise = PAPER_AXIS_NOISE
     paper = (_degrees(noise.psi), _degrees(noise.theta), _mm(noise.x), _mm(noise.z))
     rows.append(Row("[A] Table 1", ("", "", *paper, "", "")))
-    columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
+    columns = ("Station", "Leg", "Images", "ψ", "θ", "x", "z", "Shift", "Tilt")
     table = Table("Scatter of repeated images", columns, tuple(rows), legend=REPEATS_TABLE_LEGEND)
     return Part("repeats", "Repeats", tables=(table,))
 

@@ -224,8 +224,9 @@ def _either(noise: tuple[float, Sequence[str]], spec: str) -> str:
 
 def _range(ends: tuple[float, float | None], _rest: str) -> str:
     """Interval with two digits; open upwards if the second end is None."""
-    low, high = ends
-    return f"more than {low:.2g}" if high is None else f"{low:.2g} to {high:.2g}"
+    # rounded first: two digits alone would give 1.2e+02
+    low, *high = (f"{float(f'{end:.2g}'):g}" for end in ends if end is not None)
+    return f"{low} to {high[0]}" if high else f"more than {low}"
 
 
 _FORMATS: dict[str, Callable[[Any, str], str]] = {

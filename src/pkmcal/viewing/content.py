@@ -80,6 +80,12 @@ class SessionContent:
             raise InputError("there is no such station", found=s + 1)
         return self.session.stations[s]
 
+    def set_pose(self, s: int, T_camera_base: Array) -> None:
+        """Replace a station's pose, which was written into session.yaml."""
+        stations = list(self.session.stations)
+        stations[s] = replace(stations[s], T_camera_base=T_camera_base)
+        self.session = replace(self.session, stations=tuple(stations))
+
     def image_entry(self, s: int, k: int) -> Image:
         """Image of a station by its index. Raises InputError for an index out of range."""
         images = self.station(s).images

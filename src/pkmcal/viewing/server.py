@@ -24,8 +24,11 @@ if TYPE_CHECKING:
     from starlette.routing import BaseRoute
 
 
-def session_routes(content: SessionContent, document: SessionDocument) -> list[BaseRoute]:
-    """Routes of a session's page: the page, images by GET, and requests by POST."""
+def session_routes(content: SessionContent, report: str = "") -> list[BaseRoute]:
+    """Routes of a session's page: the page, images by GET, and requests by POST.
+
+    report : address of the calibration's report.
+    """
     from starlette.responses import Response
     from starlette.routing import Route
 
@@ -46,7 +49,9 @@ def session_routes(content: SessionContent, document: SessionDocument) -> list[B
 
     def save(request: ViewRequest) -> Schema:
         pose = placed_by_hand(content, request).T_camera_base
-        return SavedAnswer(text=pose_file.write(content.station(request.station), pose))
+        text = pose_file.write(content.station(request.station), pose)
+        content.set_pose(request.station, pose)  # for a page that is opened again
+        return SavedAnswer(text=text)
 
     def stage() -> Schema:
         from pkmcal.viewing.stage import calibrated_stage
@@ -70,7 +75,7 @@ def session_routes(content: SessionContent, document: SessionDocument) -> list[B
 
     answers = {"overlay": overlay, "edges": edges, "localize": localize, "save": save}
     return [
-        *serving.page_routes(document),
+        *serving.page_routes(lambda: session_document(content, report)),
         Route("/image/{s:int}/{k:int}", image),
         Route("/thumbnail/{s:int}/{k:int}", thumbnail),
         Route("/stage", stage_block),

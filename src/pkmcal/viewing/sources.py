@@ -60,7 +60,7 @@ class Source:
     @classmethod
     def of_document(cls, document: AnyDocument) -> Source:
         """Page that requests nothing but its own files."""
-        return cls(document, lambda: page_routes(document))
+        return cls(document, lambda: page_routes(lambda: document))
 
 
 def source_of(path: Path, calibration: Path | None = None) -> Source:
@@ -131,13 +131,13 @@ def session_source(folder: Path, calibration: Path | None = None) -> Source:
     def routes() -> list[BaseRoute]:
         from starlette.routing import Mount
 
-        own_routes = session_routes(content, document)
+        own_routes = session_routes(content, report_address)
         if report is None or not has_report:
             return own_routes
         return [*own_routes, Mount("/report", app=OnDemand(lambda _: page_source(report)))]
 
-    document = session_document(content, "report/" if has_report else "")
-    return Source(document, routes)
+    report_address = "report/" if has_report else ""
+    return Source(session_document(content, report_address), routes)
 
 
 def page_source(path: Path) -> Source:
@@ -187,7 +187,7 @@ def folder_source(folder: Path) -> Source:
     def routes() -> list[BaseRoute]:
         from starlette.routing import Mount
 
-        return [*page_routes(document), Mount("/{n:int}", app=OnDemand(open_place))]
+        return [*page_routes(lambda: document), Mount("/{n:int}", app=OnDemand(open_place))]
 
     return Source(document, routes)
 

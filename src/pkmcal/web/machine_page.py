@@ -161,7 +161,7 @@ def application(machine: Machine, document: shapes.MachineDocument, token: str, 
         return configuration_at(machine, request)
 
     routes = [
-        *serving.page_routes(document),
+        *serving.page_routes(lambda: document),
         Route("/pose", serving.json_endpoint(PoseRequest, pose), methods=["POST"]),
     ]
     return serving.application(routes, token, port)

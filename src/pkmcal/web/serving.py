@@ -66,13 +66,13 @@ def application(routes: Sequence[BaseRoute], token: str, port: int) -> Guard:
     return Guard(Starlette(routes=[Mount(f"/{token}", routes=routes)]), token, port)
 
 
-def page_routes(document: AnyDocument) -> list[BaseRoute]:
-    """Routes of a page: the document in its shell, and the viewer's bundle."""
+def page_routes(document: Callable[[], AnyDocument]) -> list[BaseRoute]:
+    """Routes of a page: its present document in its shell, and the viewer's bundle."""
     from starlette.responses import HTMLResponse, Response
     from starlette.routing import Route
 
     async def page(_request: Request) -> Response:
-        return HTMLResponse(served_page(document))
+        return HTMLResponse(served_page(document()))
 
     async def script(_request: Request) -> Response:
         return Response(bundle_file(SCRIPT_FILE), media_type="text/javascript")

@@ -241,7 +241,7 @@ function line(block: PlotBlock, mark: LineMark, tips: Tip[]): Plot.Markish[] {
   if (!covered) {
     for (const [k, [x, y]] of mark.points.entries()) {
       const at = points[k];
-      if (at && y !== null) tips.push({ ...at, text: `${mark.name ? `${mark.name}\n` : ""}${said(block.x, x)}\n${said(block.y, y)}` });
+      if (at && y !== null) tips.push({ ...at, text: `${mark.name ? `${mark.name}\n` : ""}${valueText(block.x, x)}\n${valueText(block.y, y)}` });
     }
   }
   return [Plot.line(points, {
@@ -251,7 +251,7 @@ function line(block: PlotBlock, mark: LineMark, tips: Tip[]): Plot.Markish[] {
 }
 
 /** Value of an axis in words, for a tooltip. */
-function said(axis: Axis, value: number | string): string {
+function valueText(axis: Axis, value: number | string): string {
   if (typeof value === "string") return axis.label ? `${axis.label}: ${value}` : value;
   const decimals = Math.max(0, 2 - Math.floor(Math.log10(Math.abs(value) || 1)));
   return `${axis.label}: ${number(value, Math.min(decimals, 8))}`;
@@ -327,7 +327,7 @@ function cells(block: PlotBlock, mark: CellsMark, tips: Tip[]): Plot.Markish[] {
       grouped.set(step, places);
       tips.push({
         x: at(mark.x, (c + 0.5) / columns), y: at(mark.y, (r + 0.5) / rows),
-        text: `${mark.rows[r]}\n${mark.columns[c]}\n${said({ ...block.x, label: colours.label }, value)}`,
+        text: `${mark.rows[r]}\n${mark.columns[c]}\n${valueText({ ...block.x, label: colours.label }, value)}`,
       });
     }
   }

@@ -6,7 +6,7 @@ import { h, number } from "../dom";
 import type { Key } from "../selection";
 import { legTable } from "../stage/legs";
 import { FrustumImages } from "../stage/frusta";
-import { type Shown, SpaceModel } from "../stage/space";
+import { type SpaceState, SpaceModel } from "../stage/space";
 import { NO_WEBGL, PLANE_VIEW, Stage, VIEWS } from "../stage/stage";
 import type { Context } from "./index";
 import "./space.css";
@@ -36,7 +36,7 @@ export function space(block: Space, context: Links): HTMLElement {
     return figure;
   }
   const model = new SpaceModel(block, stage);
-  const state: Shown = {
+  const state: SpaceState = {
     pose: 0, share: 1, enlargement: block.enlargement, ellipsoids: block.ellipsoid_enlargement,
   };
   const frusta = new FrustumImages(block.machine.cameras, model.model.layers.cameras, stage);
@@ -136,7 +136,7 @@ function poseBar(block: Space, onchange: (pose: number) => void) {
 /** Sliders from one machine to the other, and of enlargements; none where nothing is enlarged. */
 function changeBar(
   block: Space,
-  state: Shown,
+  state: SpaceState,
   draw: () => void,
   stage: HTMLElement,
 ): HTMLElement | null {
@@ -248,9 +248,9 @@ function select(
 
 /** Checkboxes of what is drawn, with its colour. */
 function switches(block: Space, model: SpaceModel): HTMLElement {
-  const layer = (name: "cameras" | "axes" | "frames", text: string, shown: boolean): Node => {
-    model.model.setLayer(name, shown);
-    return box(text, "", shown, (visible) => model.model.setLayer(name, visible));
+  const layer = (name: "cameras" | "axes" | "frames", text: string, visible: boolean): Node => {
+    model.model.setLayer(name, visible);
+    return box(text, "", visible, (on) => model.model.setLayer(name, on));
   };
   return h("fieldset", { class: "layers" },
     h("legend", { class: "hidden" }, "Shown"),
@@ -260,8 +260,8 @@ function switches(block: Space, model: SpaceModel): HTMLElement {
     layer("frames", "Frames", true));
 }
 
-function box(name: string, colour: string, shown: boolean, onchange: (visible: boolean) => void): Node {
-  const input = h("input", { type: "checkbox", checked: shown, onchange: () => onchange(input.checked) });
+function box(name: string, colour: string, visible: boolean, onchange: (visible: boolean) => void): Node {
+  const input = h("input", { type: "checkbox", checked: visible, onchange: () => onchange(input.checked) });
   const key = h("span", { class: "colour-key" });
   if (colour) key.style.setProperty("--c", `var(${colour})`);
   return h("label", {}, input, ...(colour ? [key] : []), name);

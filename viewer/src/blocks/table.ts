@@ -37,15 +37,15 @@ export function dataTable(block: DataTable, { selection, printSteps }: Context):
   const passing = (): number[] => sorting.order().filter((k) => passes(block, block.rows[k]!, pressed));
   const update = (): void => {
     const rows = passing();
-    const shown = all ? rows : rows.slice(0, FIRST_ROWS);
-    body.replaceChildren(...shown.map((k) => drawn[k]!));
+    const visible = all ? rows : rows.slice(0, FIRST_ROWS);
+    body.replaceChildren(...visible.map((k) => drawn[k]!));
     selection.apply(body);
-    markGroups(shown, block, drawn, sorting.column < 0);
+    markGroups(visible, block, drawn, sorting.column < 0);
     heads.forEach((head, k) => {
       if (k === sorting.column) head.setAttribute("aria-sort", sorting.down ? "descending" : "ascending");
       else head.removeAttribute("aria-sort");
     });
-    more.hidden = shown.length === rows.length;
+    more.hidden = visible.length === rows.length;
     more.textContent = `All ${rows.length} rows`;
   };
 
@@ -189,10 +189,10 @@ function cellContent(column: Column, text: string, value: number | null): (Node 
 }
 
 /** A line above the first row of each leg, in the order as given. */
-function markGroups(shown: number[], block: DataTable, drawn: HTMLElement[], asGiven: boolean): void {
+function markGroups(visible: number[], block: DataTable, drawn: HTMLElement[], asGiven: boolean): void {
   const leg = block.columns.findIndex((column) => column.form === "leg");
-  shown.forEach((k, place) => {
-    const before = block.rows[shown[place - 1] ?? -1];
+  visible.forEach((k, place) => {
+    const before = block.rows[visible[place - 1] ?? -1];
     const starts = asGiven && leg >= 0 && before !== undefined && before.cells[leg] !== block.rows[k]!.cells[leg];
     drawn[k]!.classList.toggle("group", starts);
   });

@@ -507,9 +507,9 @@ export class MachineModel {
     }
     if (this.layers.signs.visible) {
       machine.legs.forEach((_leg, j) => {
-        const way = configuration.legs[j].positive as Point[];
-        if (way.length < 2 || this.highlighted?.includes(j) === false) return;
-        const [before, end] = way.slice(-2).map(vector);
+        const path = configuration.legs[j].positive as Point[];
+        if (path.length < 2 || this.highlighted?.includes(j) === false) return;
+        const [before, end] = path.slice(-2).map(vector);
         const ahead = end.clone().sub(before).normalize();
         add("+", `sign ${legClass(j + 1)}`, end.addScaledVector(ahead, 2.6 * HEAD * extent));
         const zero = configuration.legs[j].zero as Point[];

@@ -33,7 +33,7 @@ interface Item {
  * What is shown of the block: a pose, the share of the way from the machine before (0) to the one
  * after (1), and the enlargements of changes and of ellipsoids.
  */
-export interface Shown {
+export interface SpaceState {
   pose: number;
   share: number;
   enlargement: number;
@@ -117,7 +117,7 @@ export class SpaceModel {
     scene.updateMatrixWorld();
   }
 
-  show({ pose, share, enlargement, ellipsoids }: Shown): void {
+  show({ pose, share, enlargement, ellipsoids }: SpaceState): void {
     const { poses, changes, machine, arrows } = this.block;
     const one = poses[pose]?.configuration ?? machine.home;
     const own = changes.length > 1 ? changes[pose] : changes[0];
@@ -167,10 +167,10 @@ export class SpaceModel {
   /** Points of the machine in all its poses, and of its enlarged change, without the cameras. */
   machinePoints(): Vector3[] {
     const { cameras } = this.model.layers;
-    const shown = cameras.visible;
+    const { visible } = cameras;
     cameras.visible = false;
     const own = this.model.fitPoints();
-    cameras.visible = shown;
+    cameras.visible = visible;
     const legs = [...this.block.poses.flatMap((pose) => pose.configuration.legs), ...this.drawn];
     return [...own, ...legs.flatMap((leg) => [...leg.base, ...leg.platform] as Point[]).map(vector)];
   }

@@ -76,7 +76,7 @@ class SessionView {
   private overlaying: Promise<void> | null = null;
   private measuring = 0;
   private marking = false;
-  private distance: { pose: Pose | null; factor: number; timer: number } | null = null;
+  private distance: { pose: Pose | null; factor: number; timer: number; epoch: number } | null = null;
   private overlay: Layer[] = [];
   private measured: Layer[] = [];
   private joints: JointPixel[] = [];
@@ -113,7 +113,6 @@ class SessionView {
     this.counts = Array.from({ length: legs }, () => h("span", { class: "small" }));
     this.machines = choice("Machine laid over", [["nominal", "Nominal"], ["calibration", "Calibrated"]],
       "nominal", (name) => this.choose(name));
-    this.machines.hidden = !content.calibration;
     this.views = choice("View", [["image", "Image"], ["space", "In space"]], "image", (name) => this.showSpace(name === "space"));
     this.views.hidden = !content.calibration;
     this.kinds = choice("What a drag does", KINDS, "aim", (name) => {
@@ -200,11 +199,12 @@ class SessionView {
     }
   }
 
-  /** Answer, or null after a fault that the page shows. */
+  /** Answer, or null after a fault, which the page shows unless another image or pose is present by then. */
   private async query<T extends object>(path: string, body: ViewRequest): Promise<T | null> {
+    const { epoch } = this;
     const answer = await this.post<T>(path, body);
     if (!("message" in answer)) return answer;
-    this.notify(answer.message, "bad");
+    if (epoch === this.epoch) this.notify(answer.message, "bad");
     return null;
   }
 
@@ -288,8 +288,9 @@ class SessionView {
 
   /** Buttons and the origin of the pose. */
   private showState(): void {
-    const { fixed, station, pose } = this;
+    const { content, fixed, station, pose } = this;
     for (const element of this.editing) element.hidden = fixed || !this.stage.hidden;
+    this.machines.hidden = !content.calibration || !this.stage.hidden; // in space, the calibrated one stands
     this.inspector.element.classList.toggle("session-editing", !fixed && this.kind !== "pan");
     this.undoButton.disabled = fixed || !pose.undoable;
     this.fitButton.disabled = this.searchButton.disabled = fixed || !station.legs;
@@ -481,28 +482,30 @@ class SessionView {
     const { drag } = this;
     this.drag = null;
     if (!drag?.moved) return this.markOthers(); // which the drag interrupted
+    if (cancelled) return this.undo();
+    const { epoch } = this;
     await this.overlaying;
-    if (cancelled) this.undo();
+    if (epoch !== this.epoch) return; // another image, or another drag
     // two joints determine the place well enough for the machine to be localized there
-    else if (drag.joint && this.pose.pins.length >= PINS_TO_FIT && this.station.legs) await this.localize(false);
+    if (drag.joint && this.pose.pins.length >= PINS_TO_FIT && this.station.legs) await this.localize(false);
     else await this.measure();
   }
 
   /** Change the distance; presses in quick succession are one step. */
   private changeDistance(factor: number, at: Pixel): void {
     if (this.fixed || this.drag) return;
-    if (!this.distance) {
+    if (this.distance?.epoch !== this.epoch) {
       this.begin();
       this.pose.pins = [];
-      this.distance = { pose: this.pose.pose, factor: 1, timer: 0 };
+      this.distance = { pose: this.pose.pose, factor: 1, timer: 0, epoch: this.epoch };
     }
     const { distance } = this;
     distance.factor *= factor;
     clearTimeout(distance.timer);
     distance.timer = window.setTimeout(async () => {
-      this.distance = null;
+      if (distance === this.distance) this.distance = null;
       await this.overlaying;
-      await this.measure();
+      if (distance.epoch === this.epoch) await this.measure();
     }, PAUSE);
     const gesture = { kind: "distance" as const, start: at, end: at, factor: distance.factor };
     void this.requestOverlay({ pose: distance.pose, gesture });
@@ -510,8 +513,9 @@ class SessionView {
 
   private async localize(anywhere: boolean): Promise<void> {
     if (this.fixed || !this.station.legs) return;
-    await this.overlaying;
     const { epoch } = this;
+    await this.overlaying;
+    if (epoch !== this.epoch) return;
     this.notify("Localizing …");
     this.measuring += 1;
     this.fitButton.disabled = this.searchButton.disabled = true;
@@ -529,11 +533,13 @@ class SessionView {
   }
 
   private async save(): Promise<void> {
-    const { pose } = this;
+    const { s, k, pose } = this;
     await this.overlaying;
-    const answer = await this.query<SavedAnswer>("save", this.request());
-    if (!answer) return;
-    pose.saved();
+    const written = pose.pose;
+    const body = this.request({ machine: "nominal", pose: written }, s, k);
+    const answer = await this.post<SavedAnswer>("save", body);
+    if ("message" in answer) return this.notify(answer.message, "bad");
+    pose.saved(written);
     this.notify(answer.text, "good");
     this.showState();
   }
@@ -543,7 +549,7 @@ class SessionView {
   private listen(): void {
     addEventListener("keydown", (event) => {
       const target = event.target as Element;
-      if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
+      if ((event.ctrlKey || event.metaKey) && !event.shiftKey && event.key.toLowerCase() === "z") {
         event.preventDefault();
         this.undo();
         return;
@@ -563,15 +569,18 @@ class SessionView {
       event.preventDefault();
     });
     addEventListener("beforeunload", (event) => {
-      if (this.poses.some((pose) => pose.changed)) event.preventDefault();
+      // the pose of a hand-held camera is not written
+      if (this.poses.some((pose, s) => pose.changed && !this.content.stations[s].handheld)) event.preventDefault();
     });
     // the first image precedes the thumbnails; one that does not come has its reason in words
     this.inspector.element.addEventListener("load", () => this.list.load(), { capture: true, once: true });
     this.inspector.element.addEventListener("error", () => {
       this.list.load();
-      const fault = (answer: { message?: string } | null): void =>
-        this.notify(answer?.message ?? "The image does not come.", "bad");
-      fetch(this.image.url).then((response) => response.json() as Promise<{ message?: string }>)
+      const { image } = this;
+      const fault = (answer: { message?: string } | null): void => {
+        if (image === this.image) this.notify(answer?.message ?? "The image cannot be loaded.", "bad");
+      };
+      fetch(image.url).then((response) => response.json() as Promise<{ message?: string }>)
         .then(fault, () => fault(null));
     }, true);
   }

@@ -38,8 +38,10 @@ export class StationPose {
     return last !== undefined;
   }
 
-  saved(): void {
-    this.changed = false;
+  /** A pose was written into session.yaml: the present one, if it did not change meanwhile. */
+  saved(pose: Pose | null): void {
+    for (const step of this.before) step.changed = true;
+    this.changed = this.pose !== pose;
     this.posed = true;
   }
 }
