@@ -274,7 +274,7 @@ def test_the_command(demo, tmp_path):
     assert [mark["name"] for mark in bars["marks"]] == ["base joint", "platform joint"]
     done = run("diff", demo.calibration, "gough-stewart", "-o", out)
     assert (
-        "✗ Nominal model and calibration differ by more than chance explains: the tool" in done.out
+        "· Nominal model and calibration differ by more than chance explains: the tool" in done.out
     )
     assert "What changed" in done.out
     assert max(map(len, done.out.splitlines())) <= 80 + len(str(out))

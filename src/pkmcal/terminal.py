@@ -143,7 +143,8 @@ def print_outcome(out: Console, outcome: Outcome) -> None:
     if outcome.subject:
         print_points(out, [("", outcome.subject)])
         out.print()
-    print_points(out, [(MARK_SIGNS[outcome.mark], verdict.headline)])
+    mark = MARK_SIGNS["note" if outcome.neutral else outcome.mark]
+    print_points(out, [(mark, verdict.headline)])
     print_points(out, [("  [red]•[/]", reason) for reason in verdict.reasons])
     brief = any(table.brief for part in outcome.parts for table in part.tables)
     if outcome.figures and not brief:

@@ -177,7 +177,7 @@ class Outcome:
     stamp : the verdict in one to three words.
     level : severity of an unusable result.
     partial : usable, but some of the result does not hold.
-    neutral : the page judges nothing by colour, such as a change that was the purpose.
+    neutral : colours judge nothing, such as a change that was the purpose.
     figures : cards at the top of the page; a terminal prints them if no part has a brief table.
     parts : sections of the page.
     findings : warnings and notes besides those of the verdict.
