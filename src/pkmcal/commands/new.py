@@ -30,8 +30,8 @@ def _dimension(name: str, described: str, usual: str = "") -> Any:
     EXAMPLES,
     argument("folder", "DIR", "New or empty folder.", Path),
     option(
-        "--machine", "MACHINE", "Name of a built-in machine, mechanism file, or family of machines"
-        " whose dimensions are given below. [default: a dialogue, or gough-stewart]",
+        "--machine", "MACHINE", "Name of a built-in machine, mechanism file, or, with dimensions,"
+        " hexapod, rotary-hexapod, delta or linear-delta. [default: a dialogue, or gough-stewart]",
     ),
     flag("--legs", "The cameras observe the legs. [default where legs can be observed]"),
     flag("--board", "The cameras observe a board."),
