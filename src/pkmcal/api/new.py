@@ -19,7 +19,7 @@ from pkmcal.ranges import check_number
 from pkmcal.starter import check_new_folder, session_texts, write_texts
 from pkmcal.starter.families import FAMILIES, family_model
 from pkmcal.starter.joint_centres import centres_model
-from pkmcal.starter.nominal import option_of
+from pkmcal.starter.nominal import NominalModel, option_of
 
 SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
@@ -201,27 +201,11 @@ def new(
         )
     if printer is None and probed is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
-        nominal = None if machine is None else str(machine)
-        assumed: tuple[str, ...] = ()
-        if from_file is not None:
-            if machine is not None:
-                raise InputError(
-                    "the machine is described twice",
-                    where="--from",
-                    found="--machine besides",
-                    expected="one of them",
-                )
-            nominal = centres_model(Path(from_file), unit, dimensions)
-        elif unit is not None:
-            raise InputError(
-                "a unit is named for a file of joint centres",
-                where="--unit",
-                expected="--from FILE besides",
-            )
-        elif dimensions or nominal in FAMILIES.keys() - catalogue().keys():
-            nominal = family_model(nominal, dimensions)
-            assumed = nominal.assumed
-        return NewResult(session_texts(nominal, what, places or 1), assumed=assumed)
+        nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
+        return NewResult(
+            session_texts(nominal, what, places or 1),
+            assumed=nominal.assumed if isinstance(nominal, NominalModel) else (),
+        )
     if printer is None:
         raise InputError(
             "probed points need the printer's configuration",
@@ -247,3 +231,31 @@ def new(
         firmware,
     )
     return NewResult(texts, of_printer=True, complete=not board)
+
+
+def _nominal(
+    machine: str | None,
+    from_file: Path | str | None,
+    unit: str | None,
+    dimensions: Mapping[str, float],
+) -> NominalModel | str | None:
+    """Nominal model of joint centres or of a family's dimensions; otherwise ``machine``."""
+    if from_file is not None:
+        if machine is not None:
+            raise InputError(
+                "the machine is described twice",
+                where="--from",
+                found="--machine besides",
+                expected="one of them",
+            )
+        return centres_model(Path(from_file), unit, dimensions)
+    if unit is not None:
+        raise InputError(
+            "a unit is named for a file of joint centres",
+            where="--unit",
+            expected="--from FILE besides",
+        )
+    # of the families, only those without a built-in machine of their name need dimensions
+    if dimensions or machine in FAMILIES.keys() - catalogue().keys():
+        return family_model(machine, dimensions)
+    return machine

@@ -17,7 +17,6 @@ pkmcal new my-machine --machine h4 --board
 pkmcal new my-printer --printer printer.cfg
 """
 DIMENSIONS_GROUP = "Dimensions of a family (--machine) or of --from"
-
 SPACING = "a fifth of the radius"
 
 
