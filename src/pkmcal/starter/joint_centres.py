@@ -19,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError, legible
 from pkmcal.files import MOST_MACHINE_LEGS, check_count, quoted, read_text
-from pkmcal.files.quantities import split_head
+from pkmcal.files.quantities import LARGEST_UNITLESS_LENGTH, split_head
 from pkmcal.starter.families import DIMENSIONS
 from pkmcal.starter.nominal import NominalLeg, NominalModel, millimetres, option_of
 from pkmcal.wording import listed
@@ -63,6 +63,15 @@ def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> N
             where=path.name,
             expected="LinuxCNC's lines 'setp genhexkins.base.0.x VALUE', or a .csv table with the"
             f" header {EXPECTED_HEADER}",
+        )
+    largest = float(np.abs([base, platform]).max())
+    if largest > LARGEST_UNITLESS_LENGTH:
+        raise InputError(
+            "a joint centre is too far from the frame's origin",
+            where=path.name,
+            found=f"{largest:.3g} m",
+            expected=f"at most {LARGEST_UNITLESS_LENGTH:g} m",
+            next_step="Check the unit",
         )
     home = _home(base, platform, given["leg"])
     lengths = np.linalg.norm(platform + home - base, axis=1)
