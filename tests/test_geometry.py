@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from pkmcal.geometry import cylinders, rigid
@@ -175,3 +176,21 @@ def test_tangent_basis(seed):
     gram = np.swapaxes(basis, -1, -2) @ basis
     np.testing.assert_allclose(gram, np.broadcast_to(np.eye(2), gram.shape), atol=1e-12)
     np.testing.assert_allclose(np.einsum("ij,ijk->ik", n, basis), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_distance_of_segments_against_dense_points(parallel):
+    rng = np.random.default_rng(3)
+    p0, p1, q0 = rng.normal(size=(3, 50, 3))
+    q1 = q0 + (rng.uniform(0.1, 2, (50, 1)) * (p1 - p0) if parallel else rng.normal(size=(50, 3)))
+    share = np.linspace(0, 1, 801)[:, None]
+    p, q = ((1 - share) * a[:, None] + share * b[:, None] for a, b in ((p0, p1), (q0, q1)))
+    dense = np.array([cdist(*pair).min() for pair in zip(p, q, strict=True)])
+    nearest = cylinders.segment_distance(p0, p1, q0, q1)
+    assert np.all(nearest <= dense + 1e-12)
+    np.testing.assert_allclose(nearest, dense, atol=6e-3)
+
+
+def test_segments_that_cross_have_no_distance():
+    p0, p1, q0, q1 = np.array([[-1, 0, 0], [1, 0, 0], [0.5, -2, 0], [0.5, 1, 0.0]])
+    assert cylinders.segment_distance(p0, p1, q0, q1) == pytest.approx(0, abs=1e-15)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.distance import cdist
 
 import pkmcal
 from conftest import run
 from pkmcal.errors import InputError
+from pkmcal.files import parse_yaml, validated_document
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.judge.against_truth import compare_with_truth
-from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.mechanisms import MechanismDocument, checked_machine, load_mechanism, mechanism_text
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.drives import drives_of, reaches, side_bars
 from pkmcal.observe.profiles import PROFILE_OPTIONS, Profiles, estimate_blur
-from pkmcal.placement.configurations import FARTHEST_TURN, platform_unfolded
+from pkmcal.placement.configurations import FARTHEST_TURN, draw_configurations, platform_unfolded
 from pkmcal.placement.default_camera import camera_of_size
 from pkmcal.simulation import (
     Settings,
@@ -83,6 +86,44 @@ def test_rods_without_cylinders_get_one(machine):
 def test_a_cylinder_that_is_drawn_stays():
     gough = load_mechanism("gough-stewart")
     assert with_forearms(gough) is gough
+
+
+def cables(side=0.08):
+    """Eight crossed cables; side : x of the platform's lower joints, m."""
+    signs = [(x, y) for x in (1, -1) for y in (1, -1)]
+    legs = [
+        {
+            "base": {"joint": "spherical", "center": [5 * x, 3 * y, -2 * z]},
+            "platform": {"joint": "spherical", "center": [half * x, 0.4 * y, 0.2 * z]},
+            "length": {"actuated": True, "range": [3, 9]},
+        }
+        for z, half in ((1, side), (-1, 0.05))
+        for x, y in signs
+    ]
+    text = yaml.safe_dump(
+        {"name": "cables", "motion": "spatial", "legs": legs, "home": {"position": [0, 0, 0]}}
+    )
+    document = parse_yaml(text, Path("cables.yaml"))
+    return checked_machine(validated_document(document, MechanismDocument), document)
+
+
+def test_rods_of_crossed_cables_are_thin():
+    machine = with_forearms(cables())
+    radius = machine.radii()[0][0]
+    home = machine.home()
+    ends = machine.ends_at(machine.inverse(home[None])[0], home)
+    along = np.linspace(0, 1, 2001)[:, None]
+    first, second = (ends.a[j] + along * (ends.b[j] - ends.a[j]) for j in (0, 4))
+    assert 0.001 < radius < cdist(first, second).min() / 4 + 1e-9
+    poses, _ = draw_configurations(machine, 20, 0.3, np.random.default_rng(0))
+    assert len(poses) >= 20
+
+
+def test_rods_that_cross_at_home_are_refused():
+    with pytest.raises(InputError) as refused:
+        with_forearms(cables(side=0.05))
+    assert refused.value.code == "mechanism.legs_touch"
+    assert "legs 1 and 5" in refused.value.found
 
 
 # where motors are

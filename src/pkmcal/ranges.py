@@ -48,7 +48,8 @@ class Range:
             "this number cannot be used",
             where=where,
             found=f"{value:g}" if isinstance(value, float) else repr(value),
-            expected=f"{'a whole number, ' if self.whole else ''}{self}",
+            expected=f"{'a whole number, ' if self.whole else ''}{self}"
+            f"{f' {self.unit}' if self.unit in ('m', 'rad', 'deg') else ''}",
         )
 
 
@@ -64,12 +65,25 @@ MOST_PLANNED_CONFIGURATIONS = 200
 memory grows with their number."""
 GOOD_ENCODER_SIGMA = 3e-6
 """Standard deviation of a reading of a good encoder, m or rad."""
+FAMILY_DIMENSIONS = (
+    "base_radius",
+    "platform_radius",
+    "leg",
+    "arm",
+    "base_spacing",
+    "platform_spacing",
+    "travel",
+    "tube_radius",
+)
+"""Numbers that nominal models of families are made of; described in
+:mod:`pkmcal.starter.families`."""
+_DIMENSION = Range(0, 50, above=True, unit="m")
 _SEED = _whole(0, 2**63 - 1, 0)
 RANGES: Mapping[str, Mapping[str, Range]] = MappingProxyType(
     {
         "calibrate": {"seed": _SEED, "holdout": _whole(0, 100_000, 0)},
         "check": {"seed": _SEED},
-        "new": {"places": _whole(1, 20)},
+        "new": {"places": _whole(1, 20), **dict.fromkeys(FAMILY_DIMENSIONS, _DIMENSION)},
         "plan": {
             "configurations": _whole(2, MOST_PLANNED_CONFIGURATIONS, 15),
             "places": _whole(1, 12),

@@ -12,9 +12,14 @@ from typing import Any
 from pkmcal.api.result import Result
 from pkmcal.errors import InputError
 from pkmcal.firmware.session import printer_session_texts
+from pkmcal.mechanisms import catalogue
 from pkmcal.outcome import Outcome, Verdict
+from pkmcal.outcome.finding import note
 from pkmcal.ranges import check_number
 from pkmcal.starter import check_new_folder, session_texts, write_texts
+from pkmcal.starter.families import FAMILIES, family_model
+from pkmcal.starter.joint_centres import centres_model
+from pkmcal.starter.nominal import NominalModel, option_of
 
 SESSION_FILE_DESCRIPTIONS = {
     "session.yaml": "begin here: what to do, step by step",
@@ -39,12 +44,13 @@ class NewResult(Result):
     """Files of a new session.
 
     texts : contents by name. of_printer : whether the nominal model is that of a firmware.
-    complete : whether nothing is missing.
+    complete : whether nothing is missing. assumed : dimensions that were not given.
     """
 
     texts: Mapping[str, str]
     of_printer: bool = False
     complete: bool = False
+    assumed: tuple[str, ...] = ()
 
     @cached_property
     def outcome(self) -> Outcome:
@@ -53,6 +59,10 @@ class NewResult(Result):
             command="new",
             title="New session",
             verdict=Verdict(True, "A session:" if self.complete else "A session to fill in:"),
+            findings=tuple(
+                note("session.assumed_dimension", "mechanism.yaml", option=option_of(name))
+                for name in self.assumed
+            ),
             document={"files": [*self.texts]},
         )
 
@@ -103,6 +113,16 @@ def new(
     printer: Path | str | None = None,
     probed: Path | str | None = None,
     firmware: str | None = None,
+    from_file: Path | str | None = None,
+    unit: str | None = None,
+    base_radius: float | None = None,
+    platform_radius: float | None = None,
+    leg: float | None = None,
+    arm: float | None = None,
+    base_spacing: float | None = None,
+    platform_spacing: float | None = None,
+    travel: float | None = None,
+    tube_radius: float | None = None,
 ) -> NewResult:
     """Make a commented session to fill in, or the session of a delta printer, without writing
     files.
@@ -110,7 +130,9 @@ def new(
     Parameters
     ----------
     machine :
-        Name of a built-in machine, or a mechanism file; by default a hexapod to be edited.
+        Name of a built-in machine, or a mechanism file; by default a hexapod to be edited. With
+        dimensions a family of machines: ``hexapod``, ``rotary-hexapod``, ``delta`` or
+        ``linear-delta``.
     board, legs :
         What the camera observes; by default the legs, or a board if the nominal model has no
         cylinders, or nothing if its readings alone determine the geometry.
@@ -126,6 +148,24 @@ def new(
     firmware :
         ``klipper``, ``marlin``, ``repetier``, ``reprap`` or ``smoothie``, for a ``printer`` that
         does not show which it is of.
+    from_file :
+        File of a hexapod's joint centres: LinuxCNC's HAL file with pins of genhexkins, or a CSV
+        table with the columns leg, base_x, base_y, base_z, platform_x, platform_y, platform_z and
+        their units. With ``leg``, and where known ``travel`` and ``tube_radius``.
+    unit :
+        ``mm`` or ``inch``, of the lengths in a HAL file.
+    base_radius, platform_radius :
+        Radii, m, of the circles through the joints of base (motors, towers) and platform.
+    leg :
+        Length, m, of a leg at home, or of a leg's rod.
+    arm :
+        Length, m, of a crank.
+    base_spacing, platform_spacing :
+        Distances, m, between the joints of a pair of a hexapod; a fifth of the radius by default.
+    travel :
+        Range, m, of the legs' lengths or the carriages' readings.
+    tube_radius :
+        Radius, m, of the legs' cylinders.
 
     Returns
     -------
@@ -135,10 +175,24 @@ def new(
     Raises
     ------
     pkmcal.errors.InputError
-        The machine or the printer's file is invalid, or the arguments exclude each other.
+        The machine or the printer's file is invalid, the dimensions are those of no machine, or the
+        arguments exclude each other.
 
     """
     check_number("new", "places", places)
+    given = {
+        "base_radius": base_radius,
+        "platform_radius": platform_radius,
+        "leg": leg,
+        "arm": arm,
+        "base_spacing": base_spacing,
+        "platform_spacing": platform_spacing,
+        "travel": travel,
+        "tube_radius": tube_radius,
+    }
+    dimensions = {name: value for name, value in given.items() if value is not None}
+    for name, value in dimensions.items():
+        check_number("new", name, value)
     if printer is None and firmware is not None:
         raise InputError(
             "a firmware is named for a printer's file",
@@ -147,8 +201,10 @@ def new(
         )
     if printer is None and probed is None:
         what = "both" if board and legs else "board" if board else "legs" if legs else None
+        nominal = _nominal(None if machine is None else str(machine), from_file, unit, dimensions)
         return NewResult(
-            session_texts(None if machine is None else str(machine), what, places or 1)
+            session_texts(nominal, what, places or 1),
+            assumed=nominal.assumed if isinstance(nominal, NominalModel) else (),
         )
     if printer is None:
         raise InputError(
@@ -158,6 +214,8 @@ def new(
             " printed",
         )
     others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
+    others |= {"--from": from_file, "--unit": unit}
+    others |= {option_of(name): True for name in dimensions}
     if extra := [name for name, given in others.items() if given]:
         raise InputError(
             "a printer's session has probed heights, or with --board a board on the tool",
@@ -173,3 +231,31 @@ def new(
         firmware,
     )
     return NewResult(texts, of_printer=True, complete=not board)
+
+
+def _nominal(
+    machine: str | None,
+    from_file: Path | str | None,
+    unit: str | None,
+    dimensions: Mapping[str, float],
+) -> NominalModel | str | None:
+    """Nominal model of joint centres or of a family's dimensions; otherwise ``machine``."""
+    if from_file is not None:
+        if machine is not None:
+            raise InputError(
+                "the machine is described twice",
+                where="--from",
+                found="--machine besides",
+                expected="one of them",
+            )
+        return centres_model(Path(from_file), unit, dimensions)
+    if unit is not None:
+        raise InputError(
+            "a unit is named for a file of joint centres",
+            where="--unit",
+            expected="--from FILE besides",
+        )
+    # of the families, only those without a built-in machine of their name need dimensions
+    if dimensions or machine in FAMILIES.keys() - catalogue().keys():
+        return family_model(machine, dimensions)
+    return machine

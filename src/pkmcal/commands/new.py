@@ -16,14 +16,21 @@ pkmcal new my-machine
 pkmcal new my-machine --machine h4 --board
 pkmcal new my-printer --printer printer.cfg
 """
+DIMENSIONS_GROUP = "Dimensions of a family (--machine) or of --from"
+SPACING = "a fifth of the radius"
+
+
+def _dimension(name: str, described: str, usual: str = "") -> Any:
+    """Option of a length of a family of machines."""
+    return number("new", name, "LENGTH", described, usual=usual, group=DIMENSIONS_GROUP)
 
 
 @command(
     EXAMPLES,
     argument("folder", "DIR", "New or empty folder.", Path),
     option(
-        "--machine", "MACHINE", "Name of a built-in machine, or mechanism file."
-        " [default: a dialogue, or gough-stewart]",
+        "--machine", "MACHINE", "Name of a built-in machine, mechanism file, or, with dimensions,"
+        " hexapod, rotary-hexapod, delta or linear-delta. [default: a dialogue, or gough-stewart]",
     ),
     flag("--legs", "The cameras observe the legs. [default where legs can be observed]"),
     flag("--board", "The cameras observe a board."),
@@ -37,6 +44,19 @@ pkmcal new my-printer --printer printer.cfg
         "--firmware", "NAME", "Printer's firmware, if its file does not show it: klipper, marlin,"
         " repetier, reprap or smoothie.",
     ),
+    option(
+        "--from from_file", "FILE", "LinuxCNC's HAL file of genhexkins, or CSV table of a hexapod's"
+        " joint centres; with --leg.", Path,
+    ),
+    option("--unit", "NAME", "Unit of a HAL file's lengths: mm or inch."),
+    _dimension("base_radius", "Radius of the circle through the base joints, motors or towers."),
+    _dimension("platform_radius", "Radius of the circle through the platform joints."),
+    _dimension("leg", "Length of a leg at home, or of a leg's rod."),
+    _dimension("arm", "Length of a crank."),
+    _dimension("base_spacing", "Distance between the base joints of a pair.", SPACING),
+    _dimension("platform_spacing", "Distance between the platform joints of a pair.", SPACING),
+    _dimension("travel", "How far legs change their lengths, or carriages move."),
+    _dimension("tube_radius", "Radius of the legs' cylinders."),
     as_json(),
 )  # fmt: skip
 def new(folder: Path, as_json: bool, **options: Any) -> int:

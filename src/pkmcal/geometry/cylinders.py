@@ -162,3 +162,21 @@ def tangent_basis(n: Array, along: Array) -> Array:
     first = along - dot(along, n)[..., None] * n
     first = first / np.sqrt(dot(first, first))[..., None]
     return np.stack([first, cross(n, first)], axis=-1)
+
+
+def segment_distance(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
+    """Smallest distance (...), m, between the segments p0 p1 and q0 q1 (..., 3) of positive length.
+
+    The distance of points p0 + s (p1 - p0) and q0 + t (q1 - q0) is convex in s and t: the best s on
+    the lines is clipped to the segment, then the best t for it, then s once more [Ericson 2005,
+    5.1.9].
+    """
+    u, v, w = p1 - p0, q1 - q0, p0 - q0
+    uu, vv, uv, uw, vw = dot(u, u), dot(v, v), dot(u, v), dot(u, w), dot(v, w)
+    det = uu * vv - uv * uv
+    # of parallel segments, any s is a start
+    lines = np.divide(uv * vw - uw * vv, det, out=np.zeros_like(det), where=det > 1e-12 * uu * vv)
+    t = np.clip((uv * np.clip(lines, 0, 1) + vw) / vv, 0, 1)
+    s = np.clip((uv * t - uw) / uu, 0, 1)
+    t = np.clip((uv * s + vw) / vv, 0, 1)
+    return np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)

@@ -10,6 +10,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError
+from pkmcal.geometry.cylinders import segment_distance
 from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
@@ -29,6 +30,10 @@ GUIDE_SIDE_ROOM = 4.0
 """Clearance beside a guide for rail and carriage, in radii of the leg on it."""
 SIDE_BY_SIDE = 0.9
 """Cosine of the angle between two guides' backs above which the guides lie side by side."""
+LEG_MIDDLE = (0.06, 0.97)
+"""Part of a leg, from A to B, that is compared with other legs and guides."""
+GUIDE_SAMPLES = 24
+"""Points of a leg that are compared with a guide."""
 READING_RANGE_SHARES = (0.03, 0.97)
 """Shares of a joint's range between which readings are drawn, away from the stops."""
 
@@ -141,30 +146,47 @@ def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
     return value.T_base_platform[value.converged]
 
 
+def leg_distances(ends: tuple[Array, Array]) -> Array:
+    """Smallest distances (n, L, L), m, between the axes of legs j < i without their ends; infinite
+    elsewhere.
+
+    ends : points A and B (n, L, 3) of the rods.
+    """
+    start, stop = ((1 - share) * ends[0] + share * ends[1] for share in LEG_MIDDLE)
+    nearest = np.full((*start.shape[:2], start.shape[1]), np.inf)
+    for i, j in zip(*np.tril_indices(start.shape[1], -1), strict=True):
+        nearest[:, i, j] = segment_distance(start[:, i], stop[:, i], start[:, j], stop[:, j])
+    return nearest
+
+
+def touching_legs(ends: tuple[Array, Array], nearest: Array, radii: Array) -> Booleans:
+    """(n, L, L) True where legs j < i touch, but for legs with a common joint.
+
+    nearest : :func:`leg_distances`. radii : (L,) of the legs, m.
+    """
+    thick = radii[:, None] + radii
+    meet = np.zeros(nearest.shape, dtype=bool)
+    for end in ends:
+        gap = end[:, :, None] - end[:, None]
+        meet |= np.linalg.norm(gap, axis=-1) < thick
+    return (nearest <= thick) & ~meet
+
+
 def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     """(n,) True where no two legs come nearer than their radii, nor a leg near another leg's guide.
 
     Legs with a common joint are exempt, as in nominal models that reduce the platform to a point:
     such legs come near each other nowhere else.
     """
-    ends = machine.ends_at(joints, T_base_platform)
-    along = np.linspace(0.06, 0.97, 24)[:, None]
-    points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
-    # components first: every sample of a leg is compared with every sample of another in long rows
-    on_leg = np.ascontiguousarray(np.moveaxis(points, (-1, 1), (0, 1)))
+    limbs = machine.ends_at(joints, T_base_platform)
+    ends = limbs.a, limbs.b
+    along = np.linspace(*LEG_MIDDLE, GUIDE_SAMPLES)[:, None]
+    points = limbs.a[..., None, :] * (1 - along) + limbs.b[..., None, :] * along
     widths = np.array([r.max() if len(r) else 0.0 for r in machine.radii()])
     drives = drives_of(machine)
-    apart = np.ones(T_base_platform.shape[0], dtype=bool)
+    touching = touching_legs(ends, leg_distances(ends), widths)
+    apart: Booleans = ~np.asarray(touching.any(axis=(-1, -2)))
     for i, j in np.ndindex(machine.n_legs, machine.n_legs):
-        if j < i:
-            thick = widths[i] + widths[j]
-            gap = on_leg[:, i, :, :, None] - on_leg[:, j, :, None, :]
-            gap *= gap
-            meet = [
-                np.linalg.norm(end[:, i] - end[:, j], axis=1) < thick for end in (ends.a, ends.b)
-            ]
-            nearest = np.sqrt((gap[0] + gap[1] + gap[2]).min(axis=(-1, -2)))
-            apart &= (nearest > thick) | meet[0] | meet[1]
         # the legs of carriages side by side on one guide are beside that guide
         if j != i and drives.guides[j] and drives.away[i] @ drives.away[j] <= SIDE_BY_SIDE:
             for start, stop in pairwise(drives.ways[j]):

@@ -19,6 +19,7 @@ from pkmcal.files import csv_text, entries, read_text, staged_folder
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.document import MOTION_DIRECTIONS
 from pkmcal.outcome.finding import Finding, doubtful
+from pkmcal.starter.nominal import NominalModel
 
 ObservedChoice = Literal["legs", "board", "both", "readings"]
 OBSERVED_CHOICES: tuple[ObservedChoice, ...] = ("legs", "board", "both", "readings")
@@ -98,11 +99,14 @@ def check_new_folder(folder: Path | str) -> None:
 
 
 def session_texts(
-    machine: str | None = None, what: ObservedChoice | None = None, places: int = 1
+    machine: NominalModel | str | None = None,
+    what: ObservedChoice | None = None,
+    places: int = 1,
 ) -> dict[str, str]:
     """Texts of a starter session's files by name.
 
-    machine : a built-in machine's name or a mechanism file; by default a hexapod to be edited.
+    machine : a built-in machine's name, a mechanism file, or a nominal model of few numbers; by
+        default a hexapod to be edited.
     what : what the camera observes; by default the legs, or a board if the nominal model has no
         tubes, or nothing if readings alone determine the geometry.
     places : number of stations of the camera.
@@ -115,19 +119,26 @@ def session_texts(
     }
     turns = False
     if machine is not None:
-        model = load_mechanism(machine)
+        generated = isinstance(machine, NominalModel)
+        model = machine.machine() if generated else load_mechanism(machine)
         has_tubes = any(leg.tubes for leg in model.document.legs)
         if not has_tubes and what in ("legs", "both"):
             raise InputError(
                 f"the nominal model of {model.name} has no cylinders that a camera could see",
-                where=machine,
+                where=None if generated else machine,
                 expected="a board on the platform, or tubes on its legs",
-                next_step="Ask for a board alone, or give the legs of a copy of the"
-                " nominal model tubes",
+                next_step="Ask for a board alone, or "
+                + (
+                    "give --tube-radius"
+                    if generated
+                    else "give the legs of a copy of the nominal model tubes"
+                ),
             )
         if what is None and not has_tubes:
             what = "readings" if model.redundancy > 0 else "board"
-        texts["mechanism.yaml"] = read_text(catalogue().get(machine, Path(machine)))
+        texts["mechanism.yaml"] = (
+            machine.text() if generated else read_text(catalogue().get(machine, Path(machine)))
+        )
         texts["joints.csv"] = example_readings(model)
         turns = set(model.joint_units) == {"rad"}
     what = what or "legs"

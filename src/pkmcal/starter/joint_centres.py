@@ -1,0 +1,217 @@
+"""Nominal model of a hexapod from a file of its joint centres: LinuxCNC's HAL file with pins of
+genhexkins, or a CSV table.
+
+genhexkins (LinuxCNC's src/emc/kinematics): joint N is the length from ``base.N``, in the base
+frame, to ``platform.N``, in the platform frame; pins have the unit of the INI file's LINEAR_UNITS.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError, legible
+from pkmcal.files import MOST_MACHINE_LEGS, check_count, quoted, read_text
+from pkmcal.files.quantities import LARGEST_UNITLESS_LENGTH, split_head
+from pkmcal.starter.families import DIMENSIONS
+from pkmcal.starter.nominal import NominalLeg, NominalModel, millimetres, option_of
+from pkmcal.wording import listed
+
+UNITS: Mapping[str, float] = {"mm": 1e-3, "inch": 0.0254}
+"""LinuxCNC's units of length, m."""
+STRUTS = 6
+COLUMNS = tuple(f"{end}_{axis}" for end, axis in product(("base", "platform"), "xyz"))
+EXPECTED_HEADER = f"leg,{','.join(f'{name} [mm]' for name in COLUMNS)}"
+NEEDS, TAKES = ("leg",), ("travel", "tube_radius")
+"""Dimensions besides the joint centres."""
+_PIN = re.compile(r"^\s*setp\s+genhexkins\.(\S+)\s+(\S+)", re.MULTILINE)
+
+
+def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> NominalModel:
+    """Nominal model of the joint centres in a file.
+
+    unit : of a HAL file, ``mm`` or ``inch``. given : dimensions besides the centres, m. Raises
+    InputError for another file, missing centres, and legs that do not reach.
+    """
+    if "leg" not in given or any(name not in (*NEEDS, *TAKES) for name in given):
+        raise InputError(
+            "joint centres need the legs' length at home, and no other radius, spacing or arm",
+            where="--from",
+            found=listed([option_of(name) for name in given]) or "no --leg",
+            expected="--leg LENGTH, and where known --travel and --tube-radius",
+        )
+    text = read_text(path)
+    remarks: tuple[str, ...] = ()
+    if _PIN.search(text):
+        base, platform, remarks = _of_hal(text, path.name, unit)
+    elif path.suffix.lower() == ".csv":
+        if unit is not None:
+            raise InputError(
+                "a table names its units in its header", where="--unit", expected=EXPECTED_HEADER
+            )
+        base, platform = _of_table(text, path.name)
+    else:
+        raise InputError(
+            "the file has no joint centres that can be read",
+            where=path.name,
+            expected="LinuxCNC's lines 'setp genhexkins.base.0.x VALUE', or a .csv table with the"
+            f" header {EXPECTED_HEADER}",
+        )
+    largest = float(np.abs([base, platform]).max())
+    if largest > LARGEST_UNITLESS_LENGTH:
+        raise InputError(
+            "a joint centre is too far from the frame's origin",
+            where=path.name,
+            found=f"{largest:.3g} m",
+            expected=f"at most {LARGEST_UNITLESS_LENGTH:g} m",
+            next_step="Check the unit",
+        )
+    home = _home(base, platform, given["leg"])
+    lengths = np.linalg.norm(platform + home - base, axis=1)
+    half = given.get("travel", 0.0) / 2
+    sweep = (float(lengths.min()) - half, float(lengths.max()) + half) if half else None
+    if sweep is not None and sweep[0] <= 0:
+        raise InputError(
+            "the shortest leg would have no length",
+            where="--travel",
+            found=millimetres(2 * half),
+            expected=f"less than {millimetres(2 * float(lengths.min()))}",
+        )
+    return NominalModel(
+        "hexapod",
+        (
+            f"A hexapod by the joint centres in {legible(path.name)}: legs of variable length, in"
+            " that file's order. A reading is the leg's length.",
+            *remarks,
+        ),
+        tuple(
+            (f"{name}: {millimetres(given[name])}", *DIMENSIONS[name])
+            for name in (*NEEDS, *TAKES)
+            if name in given
+        ),
+        "spatial",
+        tuple(NominalLeg.telescope(a, b, sweep) for a, b in zip(base, platform, strict=True)),
+        home,
+        given.get("tube_radius"),
+    )
+
+
+def _home(base: Array, platform: Array, leg: float) -> Array:
+    """Position (3,) of the platform, without rotation and above the base, at which legs have the
+    root mean square length ``leg``.
+    """
+    gap = platform - base
+    across = gap[:, :2] - gap[:, :2].mean(axis=0)
+    # mean of across^2 + (z + gap_z)^2 = leg^2
+    rest = leg**2 - np.sum(across**2, axis=1).mean() - gap[:, 2].var()
+    if rest <= 0:
+        raise InputError(
+            "the legs do not reach the platform at home",
+            where="--leg",
+            found=millimetres(leg),
+            expected=f"more than {millimetres(np.sqrt(leg**2 - rest))}, by these joint centres",
+        )
+    return np.array([*-gap[:, :2].mean(axis=0), np.sqrt(rest) - gap[:, 2].mean()])
+
+
+def _of_hal(text: str, label: str, unit: str | None) -> tuple[Array, Array, tuple[str, ...]]:
+    """Centres (6, 3) of base and platform, m, and remarks, of pins of genhexkins."""
+    if unit not in UNITS:
+        raise InputError(
+            f"{label} does not name the unit of its values",
+            where="--unit",
+            found=unit,
+            expected=f"{listed(list(UNITS))}: LINEAR_UNITS in the INI file".replace(
+                " and ", " or "
+            ),
+        )
+    pins = {name: (value, m) for m in _PIN.finditer(text) for name, value in [m.groups()]}
+    values = np.empty((2, STRUTS, 3))
+    for (e, end), strut, (k, axis) in product(
+        enumerate(("base", "platform")), range(STRUTS), enumerate("xyz")
+    ):
+        name = f"{end}.{strut}.{axis}"
+        if name not in pins:
+            raise InputError(
+                "a joint centre is incomplete",
+                where=label,
+                found=f"no genhexkins.{name}",
+                expected=f"setp genhexkins.{name} VALUE",
+            )
+        value, match = pins[name]
+        line = text.count("\n", 0, match.start(1)) + 1
+        values[e, strut, k] = _number(value, f"{label}, line {line}, genhexkins.{name}")
+    remarks = ()
+    lead = pins.get("screw-lead", ("0", None))[0]
+    if lead.strip("+-0.") != "":
+        remarks = (
+            f"genhexkins.screw-lead is {legible(lead)}: how far a strut grows as its joints turn it"
+            " is not part of this model.",
+        )
+    return values[0] * UNITS[unit], values[1] * UNITS[unit], remarks
+
+
+def _of_table(text: str, label: str) -> tuple[Array, Array]:
+    """Centres (L, 3) of base and platform, m, of a table."""
+    rows = [
+        (number, [cell.strip() for cell in row])
+        for number, row in enumerate(csv.reader(io.StringIO(text.removeprefix("\ufeff"))), 1)
+        if any(cell.strip() for cell in row)
+    ]
+    heads = [split_head(head) for head in (rows[0][1] if rows else [])]
+    names = [name.lower() for name, _ in heads]
+    if names != ["leg", *COLUMNS]:
+        raise InputError(
+            "the table's columns are not those of joint centres",
+            where=f"{label}, line {rows[0][0] if rows else 1}",
+            found=quoted(",".join(names)),
+            expected=EXPECTED_HEADER,
+        )
+    if wrong := [name for name, head_unit in heads[1:] if head_unit and head_unit.kind != "m"]:
+        raise InputError(
+            "a joint centre is a length",
+            where=f"{label}, line {rows[0][0]}",
+            found=f"another unit of {wrong[0]}",
+            expected="m, mm or in",
+        )
+    check_count(len(rows) - 1, MOST_MACHINE_LEGS, "legs", label)
+    if len(rows) - 1 < STRUTS:
+        raise InputError(
+            "a platform with six degrees of freedom has six legs or more",
+            where=label,
+            found=f"{len(rows) - 1} rows",
+            expected=f"{STRUTS} or more",
+        )
+    values = np.empty((len(rows) - 1, 6))
+    for row, (line, cells) in enumerate(rows[1:]):
+        if len(cells) != len(names):
+            raise InputError(
+                "a row has another number of cells than the header",
+                where=f"{label}, line {line}",
+                found=len(cells),
+                expected=len(names),
+            )
+        for k, cell in enumerate(cells[1:]):
+            values[row, k] = _number(cell, f"{label}, line {line}, {COLUMNS[k]}")
+    values *= [1.0 if head_unit is None else head_unit.factor for _, head_unit in heads[1:]]
+    return values[:, :3], values[:, 3:]
+
+
+def _number(text: str, where: str) -> float:
+    """Finite number of a text."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(
+            "this is not a number", where=where, found=quoted(text), expected="a finite number"
+        )
+    return value

@@ -1,0 +1,166 @@
+"""Nominal models that are made of joint centres, and their commented ``mechanism.yaml``."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.files import parse_yaml, validated_document
+from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
+
+TOLERANCE_SHARE, LARGEST_TOLERANCE = 0.02, 0.002
+"""Standard deviation of a centre relative to the longest leg, and its largest value, m: a ruler
+from one joint's middle to another's."""
+TUBE_PART = (0.1, 0.85)
+"""Part of the shortest leg, from A, that its cylinder takes."""
+
+
+def millimetres(length: float) -> str:
+    """Length with its unit, to the micrometre."""
+    return f"{float(np.round(1e3 * length, 3)) + 0.0:.10g} mm"
+
+
+def option_of(number: str) -> str:
+    """Option of a dimension."""
+    return f"--{number.replace('_', '-')}"
+
+
+@dataclass(frozen=True)
+class NominalLeg:
+    """Leg of a nominal model, m.
+
+    base, rod : their entries in the file. start : A (3,) at home, base frame. platform : B (3,),
+    platform frame. least : shortest length; None for that at home.
+    """
+
+    base: str
+    rod: str
+    start: Array
+    platform: Array
+    least: float | None = None
+
+    __repr__ = short_repr
+
+    @classmethod
+    def telescope(
+        cls, base: Array, platform: Array, sweep: tuple[float, float] | None
+    ) -> NominalLeg:
+        """Leg of variable length; sweep : its shortest and longest length."""
+        ends = "" if sweep is None else f", range: {_numbers(sweep)}"
+        return cls(
+            f"{{joint: spherical, center: {_numbers(base)}}}",
+            f"{{actuated: true, offset: 0{ends}}}",
+            base,
+            platform,
+            None if sweep is None else sweep[0],
+        )
+
+    @classmethod
+    def crank(
+        cls, center: Array, axis: Array, zero: Array, arm: float, platform: Array, rod: float
+    ) -> NominalLeg:
+        """Rod on a crank; axis, zero : unit vectors, zero that of the arm at reading 0."""
+        base = (
+            f"{{joint: crank, center: {_numbers(center)}, axis: {_direction(axis)},"
+            f" zero: {_direction(zero)}, arm: {millimetres(arm)}}}"
+        )
+        return cls(base, _constant(rod), center + arm * zero, platform, rod)
+
+    @classmethod
+    def slider(
+        cls,
+        center: Array,
+        axis: Array,
+        sweep: tuple[float, float] | None,
+        platform: Array,
+        rod: float,
+    ) -> NominalLeg:
+        """Rod on a carriage; sweep : its least and largest reading."""
+        ends = "" if sweep is None else f", range: {_numbers(sweep)}"
+        base = f"{{joint: slider, center: {_numbers(center)}, axis: {_direction(axis)}{ends}}}"
+        return cls(base, _constant(rod), center, platform, rod)
+
+
+@dataclass(frozen=True)
+class NominalModel:
+    """Nominal model by its legs and home.
+
+    heading : paragraphs of the file's first comment. numbers : lines of a comment for each number
+    that it is made of. home : (3,) position of the platform, m, without rotation. tube_radius : of
+    every leg's cylinder, None for legs without. assumed : names of numbers that were not given.
+    """
+
+    name: str
+    heading: tuple[str, ...]
+    numbers: tuple[tuple[str, ...], ...]
+    motion: str
+    legs: tuple[NominalLeg, ...]
+    home: Array
+    tube_radius: float | None = None
+    assumed: tuple[str, ...] = ()
+
+    __repr__ = short_repr
+
+    def text(self) -> str:
+        """Text of mechanism.yaml."""
+        lines = [line for part in self.heading for line in textwrap.wrap(part, 96)]
+        for first, *rest in self.numbers:
+            lines += ["", first, *(f"  {line}" for line in rest)]
+        comment = "\n".join(f"# {line}".rstrip() for line in lines)
+        sigma = min(LARGEST_TOLERANCE, TOLERANCE_SHARE * float(self._lengths().max()))
+        return (
+            f"{comment}\nname: {self.name}\nmotion: {self.motion}\n\n"
+            "# Base joints in the base frame, platform joints in the platform frame, which has the"
+            " same\n# directions at home; z is up. Replace any centre by a better one.\nlegs:\n"
+            + "".join(map(self._leg_text, self.legs))
+            + f"\n# The platform frame's origin in the middle of the workspace.\n"
+            f"home: {{position: {_numbers(self.home)}}}\n\n"
+            "# Standard deviations of these numbers: how well they were measured, and made.\n"
+            f"tolerance: {{center: {millimetres(sigma)}, offset: {millimetres(sigma)}}}\n"
+        )
+
+    def machine(self) -> Machine:
+        """The machine. Raises InputError for a text that is no machine."""
+        document = parse_yaml(self.text(), Path("mechanism.yaml"))
+        return checked_machine(validated_document(document, MechanismDocument), document)
+
+    def readings(self) -> Array:
+        """Readings (1, m) at home."""
+        machine = self.machine()
+        return machine.inverse(machine.home()[None])
+
+    def _lengths(self) -> Array:
+        """Distances (L,) of A and B at home, m."""
+        return np.array([np.linalg.norm(x.platform + self.home - x.start) for x in self.legs])
+
+    def _leg_text(self, leg: NominalLeg) -> str:
+        """Entry of a leg."""
+        platform = f"{{joint: spherical, center: {_numbers(leg.platform)}}}"
+        text = f"  - base: {leg.base}\n    platform: {platform}\n    length: {leg.rod}\n"
+        if self.tube_radius is None:
+            return text
+        length = float(np.linalg.norm(leg.platform + self.home - leg.start))
+        start, stop = ((leg.least or length) * share for share in TUBE_PART)
+        return text + (
+            f"    tubes: [{{radius: {millimetres(self.tube_radius)}, from: {millimetres(start)},"
+            f" to: {millimetres(stop)}}}]\n"
+        )
+
+
+def _numbers(values: Array | tuple[float, ...]) -> str:
+    """Lengths as a list."""
+    return f"[{', '.join(millimetres(value) for value in values)}]"
+
+
+def _direction(vector: Array) -> str:
+    """Unit vector as a list."""
+    return f"[{', '.join(f'{float(np.round(x, 10)) + 0.0:.10g}' for x in vector)}]"
+
+
+def _constant(length: float) -> str:
+    """Rod of constant length."""
+    return f"{{actuated: false, constant: {millimetres(length)}}}"
