@@ -164,7 +164,8 @@ def test_files_as_others_write_them(tmp_path):
         (ROS, "image_width: 640\n", "", "c.yaml, image_width: this is missing."),
         (ROS, "camera_matrix", "matrix", "c.yaml, model: the camera's model is missing; expected "
          "double_sphere or extended_unified or fisheye or pinhole or rational or unified. "
-         "OpenCV's files have camera_matrix, image_width and image_height; ROS's camera_matrix; Kalibr's camera_model under cam0."),
+         "OpenCV's files have camera_matrix, image_width and image_height; ROS's "
+         "camera_matrix; Kalibr's camera_model under cam0."),
         (KALIBR, "", "", "c.yaml: the file holds several cameras; found cam0 and cam1. Name one "
          "behind a #, such as c.yaml#cam1."),
     ],

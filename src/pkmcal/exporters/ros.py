@@ -88,9 +88,9 @@ class Ros(Exporter):
         out: list[Finding] = []
         if lost:
             out.append(doubtful("export.ros_no_camera_file", listed(lost), stations=lost))
-        mirrors = [s for s, camera in source.cameras.items() if not _has_ros_model(camera)]
-        if mirrors:
-            out.append(doubtful("export.ros_mirrors", listed(mirrors), stations=mirrors))
+        without_model = [s for s, camera in source.cameras.items() if not _has_ros_model(camera)]
+        if without_model:
+            out.append(doubtful("export.ros_lens", listed(without_model), stations=without_model))
         out.append(note("export.ros_launch", ROS_LAUNCH_FILE))
         return tuple(out)
 
