@@ -168,7 +168,7 @@ def test_readings_that_the_nominal_model_cannot_take(session, x, where, message)
     [
         (GOOD, None),
         (replace(GOOD, saturated=0.3), "30% of the legs are overexposed"),
-        (replace(GOOD, saturated=0.3, recognised=False), "30% of the pictures are overexposed"),
+        (replace(GOOD, saturated=0.3, recognised=False), "30% of the images are overexposed"),
         (replace(GOOD, black=0.6), "60% of the legs are black"),
         (replace(GOOD, blur=1.9), "blurred over 1.9 px"),
         (replace(GOOD, blur=float("nan")), None),

@@ -141,8 +141,9 @@ def test_one_folder_holds_the_history_of_a_machine(demo, later, tmp_path):
     folder = tmp_path / "watch"
     results = []
     for session in (later.same, later.off, later.off):
-        run("watch", demo.calibration, session, "-o", folder)
+        printed = run("watch", demo.calibration, session, "-o", folder, "--json").json
         document = json.loads((folder / "watch.json").read_text())
+        assert printed["runs"] == document["runs"]
         results.append([one["result"] for one in document["runs"]])
     first, second, again = results
     assert first == ["as_calibrated"]

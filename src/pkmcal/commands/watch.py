@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,11 @@ def watch(calibration: Path, session: Path, out: Path | None, as_json: bool, **o
 
     with console.progress(as_json) as progress:
         from pkmcal.api.watch import WatchResult
+        from pkmcal.judge.watch_runs import earlier_runs
 
         loaded = pkmcal.load_session(session)
         folder = console.output_folder(out, loaded.folder / "watch", WatchResult)
         result = pkmcal.watch(calibration, loaded, progress=progress.work, **options)
+        # what is printed has the run chart's history, as the files have
+        result = replace(result, earlier=earlier_runs(folder))
         return finish(result, folder, progress, as_json=as_json)

@@ -214,6 +214,12 @@ class Firmware(Exporter, ABC):
         same = values.print_radius == (None if radius is None else float(radius))
         expected = np.zeros(0) if steps is None else steps
         same_number = len(values.steps) == len(expected)
+        motor_steps = Difference(
+            "motor steps",
+            largest(values.steps, expected) if same_number else np.inf,
+            STEPS_ROUNDING,
+            "steps per mm",
+        )
         return [
             firmware_tool_difference(text, fit, values.inverse, zero, values.end_rounding),
             Difference(
@@ -223,12 +229,7 @@ class Firmware(Exporter, ABC):
                 "mm or degrees",
             ),
             Difference("print radius", 0.0 if same else np.inf, 0.0, "mm"),
-            Difference(
-                "motor steps",
-                largest(values.steps, expected) if same_number else np.inf,
-                STEPS_ROUNDING,
-                "steps per mm",
-            ),
+            *([motor_steps] if len(values.steps) or len(expected) else []),
             *values.others,
         ]
 
