@@ -254,6 +254,23 @@ def test_too_many_corners_off_are_refused():
     assert float(caught.value.found.partition("%")[0]) == pytest.approx(100 * 14 / 48, abs=2)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_narrow_lens_is_a_pinhole_where_a_mirror_fits_as_well(seed):
+    """Thirteen images as by a webcam: xi takes the place of k1 and k2 with fewer parameters, with a
+    focal length of 2000 px.
+    """
+    true, noise = camera_of("pinhole", 855, 854, 547, 376, -0.28, 0.1, 1e-3), (0.15, 0.3)[seed]
+    values = detections(true, poses_for(true, 13, seed, 0.35), seed, noise=noise)
+    pool = camera_candidates(views_of(values, BOARD), SIZE, ("pinhole", "unified"))
+    best = min(pool, key=lambda c: c.robust)
+    fewest = min((c for c in pool if not is_worse(c, best)), key=lambda c: c.parameters)
+    assert fewest.model == "unified"
+    assert fewest.fit.camera.focal[0] > 1900
+    chosen = best_of(pool)
+    assert chosen.model == "pinhole"
+    np.testing.assert_allclose(chosen.fit.camera.focal, true.focal, rtol=2e-3)
+
+
 def test_no_model_wins_by_giving_up_more():
     """A fit without a quarter of the corners, whose rest fits better, against one that has all."""
     true = TRUE["pinhole"]

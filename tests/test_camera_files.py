@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -16,19 +17,38 @@ VALUES = {
     "pinhole": [1056.0033333333333, 1057.4, 515.5, 378.1, -0.17, 0.07, 4e-4, -3e-4, 0.0],
     "fisheye": [350.1, 351.2, 510.3, 388.8, 0.01, -0.002, 0.003, -1 / 3e3],
     "unified": [260.1, 259.9, 514.2, 383.3, 0.9777777777777777, -0.1, 0.02, 3e-4, -1e-4],
+    "rational": [
+        *(1056.0033333333333, 1057.4, 515.5, 378.1, 0.5, 0.1, 4e-4, -3e-4, 0.01, 0.7, 0.15, 1 / 3),
+        *np.zeros(6),
+    ],
+    "double_sphere": [280.1, 281.3, 510.3, 388.8, -0.2, 0.58 + 1e-13],
+    "extended_unified": [280.1, 281.3, 510.3, 388.8, 0.6, 1.1 + 1e-13],
 }
+FORMS = {
+    "pinhole": ("opencv", "ros", "kalibr"),
+    "fisheye": ("opencv", "ros", "kalibr"),
+    "unified": ("opencv", "kalibr"),
+    "rational": ("opencv", "ros"),
+    "double_sphere": ("kalibr",),
+    "extended_unified": ("kalibr",),
+}
+"""Formats that have each camera model."""
 
 
 def camera_of(model):
     return camera_models()[model]((1024, 768), np.array(VALUES[model]))
 
 
-@pytest.mark.parametrize("model", VALUES)
-@pytest.mark.parametrize("form", ["opencv", "ros", "kalibr"])
-@pytest.mark.parametrize("ending", ["yaml", "xml"])
+@pytest.mark.parametrize(
+    ("model", "form", "ending"),
+    [
+        (model, form, ending)
+        for model, forms in FORMS.items()
+        for form in forms
+        for ending in (("yaml", "xml") if form == "opencv" else ("yaml",))
+    ],
+)
 def test_a_written_camera_is_read_back_the_same(model, form, ending, tmp_path):
-    if (ending == "xml" and form != "opencv") or (model, form) == ("unified", "ros"):
-        pytest.skip("no such file")
     path = tmp_path / f"camera.{ending}"
     path.write_text(foreign_text(camera_of(model), path, form))
     again = load_camera(path)
@@ -132,9 +152,10 @@ def test_files_as_others_write_them(tmp_path):
     [
         (ROS, "[500, 0,", "[500, 2,", "c.yaml, line 4, camera_matrix: the camera has skew, which "
          "no model here has; found 2."),
-        (ROS, "plumb_bob", "rational_polynomial", "c.yaml, line 5, distortion_model: this camera "
-         "or lens model is not supported; found rational_polynomial, expected plumb_bob, "
-         "equidistant and fisheye. Calibrate again from images of a board: pkmcal camera."),
+        (ROS, "plumb_bob", "field_of_view", "c.yaml, line 5, distortion_model: this camera "
+         "or lens model is not supported; found field_of_view, expected plumb_bob, "
+         "rational_polynomial, equidistant and fisheye. Calibrate again from images of a board: "
+         "pkmcal camera."),
         (ROS, "0.3]", "0.3, 0.1]", "c.yaml, line 4, camera_matrix: the camera has distortion "
          "beyond the model's 5 terms; found 6 terms."),
         (ROS, "[500, 0, 320, 0, 501,", "[5, 0, 320, 0, 5,", "c.yaml, line 4, camera_matrix: the "
@@ -142,8 +163,9 @@ def test_files_as_others_write_them(tmp_path):
          "at a width of 640."),
         (ROS, "image_width: 640\n", "", "c.yaml, image_width: this is missing."),
         (ROS, "camera_matrix", "matrix", "c.yaml, model: the camera's model is missing; expected "
-         "fisheye or pinhole or unified. OpenCV's files have camera_matrix, image_width and "
-         "image_height; ROS's camera_matrix; Kalibr's camera_model under cam0."),
+         "double_sphere or extended_unified or fisheye or pinhole or rational or unified. "
+         "OpenCV's files have camera_matrix, image_width and image_height; ROS's "
+         "camera_matrix; Kalibr's camera_model under cam0."),
         (KALIBR, "", "", "c.yaml: the file holds several cameras; found cam0 and cam1. Name one "
          "behind a #, such as c.yaml#cam1."),
     ],
@@ -159,13 +181,25 @@ def test_kalibr_faults(tmp_path):
     one = KALIBR.partition("cam1")[0]
     with pytest.raises(InputError, match="negative xi"):
         read_text(tmp_path, one.replace("[1.2,", "[-1.2,"))
-    with pytest.raises(InputError, match="found ds-none"):
+    with pytest.raises(InputError, match="found omni-fov"):
+        read_text(tmp_path, one.replace("radtan", "fov"))
+    with pytest.raises(InputError, match=r"expected 6 numbers"):
         read_text(tmp_path, one.replace("omni", "ds").replace("radtan", "none"))
     with pytest.raises(InputError, match="no such camera; found cam7, expected cam0"):
         read_text(tmp_path, one, "cam7")
 
 
 def test_what_a_format_cannot_hold_is_refused():
+    assert set(FORMS) == set(VALUES) == set(camera_models())
+    for model, forms in FORMS.items():
+        for form in {"opencv", "ros", "kalibr"} - set(forms):
+            with pytest.raises(InputError):
+                foreign_text(camera_of(model), "a.yaml", form)
+    prism = replace(
+        camera_of("rational"), parameters=np.array([*VALUES["rational"][:12], 1e-3, *np.zeros(5)])
+    )
+    with pytest.raises(InputError, match="no distortion model for a rational camera with a thin"):
+        foreign_text(prism, "a.yaml", "ros")
     with pytest.raises(InputError, match="no distortion model for a unified camera"):
         foreign_text(camera_of("unified"), "a.yaml", "ros")
     camera = camera_of("pinhole")
@@ -199,6 +233,261 @@ def test_faults_of_own_files(tmp_path, line, sentence):
     with pytest.raises(InputError) as caught:
         load_camera(tmp_path / "a.yaml")
     assert str(caught.value).startswith(sentence)
+
+
+ROS_CAMERA = """\
+image_width: 640
+image_height: 480
+camera_name: cam
+camera_matrix: {rows: 3, cols: 3, data: [560, 0, 319.5, 0, 560, 239.5, 0, 0, 1]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("word", "coefficients"),
+    [
+        ("''", []),
+        ("", []),
+        ("none", [0, 0, 0, 0, 0]),
+        ("inverse_brown_conrady", [0, 0, 0, 0, 0]),
+        ("plumb_bob", [0.1, -0.2, 4e-4, -2e-4, 0.05, 0, 0, 0]),
+        ("rational_polynomial", [0.1, -0.2, 4e-4, -2e-4, 0.05, 0, 0, 0]),
+        ("rational_polynomial", [0.1, -0.2, 4e-4, -2e-4, 0.05, 0.3, 0.2, 0.1]),
+    ],
+)
+def test_ros_cameras_of_every_distortion_model(tmp_path, word, coefficients):
+    """No distortion, a tail of zeros, and the whole rational model."""
+    lens = f"distortion_coefficients: {{rows: 1, cols: 1, data: {coefficients}}}\n"
+    camera = read_text(tmp_path, f"{ROS_CAMERA}distortion_model: {word}\n{lens}")
+    assert camera.model == ("rational" if any(coefficients[5:]) else "pinhole")
+    lens = np.zeros(14 if any(coefficients[5:]) else 5)
+    lens[: len(coefficients)] = coefficients[: len(lens)]
+    np.testing.assert_array_equal(camera.parameters, [560, 560, 319.5, 239.5, *lens])
+
+
+def test_a_ros_model_of_other_mathematics_is_refused_with_distortion(tmp_path):
+    lens = "distortion_coefficients: {rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}\n"
+    for word in ("none", "inverse_brown_conrady"):
+        with pytest.raises(InputError) as caught:
+            read_text(tmp_path, f"{ROS_CAMERA}distortion_model: {word}\n{lens}")
+        assert word in caught.value.found
+
+
+def test_opencv_files_of_all_coefficients(tmp_path):
+    lens = [0.3, 0.1, 1e-3, -2e-3, 0.01, 0.5, 0.1, 0.02, 1e-3, 5e-4, -1e-3, 2e-4, 0.06, -0.09]
+    for count in (4, 5, 8, 12, 14):
+        storage = cv2.FileStorage(str(tmp_path / "c.yaml"), cv2.FileStorage_WRITE)
+        storage.write("image_width", 640)
+        storage.write("image_height", 480)
+        storage.write("camera_matrix", np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]))
+        storage.write("distortion_coefficients", np.array(lens[:count]))
+        storage.release()
+        camera = load_camera(tmp_path / "c.yaml")
+        assert camera.model == ("pinhole" if count <= 5 else "rational")
+        full = np.zeros(5 if count <= 5 else 14)
+        full[:count] = lens[:count]
+        np.testing.assert_array_equal(camera.parameters, [500, 501, 320, 240, *full])
+
+
+def kalibr_projection(model, own, point):
+    """Kalibr's DoubleSphereProjection and ExtendedUnifiedProjection, without the camera matrix."""
+    x, y, z = point
+    if model == "ds":
+        xi, alpha = own
+        k = xi * np.sqrt(x * x + y * y + z * z) + z
+        norm = alpha * np.sqrt(x * x + y * y + k * k) + (1 - alpha) * k
+    else:
+        alpha, beta = own
+        norm = alpha * np.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z
+    return x / norm, y / norm
+
+
+@pytest.mark.parametrize(("word", "own"), [("ds", (-0.2, 0.58)), ("eucm", (0.6, 1.1))])
+def test_kalibr_wide_cameras(tmp_path, word, own):
+    """intrinsics: xi alpha, or alpha beta, before the focal lengths."""
+    text = (
+        f"cam0:\n  camera_model: {word}\n  intrinsics: [{own[0]}, {own[1]}, 280, 281, 320, 240]\n"
+        "  distortion_model: none\n  distortion_coeffs: []\n  resolution: [640, 480]\n"
+    )
+    camera = read_text(tmp_path, text)
+    point = np.array([0.7, -0.4, 0.3])
+    x, y = kalibr_projection(word, own, point)
+    np.testing.assert_allclose(camera.project(point), [280 * x + 320, 281 * y + 240], rtol=1e-12)
+
+
+MRCAL = """\
+# generated on 2026-11-29 with   mrcal-calibrate-cameras
+{
+    'lensmodel':  'LENSMODEL_OPENCV8',
+    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....
+    'intrinsics': [ 500., 501., 320., 240., 0.5, 0.1, 1e-3, -2e-3, 0.01, 0.7, 0.15, 0.01,],
+    'valid_intrinsics_region': [],
+    # extrinsics are rt_fromref
+    'extrinsics': [ 0., 0., 0., 0., 0., 0.,],
+    'imagersize': [ 640, 480,],
+    'icam_intrinsics': 0,
+    'optimization_inputs': b'P4#a{',
+}
+"""
+MRCAL_LENS = [0.5, 0.1, 1e-3, -2e-3, 0.01, 0.7, 0.15, 0.01, 1e-3, 5e-4, -1e-3, 2e-4]
+
+
+@pytest.mark.parametrize("count", [0, 4, 5, 8, 12])
+def test_mrcal_cameras(tmp_path, count):
+    numbers = [500.0, 501.0, 320.0, 240.0, *MRCAL_LENS[:count]]
+    text = MRCAL.replace("OPENCV8", f"OPENCV{count}" if count else "PINHOLE")
+    text = re.sub(r"'intrinsics': \[[^]]*\]", f"'intrinsics': {numbers}", text)
+    camera = read_text(tmp_path, text)
+    matrix = np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]])
+    points, zero = half_field(camera, 3), np.zeros(3)
+    lens = np.array(MRCAL_LENS[:count]) if count else None
+    theirs = cv2.projectPoints(points, zero, zero, matrix, lens)[0].reshape(-1, 2)
+    np.testing.assert_allclose(camera.project(points), theirs, atol=1e-9)
+    assert camera.image_size == (640, 480)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("LENSMODEL_OPENCV8", "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=30_Ny=20_fov_x_deg=170",
+         "found"),
+        ("LENSMODEL_OPENCV8", "LENSMODEL_CAHVOR", "found"),
+        ("0.15, 0.01,]", "0.15]", "expected"),
+        ("'imagersize': [ 640, 480,]", "'imagersize': [ 640 ]", "expected"),
+        ("'imagersize'", "imagersize", "expected"),
+    ],
+)  # fmt: skip
+def test_faults_of_mrcal_files(tmp_path, old, new, field):
+    assert old in MRCAL
+    with pytest.raises(InputError) as caught:
+        read_text(tmp_path, MRCAL.replace(old, new))
+    assert getattr(caught.value, field)
+    if "SPLINED" in new:
+        assert "mrcal-convert-lensmodel" in caught.value.next_step
+        assert "splined" in str(caught.value)
+
+
+COLMAP = """\
+# Camera list with one line of data per camera:
+#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+# Number of cameras: 9
+1 SIMPLE_PINHOLE 640 480 500 320.5 240.5
+2 PINHOLE 640 480 500 501 320.5 240.5
+3 SIMPLE_RADIAL 640 480 500 320.5 240.5 0.1
+4 RADIAL 640 480 500 320.5 240.5 0.1 0.2
+5 OPENCV 640 480 500 501 320.5 240.5 0.1 0.2 0.003 0.004
+6 FULL_OPENCV 640 480 500 501 320.5 240.5 0.1 0.2 0.003 0.004 0.05 0.3 0.2 0.1
+7 OPENCV_FISHEYE 640 480 500 501 320.5 240.5 0.1 0.2 0.003 0.004
+8 SIMPLE_RADIAL_FISHEYE 640 480 500 320.5 240.5 0.1
+9 RADIAL_FISHEYE 640 480 500 320.5 240.5 0.1 0.2
+10 FOV 640 480 500 501 320.5 240.5 0.9
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "fy", "lens"),
+    [
+        ("1", "pinhole", 500, []),
+        ("2", "pinhole", 501, []),
+        ("3", "pinhole", 500, [0.1]),
+        ("4", "pinhole", 500, [0.1, 0.2]),
+        ("5", "pinhole", 501, [0.1, 0.2, 0.003, 0.004]),
+        ("6", "rational", 501, [0.1, 0.2, 0.003, 0.004, 0.05, 0.3, 0.2, 0.1]),
+        ("7", "fisheye", 501, [0.1, 0.2, 0.003, 0.004]),
+        ("8", "fisheye", 500, [0.1]),
+        ("9", "fisheye", 500, [0.1, 0.2]),
+    ],
+)
+def test_colmap_cameras(tmp_path, name, model, fy, lens):
+    """COLMAP's first pixel has its centre at (0.5, 0.5)."""
+    camera = read_text(tmp_path, COLMAP, name)
+    assert camera.model == model
+    full = np.zeros(len(camera.parameters) - 4)
+    full[: len(lens)] = lens
+    np.testing.assert_array_equal(camera.parameters, [500, fy, 320, 240, *full])
+    alone_in_file = next(line for line in COLMAP.splitlines() if line.startswith(f"{name} "))
+    assert read_text(tmp_path, alone_in_file).model == model
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "field", "value"),
+    [
+        (COLMAP, None, "what", "several cameras"),
+        (COLMAP, "11", "found", "11"),
+        (COLMAP, "10", "found", "FOV"),
+        (COLMAP.replace("320.5 240.5 0.9", "320.5"), "10", "found", "FOV"),
+        (COLMAP.replace("500 320.5 240.5 0.1 0.2", "500 320.5"), "4", "expected", "5 numbers"),
+        (COLMAP.replace("SIMPLE_PINHOLE 640 480 500", "SIMPLE_PINHOLE 640 480 nan"), "1",
+         "expected", "3 numbers"),
+    ],
+)  # fmt: skip
+def test_faults_of_colmap_files(tmp_path, text, name, field, value):
+    with pytest.raises(InputError) as caught:
+        read_text(tmp_path, text, name)
+    assert value in str(getattr(caught.value, field, None) or caught.value)
+
+
+VISP = """\
+<?xml version="1.0"?>
+<root>
+  <!--This file stores intrinsic camera parameters-->
+  <camera>
+    <name>Camera</name>
+    <image_width>640</image_width>
+    <image_height>480</image_height>
+    <model>
+      <type>perspectiveProjWithoutDistortion</type>
+      <px>1129.0</px>
+      <py>1130.6</py>
+      <u0>317.9</u0>
+      <v0>229.1</v0>
+    </model>
+    <model>
+      <type>perspectiveProjWithDistortion</type>
+      <px>1089.9</px>
+      <py>1090.1</py>
+      <u0>326.1</u0>
+      <v0>230.5</v0>
+      <kud>-0.196</kud>
+      <kdu>0.204</kdu>
+    </model>
+  </camera>
+</root>
+"""
+
+
+def test_visp_cameras(tmp_path):
+    """The model with distortion if there is one; u = u0 + px x (1 + kud r^2)."""
+    camera = read_text(tmp_path, VISP)
+    x, y = 0.2, -0.1
+    factor = 1 - 0.196 * (x * x + y * y)
+    expected = [326.1 + 1089.9 * x * factor, 230.5 + 1090.1 * y * factor]
+    np.testing.assert_allclose(camera.project(np.array([x, y, 1.0])), expected, rtol=1e-12)
+    plain = read_text(tmp_path, VISP.replace("WithDistortion", "WithKannalaBrandt"), "Camera")
+    np.testing.assert_array_equal(plain.parameters, [1129, 1130.6, 317.9, 229.1, *np.zeros(5)])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "name"),
+    [
+        ("</root>", "", None),
+        ("<root>", "<!DOCTYPE a [<!ENTITY b 'c'>]>\n<root>", None),
+        ("<px>1089.9</px>", "<px>nan</px>", None),
+        ("<kud>-0.196</kud>", "", None),
+        ("<image_width>640</image_width>", "", None),
+        ("out", "Kannala", None),
+        ("  <camera>", "  <camera><name>b</name></camera>\n  <camera>", None),
+        ("Camera<", "Front<", "Camera"),
+    ],
+)
+def test_faults_of_visp_files(tmp_path, old, new, name):
+    assert old in VISP
+    text = VISP.replace(old, new)
+    if new == "Kannala":
+        text = text.replace("WithDistortion", "WithKannala")
+    with pytest.raises(InputError) as caught:
+        read_text(tmp_path, text, name)
+    assert str(caught.value).startswith("c.yaml")
 
 
 # cv2's own mathematics, in the half of the field where it has them

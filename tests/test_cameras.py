@@ -68,6 +68,43 @@ EXAMPLES = {
         "barrel that turns": pinhole(-0.462, -0.132, 4e-3, 0.0, 0.16, imaged=0.5),
         "pincushion that turns": pinhole(0.417, -0.253, -2e-3, -4e-3, -0.043, imaged=0.75),
     },
+    "rational": {
+        "no lens": pinhole(),
+        "usual": pinhole(0.5, 0.1, 1e-3, -2e-3, 0.01, 0.7, 0.15, 0.01),
+        "thin prism": pinhole(
+            -0.2, 0.08, 1e-3, -2e-3, 0, 0, 0, 0, 4e-3, -2e-3, -3e-3, 1e-3, imaged=0.95
+        ),
+        "tilted": pinhole(
+            *(0.3, 0.1, 1e-3, -2e-3, 0.01, 0.5, 0.1, 0.02, 1e-3, 5e-4, -1e-3, 2e-4, 0.06, -0.09)
+        ),
+        # the radial factor has a pole at s = 2; the image grows without end before it
+        "pole": pinhole(
+            *(0, 0, 0, 0, 0, -0.5),
+            outside=((1.4143, 0.0, 1.0), (0.0, 3.0, 1.0)),
+            inside=((0.0, 1.4141, 1.0),),
+        ),
+        # r (1 - s / 5) / (1 + s / 5) stops growing where 1 - 0.8 s - 0.04 s^2 = 0
+        "folding": pinhole(
+            *(-0.2, 0, 0, 0, 0, 0.2),
+            imaged=0.4,
+            outside=((1.087, 0.0, 1.0),),
+            inside=((0.0, 1.086, 1.0),),
+        ),
+    },
+    "double_sphere": {
+        "usual": wide(xi=-0.2, alpha=0.58, focal=(280.0, 281.0), beyond=(1.0, 0.5, -0.3)),
+        "two spheres": wide(
+            xi=0.6, alpha=0.3, focal=(400.0, 402.0), beyond=(1.0, 0.5, -0.5), behind=(0.1, 0, -0.9)
+        ),
+        "no spheres": wide(xi=0.0, alpha=0.0, focal=(500.0, 510.0), behind=(1.0, 0.0, -1e-3)),
+    },
+    "extended_unified": {
+        "usual": wide(
+            alpha=0.6, beta=1.1, focal=(280.0, 281.0), beyond=(1.0, 0.5, -0.3), imaged=0.98
+        ),
+        "flat": wide(alpha=0.3, beta=2.0, focal=(400.0, 402.0), beyond=(1.0, 0.5, -0.4)),
+        "no ellipsoid": wide(alpha=0.0, beta=1.0, focal=(500.0, 510.0), behind=(1.0, 0.0, -1e-3)),
+    },
     "fisheye": {
         "equidistant": wide(focal=(450.0, 452.0), beyond=(0.0, 1.0, -1.0)),
         "usual": wide(-0.03, 0.01, -4e-3, 3e-4, focal=(480.0, 481.0), beyond=(0.1, 1.0, -0.2)),
@@ -115,10 +152,10 @@ def opencv_pinhole_undistort(fields, pixels):
 def opencv_matrix(fields):
     (fx, fy), (cx, cy) = fields["focal"], fields["center"]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    return matrix, np.array([*fields["distortion"], 0, 0, 0, 0, 0])[:5].astype(float)
+    return matrix, np.array([*fields["distortion"], *np.zeros(14)])[:14].astype(float)
 
 
-OPENCV = {"pinhole": (opencv_pinhole_project, opencv_pinhole_undistort)}
+OPENCV = dict.fromkeys(("pinhole", "rational"), (opencv_pinhole_project, opencv_pinhole_undistort))
 
 ALL = [(model, name) for model, examples in EXAMPLES.items() for name in examples]
 

@@ -13,8 +13,7 @@ from conftest import run
 from document_keys import assert_keys
 from export_sources import CAMERA, built, calibration, source_of
 from pkmcal.calibration.machine_source import load_source
-from pkmcal.cameras.files import load_camera
-from pkmcal.cameras.unified import Unified
+from pkmcal.cameras import camera_models, load_camera
 from pkmcal.errors import InputError, ResultError
 from pkmcal.exporters import ros
 from pkmcal.exporters.contract import Difference, exporters, make_export
@@ -345,13 +344,27 @@ def test_a_camera_that_is_not_found_is_named(tmp_path):
     assert len(make_export(load_source(folder, there), "ros").files) == 3
 
 
-def test_a_mirror_has_no_camera_info(tmp_path):
-    mirror = Unified((640, 480), np.array([300.0, 300, 320, 240, 0.9, 0, 0, 0, 0]))
+PRISM = [1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("model", "lens", "possible"),
+    [
+        ("unified", [0.9, 0, 0, 0, 0], False),
+        ("double_sphere", [-0.2, 0.58], False),
+        ("extended_unified", [0.6, 1.1], False),
+        ("rational", [0.5, 0.1, 4e-4, -3e-4, 0.01, 0.7, 0.15, 0.01, *PRISM], False),
+        ("rational", [0.5, 0.1, 4e-4, -3e-4, 0.01, 0.7, 0.15, 0.01, *np.zeros(6)], True),
+    ],
+)
+def test_lenses_that_ros_lacks_have_no_camera_info(tmp_path, model, lens, possible):
+    camera = camera_models()[model]((640, 480), np.array([300.0, 300, 320, 240, *lens]))
     made = make_export(
-        load_source(calibration(tmp_path, built("gough-stewart"), camera=mirror)), "ros"
+        load_source(calibration(tmp_path, built("gough-stewart"), camera=camera)), "ros"
     )
-    assert list(made.files) == ["static_transforms.launch.yaml"]
-    assert "ROS has no model for mirrors" in made.notes[0].text
+    assert (len(made.files) > 1) is possible
+    codes = {note.code for note in made.notes}
+    assert ("export.ros_lens" in codes) is not possible
 
 
 def test_frames_have_names_that_ros_takes(tmp_path):

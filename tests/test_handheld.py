@@ -212,6 +212,76 @@ def test_an_image_without_a_focal_length(folder):
     assert "0000-2.jpg: the image does not state the focal length" in message
 
 
+def exif_jpeg(path, picture=PICTURE, **tags):
+    """JPEG file with EXIF entries by their names in the standard, written by Pillow."""
+    from PIL import ExifTags, Image
+
+    entries = Image.Exif()
+    for name, value in tags.items():
+        entries.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base[name].value] = value
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(picture).save(path, exif=entries)
+    return path
+
+
+CANON = {
+    "FocalLength": 6.2, "FocalPlaneXResolution": 2260.0, "FocalPlaneResolutionUnit": 2,
+    "ExifImageWidth": 8, "ExifImageHeight": 6,
+}  # fmt: skip
+"""A focal length of 551.68 px as Canon writes it; without a sensor of 7 mm, only for a file of
+640x480 pixels."""
+
+
+@pytest.mark.parametrize(
+    ("unit", "density"), [(2, 2260.0), (3, 2260 / 2.54), (4, 2260 / 25.4), (None, 2260.0)]
+)
+@pytest.mark.parametrize("scale", [1, 2])
+def test_the_focal_length_by_the_focal_plane(tmp_path, unit, density, scale):
+    """In every unit, an inch by default; a resized image has fewer pixels per radian."""
+    picture = np.zeros((480 // scale, 640 // scale), np.uint8)
+    tags = {**CANON, "ExifImageWidth": 640, "ExifImageHeight": 480}
+    tags |= {"FocalPlaneXResolution": density, "FocalPlaneResolutionUnit": unit}
+    tags = {name: value for name, value in tags.items() if value is not None}
+    path = exif_jpeg(tmp_path / "a.jpg", picture, **tags)
+    camera = camera_by_exif([(path, "a.jpg")], "session.yaml")
+    np.testing.assert_allclose(camera.focal, 6.2 * 2260 / 25.4 / scale, rtol=1e-6)
+
+
+@pytest.mark.parametrize("absent", ["FocalLength", "FocalPlaneXResolution", "ExifImageWidth"])
+def test_an_incomplete_focal_plane_names_what_is_absent(tmp_path, absent):
+    path = exif_jpeg(tmp_path / "a.jpg", **{n: v for n, v in CANON.items() if n != absent})
+    with pytest.raises(InputError) as caught:
+        camera_by_exif([(path, "a.jpg")], "session.yaml")
+    word = absent.replace("ExifImageWidth", "PixelXDimension")
+    missing, _, present = caught.value.found.partition(", only ")
+    assert word in missing
+    assert word not in present
+    assert present
+
+
+def test_a_focal_plane_of_no_sensor_is_refused(tmp_path):
+    """2260 pixels per inch of an image of 8 x 6 pixels are a sensor of 0.1 mm."""
+    message = fault(camera_by_exif, [(exif_jpeg(tmp_path / "a.jpg", **CANON), "a.jpg")], "s.yaml")
+    assert "no sensor has this diagonal; found 0.112 mm" in message
+
+
+@pytest.mark.parametrize(("shape", "cropped"), [
+    ((440, 480), True), ((480, 640), False), ((640, 480), False), ((240, 320), False),
+    ((720, 960), False), ((451, 601), False), ((480, 632), True),
+])  # fmt: skip
+def test_a_cropped_image_gives_no_focal_length(tmp_path, shape, cropped):
+    """EXIF's size is that of the captured image, 640 x 480: turned or resized is not cropped."""
+    tags = {"FocalLengthIn35mmFilm": 27, "ExifImageWidth": 640, "ExifImageHeight": 480}
+    path = exif_jpeg(tmp_path / "a.jpg", np.zeros(shape, np.uint8), **tags)
+    files = [(path, "a.jpg")]
+    if cropped:
+        message = fault(camera_by_exif, files, "session.yaml")
+        assert f"found {shape[1]}x{shape[0]} pixels, of 640x480 by EXIF" in message
+    else:
+        focal = 27 * np.hypot(*shape) / np.hypot(36, 24)
+        np.testing.assert_allclose(camera_by_exif(files, "session.yaml").focal, focal)
+
+
 def test_images_by_different_lenses(folder):
     replaced(folder / "session.yaml", "cameras/phone.yaml", "exif")
     jpeg(folder / "images/phone/0001-1.jpg", Exif(6, 52.0))

@@ -190,3 +190,27 @@ def test_what_is_no_file_is_named_at_once(tmp_path):
         for read in (image_header, lambda p, label: decode(p, (4, 4), label), read_text):
             with pytest.raises(InputError, match=f"^a.png: {text}"):
                 read(tmp_path / f"{name}.png", "a.png")
+
+
+RECORDINGS = {
+    "a.mp4": (b"\0\0\0\x18ftypisom\0\0\2\0isommp42", "MP4", "ffmpeg"),
+    "a.mov": (b"\0\0\0\x14ftypqt  \0\0\2\0qt  ", "MOV", "ffmpeg"),
+    "a.avi": (b"RIFF\0\0\0\0AVI LIST", "AVI", "ffmpeg"),
+    "a.mkv": (b"\x1aE\xdf\xa3\x01\0\0\0", "Matroska", "ffmpeg"),
+    "a.bag": (b"#ROSBAG V2.0\nE\0\0\0\xff", "ROS bag", "rosbags"),
+    "a.db3": (b"SQLite format 3\0\x10\0\1\1", "ROS 2 bag", "rosbags"),
+    "a.mcap": (b"\x89MCAP0\r\n\x01\xff", "MCAP", "mcap"),
+}
+
+
+@pytest.mark.parametrize("read", [image_header, read_text])
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_recordings_are_named_in_place_of_images_and_tables(tmp_path, name, read):
+    """By their content, whatever their size, with the program that takes images or tables out."""
+    head, kind, program = RECORDINGS[name]
+    (tmp_path / name).write_bytes(head + bytes(200))
+    with pytest.raises(InputError) as caught:
+        read(tmp_path / name)
+    assert kind in caught.value.found
+    assert program in caught.value.next_step
+    assert name in caught.value.where

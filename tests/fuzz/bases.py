@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from fuzz import pictures
 from pkmcal.cameras import load_camera
 from pkmcal.cameras.files import CAMERA_FILE_FORMATS, foreign_text
 from pkmcal.commands.cli import main
+from pkmcal.errors import InputError
 from pkmcal.files import Exif, csv_text, with_exif, yaml_text
 from pkmcal.geometry.rigid import look_at, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
@@ -27,6 +29,22 @@ MIRROR = {"model": "unified", "image_size": list(SIZE), "focal": [90.0, 90.0],
           "center": [79.5, 59.5], "xi": 0.9, "distortion": [0.01, 0.0, 0.0, 0.0]}  # fmt: skip
 FISHEYE = {"model": "fisheye", "image_size": list(SIZE), "focal": [60.0, 60.0],
            "center": [79.5, 59.5], "distortion": [0.01, 0.0, 0.0, 0.0]}  # fmt: skip
+RATIONAL = {**CAMERA, "model": "rational", "distortion": [0.5, 0.1, 1e-3, -2e-3, 0.01, 0.7, 0.15]}
+DOUBLE_SPHERE = {"model": "double_sphere", "image_size": list(SIZE), "focal": [60.0, 60.0],
+                 "center": [79.5, 59.5], "xi": -0.2, "alpha": 0.58}  # fmt: skip
+EXTENDED_UNIFIED = {"model": "extended_unified", "image_size": list(SIZE), "focal": [60.0, 60.0],
+                    "center": [79.5, 59.5], "alpha": 0.6, "beta": 1.1}  # fmt: skip
+MRCAL = """# by mrcal
+{ 'lensmodel': 'LENSMODEL_OPENCV8',
+  'intrinsics': [ 141., 141.2, 80.4, 59.5, 0.5, 0.1, 1e-3, -2e-3, 0.01, 0.7, 0.15, 0.01,],
+  'extrinsics': [ 0., 0., 0., 0., 0., 0.,], 'imagersize': [ 160, 120,], }
+"""
+COLMAP = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 RADIAL 160 120 141 80.9 60 -0.11 0.09\n"
+VISP = """<?xml version="1.0"?>
+<root><camera><name>a</name><image_width>160</image_width><image_height>120</image_height>
+<model><type>perspectiveProjWithDistortion</type><px>141</px><py>141.2</py><u0>80.4</u0>
+<v0>59.5</v0><kud>-0.11</kud><kdu>0.11</kdu></model></camera></root>
+"""
 BOARD = {"type": "chessboard", "corners": [6, 5], "square": 0.026, "tolerance": 0.001}
 CHARUCO = {"type": "charuco", "squares": [7, 5], "square": 0.03, "marker": 0.022,
            "dictionary": "DICT_4X4_50"}  # fmt: skip
@@ -200,17 +218,20 @@ def cameras(folder: Path) -> None:
     covariance = np.diag([0.1, 0.1, 0.2, 0.2, 1e-4, 1e-4, 1e-8, 1e-8, 1e-4]).tolist()
     for name, fields in (
         ("pinhole", {**CAMERA, "covariance": covariance}), ("unified", MIRROR),
-        ("fisheye", FISHEYE),
+        ("fisheye", FISHEYE), ("rational", RATIONAL), ("double_sphere", DOUBLE_SPHERE),
+        ("extended_unified", EXTENDED_UNIFIED),
     ):  # fmt: skip
         path = folder / f"{name}.yaml"
         path.write_text(yaml_text(fields))
         camera = load_camera(path)
         for form in CAMERA_FILE_FORMATS:
-            if form == "ros" and name == "unified":
-                continue
-            (folder / f"{name}.{form}.yaml").write_text(foreign_text(camera, path, form))
+            with suppress(InputError):  # a program without this model
+                (folder / f"{name}.{form}.yaml").write_text(foreign_text(camera, path, form))
     xml = foreign_text(load_camera(folder / "pinhole.yaml"), folder / "a.xml", "opencv")
     (folder / "pinhole.opencv.xml").write_text(xml)
+    for name, text in (("a.cameramodel", MRCAL), ("cameras.txt", COLMAP), ("visp.xml", VISP)):
+        (folder / name).write_text(text)
+        load_camera(folder / name)
 
 
 def pictures_of(folder: Path, whole: bytes) -> None:

@@ -341,10 +341,16 @@ def camera_candidates(
 def best_of(
     pool: tuple[Candidate, ...], options: ModelSelectionOptions = MODEL_SELECTION_OPTIONS
 ) -> Candidate:
-    """Candidate with the fewest parameters among those not significantly worse than the best."""
+    """Simplest candidate among those not significantly worse than the best: one without xi before
+    one with it, then the one with the fewest parameters.
+
+    On a narrow lens xi replaces k1 and k2, but the data determine it only together with the focal
+    length, which may then be several times the lens's.
+    """
     best = min(pool, key=lambda c: c.robust)
     return min(
-        (c for c in pool if not is_worse(c, best, options=options)), key=lambda c: c.parameters
+        (c for c in pool if not is_worse(c, best, options=options)),
+        key=lambda c: ("xi" in c.fit.camera.own, c.parameters),
     )
 
 

@@ -220,18 +220,16 @@ class Camera(ABC):
         differently, distortion left out.
         """
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
-        name, before = self.parameter_names[lens], float(self.parameters[lens])
-        return (
+        out = (
             LensViolation("focal", self.focal_part[:, None], USUAL_FOCAL),
             LensViolation("aspect", self.aspect_part[:, None], USUAL_ASPECT),
             LensViolation("centre", eye[:, CENTER], USUAL_CENTRE * self.image_size[0]),
-            LensViolation(
-                "distortion",
-                eye[:, lens : lens + 1],
-                USUAL_DISTORTION,
-                {"coefficient": name, "stated": before},
-            ),
         )
+        if lens == len(self.parameters):
+            return out  # a model without distortion
+        facts = {"coefficient": self.parameter_names[lens], "stated": float(self.parameters[lens])}
+        column = eye[:, lens : lens + 1]
+        return (*out, LensViolation("distortion", column, USUAL_DISTORTION, facts))
 
     def usual_covariance(self) -> Array:
         """Covariance (n, n) of the parameters without a calibration, from the usual violations."""

@@ -1,4 +1,4 @@
-"""Camera files of pkmcal, OpenCV, ROS and Kalibr."""
+"""Camera files of pkmcal, OpenCV, ROS, Kalibr, mrcal, COLMAP and ViSP."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.cameras.colmap import is_colmap, read_colmap
 from pkmcal.cameras.contract import LEAST_FOCAL, Camera, camera_models
+from pkmcal.cameras.foreign import Intrinsics
+from pkmcal.cameras.mrcal import is_mrcal, read_mrcal
+from pkmcal.cameras.visp import is_visp, read_visp
 from pkmcal.errors import InputError
 from pkmcal.files import (
     LARGEST_WRITTEN_FILE,
@@ -28,13 +32,14 @@ from pkmcal.wording import listed
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
-    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; the format is detected from the content.
+    """Read a camera file of pkmcal, OpenCV, ROS, Kalibr, mrcal, COLMAP or ViSP; the format is
+    detected from the content.
 
     Parameters
     ----------
     path :
-        The file. For a Kalibr file with several cameras, the camera's name follows a #,
-        ``camchain.yaml#cam1``.
+        The file. For a file of Kalibr, COLMAP or ViSP with several cameras, the camera's name
+        follows a #, ``camchain.yaml#cam1``.
     label :
         The file's name in messages.
 
@@ -47,6 +52,12 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     path, camera = camera_path(path)
     label = label.removesuffix(f"#{camera}") if label else path.name
     text = read_text(path, label, LARGEST_WRITTEN_FILE)
+    if is_visp(text):
+        return _from_intrinsics(read_visp(text, label, camera))
+    if is_mrcal(text):
+        return _from_intrinsics(read_mrcal(text, label))
+    if is_colmap(text):
+        return _from_intrinsics(read_colmap(text, label, camera))
     if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
         return _from_opencv(text, label)
     document = parse_yaml(text, path, label)
@@ -148,16 +159,38 @@ CAMERA_FILE_FORMATS = ("opencv", "ros", "kalibr")
 CAMERA_NUMBER_ROUNDING = 1e-12
 """Relative difference allowed between a number before writing and after reading; decimal text with
 sixteen digits stays below."""
-_ROS = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+_ROS = {
+    "plumb_bob": "pinhole", "rational_polynomial": "rational", "equidistant": "fisheye",
+    "fisheye": "fisheye",
+}  # fmt: skip
 """Camera models by ROS's distortion model."""
+_ROS_ZERO = ("", "none", "brown_conrady", "inverse_brown_conrady", "modified_brown_conrady")
+"""Distortion models that drivers write for images without distortion; supported where all
+coefficients are zero."""
+_PINHOLE_TERMS = 5
+"""Coefficients of OpenCV's model up to which it is the pinhole model."""
 _KALIBR = {
     ("pinhole", "radtan"): "pinhole",
     ("pinhole", "none"): "pinhole",
     ("pinhole", "equi"): "fisheye",
     ("omni", "radtan"): "unified",
     ("omni", "none"): "unified",
+    ("ds", "none"): "double_sphere",
+    ("eucm", "none"): "extended_unified",
 }
 """Camera models by Kalibr's camera and distortion model."""
+_KALIBR_NAMES = {
+    "pinhole": ("pinhole", "radtan"),
+    "fisheye": ("pinhole", "equi"),
+    "unified": ("omni", "radtan"),
+    "double_sphere": ("ds", "none"),
+    "extended_unified": ("eucm", "none"),
+}
+"""Kalibr's camera and distortion model by camera model."""
+OPENCV_MODELS = ("pinhole", "rational", "fisheye", "unified")
+"""Camera models that OpenCV has."""
+_ROS_TERMS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+"""Number of coefficients by ROS's distortion model."""
 _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
     "matrix": ("camera_matrix", "cameraMatrix", "K", "Camera_Matrix"),
     "distortion": ("distortion_coefficients", "distCoeffs", "D", "Distortion_Coefficients"),
@@ -237,10 +270,9 @@ def _from_opencv(text: str, label: str) -> Camera:
     size = (round(float(numbers["width"][0])), round(float(numbers["height"][0])))
     k = numbers["distortion"] if numbers["distortion"] is not None else np.zeros(0)
     xi = numbers["xi"]
-    model = "unified" if xi is not None else "fisheye" if fisheye else "pinhole"
-    return _camera_from_numbers(
-        model, size, numbers["matrix"], k, None if xi is None else float(xi[0]), label
-    )
+    model = "unified" if xi is not None else "fisheye" if fisheye else _opencv_model(k)
+    own = {} if xi is None else {"xi": float(xi[0])}
+    return _camera_from_numbers(model, size, numbers["matrix"], k, own, label)
 
 
 def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
@@ -262,6 +294,12 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
     import cv2
 
     form = cv2.FileStorage_FORMAT_XML if xml else cv2.FileStorage_FORMAT_YAML
+    if camera.model not in OPENCV_MODELS:
+        raise InputError(
+            f"OpenCV has no {camera.model} camera",
+            expected=listed(OPENCV_MODELS),
+            next_step="Write it for Kalibr, or calibrate with another model",
+        )
     storage = cv2.FileStorage("", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY | form)
     parameters = _parameters_by_name(camera)
     storage.write("image_width", int(camera.image_size[0]))
@@ -278,7 +316,8 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
 def _from_ros(document: Document) -> Camera:
     """Camera of a ROS camera_info file."""
     word = document.data.get("distortion_model", "plumb_bob")
-    if not isinstance(word, str) or word not in _ROS:
+    word = "" if word is None else word
+    if not isinstance(word, str) or word not in (*_ROS, *_ROS_ZERO):
         value = word if isinstance(word, str) else quoted(word)
         raise _unsupported(document.where("distortion_model"), value, _ROS)
     size = _size_at(document, ("image_width",), ("image_height",))
@@ -286,22 +325,57 @@ def _from_ros(document: Document) -> Camera:
     k = np.zeros(0)
     if "distortion_coefficients" in document.data:
         k = _numbers_at(document, ("distortion_coefficients", "data"), range(15))
-    return _camera_from_numbers(_ROS[word], size, matrix, k, None, document.where("camera_matrix"))
+    if word in _ROS_ZERO and k.any():
+        raise InputError(
+            "this distortion model is supported without distortion only",
+            where=document.where("distortion_model"),
+            found=f"{quoted(word)} with coefficients that are not zero",
+            expected=listed(list(_ROS)),
+            next_step="Calibrate again from images of a board: pkmcal camera",
+        )
+    model = _ROS.get(word, "pinhole")
+    if model == "rational":
+        model = _opencv_model(k)
+    return _camera_from_numbers(model, size, matrix, k, {}, document.where("camera_matrix"))
+
+
+def _opencv_model(k: Array) -> str:
+    """The simpler of pinhole and rational that has all non-zero coefficients of OpenCV's model."""
+    return "rational" if np.any(k[_PINHOLE_TERMS:]) else "pinhole"
+
+
+def _from_intrinsics(given: Intrinsics) -> Camera:
+    """Camera of intrinsics read from another program's file, validated."""
+    k = np.array(given.distortion)
+    model = _opencv_model(k) if given.model in ("pinhole", "rational") else given.model
+    (fx, fy), (cx, cy) = given.focal, given.center
+    matrix = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
+    return _camera_from_numbers(model, given.image_size, matrix, k, {}, given.where)
+
+
+def ros_distortion(camera: Camera) -> tuple[str, list[float]]:
+    """ROS's distortion model of a camera and its coefficients; raises InputError if ROS has
+    none.
+    """
+    words = {"pinhole": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
+    k = camera.document()["distortion"]
+    word = words.get(camera.model)
+    if word is None or any(k[_ROS_TERMS[word] :]):
+        name = "rational camera with a thin prism or a tilted sensor" if word else camera.model
+        raise InputError(
+            f"ROS camera_info has no distortion model for a {name}" + ("" if word else " camera"),
+            expected="pinhole, rational of eight coefficients, or fisheye",
+            next_step="Write it for OpenCV or Kalibr, or calibrate with the model fisheye",
+        )
+    return word, k[: _ROS_TERMS[word]]
 
 
 def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
     """Content of a ROS camera_info file; raises InputError for models that the format does not
     have.
     """
-    words = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
-    if camera.model not in words:
-        raise InputError(
-            f"ROS camera_info has no distortion model for a {camera.model} camera",
-            expected="pinhole or fisheye",
-            next_step="Write it for OpenCV or Kalibr, or calibrate with the model fisheye",
-        )
+    word, k = ros_distortion(camera)
     matrix = _matrix(_parameters_by_name(camera))
-    k = camera.document()["distortion"]
     projection = np.concatenate([matrix, np.zeros((3, 1))], axis=1)
 
     def table(values: Array) -> dict[str, Any]:
@@ -313,7 +387,7 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
         "image_height": int(camera.image_size[1]),
         "camera_name": name,
         "camera_matrix": table(matrix),
-        "distortion_model": words[camera.model],
+        "distortion_model": word,
         "distortion_coefficients": table(np.array([k])),
         "rectification_matrix": table(np.eye(3)),
         "projection_matrix": table(projection),
@@ -338,21 +412,27 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
         models = ["-".join(names) for names in _KALIBR]
         raise _unsupported(document.where(key, "camera_model"), "-".join(pair), models)
     model = _KALIBR[pair]
-    count = 5 if model == "unified" else 4
-    intrinsics = _numbers_at(document, (key, "intrinsics"), (count,))
+    names = camera_models()[model].own
+    intrinsics = _numbers_at(document, (key, "intrinsics"), (len(names) + 4,))
     size = _size_at(document, (key, "resolution", 0), (key, "resolution", 1))
     k = np.zeros(0)
     if pair[1] != "none":
         k = _numbers_at(document, (key, "distortion_coeffs"), (4,))
     fu, fv, pu, pv = intrinsics[-4:].tolist()
     matrix = np.array([fu, 0, pu, 0, fv, pv, 0, 0, 1])
-    xi = float(intrinsics[0]) if model == "unified" else None
-    return _camera_from_numbers(model, size, matrix, k, xi, document.where(key, "intrinsics"))
+    own = dict(zip(names, intrinsics.tolist(), strict=False))
+    return _camera_from_numbers(model, size, matrix, k, own, document.where(key, "intrinsics"))
 
 
 def _kalibr_data(camera: Camera) -> dict[str, Any]:
     """Content of one camera's entry in a Kalibr file; raises InputError for a non-zero k3."""
     parameters, k = _parameters_by_name(camera), camera.document()["distortion"]
+    if camera.model not in _KALIBR_NAMES:
+        raise InputError(
+            f"Kalibr has no {camera.model} camera",
+            expected=listed(list(_KALIBR_NAMES)),
+            next_step="Write it for OpenCV, or calibrate with another model",
+        )
     if any(k[4:]):
         raise InputError(
             "Kalibr's radtan distortion has no third radial term",
@@ -360,34 +440,39 @@ def _kalibr_data(camera: Camera) -> dict[str, Any]:
             next_step="Calibrate without k3, or write the camera for OpenCV or ROS",
         )
     four = [parameters[name] for name in ("focal.x", "focal.y", "center.x", "center.y")]
-    mirror = camera.model == "unified"
+    model, distortion = _KALIBR_NAMES[camera.model]
     return {
-        "camera_model": "omni" if mirror else "pinhole",
-        "intrinsics": [parameters["xi"], *four] if mirror else four,
-        "distortion_model": "equi" if camera.model == "fisheye" else "radtan",
+        "camera_model": model,
+        "intrinsics": [*(parameters[name] for name in camera.own), *four],
+        "distortion_model": distortion,
         "distortion_coeffs": list(k[:4]),
         "resolution": [int(n) for n in camera.image_size],
     }
 
 
 def _camera_from_numbers(
-    model: str, size: tuple[int, int], matrix: Any, k: Array, xi: float | None, where: str
+    model: str, size: tuple[int, int], matrix: Any, k: Array, own: dict[str, float], where: str
 ) -> Camera:
     """Camera from another program's numbers, validated like pkmcal's own files.
 
     matrix : (9,) or (3, 3) camera matrix.
     k : distortion coefficients in the model's order; those beyond the model's number must be zero.
+    own : the model's own fields, such as xi.
     Raises InputError.
     """
     kind = camera_models()[model]
-    most = len([name for name in kind.parameter_names if name[0] in "kp" and name[1:].isdigit()])
+    most = len(kind.parameter_names) - 4 - len(kind.own)
     m = np.asarray(matrix, dtype=float).reshape(3, 3)
     faults = (
         (m[0, 1] != 0, "skew, which no model here has", f"{m[0, 1]:g}"),
         (not np.all(np.isfinite([*m.ravel(), *k])), "numbers that are not finite", "nan or inf"),
         (np.any(k[most:] != 0), f"distortion beyond the model's {most} terms", f"{len(k)} terms"),
         (min(m[0, 0], m[1, 1]) <= 0, "a focal length that is not positive", f"{m[0, 0]:g}"),
-        (xi is not None and xi < 0, "a negative xi; it should be 0 or more", f"{xi}"),
+        (
+            model == "unified" and own["xi"] < 0,
+            "a negative xi; it should be 0 or more",
+            f"{own.get('xi')}",
+        ),
         (
             min(m[0, 0], m[1, 1]) < LEAST_FOCAL * size[0],
             "a focal length that looks like millimetres; it is wanted in pixels",
@@ -403,9 +488,8 @@ def _camera_from_numbers(
         "focal": [float(m[0, 0]), float(m[1, 1])],
         "center": [float(m[0, 2]), float(m[1, 2])],
         "distortion": k[:most].tolist(),
+        **own,
     }
-    if xi is not None:
-        fields["xi"] = xi
     return camera_from_document(Document(Path(where), where, fields, {}))
 
 

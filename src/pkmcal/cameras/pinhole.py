@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, final
@@ -62,11 +62,26 @@ def undistort(target: Array, k: Array) -> Array:
     """Inverse of :func:`distort` by Newton's method, (..., 2); NaN outside the field of view."""
     if not np.any(k):
         return np.array(target, dtype=float)
-    xy = _undistort_radially(target, k)
+    return inverse_distort(target, lambda xy: distort(xy, k), lambda s: _radial(s, k), _fold(k))
+
+
+def inverse_distort(
+    target: Array,
+    distorted: Callable[[Array], tuple[Array, Array]],
+    radial: Callable[[Array], Array],
+    fold: float,
+) -> Array:
+    """Inverse of a distortion by Newton's method, (..., 2); NaN outside the field of view.
+
+    target : (..., 2) distorted normalised points. distorted : function of points (..., 2) that
+        returns their distorted values and the derivatives (..., 2, 2). radial : its radial factor
+        at squared radii. fold : squared radius where the radial terms stop increasing.
+    """
+    xy = _undistort_radially(target, radial, fold)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
             # Newton step with the inverse of the 2x2 derivative written out.
-            value, slope = distort(xy, k)
+            value, slope = distorted(xy)
             error = value - target
             det = slope[..., 0, 0] * slope[..., 1, 1] - slope[..., 0, 1] * slope[..., 1, 0]
             step = np.stack(
@@ -79,8 +94,8 @@ def undistort(target: Array, k: Array) -> Array:
             xy = xy - step / det[..., None]
             if np.nanmax(np.abs(error), initial=0.0) < 1e-14:
                 break
-        value, slope = distort(xy, k)
-        good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & before_image_fold(xy, slope, k)
+        value, slope = distorted(xy)
+        good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & before_fold(xy, slope, fold)
     return np.where(good[..., None], xy, np.nan)
 
 
@@ -114,15 +129,22 @@ def before_image_fold(xy: Array, by_xy: Array, k: Array) -> Booleans:
 
     xy : (..., 2) undistorted.
     by_xy : (..., 2, 2) derivative of :func:`distort` at xy.
+    """
+    return before_fold(xy, by_xy, _fold(k))
+
+
+def before_fold(xy: Array, by_xy: Array, fold: float) -> Booleans:
+    """Whether points (..., 2) are inside the squared radius ``fold``, where the derivative
+    ``by_xy`` (..., 2, 2) of the distortion keeps the image's orientation; (...).
 
     The radial polynomial separates the sheets. The tangential terms move the fold, where the
     derivative is singular, slightly nearer on one side; the determinant detects this.
     """
     det = by_xy[..., 0, 0] * by_xy[..., 1, 1] - by_xy[..., 0, 1] * by_xy[..., 1, 0]
-    return (det > 0) & (dot(xy, xy) < _fold(k))
+    return (det > 0) & (dot(xy, xy) < fold)
 
 
-def _undistort_radially(target: Array, k: Array) -> Array:
+def _undistort_radially(target: Array, radial: Callable[[Array], Array], fold: float) -> Array:
     """Starting points (..., 2) for Newton's method: the inverse of the radial terms alone, from a
     table.
 
@@ -130,12 +152,12 @@ def _undistort_radially(target: Array, k: Array) -> Array:
     lens and does not converge.
     """
     distance = np.sqrt(np.sum(np.square(target, dtype=float), axis=-1))
-    farthest, fold = float(np.nanmax(distance, initial=0.0)), np.sqrt(_fold(k))
+    farthest, largest = float(np.nanmax(distance, initial=0.0)), np.sqrt(fold)
     last = farthest
-    while last < fold and last * _radial(last**2, k) < farthest:
+    while last < largest and last * radial(np.asarray(last**2)) < farthest:
         last *= 2
-    radius = np.linspace(0.0, min(last, fold), _TABLE)
-    values = np.interp(distance, radius * _radial(radius**2, k), radius)
+    radius = np.linspace(0.0, min(last, largest), _TABLE)
+    values = np.interp(distance, radius * radial(radius**2), radius)
     scale = np.where(distance > 0, values / np.where(distance > 0, distance, 1.0), 1.0)
     return target * scale[..., None]
 

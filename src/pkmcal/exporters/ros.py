@@ -17,7 +17,8 @@ import yaml
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.machine_source import MachineSource
-from pkmcal.cameras.files import foreign_text, load_camera
+from pkmcal.cameras import Camera
+from pkmcal.cameras.files import foreign_text, load_camera, ros_distortion
 from pkmcal.errors import InputError
 from pkmcal.exporters.contract import Difference, Exporter, commented, exact
 from pkmcal.geometry.rigid import from_quaternion, pose, quaternion
@@ -26,7 +27,6 @@ from pkmcal.wording import listed
 
 ROS_LAUNCH_FILE = "static_transforms.launch.yaml"
 ROS_BASE_FRAME = "base"
-MIRROR_CAMERA_MODEL = "unified"
 TRANSFORM_ROUNDING = 1e-12
 """Tolerance, m and elements of a rotation matrix: rounding of a quaternion with 17 digits."""
 
@@ -53,7 +53,7 @@ class Ros(Exporter):
         out = {ROS_LAUNCH_FILE: _launch(source)}
         frames = frame_names(source)
         for station, camera in source.cameras.items():
-            if camera.model != MIRROR_CAMERA_MODEL:
+            if _has_ros_model(camera):
                 name = f"camera_info_{frames[station]}.yaml"
                 out[name] = _camera_info(source, station, frames[station])
         return out
@@ -88,9 +88,9 @@ class Ros(Exporter):
         out: list[Finding] = []
         if lost:
             out.append(doubtful("export.ros_no_camera_file", listed(lost), stations=lost))
-        mirrors = [s for s, camera in source.cameras.items() if camera.model == MIRROR_CAMERA_MODEL]
-        if mirrors:
-            out.append(doubtful("export.ros_mirrors", listed(mirrors), stations=mirrors))
+        without_model = [s for s, camera in source.cameras.items() if not _has_ros_model(camera)]
+        if without_model:
+            out.append(doubtful("export.ros_lens", listed(without_model), stations=without_model))
         out.append(note("export.ros_launch", ROS_LAUNCH_FILE))
         return tuple(out)
 
@@ -106,6 +106,15 @@ def frame_names(source: MachineSource) -> dict[str, str]:
             name, k = f"{plain}_{k}", k + 1
         out[station] = name
     return out
+
+
+def _has_ros_model(camera: Camera) -> bool:
+    """Whether ROS has a distortion model of the camera."""
+    try:
+        ros_distortion(camera)
+    except InputError:
+        return False
+    return True
 
 
 def _launch(source: MachineSource) -> str:

@@ -24,6 +24,7 @@ from pkmcal.files.limits import (
     MOST_VALUES,
     MOST_YAML_NODES,
 )
+from pkmcal.files.recordings import RECORDING_HEAD_BYTES, recording_error
 from pkmcal.files.regular import check_regular
 from pkmcal.files.replacing import check_replaced
 
@@ -62,6 +63,10 @@ def _raw_blocks(path: Path, label: str, largest: int, block_bytes: int) -> Itera
         check_replaced(path.parent)
         check_regular(path, label)
         with path.open("rb") as stream:
+            head = stream.read(RECORDING_HEAD_BYTES)
+            stream.seek(0)
+            if error := recording_error(head, label, "a text file"):
+                raise error
             size = os.fstat(stream.fileno()).st_size
             if size > largest:
                 raise InputError(

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from pkmcal.errors import InputError
 from pkmcal.files.limits import MOST_PIXELS, check_count
+from pkmcal.files.recordings import recording_error
 from pkmcal.wording import install_step
 
 if TYPE_CHECKING:
@@ -40,6 +41,11 @@ _HEAD_BYTES = 1000
 _PNG_SIGNATURE_BYTES, _PNG_CHECKSUM_BYTES = 8, 4
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+_FOCAL_LENGTH, _PIXEL_DIMENSIONS = 0x920A, (0xA002, 0xA003)
+_FOCAL_PLANE_RESOLUTION, _FOCAL_PLANE_UNIT = 0xA20E, 0xA210
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+"""Millimetres of FocalPlaneResolutionUnit: inch, centimetre; millimetre and micrometre as some
+makers write them."""
 _TRANSPOSING_ORIENTATIONS = range(5, 9)
 
 
@@ -50,10 +56,17 @@ class Exif:
     orientation : 1 to 8, as in the standard; 1 where the file has none.
     focal_35mm : focal length (mm) of the lens with the same field of view on film of 36 x 24 mm;
         None where unknown.
+    focal_mm : focal length of the lens (FocalLength), mm. pixels_per_mm : of the sensor
+        (FocalPlaneXResolution), for images of ``recorded_size``. recorded_size : (width, height)
+        of the image when it was captured (PixelXDimension, PixelYDimension), px. None where
+        unknown.
     """
 
     orientation: int = 1
     focal_35mm: float | None = None
+    focal_mm: float | None = None
+    pixels_per_mm: float | None = None
+    recorded_size: tuple[int, int] | None = None
 
 
 def open_image(stream: BinaryIO, label: str) -> ImageFile:
@@ -66,6 +79,8 @@ def open_image(stream: BinaryIO, label: str) -> ImageFile:
     head = stream.read(_HEAD_BYTES)
     length = stream.seek(0, 2)
     stream.seek(0)
+    if not _is_heif(head) and (error := recording_error(head, label, "a PNG or JPEG file")):
+        raise error
     try:
         image_class = _image_class(head, label)
         if head.startswith(b"P"):  # Pillow reads a comment byte by byte, however long it is
@@ -92,7 +107,7 @@ def _image_class(head: bytes, label: str) -> Callable[[BinaryIO], ImageFile]:
         from PIL.TiffImagePlugin import TiffImageFile as ImageClass
     elif head.startswith((b"P2", b"P3", b"P5", b"P6")):
         from PIL.PpmImagePlugin import PpmImageFile as ImageClass
-    elif head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
+    elif _is_heif(head):
         try:
             ImageClass = import_module("pillow_heif").HeifImageFile  # an extra
         except ImportError:
@@ -100,11 +115,17 @@ def _image_class(head: bytes, label: str) -> Callable[[BinaryIO], ImageFile]:
                 "HEIF images need the package pillow-heif, which is not installed",
                 where=label,
                 expected="a PNG or JPEG file",
-                next_step=f"{install_step('heic')}; or set the camera to JPEG",
+                next_step=f"{install_step('heic')}; or set the camera to JPEG ('most compatible'),"
+                " or convert the images to JPEG, keeping their EXIF",
             ) from None
     else:
         raise ValueError("a format that is not read")
     return ImageClass
+
+
+def _is_heif(head: bytes) -> bool:
+    """Whether a file that begins with these bytes is a HEIF image (HEIC of telephones)."""
+    return head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS
 
 
 def _unreadable(length: int, label: str) -> InputError:
@@ -132,13 +153,30 @@ def read_exif(image: ImageFile) -> Exif:
     try:
         exif = _png_exif(image) if image.format == "PNG" else image.getexif()
         orientation = image.info.get("original_orientation") or exif.get(_ORIENTATION, 1)
-        focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM) or 0)
+        capture = exif.get_ifd(_EXIF_DIRECTORY)
     except IMAGE_ERRORS:
         return Exif()
-    # a focal length of 0 is the standard's value for unknown
+    density = _positive(capture.get(_FOCAL_PLANE_RESOLUTION))
+    unit_mm = _UNIT_MM.get(int(_positive(capture.get(_FOCAL_PLANE_UNIT, 2)) or 0))
+    width, height = (_positive(capture.get(tag)) for tag in _PIXEL_DIMENSIONS)
     return Exif(
-        orientation if orientation in range(1, 9) else 1, focal if 0 < focal < inf else None
+        orientation=orientation if orientation in range(1, 9) else 1,
+        focal_35mm=_positive(capture.get(_FOCAL_35MM)),
+        focal_mm=_positive(capture.get(_FOCAL_LENGTH)),
+        pixels_per_mm=density / unit_mm if density and unit_mm else None,
+        recorded_size=(round(width), round(height)) if width and height else None,
     )
+
+
+def _positive(value: object) -> float | None:
+    """Positive finite number of an EXIF entry; None for others, since 0 is the standard's value
+    for unknown.
+    """
+    try:
+        number = float(value)  # pyrefly: ignore  # any type may stand in a file
+    except IMAGE_ERRORS:
+        return None
+    return number if 0 < number < inf else None
 
 
 def _png_exif(image: ImageFile) -> Entries:
