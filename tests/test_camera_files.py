@@ -367,6 +367,13 @@ def test_faults_of_mrcal_files(tmp_path, old, new, field):
         assert "splined" in str(caught.value)
 
 
+def test_a_name_where_cameras_have_none(tmp_path):
+    for text in (MRCAL, ROS):
+        with pytest.raises(InputError, match="no cameras with names") as caught:
+            read_text(tmp_path, text, "cam0")
+        assert caught.value.found == "cam0"
+
+
 COLMAP = """\
 # Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]

@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras.colmap import is_colmap, read_colmap
 from pkmcal.cameras.contract import LEAST_FOCAL, Camera, camera_models
-from pkmcal.cameras.foreign import Intrinsics
+from pkmcal.cameras.foreign import Intrinsics, named_entry
 from pkmcal.cameras.mrcal import is_mrcal, read_mrcal
 from pkmcal.cameras.visp import is_visp, read_visp
 from pkmcal.errors import InputError
@@ -54,6 +54,8 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     text = read_text(path, label, LARGEST_WRITTEN_FILE)
     if is_visp(text):
         return _from_intrinsics(read_visp(text, label, camera))
+    if is_mrcal(text) and camera is not None:
+        raise _without_names(label, camera)
     if is_mrcal(text):
         return _from_intrinsics(read_mrcal(text, label))
     if is_colmap(text):
@@ -69,10 +71,15 @@ def load_camera(path: Path | str, label: str | None = None) -> Camera:
     if cameras:
         return _from_kalibr(document, cameras, camera)
     if camera is not None:
-        raise InputError("the file holds no cameras with names", where=label, found=camera)
+        raise _without_names(label, camera)
     if "camera_matrix" in document.data:
         return _from_ros(document)
     return camera_from_document(document)
+
+
+def _without_names(label: str, camera: str) -> InputError:
+    """Error about a name behind a # where the file's format has one camera without a name."""
+    return InputError("the file holds no cameras with names", where=label, found=camera)
 
 
 def written_camera(file: str) -> str:
@@ -396,16 +403,7 @@ def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
 
 def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> Camera:
     """Camera of a Kalibr camchain file; ``wanted`` selects among several."""
-    if wanted is None and len(cameras) > 1:
-        raise InputError(
-            "the file holds several cameras", where=document.label, found=listed(cameras),
-            next_step=f"Name one behind a #, such as {document.label}#{cameras[-1]}",
-        )  # fmt: skip
-    key = wanted or cameras[0]
-    if key not in cameras:
-        raise InputError(
-            "the file has no such camera", where=document.label, found=key, expected=listed(cameras)
-        )
+    key = named_entry({name: name for name in cameras}, wanted, document.label)
     data = document.data[key]
     pair = (str(data["camera_model"]), str(data.get("distortion_model", "none")))
     if pair not in _KALIBR:

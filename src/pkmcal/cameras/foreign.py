@@ -1,15 +1,19 @@
 """Intrinsics in the files of mrcal, COLMAP and ViSP.
 
-Each file here that reads a program's format has one function from text to :class:`Intrinsics`;
+:mod:`pkmcal.cameras.mrcal`, ``colmap`` and ``visp`` read :class:`Intrinsics` from a text;
 :mod:`pkmcal.cameras.files` makes a validated camera of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from pkmcal.errors import InputError
 from pkmcal.wording import listed
+
+Entry = TypeVar("Entry")
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class Intrinsics:
     where: str
 
 
-def named_entry(entries: dict[str, str], name: str | None, label: str) -> str:
+def named_entry(entries: Mapping[str, Entry], name: str | None, label: str) -> Entry:
     """Entry of a file of several cameras, by the name behind the # of its path.
 
     entries : camera names and their content. name : None if the path has no #.
@@ -42,9 +46,9 @@ def named_entry(entries: dict[str, str], name: str | None, label: str) -> str:
             "the file holds several cameras",
             where=label,
             found=listed(list(entries)),
-            next_step=f"Name one behind a #, such as {label}#{next(reversed(entries))}",
+            next_step=f"Name one behind a #, such as {label}#{list(entries)[-1]}",
         )
-    if name not in entries:
+    if name is None or name not in entries:
         raise InputError(
             "the file has no such camera",
             where=label,

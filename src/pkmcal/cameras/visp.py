@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import isfinite
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
-from pkmcal.cameras.foreign import Intrinsics
+from pkmcal.cameras.foreign import Intrinsics, named_entry
 from pkmcal.errors import InputError
 from pkmcal.files import quoted
 from pkmcal.wording import listed
@@ -34,15 +34,7 @@ def read_visp(text: str, label: str, name: str | None) -> Intrinsics:
     except (ParseError, ValueError):
         raise InputError("not valid as ViSP writes it", where=label) from None
     cameras = {(one.findtext("name") or "").strip(): one for one in root.iter("camera")}
-    if (name is None and len(cameras) != 1) or (name is not None and name not in cameras):
-        raise InputError(
-            "the file holds several cameras" if name is None else "the file has no such camera",
-            where=label,
-            found=listed(list(cameras)) if name is None else name,
-            expected=None if name is None else listed(list(cameras)),
-            next_step=f"Name one behind a #, such as {label}#{next(reversed(cameras))}",
-        )
-    camera = cameras[name] if name is not None else next(iter(cameras.values()))
+    camera = named_entry(cameras, name, label)
     models = {(one.findtext("type") or "").strip(): one for one in camera.iter("model")}
     word = next((w for w in (_WITH, _WITHOUT) if w in models), None)
     if word is None:
