@@ -31,7 +31,7 @@ COLUMNS = tuple(f"{end}_{axis}" for end, axis in product(("base", "platform"), "
 EXPECTED_HEADER = f"leg,{','.join(f'{name} [mm]' for name in COLUMNS)}"
 NEEDS, TAKES = ("leg",), ("travel", "tube_radius")
 """Dimensions besides the joint centres."""
-_PIN = re.compile(r"^\s*setp\s+genhexkins\.(\S+)\s+(\S+)", re.MULTILINE)
+_PIN = re.compile(r"^[^\S\n]*setp[^\S\n]+genhexkins\.(\S+)[^\S\n]+(\S+)", re.MULTILINE)
 
 
 def centres_model(path: Path, unit: str | None, given: Mapping[str, float]) -> NominalModel:
