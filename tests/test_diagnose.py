@@ -14,7 +14,6 @@ import yaml
 
 from pkmcal.calibration.localization import boards_of, localize_stations, read_images
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.reading_hypotheses import READING_HYPOTHESIS_OPTIONS
 from pkmcal.observe import hypotheses
 from pkmcal.observe.distance_tables import distance_tables
 from pkmcal.observe.hypotheses import SuspectStation, _best_names, mistake
@@ -131,9 +130,7 @@ def test_two_columns_exchanged(pair, by_hand, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("motor", [2, 5])
 def test_a_motor_that_counts_the_other_way(motor):
-    """Its readings are a constant minus its lengths, with an unknown constant, of which a grid is
-    tried: with a nominal model that is 1 mm wrong, a neighbour of the nearest may fit better.
-    """
+    """Its readings are a constant minus its lengths, with an unknown constant."""
     readings = machine().inverse(poses())
     constant = readings[:, motor].min() + readings[:, motor].max() + 0.004
     readings[:, motor] = constant - readings[:, motor]
@@ -141,9 +138,7 @@ def test_a_motor_that_counts_the_other_way(motor):
     assert error.code == "readings.reversed"
     assert error.what == f"the readings of {COLUMNS[motor]} count the other way"
     named = float(re.match(r"(\d+) mm, or nearly so", error.expected)[1])
-    stroke = np.ptp(machine().joint_ranges[motor])
-    step = stroke / READING_HYPOTHESIS_OPTIONS.constants_in_a_stroke
-    assert abs(named - 1e3 * constant) < 1.5e3 * step
+    assert abs(named - 1e3 * constant) < 10
 
 
 @pytest.mark.parametrize(("turn", "another_side"), [also(1, False), also(2, True)])
@@ -176,11 +171,7 @@ def test_images_shifted_by_one(step, words, by_hand):
 
 @pytest.mark.parametrize("by_hand", [True, also(False)])
 def test_two_images_exchanged(by_hand):
-    """Without a rough pose, six images leave it to chance."""
-    count = 6 if by_hand else 9
-    order = [0, 4, 2, 3, 1, *range(5, count)]
-    readings = readings_with(np.arange(6), count)
-    error = refusal(pictures(count), readings, configuration=order, by_hand=given(by_hand))
+    error = refusal(pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(by_hand))
     assert "images of front bear each other's names" in str(error)
     assert "images/front/b.png fits configuration b" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
