@@ -26,14 +26,27 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import angle_between
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
+from pkmcal.mechanisms.reading_hypotheses import (
+    READING_HYPOTHESIS_OPTIONS,
+    ReadingHypothesis,
+    reading_error,
+    reading_hypotheses,
+    reversed_motor,
+)
 from pkmcal.observe.pose_likelihood import (
     StationView,
     likelihood_from,
     log_likelihood_by_name,
+    refine_lm,
+    score,
     settled,
 )
-from pkmcal.observe.station_localization import LocalizedPose, find_station, likelihood_nearby
+from pkmcal.observe.station_localization import (
+    LOCALIZATION_OPTIONS,
+    LocalizedPose,
+    find_station,
+    likelihood_nearby,
+)
 from pkmcal.outcome.hypotheses import (
     OPTIONS,
     EvidenceLevel,
@@ -57,6 +70,8 @@ OTHER_POSE_TURN = np.radians(45.0)
 six equal parts looks the same from there."""
 NAMING_ROUNDS = 3
 """Rounds of names for images, and of the pose by these names."""
+CONSTANTS_COMPARED = 17
+"""Constants of a motor found to be reversed, at a quarter of the spacing of those searched."""
 FEW_CONFIGURATIONS = 4
 """Images in which all hypotheses about the readings are compared first."""
 ENOUGH_IMAGES_ALONE, USUAL_IMAGES = 4, 15
@@ -285,7 +300,7 @@ def _mixed_up(
         levels.append(searched(view.few(len(view.configuration))))
     hypotheses, others = list(_hypotheses(station)), list(_other_images(station, options))
     some = [one.hypothesis for one in posterior(hypotheses, levels, SEARCH_OPTIONS)]
-    count = len(hypotheses) + len(others)
+    count = len({one.meaning for one in (*hypotheses, *others)})
     return _likelier(station, [*others, *some], in_order, rng, options, count)
 
 
@@ -300,8 +315,10 @@ def _likelier(
     """Error of the likeliest hypothesis, by a full search, that explains a station better than the
     session, if any, with the rivals that it does not exclude.
 
-    count : number of hypotheses of which these are the likeliest; of these, if None. Chance may
-    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni).
+    count : number of explanations of which these are the likeliest; of these, if None. Chance may
+    confirm any of them, so the p-value of each is multiplied by their number (Bonferroni). The
+    constants of a reversed motor are one explanation, as in the prior odds: those near each other
+    show nearly the same legs.
     """
     if not hypotheses:
         return None
@@ -341,6 +358,8 @@ def _likelier(
         some = [one.hypothesis for one in (*found, *equal)]
         found = likely(posterior(some, [level], SEARCH_OPTIONS)) or found
     errors = [one.hypothesis.error for one in found]
+    if errors[0].code == "readings.reversed":
+        errors[0] = _with_likeliest_constant(station, found[0].hypothesis, rng)
     error, also = errors[0], [one.what for one in errors[1:]]
     if station.elsewhere and localization.good:
         also.append("the pose by hand is of another side of the machine")
@@ -352,6 +371,39 @@ def _likelier(
         found=f"{error.found}; they {rivals}" if error.found else f"images that {rivals}",
         rivals=tuple(dict.fromkeys(one.code for one in errors if one.code != error.code)),
     )
+
+
+def _with_likeliest_constant(
+    station: SuspectStation, hypothesis: ImageHypothesis, rng: np.random.Generator
+) -> InputError:
+    """Error about a reversed motor, with the constant near the hypothesis's own at which the robust
+    fit of the edges is best; the camera's pose is estimated for each.
+    """
+    view, constant = station.view, hypothesis.facts["constant"]
+    (motor,) = hypothesis.facts["motors"]
+    low, high = view.machine.joint_ranges[motor]
+    spacing = (high - low) / READING_HYPOTHESIS_OPTIONS.constants_in_a_stroke
+    every = view.few(len(view.configuration))
+    # the likelihood has local maxima 20 mm of a constant apart, and has chosen among them; the
+    # truncated distances of the last descent have one minimum for each start
+    reaches = LOCALIZATION_OPTIONS.reaches + LOCALIZATION_OPTIONS.final_reaches
+    for _ in range(NAMING_ROUNDS):  # the constant determines the pose, and the pose the constant
+        turned = reversed_motor(motor, constant).apply(view.all_joints)
+        at = find_station(view.with_joints(turned), station.by_hand, rng, near_prior=True)
+        constants = constant + np.linspace(-2 * spacing, 2 * spacing, CONSTANTS_COMPARED)
+        joints = np.stack([reversed_motor(motor, c).apply(view.joints) for c in constants])
+        fk = view.machine.forward_result(joints.reshape(-1, joints.shape[-1])).T_base_platform
+        legs = view.legs_at(fk.reshape(*joints.shape[:2], 4, 4), joints)
+        each = replace(view, guessed=legs)
+        start = np.repeat(at.T_camera_base[None], len(constants), axis=0)
+        misfits = score(each, refine_lm(each, start, every, 8, reaches), every, reaches[-2], 8)
+        constant = float(constants[np.argmin(misfits)])
+    return _reading_error(station, reversed_motor(motor, constant))
+
+
+def _reading_error(station: SuspectStation, hypothesis: ReadingHypothesis) -> InputError:
+    units = station.view.machine.joint_units
+    return reading_error(hypothesis, station.table, station.columns, units, "the images fit")
 
 
 def _searched_anywhere(
@@ -419,9 +471,7 @@ def _of_readings(station: SuspectStation) -> Iterator[ImageHypothesis]:
             lambda view, joints=joints: view.with_joints(joints),
             prior,
             facts=h.facts,
-            error=reading_error(
-                h, station.table, station.columns, view.machine.joint_units, "the images fit"
-            ),
+            error=_reading_error(station, h),
             readings=joints[view.configuration],
         )
 
