@@ -296,7 +296,7 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
 
     from pkmcal import calibrate
     from pkmcal.errors import PkmcalError
-    from pkmcal.identify.kinds import READING_ROWS_KIND
+    from pkmcal.identify.row_sums import READING_ROWS
     from pkmcal.identify.noise import noise_shares
 
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
@@ -330,7 +330,7 @@ def outcome(kind: str, seed: int, folder: Path) -> Outcome:
         "other": list(verdict.warnings),
     }
     info = result.estimate.linearized.info
-    low, high = noise_shares(info, READING_ROWS_KIND).interval(INTERVAL_MISS)
+    low, high = noise_shares(info, READING_ROWS).interval(INTERVAL_MISS)
     scale = statistics.reading_scale
     return Outcome(
         findings, float(scale * low[0]), float(scale * high[0]), off_by(result, session), seconds

@@ -14,9 +14,9 @@ from pkmcal.calibration.calibrate import Clock, settle
 from pkmcal.calibration.case import Case, PriorScene
 from pkmcal.calibration.chance_matches import (
     IMAGE_OFFSET,
-    by_chance,
     chance_match_reason,
     chance_of_count,
+    misplaced_stations,
 )
 from pkmcal.calibration.localization import read_images
 from pkmcal.calibration.refinement import RefinementResult
@@ -122,27 +122,27 @@ def two_stations(second, **values):
 
 def test_a_station_that_may_stand_elsewhere_is_reported_with_why():
     session, turns = two_stations(displaced(taken(), 2.5 * IMAGE_OFFSET))
-    ((number, why),) = by_chance(session, turns).items()
+    ((number, why),) = misplaced_stations(session, turns).items()
     assert number == 1
     (measured,) = {int(np.sum(turns.observation.edges.station == 1))}
     assert why.startswith(f"only {measured} of ")
     assert why.endswith("it may stand elsewhere; a pose by hand would decide")
     session, turns = two_stations(displaced(taken(), 2.5 * IMAGE_OFFSET), T_camera_base=FRONT)
-    assert by_chance(session, turns)[1].endswith("it may stand elsewhere")
+    assert misplaced_stations(session, turns)[1].endswith("it may stand elsewhere")
 
 
 def test_a_station_is_kept_that_shows_the_machine_or_whose_pose_is_determined_otherwise():
     wrong = displaced(taken(), 2.5 * IMAGE_OFFSET)
-    assert by_chance(*two_stations(taken())) == {}
-    assert by_chance(*two_stations(wrong, boards=[1])) == {}
-    assert by_chance(*two_stations(wrong, handheld=True)) == {}
+    assert misplaced_stations(*two_stations(taken())) == {}
+    assert misplaced_stations(*two_stations(wrong, boards=[1])) == {}
+    assert misplaced_stations(*two_stations(wrong, handheld=True)) == {}
 
 
 def test_the_only_station_is_not_left_out_but_reported_as_unsure():
     session, turns = two_stations(taken())
     alone = turns_of(displaced(taken(), 2.5 * IMAGE_OFFSET))
     alone = alone._replace(measurements=turns.measurements)
-    assert by_chance(session, alone) == {}
+    assert misplaced_stations(session, alone) == {}
     assert chance_match_reason(alone)
 
 
@@ -150,7 +150,7 @@ def test_the_only_station_is_not_left_out_but_reported_as_unsure():
 def test_the_machine_is_identified_by_the_other_stations(demo, monkeypatch):
     """A station that may stand elsewhere is left out with its reason, and the rest identified."""
     item = iter([{1: "it may stand elsewhere"}])
-    monkeypatch.setattr(calibrate, "by_chance", lambda *_: next(item, {}))
+    monkeypatch.setattr(calibrate, "misplaced_stations", lambda *_: next(item, {}))
     calibration = calibrate.calibrate_session(demo.session)
     assert [station.name for station in calibration.session.stations] == ["station1", "station3"]
     assert "station2: left out, for it may stand elsewhere." in calibration.session.warnings

@@ -14,7 +14,7 @@ from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.confirmation import rejections_of
 from pkmcal.identify.robust import CLEAN_TAIL_SHARE
 from pkmcal.levels import CONTRADICTION_SIGMAS
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.solver.kernels import FULL_WEIGHT_DISTANCE, NO_WEIGHT_DISTANCE, final_loss
 from pkmcal.solver.search import minimise
 
@@ -52,7 +52,7 @@ def test_hypotheses_weigh_as_their_solutions_do(example):
     def solved(rejected):
         weight = np.full(n, in_use)
         weight[rejected] = 0.0
-        weights = Kinds(np.zeros(0), weight, np.zeros(0))
+        weights = RowGroups(np.zeros(0), weight, np.zeros(0))
         other = assembled.trusting(weights)
         other = replace(other, prior=problem.prior, prior_target=problem.prior_target)
         one = minimise(other.as_noisy_as_at(info.state), info.state)

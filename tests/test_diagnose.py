@@ -206,8 +206,8 @@ def test_two_images_exchanged_at_the_station_that_is_localized_most_surely():
     wrong = search(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
     right = search(rng, pictures(), by_hand=given(True))
     stations = [
-        station._replace(name=name, localization=replace(station.localization, by_chance=by_chance))
-        for station, name, by_chance in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
+        station._replace(name=name, localization=replace(station.localization, p_value=p_value))
+        for station, name, p_value in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
     ]
     error = mistake(stations, rng)
     assert "images of front bear each other's names" in str(error)
@@ -264,7 +264,7 @@ def test_diameters_for_radii():
     values[radii] *= 2
     rng, nominal = np.random.default_rng(0), mechanism.with_values(values)
     station = search(rng, pictures(), mechanism=nominal, by_hand=given(True))
-    unsure = station._replace(localization=replace(station.localization, by_chance=1.0))
+    unsure = station._replace(localization=replace(station.localization, p_value=1.0))
     error = mistake([unsure], rng)
     assert "the tubes' radii look like diameters" in str(error)
 
@@ -291,8 +291,8 @@ def test_another_machine_is_not_surely_localized_and_nothing_is_renamed():
     assert error is None or "not localized" in str(error)
 
 
-@pytest.mark.parametrize(("by_chance", "named"), [(5e-3, False), (1e-5, True)])
-def test_log_odds_of_an_exchange_grow_with_the_other_stations(monkeypatch, by_chance, named):
+@pytest.mark.parametrize(("p_value", "named"), [(5e-3, False), (1e-5, True)])
+def test_log_odds_of_an_exchange_grow_with_the_other_stations(monkeypatch, p_value, named):
     """From two images without localization, chance confirms one hypothesis of thirty."""
     rng, readings = np.random.default_rng(0), machine().inverse(poses())
     localization = LocalizedPose(rough_pose(4), 0.5, 1.0, 0.02, has_prior=True)
@@ -301,7 +301,7 @@ def test_log_odds_of_an_exchange_grow_with_the_other_stations(monkeypatch, by_ch
     )
 
     def confirmed(view, _start, _rng, near_prior):
-        return replace(localization, by_chance=by_chance)
+        return replace(localization, p_value=p_value)
 
     monkeypatch.setattr(hypotheses, "find_station", confirmed)
     monkeypatch.setattr(

@@ -22,7 +22,7 @@ from pkmcal.geometry.cylinders import line_through, tangent_basis
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.discrepancy import Component, discrepancy_of
-from pkmcal.identify.kinds import READING_ROWS_KIND
+from pkmcal.identify.row_sums import READING_ROWS
 from pkmcal.identify.score import ScoreTests, columns_of
 from pkmcal.identify.start import start_state
 from pkmcal.identify.tool import tool_error
@@ -307,7 +307,7 @@ def test_components_act_in_the_readings_units():
     assert len(set(codes)) == len(codes)
     for one in components:
         assert one.column.count == len(one.roots[0])
-        if READING_ROWS_KIND in one.inflates:
+        if READING_ROWS in one.inflates:
             for root in one.roots:
                 size = np.sum((one.column.readings @ root) ** 2, axis=-1)
                 assert np.mean(size) == pytest.approx(1, rel=0.2)

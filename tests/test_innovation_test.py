@@ -10,7 +10,7 @@ import pytest
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.innovation_test import innovations
 from pkmcal.identify.robust import as_pairs, norms
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.solver.search import minimise
 from test_noise import pose_problem
 
@@ -27,7 +27,7 @@ def rejected_pose(readings_off):
     problem = replace(
         problem, data=replace(problem.data, joints=joints), joint_noise=np.array([COARSE])
     )
-    every = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
+    every = RowGroups(*(kind.present[None].astype(float) for kind in problem.row_groups))
     weight = every.poses.copy()
     weight[0, REJECTED] = 0.0
     without = problem.weighted(every._replace(poses=weight))
@@ -43,7 +43,7 @@ def test_the_innovation_is_what_the_pose_would_cost(readings_off):
     judged = innovations(info, plain, weight, np.ones(1))
     others = np.arange(judged.shape[1]) != REJECTED
     np.testing.assert_array_equal(judged[:, others], plain[:, others])
-    factor = as_pairs(whole.kinds.poses)[REJECTED, 0]
+    factor = as_pairs(whole.row_groups.poses)[REJECTED, 0]
     square = (judged[0, REJECTED, 0] / factor) ** 2
     again = minimise(whole, value.state)
     assert square == pytest.approx(again.cost[0] - value.cost[0], rel=0.05)

@@ -16,7 +16,7 @@ from pkmcal.identify.gauge import BestFit, centre_index, generators, transformat
 from pkmcal.identify.methods import linear
 from pkmcal.identify.methods.estimates import linear_estimate
 from pkmcal.identify.methods.linear_together import base_together
-from pkmcal.identify.unidentified import Findings
+from pkmcal.identify.unidentified import Identification
 from pkmcal.identify.verdict import assess
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.measurements.effects import EDGE_SHIFT
@@ -203,7 +203,7 @@ def test_verdict_states_how_far_the_method_goes(scenes):
         estimate.state.T_camera_base,
     )
     information = Identifiability(0, 0, 0, (), (), np.zeros(0), np.zeros((0, 0)))
-    verdict = assess(observation, estimate, Findings(information, (), (), 1.0), "linear")
+    verdict = assess(observation, estimate, Identification(information, (), (), 1.0), "linear")
     assert not verdict.usable
     (base,) = verdict.of("estimate.base_only")
     both, edges, nominal = (

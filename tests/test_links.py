@@ -25,7 +25,7 @@ from pkmcal.measurements import (
     PoseSet,
 )
 from pkmcal.measurements.distances import DistanceSet
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.solver import search
 from pkmcal.solver.strips import normal_equations
@@ -147,7 +147,11 @@ def test_links_of_every_machine(name):
     start = replace(start, T_mount=pose(np.eye(3), POINT)[None])
     assembled = assemble(machine, data, default_gauge(machine))
     problem = assembled.problem
-    state, u, rows = batch_of(machine, assembled, start), problem.unknowns, problem.kinds.links.rows
+    state, u, rows = (
+        batch_of(machine, assembled, start),
+        problem.unknowns,
+        problem.row_groups.links.rows,
+    )
     np.testing.assert_allclose(problem.residuals(state).value[0][:, rows], 0, atol=1e-6)
     own = np.zeros((1, 5, problem.layout.own_motion.shape[1]))
     step = np.zeros((1, u.count))
@@ -194,15 +198,15 @@ def test_covariance_and_step_are_those_of_the_whole_problem(machine, case):
         info.covariance[0][np.ix_(shared, shared)] / scale, covariance[:na, :na] / scale, atol=2e-5
     )
     hat = np.einsum("ij,jk,ik->i", whole, covariance, whole)
-    weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
+    weight = RowGroups(*(kind.present[None].astype(float) for kind in problem.row_groups))
     freedom = components(info, weight).freedom[0]
     _, count, r, _ = problem.linearize(state).by_own.shape
     remainder = (1 - hat[: count * r]).reshape(count, r)
-    links = problem.kinds.links
+    links = problem.row_groups.links
     expected = remainder[:, links.rows][links.present].sum()
     assert 0 < expected < len(data.links[0])
     assert freedom[3] == pytest.approx(expected, rel=1e-5)
-    poses = remainder[:, problem.kinds.poses.rows].sum()
+    poses = remainder[:, problem.row_groups.poses.rows].sum()
     assert freedom[1] == pytest.approx(poses, rel=1e-5)
     assert freedom[2] == pytest.approx(remainder[:, problem.closure_rows].sum(), rel=1e-4)
 
@@ -263,14 +267,14 @@ def test_edges_of_linked_configurations(with_edges):
     gradient = normal.gradient[0][shared]
     np.testing.assert_allclose(gradient / size, residual.T @ value / size, rtol=1e-6, atol=1e-5)
     info = Information(problem, state)
-    weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
+    weight = RowGroups(*(kind.present[None].astype(float) for kind in problem.row_groups))
     unit = whole / np.linalg.norm(whole, axis=0)
     inverse = np.linalg.inv(unit.T @ unit)
     hat = np.einsum("ij,jk,ik->i", unit, inverse, unit)
     _, count, r, _ = linear.by_own.shape
     residual = (1 - hat[: count * r]).reshape(count, r)
     freedom = components(info, weight).freedom[0]
-    edges, links = problem.kinds.edges, problem.kinds.links
+    edges, links = problem.row_groups.edges, problem.row_groups.links
     of_edges = residual[:, edges.rows][np.repeat(edges.present, 2, axis=1)].sum()
     assert freedom[0] == pytest.approx(of_edges, rel=1e-5)
     of_links = residual[:, links.rows][links.present].sum()

@@ -126,7 +126,7 @@ def rows_of(kind, problem):
     """Rows of a kind in a problem's residuals."""
     if issubclass(kind, MotorKind):
         return problem.closure_rows
-    kinds = problem.kinds
+    kinds = problem.row_groups
     if issubclass(kind, LinkKind):
         return kinds.links.rows
     return kinds.edges.rows if kind.code == "edges" else kinds.poses.rows

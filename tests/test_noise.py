@@ -12,7 +12,6 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.kinds import LINK_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND
 from pkmcal.identify.noise import (
     LEAST_NOISE_FREEDOM,
     NOISE,
@@ -20,9 +19,10 @@ from pkmcal.identify.noise import (
     components,
     noise_shares,
 )
+from pkmcal.identify.row_sums import LINK_ROWS, POSE_ROWS, READING_ROWS
 from pkmcal.identify.start import start_state
 from pkmcal.measurements.distances import DistanceSet
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import load_mechanism
 from pose_sessions import T_CAMERA_BASE, T_PLATFORM_BOARD, measured, upright
 from test_identify_scene import JOINT_NOISE, exact, make_scene
@@ -64,8 +64,8 @@ def test_variances_are_as_their_shares_say(factor):
         assert np.mean(u[some] ** 2) == pytest.approx(1, abs=4 * np.sqrt(2 / some.sum()))
     assert np.mean(u[:, 1:] * u[:, :-1]) == pytest.approx(0, abs=4 / np.sqrt(real.sum()))
     if factor == 1:
-        expected = value.freedom[:, READING_ROWS_KIND]
-        assert np.mean(value.chi2[:, READING_ROWS_KIND] / expected) == pytest.approx(1, abs=0.1)
+        expected = value.freedom[:, READING_ROWS]
+        assert np.mean(value.chi2[:, READING_ROWS] / expected) == pytest.approx(1, abs=0.1)
 
 
 def coverage(configurations, true, chance, runs):
@@ -219,7 +219,7 @@ def test_traces_are_those_of_the_hat_matrix(name):
     jac /= np.maximum(np.linalg.norm(jac, axis=0), 1e-300)
     u, s, _ = np.linalg.svd(jac, full_matrices=False)
     q = u[: k * r, s > 1e-10 * s[0]]
-    edges, poses, links = (kind.rows for kind in problem.kinds)
+    edges, poses, links = (kind.rows for kind in problem.row_groups)
     m, n = problem.layout.n_readings, problem.layout.n_equations
     pick = np.zeros((k, m, r))
     unit = np.broadcast_to(np.eye(n)[:, None], (n, k, n))
@@ -231,12 +231,12 @@ def test_traces_are_those_of_the_hat_matrix(name):
     of = [part.reshape(-1, k * r) for part in of]
     used = problem._in_use[0].ravel()
     of = [part[np.abs(part) @ used > 0] for part in of]
-    weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
+    weight = RowGroups(*(kind.present[None].astype(float) for kind in problem.row_groups))
     results = components(Information(problem, state), weight)
     residual = [[a @ b.T - (a @ q) @ (b @ q).T for b in of] for a in of]
     freedom = np.array([np.trace(residual[i][i]) for i in range(4)])
     np.testing.assert_allclose(results.freedom[0], freedom, atol=1e-5)
-    for kind in (READING_ROWS_KIND, POSE_ROWS_KIND, LINK_ROWS_KIND):
+    for kind in (READING_ROWS, POSE_ROWS, LINK_ROWS):
         part = of[kind]
         shares = noise_shares(Information(problem, state), kind)
         if not part.size:
@@ -250,4 +250,4 @@ def test_traces_are_those_of_the_hat_matrix(name):
         distance = (turn[:, some].T @ z) ** 2 / size[some]
         assert np.sum(shares.z**2) == pytest.approx(distance.sum(), rel=1e-3)
         np.testing.assert_allclose(shares.own + shares.others + shares.fixed, 1, atol=1e-12)
-    assert freedom[READING_ROWS_KIND] > 1e-3  # the data contain information on each kind
+    assert freedom[READING_ROWS] > 1e-3  # the data contain information on each kind

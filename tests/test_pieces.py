@@ -11,7 +11,7 @@ from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information, identifiability, reduced_rows
 from pkmcal.identify.methods import linear
 from pkmcal.identify.noise import components
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.solver import elimination
 from pkmcal.solver.elimination import condensed, rows_on_shared
 from test_identify_scene import make_scene
@@ -62,7 +62,7 @@ def test_residuals_by_themselves_are_the_same(runs):
 def test_what_weights_do_not_change_is_kept():
     problem, truth, _ = problem_of()
     weights = 0.5 * problem.data.weight, problem.pose_data.weight, problem.link_data.weight
-    weighted = problem.weighted(Kinds(*weights))
+    weighted = problem.weighted(RowGroups(*weights))
     assert weighted.structure is problem.structure
     part = problem.among(slice(0, 2))
     assert part.structure is weighted.among(slice(0, 2)).structure is not problem.structure

@@ -19,7 +19,7 @@ from pkmcal.api.calibrate import CalibrationResult
 from pkmcal.arrays import short_repr
 from pkmcal.calibration import plots
 from pkmcal.errors import InputError
-from pkmcal.identify.tool import ToolError
+from pkmcal.identify.tool import ToolAccuracy
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.finding import Finding, Level
 from pkmcal.placement.default_camera import camera_of_size, default_camera
@@ -101,14 +101,14 @@ def test_reprs_are_short(result, loaded, planned):
     assert repr(result).startswith("<Calibration of gough-stewart from session, method bundle, ")
     assert repr(result).endswith(": usable>")
     count = len(tool.position)
-    assert repr(tool).startswith(f"ToolError(T_base_platform=<{count} × 4 × 4>, by_parameters=<")
+    assert repr(tool).startswith(f"ToolAccuracy(T_base_platform=<{count} × 4 × 4>, by_parameters=<")
 
 
 def test_short_reprs_of_all_kinds_of_values():
-    tool = ToolError(np.zeros((2, 4, 4)), np.array(1.0), ["a"] * 30, {"a": np.zeros(3)})
+    tool = ToolAccuracy(np.zeros((2, 4, 4)), np.array(1.0), ["a"] * 30, {"a": np.zeros(3)})
     assert repr(tool) == short_repr(tool)
     assert repr(tool) == (
-        "ToolError(T_base_platform=<2 × 4 × 4>, by_parameters=<one number>, parameters=<list of"
+        "ToolAccuracy(T_base_platform=<2 × 4 × 4>, by_parameters=<one number>, parameters=<list of"
         " 30>, off={'a': array([0., 0., 0.])})"
     )
 

@@ -16,7 +16,7 @@ from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.state import State
-from pkmcal.identify.unidentified import Findings
+from pkmcal.identify.unidentified import Identification
 from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import load_mechanism
@@ -40,7 +40,7 @@ class Case:
 
 
 RANKS = Identifiability(54, 12, 42, (), (), np.full(42, 20.0), np.zeros((42, 54)))
-IDENTIFIABILITY = Findings(RANKS, (), (), 1e-3)
+IDENTIFIABILITY = Identification(RANKS, (), (), 1e-3)
 """Findings if the data determine everything."""
 
 

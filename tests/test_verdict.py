@@ -19,7 +19,7 @@ from pkmcal.identify.covariance import ParameterDirection, identifiability
 from pkmcal.identify.motions import UNIDENTIFIED
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import centres_and_tool, platform_by_parameters, platform_sigma
-from pkmcal.identify.unidentified import Findings, explain, observed_legs
+from pkmcal.identify.unidentified import Identification, explain, observed_legs
 from pkmcal.identify.verdict import VERDICT, VerdictOptions, assess, no_gain
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
@@ -342,4 +342,4 @@ def test_what_is_not_identified_stands_in_the_file(apart):
     assert "never seen together" in json_text(document)
     text = unidentified(estimate, findings)
     assert text[0] == f"{first['text']} {first['advice']}"
-    assert isinstance(findings, Findings)
+    assert isinstance(findings, Identification)

@@ -34,6 +34,11 @@ CONTRADICTION_SIGMAS = 5.0
 NOISE_EXCESS = 1.5
 """Ratio of errors to their standard deviations that is no reason for a report: standard deviations
 contain noise, and shading and lenses add a few tenths in any images."""
+LARGEST_NOMINAL_ERROR = 10.0
+"""Largest error of a nominal model, in prior sigmas, which a file may state too small: beyond it
+the model is another machine's, or the readings are wrong."""
+FEWEST_EDGES = 24
+"""Minimum number of edges of an estimate; a single image of a hexapod has as many."""
 RELEVANT_FACTOR = 1.2
 """Factor on a standard deviation that matters: that of half as many images in addition."""
 ALIGNED_ANGLE = radians(10.0)

@@ -31,6 +31,7 @@ from pkmcal.boards.layout import (
 )
 from pkmcal.errors import InputError
 from pkmcal.files import Document
+from pkmcal.levels import NEARLY_ALL
 from pkmcal.observe.images import decode
 from pkmcal.outcome.progress import Progress, no_progress
 from pkmcal.session.image_files import image_header
@@ -445,7 +446,7 @@ def _other_markers(image: Integers, mine: str) -> str | None:
         return f"{count} markers of {best}"
     family = best.rpartition("_")[0]
     sizes = [_dictionary_size(n) for n in dictionaries() if n.rpartition("_")[0] == family]
-    size = min(size for size in sizes if size > np.quantile(ids[best], 0.9))
+    size = min(size for size in sizes if size > np.quantile(ids[best], NEARLY_ALL))
     return f"{count} markers of {family}_{size}"
 
 

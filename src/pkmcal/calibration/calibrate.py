@@ -17,7 +17,11 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.camera_refinement import CameraRefinement, refinement_of
 from pkmcal.calibration.case import Case, PriorScene
-from pkmcal.calibration.chance_matches import by_chance, chance_match_reason, explain_images
+from pkmcal.calibration.chance_matches import (
+    chance_match_reason,
+    explain_images,
+    misplaced_stations,
+)
 from pkmcal.calibration.discrepancy_basis import ModelError, discrepancy_findings, explains_heights
 from pkmcal.calibration.faults import (
     lens_notes,
@@ -62,7 +66,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import (
-    Findings,
+    Identification,
     explain,
     observed_by_boards,
     observed_legs,
@@ -106,7 +110,7 @@ class Calibration(CalibrationSummary):
     measurements: Measurements
     estimate: Estimate
     verdict: Verdict
-    identification: Findings
+    identification: Identification
     cameras: CameraRefinement
     method: str
     seed: int
@@ -354,7 +358,7 @@ def settle(
             case = _observe(repaired, seed, now.part(0.9, 1))
             continue
         # stations that are not where they were localized
-        wrong = by_chance(case.session, turns) or inconsistent_poses(
+        wrong = misplaced_stations(case.session, turns) or inconsistent_poses(
             case.session, turns.measurements, turns.estimate, case.scene.T_camera_base
         )
         if not wrong:
@@ -496,9 +500,11 @@ def _judge(
             session, turns.observation, turns.measurements, value.estimate
         )
         value = value._replace(estimate=estimate)
-    findings = _findings(turns.measurements, without, uneven)
+    identification = _identification(turns.measurements, without, uneven)
     others = (
-        *_findings_of_estimate(session, value, findings, detections, errors, method == "bundle"),
+        *_findings_of_estimate(
+            session, value, identification, detections, errors, method == "bundle"
+        ),
         *numbering_note(session),
         *turns.responses.findings,
         *found,
@@ -506,7 +512,7 @@ def _judge(
     verdict = assess(
         turns.observation,
         value.estimate,
-        findings,
+        identification,
         method,
         richer=value.richer,
         explained=explains_heights(errors),
@@ -520,7 +526,7 @@ def _judge(
         measurements=turns.measurements,
         estimate=value.estimate,
         verdict=verdict,
-        identification=findings,
+        identification=identification,
         cameras=turns.cameras,
         method=method,
         seed=seed,
@@ -552,7 +558,7 @@ def _as_measured(session: Session, turns: RefinementResult) -> Session:
 def _findings_of_estimate(
     session: Session,
     value: _Identified,
-    findings: Findings,
+    identification: Identification,
     detections: tuple[DetectedViolation, ...],
     errors: tuple[ModelError, ...],
     at_minimum: bool,
@@ -572,7 +578,9 @@ def _findings_of_estimate(
     yield from turns.reasons
     yield from chance_match_reason(turns)
     yield from unused_configurations(session, estimate, out)
-    yield from rejection_findings(session, measurements, estimate, findings, at_minimum=at_minimum)
+    yield from rejection_findings(
+        session, measurements, estimate, identification, at_minimum=at_minimum
+    )
     yield from (one.finding for one in detections)
     yield from discrepancy_findings(errors)
     yield from outlier_explanations(session, measurements, estimate)
@@ -582,9 +590,9 @@ def _findings_of_estimate(
     yield from scale_notes(session, estimate, tuple(one.of for one in detections))
 
 
-def _findings(
+def _identification(
     measurements: Measurements, estimate: Estimate, uneven: tuple[Column, ...]
-) -> Findings:
+) -> Identification:
     """Identifiability of the machine's parameters, in words, and the papers' conditions.
 
     uneven : the model discrepancy, which bends a bed.

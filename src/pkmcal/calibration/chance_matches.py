@@ -55,7 +55,7 @@ def explain_images(case: Case, turns: RefinementResult | None, seed: int) -> Exp
     search = locate_stations(session, images, case.boards, rng)
     error = search.error
     if error is None and (value := search.leg_localization) is not None:
-        unconfirmed = tuple(replace(pose, by_chance=1.0) for pose in value.localizations)
+        unconfirmed = tuple(replace(pose, p_value=1.0) for pose in value.localizations)
         error = mistake_in(session, images, replace(value, localizations=unconfirmed), rng)
     # that a station was not localized is in the verdict, and the report shows why
     if not isinstance(error, InputError) or error.code == "station.not_recognised":
@@ -70,8 +70,8 @@ class _Offered(NamedTuple):
 
     in_sight: int
     measured: int
-    by_chance: float
-    chance: float
+    expected: float
+    p_value: float
 
 
 def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
@@ -86,14 +86,14 @@ def chance_match_reason(turns: RefinementResult) -> tuple[Finding, ...]:
             "edges.by_chance",
             in_sight=offered.in_sight,
             measured=offered.measured,
-            aside=offered.by_chance,
+            aside=offered.expected,
             distance=IMAGE_OFFSET,
-            chance=offered.chance,
+            chance=offered.p_value,
         ),
     )
 
 
-def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
+def misplaced_stations(session: Session, turns: RefinementResult) -> dict[int, str]:
     """Reasons why stations on a tripod may have a wrong pose, by their numbers: their edges may be
     chance matches. Empty if that holds for all stations.
 
@@ -111,7 +111,7 @@ def by_chance(session: Session, turns: RefinementResult) -> dict[int, str]:
             advice = "" if station.T_camera_base is not None else "; a pose by hand would decide"
             reasons[k] = (
                 f"only {offered.measured} of {offered.in_sight} edges in sight were measured where"
-                f" the machine has them, and chance offers as many {how_often(offered.chance)}: it"
+                f" the machine has them, and chance offers as many {how_often(offered.p_value)}: it"
                 f" may stand elsewhere{advice}"
             )
     return reasons if len(reasons) < len(turns.images) else {}
@@ -135,7 +135,7 @@ def _offered(turns: RefinementResult, stations: Sequence[int]) -> _Offered | Non
     lateral = IMAGE_OFFSET * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     counts = np.array([_count(turns, stations, away) for away in lateral])
     chance = chance_of_count(_count(turns, stations, np.zeros(2)), counts)
-    surely = chance < LOCALIZATION_OPTIONS.by_chance
+    surely = chance < LOCALIZATION_OPTIONS.false_alarm
     return None if surely else _Offered(in_sight, measured, float(counts.mean()), chance)
 
 

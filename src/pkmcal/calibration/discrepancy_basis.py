@@ -24,9 +24,9 @@ from pkmcal.identify.covariance import data_share, machine_covariance
 from pkmcal.identify.discrepancy import Component, Discrepancy
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.row_sums import POSE_ROWS, READING_ROWS
 from pkmcal.identify.score import prior_root
-from pkmcal.identify.tool import ToolError
+from pkmcal.identify.tool import ToolAccuracy
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements
 from pkmcal.outcome.finding import Finding, doubtful
@@ -180,7 +180,7 @@ def _of_bed(measurements: Measurements, estimate: Estimate) -> list[Component]:
         return []
     effect = np.zeros((len(poses), 6, basis.shape[1]))
     effect[felt, 5] = basis
-    either = READING_ROWS_KIND, POSE_ROWS_KIND  # a height is as much its readings' as its probe's
+    either = READING_ROWS, POSE_ROWS  # a height is as much its readings' as its probe's
     in_metres = tuple((size * lengths).tolist())
     return [Component(Column(UNEVEN_BED, poses=effect), roots, either, in_metres)]
 
@@ -210,7 +210,7 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
     yield Component(
         Column("readings.workspace", readings=by_motor(basis)),
         tuple(np.kron(root, each) for root in roots),
-        (READING_ROWS_KIND,),
+        (READING_ROWS,),
     )
     step = np.diff(joints, axis=0, prepend=joints[:1])
     size = float(np.sqrt(np.mean(step[used] ** 2)))
@@ -221,11 +221,11 @@ def _of_readings(measurements: Measurements, estimate: Estimate) -> Iterator[Com
         yield Component(
             Column("readings.step", readings=np.concatenate([alone, together], axis=2)),
             (np.eye(2 * m + 2) / 2,),
-            (READING_ROWS_KIND,),
+            (READING_ROWS,),
         )
     time = functions_of_time(n)[used]
     yield Component(
-        Column("readings.time", readings=by_motor(time)), (np.eye(2 * m),), (READING_ROWS_KIND,)
+        Column("readings.time", readings=by_motor(time)), (np.eye(2 * m),), (READING_ROWS,)
     )
 
 
@@ -394,8 +394,8 @@ def bed_surface(
 
 def model_errors(
     discrepancy: Discrepancy,
-    tool: ToolError,
-    before: ToolError,
+    tool: ToolAccuracy,
+    before: ToolAccuracy,
     unit: str,
     surface: BedSurface | None,
 ) -> tuple[ModelError, ...]:

@@ -9,12 +9,9 @@ import numpy as np
 
 from pkmcal.calibration.saved_calibration import SavedCalibration, load
 from pkmcal.errors import InputError
+from pkmcal.levels import LARGEST_NOMINAL_ERROR
 from pkmcal.session.load import Session, load_session
 from pkmcal.wording import listed
-
-OTHER_MACHINE_TOLERANCES = 10.0
-"""Largest difference between two nominal models of one machine, in prior sigmas: a corrected
-value, not another machine."""
 
 
 def read_same_machine(
@@ -51,7 +48,7 @@ def _check_machine(saved: SavedCalibration, session: Session) -> None:
     values = table.unit_axes(drawn.values)[own]
     before = saved.nominal[rows], machine.values[rows]
     off = [np.abs(values - v) / table.tolerance[own] for v in before]
-    if min(o.max(initial=0.0) for o in off) > OTHER_MACHINE_TOLERANCES:
+    if min(o.max(initial=0.0) for o in off) > LARGEST_NOMINAL_ERROR:
         k = int(np.argmax(off[0]))
         raise _another(
             f"{wanted[own[k]]} {before[0][k]:.6g} in its nominal model",

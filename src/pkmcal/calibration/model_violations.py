@@ -34,7 +34,7 @@ from pkmcal.identify.score import (
     Score,
     ScoreTests,
 )
-from pkmcal.identify.tool import ToolError, tool_error
+from pkmcal.identify.tool import ToolAccuracy, tool_error
 from pkmcal.identify.unidentified import only_heights
 from pkmcal.measurements import Column, Measurements, Observation
 from pkmcal.measurements.effects import columns_of_effects
@@ -184,7 +184,7 @@ def model_violations(
     return ModelViolations(violations, errors, estimate, discrepancy.random)
 
 
-def tool_of(session: Session, estimate: Estimate) -> ToolError:
+def tool_of(session: Session, estimate: Estimate) -> ToolAccuracy:
     """Error of the tool at the session's poses."""
     used, machine = estimate.configurations, estimate.machine
     return tool_error(
@@ -205,7 +205,9 @@ def _tube_update(fit: OneStepUpdate, one: Outline) -> OneStepUpdate:
     )
 
 
-def _detection(one: Column, score: Score, fit: OneStepUpdate, tool: ToolError) -> DetectedViolation:
+def _detection(
+    one: Column, score: Score, fit: OneStepUpdate, tool: ToolAccuracy
+) -> DetectedViolation:
     shifted = np.linalg.norm((tool.by_parameters @ fit.by_data)[:, 3:], axis=-1)
     shift = float(np.sqrt(np.nanmean(shifted**2)))
     sigma = float(np.sqrt(np.nanmean(tool.position**2)))

@@ -9,7 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.identify.parameter_estimates import ParameterEstimates
-from pkmcal.identify.tool import ToolError
+from pkmcal.identify.tool import ToolAccuracy
 from pkmcal.outcome.blocks.plot import log_axis
 from pkmcal.wording import install_step
 
@@ -81,7 +81,7 @@ def parameters(estimates: ParameterEstimates, tolerance: Array, ax: Axes | None 
     return ax
 
 
-def tool(error: ToolError, ax: Axes | None = None) -> Axes:
+def tool(error: ToolAccuracy, ax: Axes | None = None) -> Axes:
     """Tool error of the nominal model, and standard deviation after the calibration, at each pose,
     mm.
     """

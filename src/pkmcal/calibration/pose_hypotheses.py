@@ -43,6 +43,7 @@ from pkmcal.identify.start import middle_pose, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.unidentified import identified, only_heights
 from pkmcal.identify.verdict import VERDICT, RicherModel
+from pkmcal.levels import LARGEST_NOMINAL_ERROR
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.reading_hypotheses import reading_error, reading_hypotheses
@@ -79,7 +80,7 @@ class ClosureOptions:
     # consequence of the prior, which a file may state too small: beyond it neither a hypothesis nor
     # the data as stated are tenable. A motor that stands still while its readings move, or the
     # reverse, is off by 20 to 50 times as much
-    most_nominal_error: float = 10.0
+    most_nominal_error: float = LARGEST_NOMINAL_ERROR
     # machines drawn from the prior sigmas for the size of closure residuals by nominal errors: four
     # draws of some thirty parameters each determine it to a tenth
     draws: int = 4

@@ -33,7 +33,7 @@ from pkmcal.identify.noise import LEAST_NOISE_FREEDOM
 from pkmcal.identify.start import edge_misfit, start_state
 from pkmcal.identify.state import State
 from pkmcal.identify.verdict import POLISHED_SHADING
-from pkmcal.levels import FEW, NEARLY_ALL
+from pkmcal.levels import FEW, FEWEST_EDGES, NEARLY_ALL
 from pkmcal.measurements import (
     EdgeSet,
     Measurements,
@@ -95,8 +95,10 @@ class RefinementOptions:
     # images of a station from which a blur wider than the profiles is estimated: a lens blurs all
     # of them equally
     images_for_blur: int = 4
-    # fewest edges of a calibration: one image of a hexapod shows as many
-    fewest_edges: int = 24
+    # search of whole legs, before any estimate
+    search: legs.LegSearchOptions = legs.LEG_SEARCH_OPTIONS
+    # fewest edges of a calibration
+    fewest_edges: int = FEWEST_EDGES
 
 
 REFINEMENT = RefinementOptions()
@@ -553,11 +555,11 @@ def _first_estimate(
         return bundle(session.machine, measurements, begin(measurements))
     start: State | None = None
     for text, reach, share in (
-        ("Finding the legs", legs.LEG_SEARCH_OPTIONS.reach, 0.0),
-        ("Finding the legs again", legs.LEG_SEARCH_OPTIONS.repeated_reach, 0.5),
+        ("Finding the legs", options.search.reach, 0.0),
+        ("Finding the legs again", options.search.repeated_reach, 0.5),
     ):
         done = _counted(part(progress, share, share + 0.5), text, total)
-        search = partial(_whole_legs, scene=scene, reach=reach, done=done)
+        search = partial(_whole_legs, scene=scene, reach=reach, done=done, options=options.search)
         passes = _search_pass(images, search)
         measurements = measurements_of(session, boards, _edges(passes, options))
         lap("observe")
@@ -586,9 +588,10 @@ def _whole_legs(
     scene: PriorScene,
     reach: float,
     done: legs.ImageBatchesInUse,
+    options: legs.LegSearchOptions,
 ) -> list[legs.StationEdges]:
     placed = placed_at(images, scene.T_camera_base, scene.T_base_platform)
-    return legs.search_stations(placed, scene.machine, reach, done)
+    return legs.search_stations(placed, scene.machine, reach, done, options)
 
 
 def _measure(

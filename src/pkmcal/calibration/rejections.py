@@ -11,7 +11,7 @@ from pkmcal.identify.bed import bed_by_parameters
 from pkmcal.identify.confirmation import RejectedUnit, rejected_units, rejections_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import platform_by_parameters, platform_sigma
-from pkmcal.identify.unidentified import Findings
+from pkmcal.identify.unidentified import Identification
 from pkmcal.measurements import LinkSet, Measurements
 from pkmcal.measurements.contract import measurement_kinds
 from pkmcal.outcome.finding import Finding, doubtful, wrong
@@ -28,7 +28,7 @@ def rejection_findings(
     session: Session,
     measurements: Measurements,
     estimate: Estimate,
-    findings: Findings,
+    identification: Identification,
     *,
     at_minimum: bool,
 ) -> Iterator[Finding]:
@@ -63,8 +63,8 @@ def rejection_findings(
     if not at_minimum:
         return
     # effect of the rejections on the bed or, without one, on the platform
-    if findings.bed:
-        tool, sigma, what = bed_by_parameters(estimate), findings.bed.sigma, "the bed"
+    if identification.bed:
+        tool, sigma, what = bed_by_parameters(estimate), identification.bed.sigma, "the bed"
     else:
         used = estimate.state.T_base_platform[estimate.configurations]
         tool, sigma = platform_by_parameters(estimate.machine, used), platform_sigma(estimate)

@@ -38,7 +38,7 @@ from pkmcal.wording import listed
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.calibration.toolmap import ToolMap
-    from pkmcal.identify.unidentified import Findings
+    from pkmcal.identify.unidentified import Identification
 
 CALIBRATION_RESULT_FILES = (
     CALIBRATION_REPORT_FILE,
@@ -227,21 +227,21 @@ def versions() -> Mapping[str, str]:
     return results
 
 
-def identifiability_of(findings: Findings) -> dict[str, Any]:
+def identifiability_of(identification: Identification) -> dict[str, Any]:
     """Rank, unidentifiable directions in words, and the papers' conditions.
 
     moves_platform : m, root mean square over the platform's joints and poses.
     """
-    ranks = findings.identifiability
+    ranks = identification.identifiability
     return {
         "rank": ranks.rank,
         "n_parameters": ranks.n_parameters,
         "n_frames": ranks.n_frames,
         "singular_values": ranks.singular_values,
-        "moves_platform_by_drawing": findings.by_nominal,
-        "unidentified": [asdict(sentence) for sentence in findings.unidentified],
-        "weak": [asdict(sentence) for sentence in findings.weak],
-        "conditions": [asdict(condition) for condition in findings.conditions],
+        "moves_platform_by_drawing": identification.by_nominal,
+        "unidentified": [asdict(sentence) for sentence in identification.unidentified],
+        "weak": [asdict(sentence) for sentence in identification.weak],
+        "conditions": [asdict(condition) for condition in identification.conditions],
     }
 
 

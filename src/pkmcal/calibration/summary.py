@@ -15,7 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.parameter_estimates import ParameterEstimates, parameter_estimates
-from pkmcal.identify.tool import ToolError, checked_poses, tool_error
+from pkmcal.identify.tool import ToolAccuracy, checked_poses, tool_error
 from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -62,7 +62,7 @@ class CalibrationSummary(ABC):
     def overview(self) -> Overview:
         """Contents of the summary."""
 
-    def tool_error(self, T_base_platform: Array) -> ToolError:
+    def tool_error(self, T_base_platform: Array) -> ToolAccuracy:
         """Uncertainty of poses of the calibrated machine, and errors of the nominal model there.
 
         See :func:`pkmcal.identify.tool.tool_error`. The result does not depend on the gauge: base

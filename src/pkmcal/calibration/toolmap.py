@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.geometry.rigid import pose, pose_difference
 from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.tool import ToolError, tool_error
+from pkmcal.identify.tool import ToolAccuracy, tool_error
 from pkmcal.levels import NEGLIGIBLE, TRANSLATION_TURN
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold
@@ -83,13 +83,13 @@ class ToolMap:
     region: Region
     spread: int
     slices: tuple[Slice, ...]
-    after: ToolError
-    before: ToolError
+    after: ToolAccuracy
+    before: ToolAccuracy
 
     __repr__ = short_repr
 
     @cached_property
-    def evenly(self) -> tuple[ToolError, ToolError]:
+    def evenly(self) -> tuple[ToolAccuracy, ToolAccuracy]:
         """``before`` and ``after`` at the evenly distributed poses alone."""
         return self.before.first(self.spread), self.after.first(self.spread)
 

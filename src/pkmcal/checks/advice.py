@@ -14,7 +14,7 @@ import numpy as np
 from pkmcal.checks.forecast import Forecast, LegForecast
 from pkmcal.checks.inspection import Inspection, StationInspection
 from pkmcal.geometry.rigid import inverse
-from pkmcal.levels import RELEVANT_FACTOR
+from pkmcal.levels import MAJORITY, RELEVANT_FACTOR
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import PROFILE_OPTIONS
 from pkmcal.outcome import Figure, Level, Part, Row, Table
@@ -25,8 +25,6 @@ from pkmcal.wording import brief, count, listed, named
 
 INFORMATION_LOST_SHARE = 1 - 1 / RELEVANT_FACTOR**2
 """Share of the information that is lost with that factor."""
-POOR_LEG = 0.5
-"""Information of a leg, relative to the mean of all legs, below which the leg is named."""
 LEG_COLUMNS = {
     "In view": "Share of the leg's edges that nothing hides.",
     "Measured": "Share of these that are measured and agree with the others.",
@@ -153,7 +151,7 @@ def _lost_edges(
         "white": brighter >= station.quality.options.saturated,
         "black": brighter <= station.quality.options.black,
     }
-    kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < usual / 2)
+    kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < MAJORITY * usual)
     kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
     number = {name: int(np.sum(finite & of)) for name, of in kinds.items()}
     kind = max(number, key=lambda name: number[name])
@@ -204,7 +202,7 @@ def forecast_part(forecast: Forecast) -> Part:
     by = {(leg.station, leg.leg): leg for leg in forecast.legs}
     total = {j: sum(by[s, j].tells for s in stations) for j in numbers}
     mean = sum(total.values()) / len(total)
-    poor = [j for j in numbers if total[j] < POOR_LEG * mean]
+    poor = [j for j in numbers if total[j] < MAJORITY * mean]
     hints = ("", *LEG_COLUMNS.values())
     details = Table(
         "By station and leg",

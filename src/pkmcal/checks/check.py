@@ -386,7 +386,7 @@ def _check_station(
     summary = replace(
         _station_check(station, leg_quality, recognised=recognised),
         mismatch=pose.score,
-        by_chance=pose.by_chance,
+        by_chance=pose.p_value,
     )
     if recognised and by_hand is not None:
         change = pose_difference(inverse(T_camera_base), inverse(by_hand))

@@ -22,7 +22,7 @@ from pkmcal.measurements.effects import SHADING, columns_of_effects, lines
 from pkmcal.measurements.line_cells import LineCells
 from pkmcal.measurements.poses import PoseBlocks, PoseData
 from pkmcal.measurements.readings import ReadingColumns
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import Machine
 
 LEVEL_SIGMA = 1e-6
@@ -42,16 +42,16 @@ class Assembled:
 
     problem: Problem
     observed: Booleans
-    places: Kinds[Places]
+    places: RowGroups[Places]
     priors: tuple[str, ...]
     __repr__ = short_repr
 
-    def trusting(self, weights: Kinds[Array]) -> Problem:
+    def trusting(self, weights: RowGroups[Array]) -> Problem:
         """The problem with weights (N,) of its measurements; see
         :meth:`~pkmcal.identify.problem.Problem.weighted`.
         """
         placed = zip(self.places, weights, strict=True)
-        return self.problem.weighted(Kinds(*(at.filled(weight)[None] for at, weight in placed)))
+        return self.problem.weighted(RowGroups(*(at.filled(weight)[None] for at, weight in placed)))
 
 
 def assemble(
@@ -118,7 +118,7 @@ def assemble(
     if unknowns.codes:
         n_lines = unknowns.columns(SHADING).size
         problem = problem.shaded(np.broadcast_to(shading, (1, n_lines)).astype(float))
-    return Assembled(problem, observed, Kinds(edges, poses, link_blocks.at), kinds)
+    return Assembled(problem, observed, RowGroups(edges, poses, link_blocks.at), kinds)
 
 
 def observed_configurations(measurements: Measurements) -> Booleans:

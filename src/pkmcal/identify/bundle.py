@@ -32,12 +32,6 @@ from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.external_reliability import covariance_of_undetected
 from pkmcal.identify.gauge import Gauge, default_gauge, in_gauge
 from pkmcal.identify.innovation_test import innovations
-from pkmcal.identify.kinds import (
-    EDGE_ROWS_KIND,
-    LINK_ROWS_KIND,
-    POSE_ROWS_KIND,
-    READING_ROWS_KIND,
-)
 from pkmcal.identify.line_shading import LINE_SHADING, LineShadingOptions, common_shading
 from pkmcal.identify.noise import (
     LEAST_NOISE_FREEDOM,
@@ -58,12 +52,18 @@ from pkmcal.identify.robust import (
     robust_start,
     settled_weights,
 )
+from pkmcal.identify.row_sums import (
+    EDGE_ROWS,
+    LINK_ROWS,
+    POSE_ROWS,
+    READING_ROWS,
+)
 from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.effects import SHADING, SHIFT_SIGMA
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import rank_of_normal
 from pkmcal.solver.search import SEARCH, STEP_TOLERANCE, SearchOptions, Solution, Stop, minimise
@@ -127,8 +127,8 @@ class BatchResult:
     """
 
     solution: Solution
-    weight: Kinds[Array]
-    scale: Kinds[Array]
+    weight: RowGroups[Array]
+    scale: RowGroups[Array]
     info: Information
     edges: EdgeScatter
     irls_weight: Array
@@ -143,7 +143,7 @@ class BatchResult:
     @cached_property
     def reading_noise(self) -> NoiseShares:
         """Likelihood of factors on the readings' noise."""
-        return self.noise_of(READING_ROWS_KIND)
+        return self.noise_of(READING_ROWS)
 
     def noise_of(self, kind: int) -> NoiseShares:
         """Independent residuals of a kind of rows, which determine its noise."""
@@ -188,9 +188,9 @@ def solve_batch(
         than stated by more than this factor.
     """
     n_runs = start.z.shape[0]
-    ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs), np.ones(n_runs))
-    present = (kind.present.astype(float) for kind in problem.kinds)
-    every = Kinds(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
+    ones: RowGroups[Array] = RowGroups(np.ones(n_runs), np.ones(n_runs), np.ones(n_runs))
+    present = (kind.present.astype(float) for kind in problem.row_groups)
+    every = RowGroups(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
     # The shading starts with the prior of a whole camera's shift: a narrow prior would make
     # outliers of edges that contradict it.
     n_lines = problem.shading.shape[1]
@@ -215,7 +215,7 @@ def solve_batch(
             # The readings' noise is estimated where the data contradict the stated one, or where
             # nothing else was measured, so that it is only the unit of all standard deviations.
             noise = fit.reading_noise
-            alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
+            alone = not any(kind.present.any() for kind in fit.info.problem.row_groups)
             by_data = noise.contradicts() | (
                 alone & (noise.freedom(noise.best) > LEAST_NOISE_FREEDOM)
             )
@@ -288,7 +288,7 @@ class _Noise(NamedTuple):
     """
 
     problem: Problem
-    scale: Kinds[Array]
+    scale: RowGroups[Array]
     edges: EdgeScatter
     shading: Array
     readings: Array
@@ -301,9 +301,9 @@ class _Noise(NamedTuple):
 
     def with_scales(self, fit: BatchResult) -> _Noise:
         """With the scales that the residuals of poses and links require."""
-        poses = _scale_of(fit, fit.scale.poses, POSE_ROWS_KIND)
-        links = _scale_of(fit, fit.scale.links, LINK_ROWS_KIND)
-        return self._replace(scale=Kinds(np.ones_like(fit.scale.edges), poses, links))
+        poses = _scale_of(fit, fit.scale.poses, POSE_ROWS)
+        links = _scale_of(fit, fit.scale.links, LINK_ROWS)
+        return self._replace(scale=RowGroups(np.ones_like(fit.scale.edges), poses, links))
 
     def with_edges(
         self, fit: BatchResult, by_tube: bool, number: int, least: Array, options: BatchOptions
@@ -345,7 +345,7 @@ class _Noise(NamedTuple):
         return replace(problem, joint_noise=self.readings), state
 
 
-def _weights(fit: BatchResult, noise: _Noise, by_tube: bool) -> tuple[Kinds[Array], Array]:
+def _weights(fit: BatchResult, noise: _Noise, by_tube: bool) -> tuple[RowGroups[Array], Array]:
     """Weights by a solution's residuals and the noise, and those of the edges' IRLS."""
     problem, irls_weight = noise.problem, fit.irls_weight
     rows = problem.unweighted(fit.info.state)
@@ -379,10 +379,10 @@ def _readings_step(
 
 
 def _settled(
-    scale: Kinds[Array],
-    old_scale: Kinds[Array],
-    weight: Kinds[Array],
-    old_weight: Kinds[Array],
+    scale: RowGroups[Array],
+    old_scale: RowGroups[Array],
+    weight: RowGroups[Array],
+    old_weight: RowGroups[Array],
     most: float,
 ) -> bool:
     """Whether scales change by less than ``most``, relative, and weights by less than ten times."""
@@ -397,8 +397,8 @@ def _settled(
 def _solved(
     problem: Problem,
     state: BatchState,
-    weight: Kinds[Array],
-    scale: Kinds[Array],
+    weight: RowGroups[Array],
+    scale: RowGroups[Array],
     steps: Integers,
     edges: EdgeScatter,
     irls_weight: Array,
@@ -408,7 +408,7 @@ def _solved(
 ) -> BatchResult:
     """Solution with given weights up to a tolerance, from a state reached after ``steps`` (B,)."""
     parts = zip(weight._replace(edges=weight.edges * irls_weight), scale, strict=True)
-    used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
+    used = problem.weighted(RowGroups(*(own / each[:, None, None] ** 2 for own, each in parts)))
     solution, info = _searched(used, state, steps, tolerance, options)
     return BatchResult(solution, weight, scale, info, edges, irls_weight, stated, options)
 
@@ -447,8 +447,8 @@ def _edges(fit: BatchResult, by_tube: bool, number: int, options: BatchOptions) 
         )
     scale, components = fit.scale.edges[:, None] * fit.edges.scale, fit.components
     chi2, freedom = (
-        components.chi2[:, EDGE_ROWS_KIND, None],
-        components.freedom[:, EDGE_ROWS_KIND, None],
+        components.chi2[:, EDGE_ROWS, None],
+        components.freedom[:, EDGE_ROWS, None],
     )
     ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
     scale = np.where(freedom > LEAST_NOISE_FREEDOM, np.maximum(scale * ratio, LEAST_SCALE), scale)
@@ -461,8 +461,8 @@ def _scale_of(fit: BatchResult, scale: Array, kind: int) -> Array:
 
     scale : (B,) factor in use, kept where too few measurements remain to judge it.
     """
-    kinds = fit.info.problem.kinds
-    if not (kinds.poses if kind == POSE_ROWS_KIND else kinds.links).present.any():
+    kinds = fit.info.problem.row_groups
+    if not (kinds.poses if kind == POSE_ROWS else kinds.links).present.any():
         return scale
     components = fit.components
     chi2, freedom = components.chi2[:, kind], components.freedom[:, kind]
@@ -601,13 +601,13 @@ def _estimate(
     covariance = {code: shared[part, part] for code, part in parts.items()}
     line_sigma = np.sqrt(np.diagonal(shared)[u.of_code(SHADING)])
     edges, poses, links = problem.unweighted(solution)
-    residuals = Kinds(
+    residuals = RowGroups(
         assembled.places.edges.taken(edges[0]),
         assembled.places.poses.taken(poses[0] / result.scale.poses[0]),
         assembled.places.links.taken(links[0] / result.scale.links[0]),
     )
     weighted = zip(assembled.places, result.weight, strict=True)
-    weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
+    weights = RowGroups(*(at.taken(weight[0]) for at, weight in weighted))
     value = result.info.by_kind.value
     closures = value[..., problem.closure_rows]
     joints = np.zeros(measurements.joints.shape)  # zero where no pose was estimated
@@ -658,7 +658,7 @@ def _statistics(
     """Statistics of the fit from the residuals (1, K, r)."""
     problem, state = result.info.problem, result.info.state
     kinds = np.array(assembled.priors)
-    rows = [kind.rows for kind in problem.kinds]
+    rows = [kind.rows for kind in problem.row_groups]
     rows.insert(1, problem.closure_rows)
     chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
     chi2[0] = float(np.sum(result.edges.squares(problem.blocks, value[..., rows[0]])))
@@ -691,17 +691,17 @@ def _statistics(
         chi2_poses=chi2[2],
         n_poses=n_poses,
         pose_scale=float(result.scale.poses[0]),
-        dof_edges=freedom[EDGE_ROWS_KIND],
-        dof_joints=freedom[READING_ROWS_KIND],
-        dof_poses=freedom[POSE_ROWS_KIND],
+        dof_edges=freedom[EDGE_ROWS],
+        dof_joints=freedom[READING_ROWS],
+        dof_poses=freedom[POSE_ROWS],
         reading_scale=float(result.reading_scale[0]),
         reading_range=_range(result.reading_noise, result.reading_scale),
-        pose_range=_range(result.noise_of(POSE_ROWS_KIND), result.scale.poses),
+        pose_range=_range(result.noise_of(POSE_ROWS), result.scale.poses),
         chi2_links=chi2[3],
         n_links=n_links,
         link_scale=float(result.scale.links[0]),
-        dof_links=freedom[LINK_ROWS_KIND],
-        link_range=_range(result.noise_of(LINK_ROWS_KIND), result.scale.links),
+        dof_links=freedom[LINK_ROWS],
+        link_range=_range(result.noise_of(LINK_ROWS), result.scale.links),
         shading=float(np.median(problem.shading[0])) if problem.shading.size else SHADING_SIGMA,
         look_scatter=float(np.sqrt(imputation_covariance)),
     )

@@ -36,7 +36,7 @@ from pkmcal.identify.robust import as_pairs
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import CONTRADICTION_SIGMAS
 from pkmcal.measurements import Measurements
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.solver.kernels import INLIER_WEIGHT, NO_WEIGHT_DISTANCE, final_loss
 
 NORMAL_RIDGE = 1e-12
@@ -209,8 +209,8 @@ class _Cases(NamedTuple):
     readmission: _Normal
     loss: Array
     row: Integers
-    in_use: Kinds[Booleans]
-    losses: Kinds[Array]
+    in_use: RowGroups[Booleans]
+    losses: RowGroups[Array]
 
     @classmethod
     def of(
@@ -233,12 +233,14 @@ class _Cases(NamedTuple):
         pose_weight, edge_weight = problem.pose_data.weight[0], problem.data.weight[0]
         links = problem.link_data.weight
         full = float(final_loss(np.array(NO_WEIGHT_DISTANCE)))
-        losses = Kinds(*(full / np.maximum(as_pairs(kind), 1e-9) ** 2 for kind in problem.kinds))
+        losses = RowGroups(
+            *(full / np.maximum(as_pairs(kind), 1e-9) ** 2 for kind in problem.row_groups)
+        )
         edges = measurements.edges
         # weight, loss and configuration of each unit
         changes, loss, rows = list[_Normal](), list[float](), list[int]()
         for unit in units[:MOST_REJECTED_UNITS]:
-            weight = Kinds(edge_weight.copy(), pose_weight.copy(), links.copy())
+            weight = RowGroups(edge_weight.copy(), pose_weight.copy(), links.copy())
             if not unit.is_image:
                 of_links = unit.link >= 0
                 places = assembled.places.links if of_links else assembled.places.poses
@@ -261,7 +263,7 @@ class _Cases(NamedTuple):
             # change of the normal equations of its configuration
             cut = slice(row, row + 1)
             there = problem.state_among(state, cut)
-            new = Kinds(weight.edges[None], weight.poses[None], weight.links)
+            new = RowGroups(weight.edges[None], weight.poses[None], weight.links)
             new = problem.weighted(new).among(cut)
             changes.append(
                 _normal_equations(new, there).plus(
@@ -269,7 +271,7 @@ class _Cases(NamedTuple):
                 )
             )
         readmission = _Normal(*(np.concatenate(x) for x in zip(*changes, strict=True)))
-        in_use = Kinds(*(kind.present & (kind.weight[0] > 0) for kind in problem.kinds))
+        in_use = RowGroups(*(kind.present & (kind.weight[0] > 0) for kind in problem.row_groups))
         return cls(problem, base, readmission, np.array(loss), np.array(rows), in_use, losses)
 
     def drops(self, state: BatchState) -> Iterator[tuple[_Normal, Array, Integers]]:
@@ -281,7 +283,7 @@ class _Cases(NamedTuple):
         for cut in self.problem.cuts:
             part, there = self.problem.among(cut), self.problem.state_among(state, cut)
             before = _normal_equations(part, there)
-            weights = Kinds(*(kind.weight for kind in part.kinds))
+            weights = RowGroups(*(kind.weight for kind in part.row_groups))
             for name in ("poses", "links"):
                 used, losses = getattr(self.in_use, name), getattr(self.losses, name)
                 for place in range(used.shape[1]):

@@ -27,8 +27,8 @@ from pkmcal.identify.gauge import (
     projector,
     transformation,
 )
-from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.row_sums import RowSums, row_sums
 from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.levels import NAMED_SHARE
@@ -107,9 +107,9 @@ class Information:
         return np.concatenate(rows, axis=1), np.concatenate(values, axis=1)
 
     @cached_property
-    def by_kind(self) -> KindSums:
+    def by_kind(self) -> RowSums:
         """Sums over the configurations of each kind's normal matrix and squares."""
-        return kind_sums(self.problem, self.state)
+        return row_sums(self.problem, self.state)
 
     @cached_property
     def root(self) -> Array:

@@ -52,7 +52,7 @@ from pkmcal.arrays import Array
 from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, FalseAlarm, Search
-from pkmcal.identify.kinds import POSE_ROWS_KIND, READING_ROWS_KIND
+from pkmcal.identify.row_sums import POSE_ROWS, READING_ROWS
 from pkmcal.identify.score import (
     columns_of,
     eliminate_beside,
@@ -105,7 +105,7 @@ class Component:
 
     column : what the k functions do to the measurements. roots : the L (k, l)
     to choose from, of functions with a mean square of one over the session's configurations.
-    inflates : kinds of rows whose noise such an error enlarges, as READING_ROWS_KIND. lengths : of
+    inflates : kinds of rows whose noise such an error enlarges, as READING_ROWS. lengths : of
     the same number as roots, m, the correlation length of each; empty where there is none.
     """
 
@@ -196,7 +196,7 @@ def discrepancy_of(
     ends = np.cumsum([0, *(column.count for column in columns)]).tolist()
     parts = [slice(*ends[k : k + 2]) for k in range(len(every))]
     at_solution = _products(assembled, info, columns)
-    kind = (READING_ROWS_KIND, POSE_ROWS_KIND)[int(np.argmax(enlarged))]
+    kind = (READING_ROWS, POSE_ROWS)[int(np.argmax(enlarged))]
     inflated = kind if max(enlarged) > options.enlarged else None
     noises = [at_solution]
     for shares in _noise_shares(enlarged, heights, options):
@@ -411,7 +411,7 @@ def _log_noise(assembled: Assembled) -> float:
     problem = assembled.problem
     readings = problem.blocks.present.shape[0] * problem.layout.n_readings
     out = readings * float(np.log(problem.joint_noise[0]))
-    kind = problem.kinds.poses
+    kind = problem.row_groups.poses
     used = kind.present & (kind.weight[0] > 0)
     return out - float(np.sum(0.5 * kind.count[used] * np.log(kind.weight[0][used])))
 

@@ -73,7 +73,7 @@ def edge_noise(
     along, rest, size = _squares(info)
     tube, results = info.problem.blocks.tube, list[tuple[Array, ...]]()
     for number in range(before.scale.shape[1]):
-        own = info.problem.kinds.edges.present & (tube == number)
+        own = info.problem.row_groups.edges.present & (tube == number)
         if not own.any():
             results.append(
                 (before.scale[:, number], before.shading[:, number], before.dof[:, number])

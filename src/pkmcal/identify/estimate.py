@@ -16,7 +16,7 @@ from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.state import State, estimated_unknowns
 from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import Machine
 
 
@@ -156,7 +156,7 @@ class Estimate:
         problem = replace(problem, data=edges, joint_noise=noise)
         if len(self.line_shading):
             problem = problem.shaded(self.line_shading[None])
-        weights = Kinds(
+        weights = RowGroups(
             self.edge_weights * self.edge_trust,
             self.pose_weights / statistics.pose_scale**2,
             self.link_weights / statistics.link_scale**2,

@@ -53,7 +53,7 @@ def covariance_of_undetected(info: Information, weight: Array) -> Array:
     """
     half, blocks = info.root, info.problem.blocks
     n_runs, na = half.shape[:2]
-    shifted = info.problem.kinds.edges.present & (blocks.n_effective > 0)
+    shifted = info.problem.row_groups.edges.present & (blocks.n_effective > 0)
     if not shifted.any():
         return np.zeros_like(half)
     # sums over all edges; U is formed by tube, shift and tilt apart

@@ -23,7 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import Information
 from pkmcal.identify.robust import as_pairs
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.solver.kernels import INLIER_WEIGHT
 from pkmcal.solver.strips import eliminate_strips
 
@@ -38,7 +38,7 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
     weight : (B, K, G).
     scale : (B,) noise scale of the poses.
     """
-    kind = info.problem.kinds.poses
+    kind = info.problem.row_groups.poses
     rejected = kind.present & (weight < INLIER_WEIGHT)
     if not rejected.any():
         return distance
@@ -48,12 +48,12 @@ def innovations(info: Information, distance: Array, weight: Array, scale: Array)
         # R and W by the weighted rows
         used = eliminate_strips(part.compact(state), np.zeros(len(state.z)))
         # A: the same rows without weights
-        whole = Kinds(*(one.present[None].astype(float) for one in part.kinds))
+        whole = RowGroups(*(one.present[None].astype(float) for one in part.row_groups))
         rows = part.weighted(whole).compact(state)
         own, shared = rows.by_own[:, :, count:], rows.by_shared[:, :, count:]
         own = own @ used.inverse
         by = np.concatenate([own, (shared - own @ used.along) @ info.root[:, None]], axis=-1)
-        value, n = rows.value[..., part.kinds.poses.rows], kind.whiten.shape[-1]
+        value, n = rows.value[..., part.row_groups.poses.rows], kind.whiten.shape[-1]
         # d^2 of each rejected pose
         for run, k, place in np.argwhere(rejected[:, cut]).tolist():
             at = slice(n * place, n * (place + 1))

@@ -32,9 +32,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.covariance import Information
-from pkmcal.identify.kinds import KindRows, kind_rows
 from pkmcal.identify.problem import Problem
-from pkmcal.measurements.rows import Kinds
+from pkmcal.identify.row_sums import GroupRows, group_rows
+from pkmcal.measurements.rows import RowGroups
 
 LEAST_NOISE_FREEDOM = 5.0
 """Degrees of freedom n below which a sum of squares determines no noise: the relative standard
@@ -96,7 +96,7 @@ class Components:
     freedom: Array
 
 
-def components(info: Information, weight: Kinds[Array]) -> Components:
+def components(info: Information, weight: RowGroups[Array]) -> Components:
     """Sums of squares and degrees of freedom of a solution; weight : (B, K, G) in use.
 
     H is Q Q^T of the own unknowns plus S S^T of the shared ones, orthogonal to each other;
@@ -113,10 +113,10 @@ def components(info: Information, weight: Kinds[Array]) -> Components:
     return Components(chi2=sums.chi2, freedom=count - sums.trace - shared)
 
 
-def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
+def counts(problem: Problem, weight: RowGroups[Array]) -> RowGroups[Array]:
     """Number of residuals of each kind, weighted by their robust weights, (B,)."""
-    parts = zip(problem.kinds, weight, strict=True)
-    return Kinds(*(np.sum(part * kind.count, axis=(1, 2)) for kind, part in parts))
+    parts = zip(problem.row_groups, weight, strict=True)
+    return RowGroups(*(np.sum(part * kind.count, axis=(1, 2)) for kind, part in parts))
 
 
 @dataclass(frozen=True)
@@ -292,11 +292,11 @@ class NoiseShares:
 
 def noise_shares(info: Information, kind: int, options: NoiseOptions = NOISE) -> NoiseShares:
     """Independent residuals of the readings, poses or links at a solution."""
-    rows, half = kind_rows(info.problem, info.state, kind), info.root
+    rows, half = group_rows(info.problem, info.state, kind), info.root
     in_prior = info.problem.prior @ half
     of_prior = in_prior.mT @ in_prior
     runs = [
-        _of_run(KindRows(*(part[run] for part in rows)), half[run], of_prior[run], options)
+        _of_run(GroupRows(*(part[run] for part in rows)), half[run], of_prior[run], options)
         for run in range(len(half))
     ]
     most = max(len(run[0]) for run in runs)
@@ -309,7 +309,7 @@ def noise_shares(info: Information, kind: int, options: NoiseOptions = NOISE) ->
 
 
 def _of_run(
-    rows: KindRows, half: Array, fixed: Array, options: NoiseOptions
+    rows: GroupRows, half: Array, fixed: Array, options: NoiseOptions
 ) -> tuple[Array, Array, Array, Array]:
     """z, own, others and fixed (n,) of one run."""
     n_configurations, n = rows.value.shape

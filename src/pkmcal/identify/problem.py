@@ -67,7 +67,7 @@ from pkmcal.measurements.readings import (
     joint_rows,
     least_joint_noise,
 )
-from pkmcal.measurements.rows import Kinds, RowsOfKind
+from pkmcal.measurements.rows import RowGroup, RowGroups
 from pkmcal.mechanisms.closure import (
     Closure,
     by_own,
@@ -149,17 +149,17 @@ class Problem:
         return cast(Structure, self.structure_cache)
 
     @cached_property
-    def kinds(self) -> Kinds[RowsOfKind]:
+    def row_groups(self) -> RowGroups[RowGroup]:
         """Rows of each kind of measurement; edges come first in a configuration, links last."""
         edges, poses, links = self.data, self.pose_data, self.link_data
         closures = self.closure_rows
         last = closures.stop + 6 * self.pose_blocks.present.shape[1]
-        return Kinds(
-            RowsOfKind(slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten),
-            RowsOfKind(
+        return RowGroups(
+            RowGroup(slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten),
+            RowGroup(
                 slice(closures.stop, last), self.pose_blocks.present, poses.weight, poses.whiten
             ),
-            RowsOfKind(slice(last, None), self.link_blocks.present, links.weight, links.whiten),
+            RowGroup(slice(last, None), self.link_blocks.present, links.weight, links.whiten),
         )
 
     @property
@@ -212,7 +212,7 @@ class Problem:
             return state.linked
         return state.T_base_platform[:, self.link_blocks.linked]
 
-    def weighted(self, weight: Kinds[Array]) -> Problem:
+    def weighted(self, weight: RowGroups[Array]) -> Problem:
         """The problem with other weights (B, K, G) of the measurements of each kind."""
         return replace(
             self,
@@ -455,7 +455,7 @@ class Problem:
     def _links(self, state: BatchState) -> LinkRows:
         return link_rows(self.link_blocks, self.link_data, self._linked_poses(state), state.T_mount)
 
-    def unweighted(self, state: BatchState) -> Kinds[Array]:
+    def unweighted(self, state: BatchState) -> RowGroups[Array]:
         """Residuals of each kind, (B, K, G, n), in the standard deviation of each measurement
         alone: without weights, and without the reduction for edges with correlated shading.
         """
@@ -463,15 +463,17 @@ class Problem:
         cuts = divisions(count, len(state.z) * n_rows, self.rows_at_once)
         if len(cuts) > 1:
             parts = (self.among(cut).unweighted(self.state_among(state, cut)) for cut in cuts)
-            return Kinds(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
-        plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
+            return RowGroups(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
+        plain = self.weighted(
+            RowGroups(*(kind.present[None].astype(float) for kind in self.row_groups))
+        )
         n_effective = np.where(self.blocks.n_effective > 0, self.blocks.n_effective, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(n_effective)))
         edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
         rows = edges.value(state.columns)
         rows = rows_at_blocks(self.blocks, rows)
         links = plain._links(state).value[..., None]  # noqa: SLF001
-        return Kinds(rows, plain._poses(state).value, links)  # noqa: SLF001
+        return RowGroups(rows, plain._poses(state).value, links)  # noqa: SLF001
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
         """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
@@ -527,7 +529,7 @@ class Problem:
     def _in_use(self) -> Booleans:
         """Rows that are neither padding nor rejected, (B or 1, K, r)."""
         edges, poses, links = (
-            np.repeat(kind.weight > 0, kind.whiten.shape[-1], axis=-1) for kind in self.kinds
+            np.repeat(kind.weight > 0, kind.whiten.shape[-1], axis=-1) for kind in self.row_groups
         )
         runs, n = max(len(edges), len(poses), len(links)), edges.shape[1]
         parts = (edges, np.ones((1, n, self.layout.n_equations), dtype=bool), poses, links)

@@ -22,7 +22,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.measurements.rows import Kinds, RowsOfKind
+from pkmcal.measurements.rows import RowGroup, RowGroups
 from pkmcal.solver.kernels import (
     FULL_WEIGHT_DISTANCE,
     INLIER_WEIGHT,
@@ -82,8 +82,8 @@ class RobustStart(NamedTuple):
     """
 
     state: BatchState
-    weight: Kinds[Array]
-    scale: Kinds[Array]
+    weight: RowGroups[Array]
+    scale: RowGroups[Array]
     steps: int
 
 
@@ -100,21 +100,21 @@ def clean_norm(share: float, count: Integers) -> Array:
     return out
 
 
-def as_pairs(kind: RowsOfKind) -> Array:
+def as_pairs(kind: RowGroup) -> Array:
     """Factors (K, G) that convert a kind's norms to those of pairs of residuals: the same share of
     inliers lies beyond FULL_WEIGHT_DISTANCE.
     """
     return FULL_WEIGHT_DISTANCE / clean_norm(CLEAN_TAIL_SHARE, kind.count)
 
 
-def norms(problem: Problem, rows: Kinds[Array]) -> Kinds[Array]:
+def norms(problem: Problem, rows: RowGroups[Array]) -> RowGroups[Array]:
     """Mahalanobis norms (B, K, G) of each kind, converted to those of pairs (:func:`as_pairs`); NaN
     for padding.
 
     rows : unweighted residuals (:meth:`Problem.unweighted`).
     """
-    parts = zip(problem.kinds, rows, strict=True)
-    return Kinds(
+    parts = zip(problem.row_groups, rows, strict=True)
+    return RowGroups(
         *(
             np.where(kind.present, np.sqrt(np.sum(own**2, axis=-1)) * as_pairs(kind), np.nan)
             for kind, own in parts
@@ -135,22 +135,22 @@ def robust_scale(d: Array, usual: Array) -> Array:
     return flat[np.arange(len(flat)), count // 2]
 
 
-def noise_scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array]:
+def noise_scales(problem: Problem, d: RowGroups[Array], least: float) -> RowGroups[Array]:
     """Noise scale of each kind (B,), at least ``least``."""
-    parts = zip(problem.kinds, d, strict=True)
+    parts = zip(problem.row_groups, d, strict=True)
     values = (robust_scale(part, clean_norm(0.5, k.count) * as_pairs(k)) for k, part in parts)
-    return Kinds(*(np.maximum(scale, least) for scale in values))
+    return RowGroups(*(np.maximum(scale, least) for scale in values))
 
 
-def settled_weights(distance: Kinds[Array], scale: Kinds[Array]) -> Kinds[Array]:
+def settled_weights(distance: RowGroups[Array], scale: RowGroups[Array]) -> RowGroups[Array]:
     """Final weights of each kind by its :func:`norms`."""
     parts = zip(distance, scale, strict=True)
-    return Kinds(*(final_weights(part / each[:, None, None]) for part, each in parts))
+    return RowGroups(*(final_weights(part / each[:, None, None]) for part, each in parts))
 
 
 def robust_cost(
     problem: Problem, state: BatchState, *, scaled: bool = True, options: RobustOptions = ROBUST
-) -> tuple[Array, Kinds[Array], Kinds[Array]]:
+) -> tuple[Array, RowGroups[Array], RowGroups[Array]]:
     """-2 log of the posterior density (B,) at a state, up to a constant; with each kind's weights
     (B, K, G) and most likely noise scale (B,), which is 1 unless ``scaled``.
 
@@ -163,7 +163,7 @@ def robust_cost(
     cost = np.sum(closures**2, axis=(1, 2)) + np.sum(values.shared_value**2, axis=-1)
     weights, scales = list[Array](), list[Array]()
     distances = norms(problem, problem.unweighted(state))
-    for kind, distance in zip(problem.kinds, distances, strict=True):
+    for kind, distance in zip(problem.row_groups, distances, strict=True):
         there = kind.present
         d, n_runs = distance[:, there], len(cost)
         own, scale = np.zeros(n_runs), np.ones(n_runs)
@@ -175,7 +175,7 @@ def robust_cost(
         cost = cost + own
         weights.append(weight)
         scales.append(scale)
-    return cost, Kinds(*weights), Kinds(*scales)
+    return cost, RowGroups(*weights), RowGroups(*scales)
 
 
 def _kind_cost(
@@ -223,7 +223,7 @@ def robust_start(
     annealed = anneal(problem, start, options)
     rejects = [
         np.any(kind.present & (weight < INLIER_WEIGHT), axis=(1, 2))
-        for kind, weight in zip(problem.kinds, annealed.weight, strict=True)
+        for kind, weight in zip(problem.row_groups, annealed.weight, strict=True)
     ]
     runs = np.flatnonzero(np.any(rejects, axis=0))
     if not runs.size:
@@ -231,14 +231,14 @@ def robust_start(
     part, state = problem.select(runs), take(annealed.state, runs)
     usual, _, _ = robust_cost(part, state, scaled=scaled, options=options)
     # second start: all measurements at full weight
-    every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.kinds)
+    every = (np.broadcast_to(k.present, (len(runs), *k.present.shape)) for k in problem.row_groups)
     one = np.ones(len(runs))
-    every = Kinds(*(p.astype(float) for p in every))
-    other = RobustStart(state, every, Kinds(one, one, one), 0)
-    poses, before = bool(problem.kinds.poses.present.any()), np.full(len(runs), np.inf)
+    every = RowGroups(*(p.astype(float) for p in every))
+    other = RobustStart(state, every, RowGroups(one, one, one), 0)
+    poses, before = bool(problem.row_groups.poses.present.any()), np.full(len(runs), np.inf)
     for _ in range(options.most_reweightings):
         parts = zip(other.weight, other.scale, strict=True)
-        weight = Kinds(*(own / each[:, None, None] ** 2 for own, each in parts))
+        weight = RowGroups(*(own / each[:, None, None] ** 2 for own, each in parts))
         searched = part.weighted(weight).as_noisy_as_at(other.state)
         solution = minimise(searched, other.state, tolerance=options.roughly_solved)
         cost, weight, scale = robust_cost(part, solution.state, scaled=scaled, options=options)
@@ -262,7 +262,7 @@ def robust_start(
 def anneal(problem: Problem, start: BatchState, options: RobustOptions = ROBUST) -> RobustStart:
     """Graduated non-convexity from a start: weights at a scale that shrinks from stage to stage."""
     state, steps = start, 0
-    most = options.pose_steps if problem.kinds.poses.present.size else 1
+    most = options.pose_steps if problem.row_groups.poses.present.size else 1
     d = norms(problem, problem.unweighted(state))
     cut = [
         options.stage_factor * options.geman_mcclure_scale * scale
@@ -278,7 +278,7 @@ def anneal(problem: Problem, start: BatchState, options: RobustOptions = ROBUST)
         ]
         settled = all(np.all(n > options.settled_stage * c) for n, c in zip(new, cut, strict=True))
         cut = new
-        weight = Kinds(
+        weight = RowGroups(
             *(geman_mcclure_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True))
         )
         searched = problem.weighted(weight).as_noisy_as_at(state)

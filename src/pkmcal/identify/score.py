@@ -521,7 +521,7 @@ def columns_of(
         out[:, part.closure_rows] = part.by_readings(c, readings[cut])[0]
         of_edges = part.data.weighed[0]
         of_poses = (np.sqrt(part.pose_data.weight)[..., None, None] * part.pose_data.whiten)[0]
-        before, after = (out[:, kind.rows] for kind in part.kinds[:2])
+        before, after = (out[:, kind.rows] for kind in part.row_groups[:2])
         for where, edges, poses in placed:
             shape = (len(out), -1, where.stop - where.start)
             if edges is not None:

@@ -108,7 +108,7 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class ToolError:
+class ToolAccuracy:
     """Errors of n poses of the platform: covariance after calibration, and differences to the
     nominal model's poses; NaN where the machine cannot take a pose, or the nominal model has none.
 
@@ -127,7 +127,7 @@ class ToolError:
 
     __repr__ = short_repr
 
-    def first(self, n: int) -> ToolError:
+    def first(self, n: int) -> ToolAccuracy:
         """Errors of the first n poses."""
         return replace(
             self,
@@ -183,7 +183,7 @@ def checked_poses(poses: Array) -> Array:
 
 def centres_and_tool(
     nominal: Machine, estimate: Estimate, joints: Array | None
-) -> tuple[tuple[Centres, ...], ToolError]:
+) -> tuple[tuple[Centres, ...], ToolAccuracy]:
     """Joint centres of an estimate, and errors of the poses of the configurations in use,
     gauge-free; joints (K, m), None for those of the calibrated machine.
     """
@@ -205,7 +205,7 @@ def tool_error(
     *,
     legs_observed: bool = True,
     fitted: Integers | None = None,
-) -> ToolError:
+) -> ToolAccuracy:
     """Errors of poses T_base_platform (n, 4, 4) of the calibrated machine and of the nominal model.
 
     covariance : (P, P) of the parameters about the best fit of the frames
@@ -235,7 +235,7 @@ def tool_error(
         without_frames(calibrated, poses, change, every=not legs_observed, fitted=fitted)
         for change in (jacobian, off)
     )
-    return ToolError(poses, by, covariance, off[..., 0])
+    return ToolAccuracy(poses, by, covariance, off[..., 0])
 
 
 def without_frames(

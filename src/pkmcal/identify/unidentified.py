@@ -64,7 +64,7 @@ class Condition:
 
 
 @dataclass(frozen=True)
-class Findings:
+class Identification:
     """Directions of the machine that the data determine, and those that they leave unidentified.
 
     identifiability : rank and spectrum of the information.
@@ -103,8 +103,8 @@ def explain(
     conditions: tuple[Condition, ...] = (),
     bed: Bed | None = None,
     options: UnidentifiedOptions = UNIDENTIFIED,
-) -> Findings:
-    """Findings of an estimate.
+) -> Identification:
+    """What an estimate determines.
 
     The displacements and numbers of changes, on which a verdict depends, are those of the whole
     space; motions with names only word it.
@@ -141,7 +141,7 @@ def explain(
     # have names
     sentences = (*text(lost), *text(weak)) if imaged else text((*lost, *weak))
     conventional, others = conventions_held(machine, effect)
-    return Findings(
+    return Identification(
         ranks,
         tuple(s for s in sentences if not s.weak),
         tuple(s for s in sentences if s.weak),

@@ -16,7 +16,7 @@ from pkmcal.identify.false_alarm import SESSION_FALSE_ALARM, Search
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import negligible_shift
 from pkmcal.identify.tool import centres_and_tool, platform_sigma
-from pkmcal.identify.unidentified import Findings, only_heights
+from pkmcal.identify.unidentified import Identification, only_heights
 from pkmcal.levels import (
     CAUSE_SHARE,
     CONTRADICTION_SIGMAS,
@@ -102,7 +102,7 @@ class RicherModel:
 def assess(
     observation: Observation,
     estimate: Estimate,
-    findings: Findings,
+    identification: Identification,
     method: str = "bundle",
     *,
     richer: RicherModel | None = None,
@@ -113,22 +113,22 @@ def assess(
 ) -> Verdict:
     """Verdict on an estimate of a session.
 
-    findings : what the data determine of the machine, and what they leave unidentified.
+    identification : what the data determine of the machine, and what they leave unidentified.
     richer : the model of the machine that explains the poses, where this one is insufficient.
     explained : whether the model discrepancy surely explains the scatter of heights; the standard
     deviations then contain it.
     others : findings of any level about the session.
     joints : (K, m) readings; by default those at which the calibrated machine takes the poses.
     """
-    bed = findings.bed
+    bed = identification.bed
     # what the data leave undetermined, then what they determine no better than the nominal model
-    undetermined = () if bed else tuple(_undetermined(estimate, findings, options))
+    undetermined = () if bed else tuple(_undetermined(estimate, identification, options))
     refused = any(one.level is Level.WRONG for one in undetermined)
     no_better: tuple[Finding, ...] = ()
     if bed:
         no_better = tuple(_no_gain("bed", bed.sigma, bed.by_drawing, options))
     elif not refused:
-        sigma, nominal = platform_sigma(estimate), findings.by_nominal
+        sigma, nominal = platform_sigma(estimate), identification.by_nominal
         no_better = tuple(_no_gain("platform", sigma, nominal, options))
     negligible = negligible_shift(estimate.machine.parameters)
     # all findings, in the order of the report
@@ -141,10 +141,10 @@ def assess(
         *_warnings(observation, estimate, options),
         *(_touch_unnoticed(bed, options) if bed else ()),
         *_few_configurations(estimate, options),
-        *(_not_by_heights(bed, findings, negligible) if bed else ()),
+        *(_not_by_heights(bed, identification, negligible) if bed else ()),
         *others,
         *(() if refused else undetermined),
-        *(() if bed else _harmless(findings)),
+        *(() if bed else _harmless(identification)),
     )
     usable = not any(one.level is Level.WRONG for one in every)
     if not usable:
@@ -221,14 +221,16 @@ def _touch_unnoticed(bed: Bed, options: VerdictOptions) -> Iterator[Finding]:
         )
 
 
-def _not_by_heights(bed: Bed, findings: Findings, negligible: float) -> Iterator[Finding]:
+def _not_by_heights(
+    bed: Bed, identification: Identification, negligible: float
+) -> Iterator[Finding]:
     """Notes on what heights leave to the nominal model, and on its largest cause.
 
     negligible : displacement of the platform, m.
     """
     yield note("bed.sideways", sigma=bed.sideways, size_sigma=bed.size)
-    sentences = (*findings.unidentified, *findings.weak)
-    if sentences and findings.undetermined_shift > negligible:
+    sentences = (*identification.unidentified, *identification.weak)
+    if sentences and identification.undetermined_shift > negligible:
         first = max(sentences, key=lambda s: s.moves_platform)
         yield note(
             "bed.undetermined",
@@ -338,7 +340,7 @@ def _singular(estimate: Estimate, options: VerdictOptions) -> Iterator[Finding]:
 
 
 def _undetermined(
-    estimate: Estimate, findings: Findings, options: VerdictOptions
+    estimate: Estimate, identification: Identification, options: VerdictOptions
 ) -> Iterator[Finding]:
     """Findings on the largest motions that the data leave undetermined.
 
@@ -346,16 +348,18 @@ def _undetermined(
     most of its variance, so that no refusal depends on the names of motions; otherwise doubtful
     where a single motion makes a noticeable part of its standard deviation.
     """
-    shift, sigma = findings.undetermined_shift, platform_sigma(estimate)
+    shift, sigma = identification.undetermined_shift, platform_sigma(estimate)
     if shift <= negligible_shift(estimate.machine.parameters):
         return
     causes = sorted(
-        (*findings.unidentified, *findings.weak), key=lambda s: s.moves_platform, reverse=True
+        (*identification.unidentified, *identification.weak),
+        key=lambda s: s.moves_platform,
+        reverse=True,
     )
     # where noise makes enough of the variance, the standard deviation suffices
     refused = (
         sigma**2 - shift**2 <= options.least_noise_share * sigma**2
-        and shift > options.undetermined_share * findings.by_nominal
+        and shift > options.undetermined_share * identification.by_nominal
     )
     least = options.large_cause_share * shift if refused else options.worth_reporting * sigma
     large = [s for s in causes if s.matters and s.moves_platform > least]
@@ -374,18 +378,19 @@ def _undetermined(
         )
 
 
-def _harmless(findings: Findings) -> Iterator[Finding]:
+def _harmless(identification: Identification) -> Iterator[Finding]:
     """One note on unidentified motions that do not move the platform; the report has the
     sentences.
     """
-    if not findings.n_harmless:
+    if not identification.n_harmless:
         return
-    harmless = [s for s in (*findings.unidentified, *findings.weak) if not s.matters]
+    harmless = [s for s in (*identification.unidentified, *identification.weak) if not s.matters]
     if harmless:
         what = re.split(r"\.(?=\s|$)", harmless[0].text)[0]  # not at the point of a number
         what = f"{what[0].lower()}{what[1:]}"
     else:  # no name describes these changes without others that move it
-        what = f"{in_full(findings.n_harmless)} of the machine's numbers, or combinations of them"
+        number = in_full(identification.n_harmless)
+        what = f"{number} of the machine's numbers, or combinations of them"
     yield note(
         "machine.undetermined_harmless",
         ", ".join(harmless[0].parameters) if harmless else "",

@@ -32,7 +32,7 @@ from pkmcal.identify.state import State
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.measurements.effects import INTRINSICS
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.mechanisms import Machine
 from pkmcal.solver.ranks import column_space, nonzero
 from pkmcal.solver.search import Stop, minimise
@@ -42,7 +42,7 @@ USUAL_RATIO_CHANGE = 1e-3
 """Typical change of a magnification or another ratio, the scale of its observability."""
 USUAL_STATION_MOVE = 1e-2
 """Typical motion of a camera, m and rad, as that of a tripod that someone ran into."""
-UNSCALED_NOISE = Kinds(1.0, 1.0, 1.0)
+UNSCALED_NOISE = RowGroups(1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -55,25 +55,25 @@ class Trust:
     and rejected.
     """
 
-    robust: Kinds[Array]
-    scale: Kinds[float] = UNSCALED_NOISE
+    robust: RowGroups[Array]
+    scale: RowGroups[float] = UNSCALED_NOISE
     readings: float = 1.0
     shading: float = SHADING_SIGMA
 
     @property
-    def weights(self) -> Kinds[Array]:
+    def weights(self) -> RowGroups[Array]:
         """Weights relative to the scaled noise."""
-        return Kinds(*(w / scale**2 for w, scale in zip(self.robust, self.scale, strict=True)))
+        return RowGroups(*(w / scale**2 for w, scale in zip(self.robust, self.scale, strict=True)))
 
     @classmethod
     def full(cls, measurements: Measurements) -> Trust:
         """Unit weights and the stated noise."""
         counts = len(measurements.edges), len(measurements.poses), measurements.n_links
-        return cls(Kinds(*map(np.ones, counts)))
+        return cls(RowGroups(*map(np.ones, counts)))
 
     @classmethod
     def of(
-        cls, estimate: Estimate, scale: Kinds[float] = UNSCALED_NOISE, readings: float = 1.0
+        cls, estimate: Estimate, scale: RowGroups[float] = UNSCALED_NOISE, readings: float = 1.0
     ) -> Trust:
         """Weights of an estimate, for data with its noise
         (:meth:`~pkmcal.identify.estimate.Estimate.stated_edge_noise`).
@@ -84,12 +84,12 @@ class Trust:
         """
         own = estimate.statistics
         return cls(
-            Kinds(
+            RowGroups(
                 estimate.edge_weights * estimate.edge_trust,
                 estimate.pose_weights,
                 estimate.link_weights,
             ),
-            Kinds(
+            RowGroups(
                 max(scale.edges / own.noise_scale, 1.0),
                 max(own.pose_scale, scale.poses),
                 max(own.link_scale, scale.links),
@@ -121,7 +121,7 @@ class Held:
         measurements.
         """
         problem, linear = self.problem, self.problem.linearize(self.state)
-        used = (np.sum((k.weight[0] > 0) * k.count, axis=1) for k in problem.kinds)
+        used = (np.sum((k.weight[0] > 0) * k.count, axis=1) for k in problem.row_groups)
         count = sum(used, start=np.full(len(linear.value[0]), problem.layout.n_equations))
         free = np.maximum(count - linear.by_own.shape[-1], 1)
         out = np.full(len(self.observed), np.nan)

@@ -30,7 +30,7 @@ from pkmcal.judge.fixed_machine import Held, Trust, change_evidence, hold
 from pkmcal.judge.new_data import calibrated_rows, check_new, measured_new_data
 from pkmcal.judge.sentences import ComparedSession, Names, watch_verdict
 from pkmcal.judge.watch_runs import Run, continued, run_of
-from pkmcal.measurements.rows import Kinds
+from pkmcal.measurements.rows import RowGroups
 from pkmcal.outcome import Verdict
 from pkmcal.outcome.progress import Progress, no_progress, part
 from pkmcal.ranges import check_number
@@ -140,7 +140,7 @@ def watch_machine(
         # Weights and noise of the new data, with the machine free; then the fit with it fixed.
         old = saved.document.get("statistics") or {}
         factors = ("noise_scale", "pose_scale", "link_scale")
-        before = Kinds(*(float(old.get(name, 1.0)) for name in factors))
+        before = RowGroups(*(float(old.get(name, 1.0)) for name in factors))
         data_weights = Trust.of(remeasured.estimate, before, _reading_scale(saved, session))
         noise = remeasured.estimate.statistics.noise_scale * data_weights.scale.edges
         held = _hold_new(saved, session, remeasured, data_weights, ~calibrated)
@@ -243,7 +243,7 @@ def _hold_new(
     data = remeasured.estimate.stated_edge_noise(remeasured.measurements)
     cameras = [station.camera for station in session.stations]
     magnified_data = magnified(data, remeasured.observation, cameras) if cameras else None
-    weights = Kinds(
+    weights = RowGroups(
         data_weights.robust.edges[keep[data.edges.configuration]],
         data_weights.robust.poses[
             keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]

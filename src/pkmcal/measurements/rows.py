@@ -1,4 +1,4 @@
-"""Layout of the rows of all kinds: K configurations of G places for measurements each, padded."""
+"""Layout of the rows of all groups: K configurations of G places for measurements each, padded."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ Item = TypeVar("Item", covariant=True)
 Numbers = TypeVar("Numbers")
 
 
-class Kinds(NamedTuple, Generic[Item]):
-    """One value for each sort of rows: edges, poses (of boards and targets), and links.
+class RowGroups(NamedTuple, Generic[Item]):
+    """One value for each group of rows: edges, poses (of boards and targets), and links. Several
+    kinds of measurement share a group.
 
     An estimate weighs, counts and scales all of these in the same way. Readings are not among them,
     since they have no robust weight.
@@ -25,12 +26,12 @@ class Kinds(NamedTuple, Generic[Item]):
     links: Item
 
     def __repr__(self) -> str:
-        return "Kinds(edges, poses, links)"
+        return "RowGroups(edges, poses, links)"
 
 
 @dataclass(frozen=True)
-class RowsOfKind:
-    """Rows of one sort in a problem.
+class RowGroup:
+    """Rows of one group in a problem.
 
     rows : their slice among a configuration's rows.
     present : (K, G) False for padding.

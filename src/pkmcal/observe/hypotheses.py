@@ -158,7 +158,7 @@ def mistake(
         return error
     bad = [station for station in stations if not station.localization.good]
     worst = max(
-        stations, key=lambda s: (not s.localization.good, s.elsewhere, s.localization.by_chance)
+        stations, key=lambda s: (not s.localization.good, s.elsewhere, s.localization.p_value)
     )
     # a station that is localized near its pose by hand shows that the readings are in order
     in_order = any(s.by_hand is not None and not s.elsewhere for s in stations)
@@ -193,13 +193,13 @@ def mistake(
 def _little(station: SuspectStation) -> str:
     """Description of the evidence, which is too weak."""
     localization = station.localization
-    if localization.by_chance < localization.limit:
+    if localization.p_value < localization.limit:
         return "legs that fit nearly as well at another place"
     count = len(station.view.configuration)
     if count < 2:
         return "one image alone, and none to confirm what it seems to show"
     few = f"{count} images alone, and " if count < ENOUGH_IMAGES_ALONE else ""
-    often = how_often(localization.by_chance)
+    often = how_often(localization.p_value)
     return f"{few}legs that readings of other configurations fit as well {often}"
 
 
@@ -341,7 +341,7 @@ def _likelier(
             # are in order
             if station.elsewhere and localization.good and not in_order and h.readings is not None:
                 out[k] = ratio + options.pose_by_hand
-            elif at.by_chance * count < at.limit:
+            elif at.p_value * count < at.limit:
                 out[k] = ratio
         return out
 

@@ -143,9 +143,9 @@ class LocalizationOptions:
     early: float = 1e-4
     # probability of so large a likelihood by chance below which the machine is localized without a
     # prior (statistical)
-    by_chance: float = 1e-3
+    false_alarm: float = 1e-3
     # the same near a hand-placed pose, which is evidence itself (statistical)
-    by_chance_with_prior: float = 1e-2
+    false_alarm_with_prior: float = 1e-2
     # probability of a second pose above which neither is accepted (statistical)
     rival: float = 0.05
     # grid of candidates without a prior
@@ -176,7 +176,7 @@ class LocalizedPose:
     T_camera_base : (4, 4).
     score : mean truncated distance to image edges, 0 perfect, 1 nothing fits.
     log_likelihood_ratio : against chance, by reduced pixels of silhouette.
-    by_chance : probability of so large a likelihood without the machine.
+    p_value : probability of so large a likelihood without the machine.
     second : probability that another pose is the correct one.
     has_prior : whether the search was around a rough pose.
     correlation_length : reduced pixels of silhouette that count as one measurement.
@@ -186,7 +186,7 @@ class LocalizedPose:
     T_camera_base: Array
     score: float
     log_likelihood_ratio: float
-    by_chance: float
+    p_value: float
     second: float = 0.0
     has_prior: bool = False
     correlation_length: float = 1.0
@@ -198,18 +198,18 @@ class LocalizedPose:
 
     @property
     def limit(self) -> float:
-        """Upper bound of ``by_chance`` for acceptance."""
-        return self.options.by_chance_with_prior if self.has_prior else self.options.by_chance
+        """Upper bound of ``p_value`` for acceptance."""
+        return self.options.false_alarm_with_prior if self.has_prior else self.options.false_alarm
 
     @property
     def good(self) -> bool:
         """Whether the machine is localized, at one pose only."""
-        return self.by_chance < self.limit and self.second < self.options.rival
+        return self.p_value < self.limit and self.second < self.options.rival
 
     @property
     def sure(self) -> bool:
         """Whether the machine would be localized without the prior."""
-        return self.by_chance < self.options.by_chance and self.second < self.options.rival
+        return self.p_value < self.options.false_alarm and self.second < self.options.rival
 
 
 def find_station(
@@ -276,7 +276,7 @@ def _localize(
     # probability by chance, from the folds that ended at the best pose
     first = np.cumsum([0, *(len(value) for value in retained)])[:-1]
     confirmed = _confirmed(view, candidates[order[0]], candidates[first], surely)
-    if parts and not prior and confirmed >= options.by_chance:
+    if parts and not prior and confirmed >= options.false_alarm:
         confirmed = min(confirmed, _second_search(view, candidates[order], parts, rng, options))
     # distinct poses, and a robust refinement of the best
     order = order[distinct_silhouettes(view, candidates[order], every)]
@@ -294,7 +294,7 @@ def _localize(
         T_camera_base=ends[scores.argmin()],
         score=float(scores.min()),
         log_likelihood_ratio=float(log_likelihood_ratio[0]),
-        by_chance=confirmed,
+        p_value=confirmed,
         second=_second(log_likelihood_ratio, each),
         has_prior=prior is not None,
         correlation_length=each,

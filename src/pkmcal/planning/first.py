@@ -20,7 +20,7 @@ from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
-from pkmcal.levels import MAJORITY, NEGLIGIBLE
+from pkmcal.levels import FEWEST_EDGES, MAJORITY, NEGLIGIBLE
 from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.measurements.effects import EDGE_SHIFT
 from pkmcal.mechanisms import Machine
@@ -39,8 +39,6 @@ FIRST_IMAGES_MEASURED = 6
 """Number of measured images of all stations together: those of a hexapod show forty edges of each
 kind, enough to know their scatter to a tenth.
 """
-FEWEST_FIRST_EDGES = 24
-"""Minimum number of edges; a single image of a hexapod has as many."""
 SHARED_EDGES_WEIGHT = 2.0
 """Weight of all edges of a kind at a station, in numbers of edges, relative to the leg's own: it
 limits the influence of chance in three images.
@@ -148,7 +146,7 @@ def first_edges(
     ]
 
     def measurements(edges: EdgeSet) -> Measurements:
-        if len(edges) < FEWEST_FIRST_EDGES:
+        if len(edges) < FEWEST_EDGES:
             raise ResultError("too few edges to predict the accuracy of others", found=len(edges))
         return Measurements(
             edges, session.joints, session.joint_noise, len(images), numbers, shaded=True

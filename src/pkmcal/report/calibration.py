@@ -25,7 +25,7 @@ from pkmcal.errors import PkmcalError
 from pkmcal.files import output_lock, write_folder
 from pkmcal.identify.centres import Centres, free_of_gauge
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolError, centres_and_tool, platform_sigma
+from pkmcal.identify.tool import ToolAccuracy, centres_and_tool, platform_sigma
 from pkmcal.identify.verdict import VERDICT
 from pkmcal.levels import CONTRADICTION_SIGMAS, ROUNDING
 from pkmcal.measurements import LinkSet, Observation
@@ -209,7 +209,7 @@ def report_of(
 
 
 def calibration_cards(
-    calibration: Calibration, centres: tuple[Centres, ...], tool: ToolError
+    calibration: Calibration, centres: tuple[Centres, ...], tool: ToolAccuracy
 ) -> tuple[Figure, ...]:
     """Cards in their order; those without data are left out."""
     session, observation = calibration.session, calibration.observation
@@ -323,7 +323,7 @@ def _joint_accuracy(estimate: Estimate, centres: tuple[Centres, ...]) -> str:
 
 
 def _comparison(
-    calibration: Calibration, tool: ToolError, holdout: HoldOut | None
+    calibration: Calibration, tool: ToolAccuracy, holdout: HoldOut | None
 ) -> LogBar | None:
     """Error of the tool's position by tolerances, as measured, after calibration and held out."""
     machine = calibration.estimate.machine
@@ -358,7 +358,7 @@ def _comparison(
 
 
 def calibration_numbers(
-    observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolError
+    observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolAccuracy
 ) -> dict[str, Any]:
     """Main numbers in m and rad, for the summary of ``--json``.
 
@@ -390,7 +390,7 @@ def _mean(values: Array) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure | None:
+def _tool_sigma(session: Session, estimate: Estimate, tool: ToolAccuracy) -> Figure | None:
     """Card on the standard deviation of the platform's pose that follows from the geometry's."""
     if not tool.position.size:
         return None
@@ -405,7 +405,7 @@ def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure
     )
 
 
-def _flatness(bed: Bed, tool: ToolError) -> Figure:
+def _flatness(bed: Bed, tool: ToolAccuracy) -> Figure:
     """Card on the flatness of a probed bed.
 
     The expected sigma of the tool's height, and how the nominal model bent the bed.
@@ -427,7 +427,7 @@ def _flatness(bed: Bed, tool: ToolError) -> Figure:
     )
 
 
-def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figure | None:
+def _tool_change(session: Session, estimate: Estimate, tool: ToolAccuracy) -> Figure | None:
     """Card on the errors that the nominal model caused in the platform's pose."""
     good = np.isfinite(tool.off_position)
     if not good.any():

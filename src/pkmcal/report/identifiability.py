@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.identify.unidentified import Findings
+from pkmcal.identify.unidentified import Identification
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.outcome import Part
 from pkmcal.outcome.blocks.plot import (
@@ -30,35 +30,35 @@ STUB_INFORMATION = 1.15 * LEAST_BAR_INFORMATION
 MOST_NAMES_LISTED = 6
 
 
-def section(findings: Findings, table: ParameterTable) -> Part:
+def section(identification: Identification, table: ParameterTable) -> Part:
     """Section on the findings of a machine with these parameters."""
     listings = tuple(
         Listing(title=title, items=tuple(f"{one.text}\n{one.advice}" for one in sentences))
         for title, sentences in (
-            ("Not determined by the data", findings.unidentified),
-            ("Better known from the nominal model", findings.weak),
+            ("Not determined by the data", identification.unidentified),
+            ("Better known from the nominal model", identification.weak),
         )
         if sentences
     )
-    held = " ".join(filter(None, (held_text(findings, table), tied(table))))
+    held = " ".join(filter(None, (held_text(identification, table), tied(table))))
     return Part(
         "identifiability",
         "What the data determine",
         (
-            f"{directions_headline(findings)} This is the rank of the data's own information with"
-            " the nominal model left out, from exact derivatives.",
+            f"{directions_headline(identification)} This is the rank of the data's own information"
+            " with the nominal model left out, from exact derivatives.",
         ),
         blocks=(
-            *panels(spectrum(findings)),
+            *panels(spectrum(identification)),
             *listings,
             *((Paragraph(text=held, small=True),) if held else ()),
-            *((_conditions(findings),) if findings.conditions else ()),
+            *((_conditions(identification),) if identification.conditions else ()),
         ),
         menu="Identifiability",
     )
 
 
-def _conditions(findings: Findings) -> DataTable:
+def _conditions(identification: Identification) -> DataTable:
     """Table of [A]'s conditions."""
     rows = tuple(
         TableRow(
@@ -69,7 +69,7 @@ def _conditions(findings: Findings) -> DataTable:
             values=(None, None, one.needed, one.available, None),
             mark="good" if one.met else Level.WRONG,
         )
-        for one in findings.conditions
+        for one in identification.conditions
     )  # fmt: skip
     return DataTable(
         title="The paper's counts",
@@ -86,9 +86,9 @@ def _conditions(findings: Findings) -> DataTable:
     )
 
 
-def directions_headline(findings: Findings) -> str:
+def directions_headline(identification: Identification) -> str:
     """Number of directions that the data determine, in sentences."""
-    ranks = findings.identifiability
+    ranks = identification.identifiability
     possible = ranks.n_parameters - ranks.n_frames
     frames = f"{ranks.n_parameters} free values less {ranks.n_frames} that only place the frames"
     lost = possible - ranks.rank
@@ -103,12 +103,12 @@ def directions_headline(findings: Findings) -> str:
     return f"{start} {capital(joined(parts))}."
 
 
-def spectrum(findings: Findings) -> Plot | None:
+def spectrum(identification: Identification) -> Plot | None:
     """Bars of the information in all directions, best known first, on a logarithmic scale."""
-    information = np.asarray(findings.identifiability.singular_values, dtype=float)
+    information = np.asarray(identification.identifiability.singular_values, dtype=float)
     if information.size == 0:
         return None
-    rank = findings.identifiability.rank
+    rank = identification.identifiability.rank
     bars: list[Point] = []
     for k, ratio in enumerate(information.tolist()):
         words = (
@@ -131,7 +131,8 @@ def spectrum(findings: Findings) -> Plot | None:
         title="How well each direction is known",
         caption="At the line, data and nominal model know as much.",
         alt=f"{len(bars)} directions; {rank} are fixed by the data and "
-        f"{len(findings.identifiability.weak)} of those are known better by the nominal model",
+        f"{len(identification.identifiability.weak)} of those are known better by the nominal"
+        " model",
         x=category_axis((str(bar.x) for bar in bars), "directions, best known first"),
         y=log_axis(
             "singular value, in tolerances",
@@ -144,12 +145,12 @@ def spectrum(findings: Findings) -> Plot | None:
     )
 
 
-def held_text(findings: Findings, table: ParameterTable) -> str:
+def held_text(identification: Identification, table: ParameterTable) -> str:
     """Sentences on the parameters that the mechanism file fixes; empty without any."""
     if not table.fixed:
         return ""
-    names = [name for name in table.fixed if name in findings.conventional]
-    if not names and not findings.also_conventional:
+    names = [name for name in table.fixed if name in identification.conventional]
+    if not names and not identification.also_conventional:
         verb, them = ("was", "it") if len(table.fixed) == 1 else ("were", "them")
         return (
             f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists {them}"
@@ -177,10 +178,10 @@ def held_text(findings: Findings, table: ParameterTable) -> str:
             f"{_listed(table, tuple(others))} {verb} held by the model that the mechanism file"
             " describes: the nominal model's value counts as exact and no direction belongs to it."
         )
-    if findings.also_conventional:
+    if identification.also_conventional:
         parts.append(
-            f"Of these, {count(findings.also_conventional, 'combination')} would only move a frame "
-            "too, such as the heights of base joints and platform joints, of which with a camera "
+            f"Of these, {count(identification.also_conventional, 'combination')} would only move a"
+            " frame too, such as the heights of base joints and platform joints, of which with a camera "
             "and a board only the sum is determined."
         )
     return " ".join(parts)

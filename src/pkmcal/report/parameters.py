@@ -16,7 +16,7 @@ from pkmcal.identify.parameter_estimates import (
     ParameterEstimates,
     parameter_estimates,
 )
-from pkmcal.identify.unidentified import Findings
+from pkmcal.identify.unidentified import Identification
 from pkmcal.levels import ROUNDING
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part
@@ -240,20 +240,22 @@ def _row(table: ParameterTable, k: int, one: ParameterEstimate) -> ParameterRow:
     )
 
 
-def unidentified(estimate: Estimate, findings: Findings) -> tuple[str, ...]:
+def unidentified(estimate: Estimate, identification: Identification) -> tuple[str, ...]:
     """Sentences on unidentifiable and weakly determined directions, then on correlated pairs."""
-    out = (f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak))
-    return (*out, *bound_together(estimate, findings))
+    out = (f"{s.text} {s.advice}" for s in (*identification.unidentified, *identification.weak))
+    return (*out, *bound_together(estimate, identification))
 
 
-def bound_together(estimate: Estimate, findings: Findings | None = None) -> tuple[str, ...]:
+def bound_together(
+    estimate: Estimate, identification: Identification | None = None
+) -> tuple[str, ...]:
     """Sentences on tightly correlated pairs.
 
     Pairs that a finding already names together are left out.
     """
     table = estimate.machine.parameters
     names = table.names
-    unidentified_directions = () if findings is None else findings.unidentified
+    unidentified_directions = () if identification is None else identification.unidentified
     named_together = [{_whole_axis(name) for name in s.parameters} for s in unidentified_directions]
     pairs = [
         (names[i], names[j], rho)

@@ -62,8 +62,8 @@ def _from_images(view: StationView, start: Array | None) -> tuple[Array, bool, s
     shots = count(len(view.configuration), "image")
     if pose.good:
         chance = (
-            f"{pose.by_chance:.0e}"
-            if pose.by_chance > LEAST_CHANCE_DISPLAYED
+            f"{pose.p_value:.0e}"
+            if pose.p_value > LEAST_CHANCE_DISPLAYED
             else f"less than {LEAST_CHANCE_DISPLAYED:.0e}"
         )
         text = f"Localized in {shots}: as good a fit by chance has probability {chance}."

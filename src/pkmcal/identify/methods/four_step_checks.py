@@ -20,6 +20,7 @@ from pkmcal.identify.methods.four_step_platform import (
 from pkmcal.identify.methods.leg_axes import Axes, in_base
 from pkmcal.identify.methods.registration import fixes_pose, loose, parts_of
 from pkmcal.identify.nominal_joints import NominalJoints, nominal_joints
+from pkmcal.levels import CAUSE_SHARE
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import named
 
@@ -200,7 +201,7 @@ def lengths_are_fixed(
     if not free.any():
         return
     part = np.abs(vectors[:, free]).max(axis=1)
-    names = np.flatnonzero(legs.closing)[part > 0.3 * part.max()]
+    names = np.flatnonzero(legs.closing)[part > CAUSE_SHARE * part.max()]
     raise ResultError(
         what=f"the images do not determine the lengths of {named(names)}",
         found="distances between platform joints that do not depend on a combination of them",

@@ -15,6 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
@@ -24,7 +25,7 @@ ONE_DIRECTION = 1e-6
 unidentifiable."""
 REVOLUTE_WEIGHT_ROUNDS = 3
 """Iterations for the weights of a revolute axis's equations; they change little after the first."""
-ONE_PLANE = 1e-4
+ONE_PLANE = NEGLIGIBLE**2
 """Ratio of eigenvalues below which a revolute axis is unidentifiable: directions within 10 mrad of
 each other, where noise dominates."""
 

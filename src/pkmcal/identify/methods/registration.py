@@ -19,12 +19,13 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot, nearest_rotation, perturb, pose, register, rotation, skew
+from pkmcal.levels import NEGLIGIBLE
 from pkmcal.solver.elimination import Linear
 from pkmcal.solver.search import Solution, Values, minimise
 
 REGISTRATION_UNIT_SIGMA = 1e-4
 """Standard deviation, in metres, of all rows; it only determines when the search stops."""
-LOOSE_ITEMS_EIGENVALUE = 1e-4
+LOOSE_ITEMS_EIGENVALUE = NEGLIGIBLE**2
 """Eigenvalue, relative to 1 for an item that one frame determines, below which a motion of items is
 unidentifiable: a shape error then appears with a hundredth of its size."""
 ANY_MOTION = np.eye(6)

@@ -16,14 +16,14 @@ from pkmcal.measurements.readings import joint_rows
 from pkmcal.solver.elimination import flat
 from pkmcal.solver.strips import Compact, Eliminated, eliminate_strips
 
-EDGE_ROWS_KIND, POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND = range(4)
-ROWS_KINDS = 4
-"""Number of kinds of rows, the length of the axes of :class:`KindSums`."""
+EDGE_ROWS, POSE_ROWS, READING_ROWS, LINK_ROWS = range(4)
+ROW_GROUPS = 4
+"""Number of kinds of rows, the length of the axes of :class:`RowSums`."""
 
 
-class KindSums(NamedTuple):
+class RowSums(NamedTuple):
     """Sums over the configurations c of B runs, by kind k of rows, numbered as
-    :data:`EDGE_ROWS_KIND`.
+    :data:`EDGE_ROWS`.
 
     Q_k and A_k are the rows of kind k in Q of a configuration's own Jacobian, and in its reduced
     rows A.
@@ -43,7 +43,7 @@ class KindSums(NamedTuple):
     value: Array
 
 
-class KindRows(NamedTuple):
+class GroupRows(NamedTuple):
     """Rows of one kind, n in each of K configurations of B runs; zero for padding and where nothing
     can be predicted.
 
@@ -57,11 +57,11 @@ class KindRows(NamedTuple):
     value: Array
 
 
-def kind_sums(problem: Problem, state: BatchState) -> KindSums:
+def row_sums(problem: Problem, state: BatchState) -> RowSums:
     """Sums of a problem's rows at a state."""
     n_runs, na = len(state.z), problem.unknowns.count
-    trace, normal = np.zeros((n_runs, ROWS_KINDS)), np.zeros((n_runs, ROWS_KINDS, na, na))
-    every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, ROWS_KINDS))
+    trace, normal = np.zeros((n_runs, ROW_GROUPS)), np.zeros((n_runs, ROW_GROUPS, na, na))
+    every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, ROW_GROUPS))
     values: list[Array] = []
     for cut in problem.cuts:
         part, at = problem.among(cut), problem.state_among(state, cut)
@@ -69,47 +69,47 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
         eliminated_part = eliminate_strips(rows, np.zeros(n_runs))
         values.append(rows.value)
         every += eliminated_part.strips_normal + eliminated_part.rows_normal
-        if part.kinds.edges.present.any():
-            trace[:, EDGE_ROWS_KIND] += np.einsum("bcii->b", eliminated_part.own)
-            normal[:, EDGE_ROWS_KIND] += eliminated_part.strips_normal
-        for kind in (POSE_ROWS_KIND, READING_ROWS_KIND, LINK_ROWS_KIND):
+        if part.row_groups.edges.present.any():
+            trace[:, EDGE_ROWS] += np.einsum("bcii->b", eliminated_part.own)
+            normal[:, EDGE_ROWS] += eliminated_part.strips_normal
+        for kind in (POSE_ROWS, READING_ROWS, LINK_ROWS):
             own, shared, _ = _rows_of_kind(part, rows, eliminated_part, by_reading, kind)
             if shared.size:
                 trace[:, kind] += np.sum(own**2, axis=(1, 2, 3))
                 normal[:, kind] += flat(shared).mT @ flat(shared)
         chi2 += _chi2(part, rows.value, by_reading)
-    return KindSums(trace, normal, every, chi2, np.concatenate(values, axis=1))
+    return RowSums(trace, normal, every, chi2, np.concatenate(values, axis=1))
 
 
-def kind_rows(problem: Problem, state: BatchState, kind: int) -> KindRows:
+def group_rows(problem: Problem, state: BatchState, kind: int) -> GroupRows:
     """Rows of poses, readings or links at a state."""
-    parts: list[KindRows] = []
+    parts: list[GroupRows] = []
     for cut in problem.cuts:
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
         eliminated_part = eliminate_strips(rows, np.zeros(len(state.z)))
         parts.append(_rows_of_kind(part, rows, eliminated_part, by_reading, kind))
-    return KindRows(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
+    return GroupRows(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 
 def _rows_of_kind(
     problem: Problem, rows: Compact, eliminated_part: Eliminated, by_reading: Array, kind: int
-) -> KindRows:
+) -> GroupRows:
     """Rows of poses, readings or links in some configurations.
 
     by_reading : (B, K, E) derivatives of the closures by the readings.
     """
     equations, start = problem.layout.n_equations, problem.closure_rows.start
     parts = eliminated_part.q, eliminated_part.rows, rows.value[:, :, start:, None]
-    if kind in (POSE_ROWS_KIND, LINK_ROWS_KIND):
-        last = problem.kinds.links.rows.start - start
-        cut = slice(equations, last) if kind == POSE_ROWS_KIND else slice(last, None)
+    if kind in (POSE_ROWS, LINK_ROWS):
+        last = problem.row_groups.links.rows.start - start
+        cut = slice(equations, last) if kind == POSE_ROWS else slice(last, None)
         own, shared, value = (part[:, :, cut] for part in parts)
     else:
         own, shared, value = (
             _readings(problem, part[:, :, :equations], by_reading) for part in parts
         )
-    return KindRows(own, shared, value[..., 0])
+    return GroupRows(own, shared, value[..., 0])
 
 
 def _readings(problem: Problem, closures: Array, by_reading: Array) -> Array:
@@ -121,6 +121,6 @@ def _chi2(problem: Problem, value: Array, by_reading: Array) -> Array:
     """Sums of squares (B, 4) of residuals (B, K, r), by kind."""
     closures = problem.closure_rows
     readings = _readings(problem, value[..., closures, None], by_reading)[..., 0]
-    poses, links = (value[..., kind.rows] for kind in problem.kinds[1:])
+    poses, links = (value[..., kind.rows] for kind in problem.row_groups[1:])
     parts = value[..., : closures.start], poses, readings, links
     return np.stack([np.sum(part**2, axis=(1, 2)) for part in parts], axis=-1)
