@@ -397,9 +397,9 @@ def test_sections_lead_from_the_contents(page):
         (0.05, "1 in 20"),
         (1 / 254, "1 in 250"),
         (1 / 25_400, "1 in 25\N{NARROW NO-BREAK SPACE}000"),
-        (3e-7, "< 1 in a million"),
-        (4e-8, "≪ 1 in a million"),
-        (0.0, "≪ 1 in a million"),
+        (3e-7, "< 1 in 10⁶"),
+        (4e-8, "≪ 1 in 10⁶"),
+        (0.0, "≪ 1 in 10⁶"),
         (float("nan"), "–"),
     ],
 )
