@@ -18,6 +18,7 @@ from pkmcal.cameras.files import load_camera
 from pkmcal.commands.cli import COMMANDS_IN_ORDER, command_named
 from pkmcal.files import parse_yaml, read_json, validated_document
 from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
+from pkmcal.outcome.finding import templates
 from pkmcal.session.schema import session_schema
 from test_cli_camera import boards  # noqa: F401 - a fixture
 from test_pose_sessions import make
@@ -207,6 +208,21 @@ def _exists(module: str, names: list[str]) -> bool:
     if not names or reduce(lambda o, n: getattr(o, n, None), names, here) is not None:
         return True
     return _exists(f"{module}.{names[0]}", names[1:])
+
+
+def test_codes_of_troubles_exist():
+    """Codes in first cells: of a sentence, or of an error; one with an asterisk begins one."""
+    package = Path(pkmcal.__file__).parent
+    areas = [path.stem for path in (package / "outcome" / "sentences").glob("*.toml")]
+    codes = {code for area in areas for code in templates(area)}
+    for path in package.rglob("*.py"):
+        codes |= set(re.findall(r'"([a-z]+\.[a-z_.]+)"', path.read_text(encoding="utf-8")))
+    cells = re.findall(r"^\| (`[a-z].*?) \|", text_of("docs/troubles.md"), re.MULTILINE)
+    named = re.findall(r"`([a-z_.*]+)`", " ".join(cells))
+    assert len(named) > 40
+    for code in named:
+        start = code.removesuffix("*")
+        assert code in codes or (start != code and any(c.startswith(start) for c in codes)), code
 
 
 def schema_keys(schema: dict) -> set[str]:

@@ -530,10 +530,15 @@ def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
 
 
 def test_heights_predict_no_readings(kit):
-    """Of a pose of which only the height was measured, the rest follows from its readings."""
-    done = run("calibrate", kit, "-o", kit.parent / "held", "--holdout", "5")
-    assert done.code == 1
-    assert "heights determine no pose" in done.err
+    """Of a pose of which only the height was measured, the rest follows from its readings; this is
+    reported before any work.
+    """
+    done = run("calibrate", kit, "-o", kit.parent / "held", "--holdout", "5", "--json")
+    assert (done.code, done.json["found"]) == (2, "heights alone")
+    steps: list[str] = []
+    with pytest.raises(InputError):
+        calibrate_session(kit, holdout=5, progress=lambda step, _share: steps.append(step))
+    assert steps == []
 
 
 def test_a_board_on_a_printers_tool(cfg):

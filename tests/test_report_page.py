@@ -328,12 +328,16 @@ ACTED = """
   const button = (text) => [...document.querySelectorAll("#parameters button")]
     .find((one) => one.textContent === text);
   const cells = (k) => rows().map((row) => row.cells[k].textContent);
+  const plotted = () => $("#parameters .plot .area > svg").getAttribute("width");
   out.first = rows().length;
+  out.screen = plotted();
   dispatchEvent(new Event("beforeprint"));
   out.printed = rows().length;
+  out.sheet = plotted();
   out.sections = document.querySelectorAll("details:not([open])").length;
   dispatchEvent(new Event("afterprint"));
   out.restored = rows().length;
+  out.again = plotted();
   button("Leg 3").click();
   out.legs = JSON.stringify([...new Set(cells(0))]);
   button("Leg 3").click();
@@ -368,6 +372,7 @@ def test_page_works_in_a_browser(page, tmp_path, width, dark):
     assert len(free) > 30
     assert [int(root[name]) for name in ("first", "printed", "restored")] == [12, len(free), 12]
     assert root["sections"] == "0"  # all are open on paper
+    assert root["again"] == root["screen"] != root["sheet"]  # plots have the paper's width
     assert json.loads(root["legs"]) == ["3"]
     changes = [abs(leading_number(text)) for text in json.loads(root["changes"])]
     assert changes == sorted(changes, reverse=True)
@@ -397,9 +402,9 @@ def test_sections_lead_from_the_contents(page):
         (0.05, "1 in 20"),
         (1 / 254, "1 in 250"),
         (1 / 25_400, "1 in 25\N{NARROW NO-BREAK SPACE}000"),
-        (3e-7, "< 1 in a million"),
-        (4e-8, "≪ 1 in a million"),
-        (0.0, "≪ 1 in a million"),
+        (3e-7, "< 1 in 10⁶"),
+        (4e-8, "≪ 1 in 10⁶"),
+        (0.0, "≪ 1 in 10⁶"),
         (float("nan"), "–"),
     ],
 )

@@ -13,6 +13,7 @@ import sys
 import threading
 import urllib.request
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import cv2
@@ -614,6 +615,34 @@ def test_a_folder_lists_sessions_and_results(results):
     # a page that this version cannot show is listed with the reason
     assert (rows["older.html"]["href"], rows["older.html"]["mark"]) == ("", "wrong")
     assert rows["diff/diff.html"]["before"] == rows["machine.html"]["date"] == ""
+    # a session has the date of its newest image, and whether it has a calibration
+    assert rows["bench"]["text"].endswith("; calibrated")
+    assert rows["broken"]["mark"] == "wrong"
+
+
+def test_a_session_in_a_list_has_the_date_of_its_newest_image(session):
+    images = sorted((session / "images").rglob("*.png"))
+    for path in (*images, session / "joints.csv"):
+        os.utime(path, (1e9, 1e9))
+    newest = datetime(2026, 11, 30, 14, 5)
+    os.utime(images[0], (newest.timestamp(),) * 2)
+    (row,) = Opened(session.parent).document()["entries"]
+    assert (row["date"], row["mark"]) == ("30 November 2026, 14:05", None)
+    assert row["text"] == f"{len(images)} images; not calibrated"
+
+
+def test_a_page_that_is_written_again_is_read_again(results, tmp_path):
+    """Opened by itself and from a list; what cannot be read meanwhile is reported."""
+    for name in ("one", "other"):
+        pkmcal.show("3-rpr").save(tmp_path / f"{name}.html")
+    alone, listed = Opened(tmp_path / "one.html"), Opened(tmp_path)
+    before = alone.document()
+    assert listed.document("0/") == before
+    pkmcal.show("delta").save(tmp_path / "one.html")
+    for document in (alone.document(), listed.document("0/")):
+        assert document["title"] != before["title"]
+    (tmp_path / "one.html").unlink()
+    assert "one.html" in alone.document()["note"]
 
 
 def test_each_entry_of_a_folder_opens(results):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 
 MINUS_SIGN = "\N{MINUS SIGN}"
 DISPLAY_UNITS = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
@@ -125,8 +126,13 @@ def how_often(probability: float) -> str:
     return f"once in {1 / probability:.0f} times" if probability < 0.5 else "as a rule"
 
 
+def date_text(moment: datetime) -> str:
+    """Day and time of a moment, ``30 November 2026, 14:05``."""
+    return f"{moment.day} {moment:%B %Y, %H:%M}"
+
+
 class Chance(str):
-    """Text of a probability: ``34%``, ``1 in 250``, ``< 1 in a million``; a dash for NaN.
+    """Text of a probability: ``34%``, ``1 in 250``, ``< 1 in 10⁶``; a dash for NaN.
 
     value : the probability.
     """
@@ -142,7 +148,7 @@ class Chance(str):
             places = max(0, math.floor(math.log10(often)) - 1)  # two significant digits
             text = f"1 in {round(often, -places):,.0f}".replace(",", "\N{NARROW NO-BREAK SPACE}")
         else:
-            text = f"{'<' if probability > 1e-7 else '≪'} 1 in a million"
+            text = f"{'<' if probability > 1e-7 else '≪'} 1 in 10⁶"
         return super().__new__(cls, text)
 
     def __init__(self, probability: float) -> None:

@@ -183,7 +183,7 @@ def calibrate_session(
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
         clock = Clock(progress)
-        session = _load(session, refine_camera, clock)
+        session = _load(session, refine_camera, holdout, clock)
         located = case or _observe(session, seed, clock.part(0, 0.25))
 
         def calibrated(refine: bool, first: float, last: float) -> Calibration:
@@ -404,11 +404,17 @@ class _Identified(NamedTuple):
     out: Holdout | None
 
 
-def _load(session: Session | Path | str, refine_camera: bool, clock: Clock) -> Session:
+def _load(
+    session: Session | Path | str, refine_camera: bool, holdout: int, clock: Clock
+) -> Session:
     """The loaded session, checked for what this observation can use."""
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
+    if holdout:
+        from pkmcal.calibration.holdout import check_predictable
+
+        check_predictable(session)
     # a pose that the machine cannot reach is reported before any work
     platform_poses(session, most=not legs_stations(session))
     refinement_of(session, refine_camera)

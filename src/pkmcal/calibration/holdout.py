@@ -18,8 +18,9 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
+from pkmcal.session.load import SESSION_FILE_NAME, Session
 from pkmcal.session.readings import same_pose
-from pkmcal.wording import count
+from pkmcal.wording import count, listed
 
 FEWEST_TO_CALIBRATE = 3
 """Fewest configurations from which a calibration is meaningful."""
@@ -65,6 +66,25 @@ class Holdout:
 
     region: Neighbours
     measurements: Measurements
+
+
+def check_predictable(session: Session) -> None:
+    """Raise InputError for a session of which no configuration's readings can be predicted: its
+    measurements have fewer numbers than a pose, so the pose follows from its own readings.
+    """
+    freedoms = session.machine.layout.motion.shape[1]
+    measured = sum(len(table.target.known) for table in session.trackers)
+    if session.stations or measured >= freedoms:
+        return
+    kinds = sorted({table.target.label for table in session.trackers})
+    raise InputError(
+        "readings cannot be predicted: poses follow from their own readings",
+        where=str(session.folder / SESSION_FILE_NAME),
+        found=f"{listed(kinds) or 'readings'} alone",
+        expected=f"stations that measure all {count(freedoms, 'number')} of a pose, by legs, a"
+        " board or a tracker's poses",
+        next_step="To see whether the machine is as it was, use pkmcal watch with new measurements",
+    )
 
 
 def points_of_poses(machine: Machine, poses: Array) -> Array:

@@ -22,7 +22,6 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.holdout import select
-from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.gauge import pose_generators
 from pkmcal.identify.state import State
@@ -91,12 +90,6 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     start : stations, mounts and poses in frames near those of the machine. Raises ResultError if
     they are not found, or if no configuration's pose is observed.
     """
-    if not measurements.n_stations:
-        raise ResultError(
-            "nothing but readings was measured, and readings are not predicted from themselves",
-            expected="a session with images, or with a table of poses",
-            next_step="To see whether the machine is as it was, use pkmcal watch with new readings",
-        )
     # links determine the difference of two poses, not the pose at either's readings
     soft = replace(measurements, joint_noise=SOFT_READING_NOISE, links=())
     held = hold(machine, soft, start)

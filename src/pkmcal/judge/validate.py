@@ -16,6 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
 from pkmcal.calibration.calibrate import Calibration
+from pkmcal.calibration.holdout import check_predictable
 from pkmcal.calibration.machine_identity import read_same_machine
 from pkmcal.calibration.saved_calibration import SavedCalibration
 from pkmcal.errors import PkmcalError
@@ -108,6 +109,7 @@ def validate_calibration(
     with threadpool_limits(1, "blas"):  # as in calibrate
         began = time.perf_counter()
         saved, session = read_same_machine(calibration, session)
+        check_predictable(session)
         lines, calibrated = paths_of(session), calibrated_rows(saved, session)
         if not regions:
             check_new(calibrated, _has_image(session), *NOT_INDEPENDENT)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
@@ -23,7 +24,7 @@ from pkmcal.outcome.finding import Level, Mark
 from pkmcal.session.load import SESSION_FILE_NAME, load_session
 from pkmcal.viewing.content import SessionContent
 from pkmcal.viewing.server import session_document, session_routes
-from pkmcal.viewing.stored_pages import is_page, pages_in, stored_document
+from pkmcal.viewing.stored_pages import StoredPage, is_page, pages_in, stored_document
 from pkmcal.web.document import (
     AnyDocument,
     FolderDocument,
@@ -33,6 +34,7 @@ from pkmcal.web.document import (
     Verdict,
 )
 from pkmcal.web.serving import page_routes
+from pkmcal.wording import count, date_text
 
 if TYPE_CHECKING:
     from starlette.routing import BaseRoute
@@ -56,11 +58,6 @@ class Source:
 
     document: AnyDocument
     routes: Callable[[], list[BaseRoute]]
-
-    @classmethod
-    def of_document(cls, document: AnyDocument) -> Source:
-        """Page that requests nothing but its own files."""
-        return cls(document, lambda: page_routes(lambda: document))
 
 
 def source_of(path: Path, calibration: Path | None = None) -> Source:
@@ -141,7 +138,9 @@ def session_source(folder: Path, calibration: Path | None = None) -> Source:
 
 
 def page_source(path: Path) -> Source:
-    """Page that a command wrote. Raises InputError where there is none."""
+    """Page that a command wrote, as its file is at each request. Raises InputError where there is
+    none.
+    """
     if not path.exists():
         raise InputError(
             "the page of this result is missing",
@@ -149,7 +148,15 @@ def page_source(path: Path) -> Source:
             expected="the page that its command wrote there",
             next_step="Run the command again",
         )
-    return Source.of_document(stored_document(path))
+    page = StoredPage(path)
+
+    def document() -> AnyDocument:
+        try:
+            return page.document()
+        except PkmcalError as error:
+            return _fault_document(error)
+
+    return Source(page.document(), lambda: page_routes(document))
 
 
 # ------------------------------------------------------------------ folder
@@ -216,16 +223,34 @@ def _entry(n: int, path: Path, folder: Path) -> FolderEntry:
     name = str(path.relative_to(folder))
     plain = FolderEntry(
         name=name if name != "." else resolved(folder).name, href=f"{n}/", title="Session",
-        date="", mark=None, text="Images with the machine laid over", before="", after="",
+        date="", mark=None, text="", before="", after="",
     )  # fmt: skip
     if path.is_dir():
-        return plain
+        return plain.model_copy(update=_session_summary(path))
     try:
         document = stored_document(path)
     except InputError as error:
         update = {"href": "", "title": "", "mark": Level.WRONG, "text": error.what}
         return plain.model_copy(update=update)
     return plain.model_copy(update=_summary(document))
+
+
+def _session_summary(folder: Path) -> dict[str, object]:
+    """Fields of a session's row: date of its newest image or table of readings, number of images,
+    and whether its calibration lies beside it.
+    """
+    try:
+        session = load_session(folder)
+    except PkmcalError as error:
+        return {"mark": Level.WRONG, "text": error.what}
+    files = [image.path for station in session.stations for image in station.images]
+    files.append(session.folder / session.document["joints"]["file"])
+    newest = datetime.fromtimestamp(max(file.stat().st_mtime for file in files))
+    calibrated = (folder / CALIBRATION_FOLDER / CALIBRATION_DOCUMENT_FILE).is_file()
+    return {
+        "date": date_text(newest),
+        "text": f"{count(session.images_taken, 'image')}; {'' if calibrated else 'not '}calibrated",
+    }
 
 
 def _summary(document: PageDocument) -> dict[str, object]:
@@ -276,17 +301,16 @@ class OnDemand:
                 source = await run_in_threadpool(self._open, n)
                 router = self._routers[n] = Router(routes=source.routes())
             except (PkmcalError, OSError) as error:  # not stored: it may be corrected meanwhile
-                router = Router(routes=_fault_source(error).routes())
+                fault = _fault_document(error)
+                router = Router(routes=page_routes(lambda: fault))
         await router(scope, receive, send)
 
 
-def _fault_source(error: PkmcalError | OSError) -> Source:
-    """Page of an entry that cannot be opened, with the reason."""
-    return Source.of_document(
-        FolderDocument(
-            program=f"pkmcal {version('pkmcal')}",
-            title="This cannot be opened",
-            entries=(),
-            note=str(error),
-        )
+def _fault_document(error: PkmcalError | OSError) -> FolderDocument:
+    """Page of what cannot be opened, with the reason."""
+    return FolderDocument(
+        program=f"pkmcal {version('pkmcal')}",
+        title="This cannot be opened",
+        entries=(),
+        note=str(error),
     )

@@ -34,6 +34,33 @@ def pages_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*.html") if is_page(path))
 
 
+class StoredPage:
+    """Page that a command wrote; it is read again when its file changes.
+
+    Raises InputError where there is no page that can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._document, self._state = stored_document(path), _file_state(path)
+
+    def document(self) -> PageDocument:
+        """Document of the file as it is now. Raises InputError as `stored_document`."""
+        state = _file_state(self._path)
+        if state != self._state:
+            self._document, self._state = stored_document(self._path), state
+        return self._document
+
+
+def _file_state(path: Path) -> tuple[int, int, int] | None:
+    """Numbers that change when a file is written; None where it is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size
+
+
 def stored_document(path: Path) -> PageDocument:
     """Document of a page. Raises InputError for another file, and for a page of another version."""
     try:

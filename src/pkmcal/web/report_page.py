@@ -13,6 +13,7 @@ from pkmcal.outcome.finding import Finding, Level
 from pkmcal.web import document as shapes
 from pkmcal.web.page import standalone_page
 from pkmcal.web.tables import table_block
+from pkmcal.wording import date_text
 
 LONGEST_HEADLINE = 240
 """Characters of two lines."""
@@ -40,7 +41,7 @@ def report_document(outcome: Outcome, made: datetime | None = None) -> shapes.Re
     """Document of the page; see :func:`report_page`."""
     verdict, program = outcome.verdict, f"pkmcal {version('pkmcal')}"
     usable = verdict.usable
-    date = (f"{made.day} {made:%B %Y, %H:%M}",) if made else ()
+    date = (date_text(made),) if made else ()
     stamp = outcome.stamp or ("Usable" if usable else "Do not use")
     headline, explanation, points = verdict_lines(verdict.headline, stamp)
     # remarks: what needs no action

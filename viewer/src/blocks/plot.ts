@@ -35,7 +35,8 @@ interface Size {
 const LETTER = 6.8, ROW = 22;
 /** Share of a plot's width that names of rows may take. */
 const MOST_NAMES = 0.4;
-const UNSEEN_WIDTH = 420;
+/** Widths of a plot on paper, px: alone, and of two side by side. */
+const PAPER_WIDTH = 640, PAPER_PANEL_WIDTH = 400;
 const PANEL_HEIGHT = 220, WIDE_HEIGHT = 320, HIGHEST = 620, WIDE = 560;
 /** Part of a category's place that bars leave free, at each side. */
 const GAP = 0.12;
@@ -44,10 +45,11 @@ const LONGEST_NAME = 12;
 const COLOUR_STEPS = 20;
 
 export function panels(block: Panels, context: Context): HTMLElement {
-  return h("div", { class: "panels" }, ...block.plots.map((one) => plot(one, context)));
+  const width = block.plots.length > 1 ? PAPER_PANEL_WIDTH : PAPER_WIDTH;
+  return h("div", { class: "panels" }, ...block.plots.map((one) => plot(one, context, width)));
 }
 
-export function plot(block: PlotBlock, { selection }: Context): HTMLElement {
+export function plot(block: PlotBlock, { selection, printSteps }: Context, paperWidth = PAPER_WIDTH): HTMLElement {
   const area = h("div", { class: "area" });
   let drawn = 0;
   const draw = (width: number) => {
@@ -56,11 +58,16 @@ export function plot(block: PlotBlock, { selection }: Context): HTMLElement {
     area.replaceChildren(picture(block, width));
     selection.apply(area);
   };
-  // a plot in a closed part of the page has no width yet; on paper it keeps this one
-  draw(UNSEEN_WIDTH);
+  draw(paperWidth); // a plot in a closed part of the page has no width yet
   new ResizeObserver(() => requestAnimationFrame(() => {
     if (area.clientWidth) draw(area.clientWidth);
   })).observe(area);
+  // a drawing for the screen would be scaled down on paper, with its text
+  printSteps.push(() => {
+    const before = drawn;
+    draw(paperWidth);
+    return () => draw(before);
+  });
   const caption = block.caption ? [h("p", { class: "small" }, block.caption)] : [];
   return h("figure", { class: "plot" },
     h("figcaption", {}, h("b", {}, block.title), ...caption), ...legend(block), area, ...values(block));
