@@ -34,6 +34,7 @@ PROBED_FILE_DESCRIPTIONS = {
     "mechanism.yaml": PRINTER_MECHANISM_DESCRIPTION,
     "joints.csv": "the carriages when the bed was probed",
     "poses.csv": "the tool's height above the bed there",
+    "distances.csv": "the distances on the printed part",
 }
 """Descriptions of the files of a complete session of a printer."""
 IMAGES_DESCRIPTION = "where the images go"
