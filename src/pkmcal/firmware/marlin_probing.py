@@ -35,7 +35,7 @@ from pkmcal.firmware.contract import (
     root_mean_square,
     touches_at,
 )
-from pkmcal.firmware.towers import Command, commands
+from pkmcal.firmware.towers import commands
 
 MOST_GRID_POINTS = 100
 """Bound on the points of a grid's row or column."""
@@ -97,15 +97,20 @@ def _offset(printer: Printer, label: str) -> Array:
 
 
 def _last_command(text: str, code: str, line: int) -> dict[str, float] | None:
-    """Words of the last command of a code up to a line of the text; None without one."""
-    before: list[Command] = [one for one in commands(text, (code,)) if one.line <= line]
-    words: dict[str, float] = {}
-    for word in before[-1].rest.upper().split() if before else ():
+    """Words of the last command of a code up to a line of the text; None without one.
+
+    Marlin's answers begin with the code as well, but their words are no letters with numbers.
+    """
+    last = None
+    for command in commands(text, (code,)):
+        words = command.rest.upper().split()
         try:
-            words[word[0]] = float(word[1:] or 0)
+            values = {word[0]: float(word[1:] or 0) for word in words}
         except ValueError:
-            return None
-    return words if before else None
+            continue
+        if command.line <= line:
+            last = values
+    return last
 
 
 def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
