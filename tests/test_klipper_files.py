@@ -287,7 +287,7 @@ def part_marks(scale=1.0):
     return scale * np.array(ends)
 
 
-def analyze(true, rng, caliper=0.02, scale=1.0):
+def analyze(true, rng, caliper=0.02, scale=1.0, *, log=False):
     """DELTA_ANALYZE's lines of the part that a machine prints, mm; pillars 9 mm and something."""
     carriages = SAYS.carriages(part_marks(scale).reshape(-1, 3))
     there = 1e3 * true.forward(1e-3 * carriages)[:, :3, 3].reshape(12, 2, 3)
@@ -300,7 +300,9 @@ def analyze(true, rng, caliper=0.02, scale=1.0):
         "CENTER_PILLAR_WIDTHS": widths[:3],
         "OUTER_PILLAR_WIDTHS": widths[3:],
     }
-    lines = [f"DELTA_ANALYZE {name}=" + ",".join(f"{x:.3f}" for x in values)
+    # klippy.log has lists, a console what was typed
+    form = "{} = [{}]" if log else "{}={}"
+    lines = ["DELTA_ANALYZE " + form.format(name, ", ".join(f"{x:.3f}" for x in values))
              for name, values in words.items()]  # fmt: skip
     return "\n".join([*lines, f"DELTA_ANALYZE SCALE={scale}"]) + "\n", distance
 
@@ -314,7 +316,7 @@ def test_a_printed_part_determines_the_size(scale, tmp_path):
     true, rng = printers.machine(BUILT, endstops=(0.5, -0.3, 0.2)), np.random.default_rng(3)
     readings = printers.felt(true, printers.bed(19), 0.015, rng)
     path = files(tmp_path, printer_cfg=printers.printer_cfg(SAYS, readings))
-    text, distance = analyze(true, rng, scale=scale)
+    text, distance = analyze(true, rng, scale=scale, log=scale != 1)
     log = files(tmp_path, klippy_log=text)
     done = run("new", tmp_path / "kit", "--printer", path, "--probed", log)
     assert done.code == 0, done.err

@@ -49,7 +49,6 @@ _PLACELESS = {
     "Bed Topography Report": "a map of heights without its places",
     "G33 Auto Calibrate": "the output of a G33 whose places or values in force it does not contain",
 }
-_GRID_ROW = re.compile(r"(?:^|[^\d.+-])(\d{1,2})((?:[ ]+(?:[-+]?\d{1,3}\.\d{1,6}|=+))+)\s*$")
 _G33_RADIUS = re.compile(rf"Checking\.\.\. AC at radius:\s*{NUMBER}")
 _G33_VALUE = re.compile(r"(?<![A-Za-z])(c|xy?|yz?|zx?):\s*([-+]?\d{1,4}\.\d{1,6})")
 
@@ -122,10 +121,10 @@ def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
         return None
     rows: list[list[float]] = []
     for line in lines[start + 2 :]:
-        row = _GRID_ROW.search(line)
-        if row is None or int(row[1]) != len(rows) or len(rows) == MOST_GRID_POINTS:
+        row = _grid_row(line, len(rows))
+        if not row or len(rows) == MOST_GRID_POINTS:
             break
-        rows.append([np.nan if "=" in word else float(word) for word in row[2].split()])
+        rows.append(row)
     left, right, front, back = (words[c] for c in "LRFB")
     sizes = {len(row) for row in rows}
     in_order = -LARGEST_PRINTER_VALUE < left < 0 < right < LARGEST_PRINTER_VALUE
@@ -148,6 +147,15 @@ def _grid_points(text: str, label: str, printer: Printer) -> Array | None:
         most = np.linalg.norm(on_axes - shift, axis=-1).max()
         probed &= np.linalg.norm(grid - shift, axis=-1) <= most * (1 + 1e-9)
     return np.column_stack([grid[probed] - beside, z[probed]])
+
+
+def _grid_row(line: str, number: int) -> list[float]:
+    """Heights behind the row's number, NaN for marks of points without; none for another line."""
+    _, _, heights = f" {line} ".partition(f" {number} ")
+    try:
+        return [np.nan if set(word) == {"="} else float(word) for word in heights.split()]
+    except ValueError:
+        return []
 
 
 def _g33_points(text: str, label: str, printer: Printer) -> Array | None:

@@ -150,14 +150,15 @@ def printer_session_texts(
     """Files of a printer's session by name; arguments as for `write_printer_session`."""
     delta = read_printer(printer, firmware)
     if in_view is None:
-        # points that do not depend on the printer's values come first in its own file
-        if probed is None:
-            touches, distances = read_measured(printer, delta, own=True)
-            touches = delta.touches or touches
-        else:
-            touches, distances = read_measured(probed, delta)
-            touches = touches or (delta.touches if distances else None)
-        return heights_texts(delta, _checked_touches(delta, touches), distances or delta.distances)
+        # of the printer's own file, points that do not depend on its values come first
+        touches, distances = delta.touches, delta.distances
+        if probed is not None:
+            points, part = read_measured(probed, delta)
+            touches, distances = points or touches, part or distances
+        elif touches is None:
+            touches, part = read_measured(printer, delta, own=True)
+            distances = part or distances
+        return heights_texts(delta, _checked_touches(delta, touches), distances)
     return carried_texts(delta, places)
 
 
