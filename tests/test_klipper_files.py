@@ -301,8 +301,8 @@ def analyze(true, rng, caliper=0.02, scale=1.0, *, log=False):
         "OUTER_PILLAR_WIDTHS": widths[3:],
     }
     # klippy.log has lists, a console what was typed
-    form = "{} = [{}]" if log else "{}={}"
-    lines = ["DELTA_ANALYZE " + form.format(name, ", ".join(f"{x:.3f}" for x in values))
+    form, comma = ("{} = [{}]", ", ") if log else ("{}={}", ",")
+    lines = ["DELTA_ANALYZE " + form.format(name, comma.join(f"{x:.3f}" for x in values))
              for name, values in words.items()]  # fmt: skip
     return "\n".join([*lines, f"DELTA_ANALYZE SCALE={scale}"]) + "\n", distance
 
